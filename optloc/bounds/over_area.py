@@ -92,7 +92,7 @@ def bound_map(
 ) -> BoundMap:
     """Return the Cramer-Rao bound of a target at every point of a grid.
 
-    Noise, station errors and biases are those of the problem.
+    Noise, station errors and biases are taken from the problem.
 
     Parameters
     ----------

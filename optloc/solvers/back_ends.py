@@ -1,7 +1,7 @@
 """Back ends that a study may use: conic solvers of cvxpy, nonlinear solvers of CasADi, least squares.
 
-A library may list a solver that does not work. Some solvers end the process, some raise an error for every program,
-some never end if there is no solution, and some report a missing solution as a success. So each solver is tried once,
+A library may list a solver that does not work. Some solvers end the process, and some raise an error for
+every program. Without a solution, some solvers never end, and some report a success. So each solver is tried once,
 in a separate process, on programs with and without a solution (`formulations.backend_trial`). Only solvers that pass
 are listed.
 """

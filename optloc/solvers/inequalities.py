@@ -287,7 +287,7 @@ def _keep_misfits(problem: Problem, before: Pool, broken: Array, pool: Pool) -> 
 
 
 def _fits(pool: Pool, cost: Array) -> Array:
-    """Return flags (N, q) of costs that noise explains; all True for a robust loss, which has no such test."""
+    """Return flags (N, q) of costs that noise explains; all True for a robust loss, which has no chi-square test."""
     if pool.loss:
         return np.ones(cost.shape, dtype=bool)
     return ~(tail_probability(cost, pool.dof[:, None]) < REFUTED)
@@ -343,7 +343,7 @@ def _on_face(
 def is_minimum(problem: Problem, face: Face, x: Array) -> Array:
     """Return flags (N,) of minima x (N, size) along a face that are minima of all admitted positions.
 
-    Such a minimum meets every constraint, the Earth hides it from no station with a row of it, and the cost grows from
+    The minimum must meet every constraint and be visible from every station with a row of it. The cost must grow from
     the face inwards: the conditions of Karush, Kuhn and Tucker.
     """
     good = (violation(problem, x) <= TOLERANCE) & ~is_hidden(problem, x)

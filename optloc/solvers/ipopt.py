@@ -96,7 +96,7 @@ def _of_blocks(problem: Problem, x: Array) -> Array:
 
 
 def _stationary(problem: Problem, x: Array, code: Array, face: Array) -> Array:
-    """Return codes with `ok` where the next Gauss-Newton step is shorter than 1e-5 sigma, whatever IPOPT reports."""
+    """Return codes with `ok` where the next Gauss-Newton step is shorter than 1e-5 sigma, for every report of IPOPT."""
     sides, out = faces(problem) if problem.constraints else [()], np.array(code)
     for number in np.unique(face):
         items = np.flatnonzero(face == number)

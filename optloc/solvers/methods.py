@@ -200,7 +200,7 @@ METHODS = {
     "robust": "roots+lsr+widen+lsr+search+suspects+certify",
 }
 
-# Endings of back ends that a sentence names; nobody reads a longer list.
+# Endings of back ends that a sentence names: a longer list does not help.
 _SHOWN = 3
 
 # Statuses that more candidates do not change, so no proof is needed.
@@ -258,8 +258,8 @@ class Method:
     def __call__(self, problem: Problem, pool: Pool | None = None) -> Pool:
         """Return the pool of a flat batch of problems.
 
-        Three groups of problems take the last branch only: problems beyond the scope of the proof, runs, whose proof
-        takes longer than all starts, and rows with an unknown factor, which closed forms set to one.
+        Three groups of problems take the last branch only. Problems beyond the scope of the proof have no proof. The
+        proof of a run takes longer than all starts. Closed forms set an unknown factor of rows to one.
         """
         branches = list(self.branches)
         # the first branch would end without a proof, or with a proof that the last branch repeats
@@ -318,7 +318,7 @@ def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
         return pool
     part, (first, *others) = problem.take(items), method.runs(len(items))
     start = first(part, None)
-    # earlier candidates compete, so that a branch never gives a worse answer than the one before
+    # earlier candidates compete, so that a branch never gives a worse answer than the branch before
     new, before = _beside(part, start, standing(take(pool, items), fix[items])), tried_before(pool, fix, items)
     for stage in others:
         # A proof takes most of the time, so it is not repeated if the other stages found no new minimum.

@@ -270,7 +270,7 @@ _RUNS = Cache["RunPlan | None"](64)
 
 
 def run_plan_of(problem: Problem) -> RunPlan | None:
-    """Return the plan of runs of one target that is free at each epoch, or None if there is no such plan.
+    """Return the plan of runs of one target that is free at each epoch, or None without a plan.
 
     The stations must be at rest, and a batch may differ in measurements only.
     """

@@ -1,4 +1,4 @@
-"""The pool: the candidates of a batch of problems, which stages pass on with what they computed about them.
+"""The pool: the candidates of a batch of problems, with costs, weights and proofs, which stages pass on.
 
 Only the verdict turns a pool into fixes.
 """

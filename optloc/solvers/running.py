@@ -30,7 +30,7 @@ from optloc.solvers.verdict.judge import verdict
 _TOLERANCE = 1.0
 # Most steps of a new linearisation: it begins a few standard deviations from its end, where two or three are enough.
 _STEPS = 20
-# Estimates of a growing run: as many as a picture can show.
+# Most estimates of a growing run: a picture cannot show more.
 _POINTS = 60
 
 

@@ -1,8 +1,8 @@
 """The short path: a few fixes of one problem from new measurements to the verdict, in compiled code, without batches.
 
 Everything that does not depend on the measurements is stored: the linear maps of the fix, the terms of the proof, and
-the constant columns of the verdict. A fix with a complication (a rival minimum, a doubtful cost, an unfinished proof)
-returns None, and the caller takes the long path through the stages of the method.
+the constant columns of the verdict. For a fix with a complication, such as a rival minimum, a doubtful cost or an
+unfinished proof, the result is None. The caller then runs the stages of the method: the long path.
 """
 
 from __future__ import annotations
@@ -166,8 +166,8 @@ class Single:
     centre : array (d,)
         Middle of the stations, metres.
     doubt, refuted, region : float
-        Cost above which a fix takes the long path, cost that refutes the model, and the largest excess of the cost in
-        the likelihood region.
+        Three limits of the cost. Above `doubt` a fix takes the long path, and `refuted` refutes the model. `region` is
+        the largest excess in the likelihood region.
     often : bool
         Whether the problem is fixed often enough to load machine code for it.
     repeatable : bool
@@ -467,8 +467,8 @@ def _told(
 def single(problem: Problem, method: Method, *, often: bool = True) -> Single | None:
     """Return a prepared problem that fixes measurements on the short path, or None if the path is not available.
 
-    The path is available under three conditions: problems differ in their measurements only, the method begins with a
-    direct solution, and the numbers of the proof are affine functions of the measurements.
+    The path has three conditions. Problems differ in their measurements only. The method begins with a direct solution.
+    The numbers of the proof are affine functions of the measurements.
 
     Parameters
     ----------

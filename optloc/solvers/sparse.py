@@ -383,7 +383,7 @@ def _spare(problem: Problem, size: Array, wrong: Array) -> Array:
 
 
 def _standardise(problem: Problem, x: Array, kept: Array) -> Array:
-    """Return residuals (N, m) at the fix of the rows kept, divided by the standard deviations of the residuals.
+    """Return residuals (N, m) at the fix of the rows kept, divided by their standard deviations.
 
     The residual of a row in the fix has the variance s^2 - J C J', the residual of a row left out s^2 + J C J'.
     """

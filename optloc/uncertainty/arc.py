@@ -160,8 +160,10 @@ def trace_arc(problem: Problem, fix: Fix) -> Arc:
     fix : Fix
         A single fix.
 
-    Notes ----- Steps follow the axis of least information, and Gauss-Newton corrects them across it. The curve ends if
-    the cost exceeds the cost of the fix by 25, or if the curve returns to the fix.
+    Notes
+    -----
+    Steps follow the axis of least information, and Gauss-Newton corrects them across it. The curve ends if the cost
+    exceeds the cost of the fix by 25, or if the curve returns to the fix.
     """
     return trace_from(RegionSurface.of(problem, fix))
 

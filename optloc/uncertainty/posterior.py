@@ -120,8 +120,10 @@ def samples(
     within : float, optional
         Radius of a ball around the middle of the stations that limits the position, metres.
 
-    Notes ----- Importance sampling from a Student distribution by Sobol points. If the fix is Gaussian in metres or in
-    the inverse-range chart, these coordinates are used; the weights make the samples exact.
+    Notes
+    -----
+    Importance sampling from a Student distribution by Sobol points. If the fix is Gaussian in metres or in the
+    inverse-range chart, these coordinates are used; the weights make the samples exact.
 
     References
     ----------
@@ -271,8 +273,10 @@ def mixture(problem: Problem, fix: Fix, k: int = _SLICES, seed: int = 0) -> Mixt
     seed : int
         Seed of the samples from which the moments are computed.
 
-    Notes ----- The weight of a minimum is exp(-gap / 2): the integral of its likelihood under Jeffreys' prior, whose
-    determinant cancels the determinant of the covariance (Laplace).
+    Notes
+    -----
+    The weight of a minimum is exp(-gap / 2): the integral of its likelihood under Jeffreys' prior, whose determinant
+    cancels the determinant of the covariance (Laplace).
     """
     if k < 1:
         raise InvalidProblem(f"{k} slices are not possible", "k", "give 1 or more; 4 are enough")

@@ -96,8 +96,10 @@ def radius(covariance: Array, level: ArrayLike) -> Array:
 def _first_guess(variance: Array, level: Array) -> Array:
     """Return squared radii (...) from the moments of the sum of squares, for variances (..., d) whose sum is 1.
 
-    Notes ----- F. E. Satterthwaite (1946) replaces the sum by a chi-square of the same variance, and E. B. Wilson, M.
-    M. Hilferty (1931) replace a chi-square by the cube of a normal number.
+    Notes
+    -----
+    F. E. Satterthwaite (1946) replaces the sum by a chi-square of the same variance, and E. B. Wilson, M. M. Hilferty
+    (1931) replace a chi-square by the cube of a normal number.
     """
     from scipy.special import ndtri
 
@@ -116,8 +118,10 @@ def probability(variance: Array, square: Array) -> tuple[Array, Array, Array]:
     square : array (...)
         Squared radius of the ball, positive; slope and curvature are derivatives to its logarithm.
 
-    Notes ----- The Laplace transform of the density of the sum of squares is ``prod_i (1 + 2 variance_i p)^(-1/2)``.
-    Its singularities are negative for every shape, so a few nodes on Talbot's contour around them invert it: L. N.
+    Notes
+    -----
+    The Laplace transform of the density of the sum of squares is ``prod_i (1 + 2 variance_i p)^(-1/2)``. Its
+    singularities are negative for every shape, so a few nodes on Talbot's contour around them invert it: L. N.
     Trefethen, J. A. C. Weideman, T. Schmelzer, "Talbot quadratures and rational approximations", BIT 46 (2006).
     """
     nodes, weights = _contour()

@@ -191,9 +191,11 @@ def likelihood_region(problem: Problem, fix: Fix, level: float = 0.95, *, boxes:
     boxes : int, optional
         Most cells that may hold the region; more are finer. By default 1 000 in the plane and 8 000 in space.
 
-    Notes ----- The region is ``{x: f(x) <= f(fix) + q}``, with q the quantile of chi-square for the number of
-    coordinates: the likelihood-ratio region (S. S. Wilks, 1938). It covers at its level even if no Gaussian does,
-    because curvature of the coordinates does not change it.
+    Notes
+    -----
+    The region is ``{x: f(x) <= f(fix) + q}``, with q the quantile of chi-square for the number of coordinates: the
+    likelihood-ratio region (S. S. Wilks, 1938). It covers at its level even if no Gaussian does, because curvature of
+    the coordinates does not change it.
     """
     surface = RegionSurface.of(problem, fix)
     threshold = surface.least + quantile(level, len(surface.position))

@@ -69,8 +69,8 @@ from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.judge import failed, fill, judge, verdict
 from optloc.solvers.verdict.minima import settle
 
-# Most restarts of a proof that a face costs too much, and refinement steps of a restart. A proof restarts at the
-# position that it found, if the cost there is less than halfway to the level, or else some steps nearer to the minimum.
+# Most restarts of a proof that a face costs too much, and refinement steps of a restart. A proof restarts at a cheaper
+# position that it found, or some steps nearer to the minimum if the cost is steep at its position.
 _BEGINS, _STEPS = 12, 8
 # Rounds of new minima along faces and repeated proofs: one round is enough except for batches of bad fixes.
 _ROUNDS = 4

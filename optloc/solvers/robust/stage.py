@@ -87,9 +87,9 @@ _WEIGHINGS = 30
 # Gap of a rival that leaves out no more than the cheapest candidate: a loss alone is no evidence between the two. The
 # gap is not zero, so that the cheapest candidate stays first.
 _CLOSE = 1e-2
-# Minima that cost more than twice the least doubt many more rows, so that a search from them does not end near it.
+# Minima that cost more than twice the least reject many more rows, so that a search from them does not end near it.
 _DEARER = 2.0
-# Content of the ellipsoid within which candidates are one answer that doubts the rows slightly differently.
+# Content of the ellipsoid within which candidates are one answer with slightly different weights.
 _ONE_ANSWER = 0.95
 
 

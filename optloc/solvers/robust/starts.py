@@ -37,7 +37,7 @@ _EACH, _NUMBERS = 64, 2**20
 # Epochs of a run that are fixed separately, spread over the run, and positions kept for each: both sides of flat
 # stations.
 _EPOCHS, _SIDES = 12, 2
-# Starts whose residuals differ by less than this many sigma are equal: the loss would doubt the same rows.
+# Starts whose residuals differ by less than this many sigma are equal: the loss would reject the same rows.
 _SAME = 0.5
 # Gauss-Newton steps before starts are compared: enough to remove the effect of the weights of the closed form.
 _FEW = 5
@@ -51,11 +51,11 @@ _MEDIAN = 1.4826
 # Halvings of that scale, down to one sigma: a scale of 64 sigma ends at the noise.
 _HALVINGS = 6
 # Growth factor of the control parameter (Yang et al.: 1.4), most steps of the graduation, and final value. At the final
-# value the weights equal those of truncated least squares, except within a thousandth around the cut.
+# value the weights equal the weights of truncated least squares, except within a thousandth around the cut.
 _GROWTH, _GRADES, _SHARP = 1.4, 40, 1e3
 
 
-# Subsets of rows for the starts: all rows except those of some stations, or all except one row.
+# Subsets of rows for the starts: all rows except the rows of some stations, or all except one row.
 
 
 def subsets(problem: Problem, clean: Array) -> tuple[Array, Array]:

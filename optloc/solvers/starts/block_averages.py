@@ -21,7 +21,7 @@ _GAP = 2.0
 
 
 def average_blocks(problem: Problem, count: int) -> Problem:
-    """Return the run as blocks of equally many epochs, with the values of its rows in the middle of each block.
+    """Return the run as blocks with an equal number of epochs, with the values of its rows in the middle of each block.
 
     Blocks have equal length, so that an average ignores the same curvature in all of them, and a bias absorbs it. The
     last epochs that do not fill a block are dropped. Blocks with a gap in time are dropped too.
@@ -36,8 +36,8 @@ def average_blocks(problem: Problem, count: int) -> Problem:
     Returns
     -------
     Problem
-        Batch (...) with one epoch per block. The value of a row is that of a line through its values, in the middle of
-        the block. A row exists if it is present in all problems of the batch. Biases are unchanged, and states have the
+        Batch (...) with one epoch per block. A line through the values of a row gives its value in the middle of the
+        block. A row exists if it is present in all problems of the batch. Biases are unchanged, and states have the
         same reference time.
     """
     length = max(1, problem.epochs // count)

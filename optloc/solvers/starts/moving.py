@@ -1,8 +1,8 @@
 """Starts of a target with unknown velocity from range rates of one epoch: a best-first search over boxes of all space.
 
 Given the position, rates are linear in the velocity, which is eliminated at the centre of each box. Over the box the
-lines of sight turn. The search bounds the change of the residuals by this turn, for a velocity of limited size, and
-takes boxes in the order of these bounds.
+lines of sight turn. For a velocity of limited size, the search bounds the change of the residuals by this turn.
+It takes boxes in the order of these bounds.
 """
 
 from __future__ import annotations

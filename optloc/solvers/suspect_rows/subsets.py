@@ -46,7 +46,7 @@ _SHORT = 0.01
 _BLIND = "a measurement is wrong, but redundancy 1 cannot identify it"
 
 
-# A set of groups, the rows that it leaves out, and those of its groups that have no rows.
+# A set of groups, the rows that it leaves out, and its groups without rows.
 _Set = tuple[tuple[int, ...], Array, frozenset[int]]
 
 
@@ -81,7 +81,7 @@ class Outcome:
     p_value : dict of tuple of int to float
         Chi-square probability of the rest without each set that was tried; NaN without redundancy.
     note : str
-        Sentence on what limited the search.
+        Sentence on the limit of the search.
     closest : Rest, optional
         The cheapest of the rests that were tried last.
     tried : int
@@ -215,8 +215,8 @@ def _search(alike: Alike) -> Generator[list[_Request], list[list[_Tried]], list[
 def listed(rests: Sequence[Rest], groups: Sequence[Group]) -> tuple[Rest, ...]:
     """Return the rests whose score is within the gap of the least, the best first.
 
-    A rest that leaves out more than another one is listed only if its cost is lower by more than chance explains: for
-    each further row by the price of a row minus the gap, as between one row and none.
+    A rest that leaves out more rows than another is listed only if its cost is lower by more than chance explains. The
+    limit for each further row is the price of a row minus the gap, as between one row and none.
     """
     if not rests:
         return ()
@@ -402,7 +402,7 @@ def _limit(dof: Array) -> Array:
 # group that fits again.
 #
 # Each step tests all groups to first order (data snooping: Baarda 1968; iterated: Kok 1984), each at 1 % over the
-# number of groups: the chi-square test of thousands of rows does not notice a few wrong ones. Many rows that agree on a
+# number of groups: the chi-square test of thousands of rows does not notice a few wrong rows. Many rows that agree on a
 # wrong answer can mask the errors. After a robust fix, the search starts from the rows that the robust fix rejected.
 
 # Groups of more rows are tested again only if no smaller group stands out. Their test is an eigenvalue problem of their
@@ -438,7 +438,7 @@ def grow(problem: Problem, groups: Sequence[Group], fix: Fix, start: Rest) -> Ou
                 {(): float(fix.p_value)},
                 f"with {len(left)} of {len(groups)} left out, the remaining data still disagree",
             )
-        # a station replaces those of its rows that were left out before
+        # a station replaces its single rows that were left out before
         left = [*(i for i in left if not _inside(groups[i], groups[worst])), worst]
         rest = fix_without(problem, groups, left, rest.x)
     left, rest = _take_back(problem, groups, left, rest, level)
@@ -451,7 +451,7 @@ def grow(problem: Problem, groups: Sequence[Group], fix: Fix, start: Rest) -> Ou
 
 
 def joined(outcomes: Sequence[Outcome], groups: Sequence[Group]) -> Outcome:
-    """Return the joined outcome of several searches of one problem; the first one without an explanation."""
+    """Return the joined outcome of several searches of one problem; without an explanation the first outcome."""
     rests = {rest.left: rest for outcome in outcomes for rest in outcome.rests}
     return replace(outcomes[0], rests=listed([*rests.values()], groups)) if rests else outcomes[0]
 

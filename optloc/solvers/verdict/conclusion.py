@@ -13,7 +13,7 @@ from optloc.problem.explanations import Explanation, Suspect
 from optloc.problem.fix import Alternatives, Fix
 from optloc.problem.problem import Problem
 
-_SHOWN = 4  # names in a sentence; nobody reads a longer list
+_SHOWN = 4  # names in a sentence: a longer list does not help
 _UNKNOWN = claim(Certificate("unknown", "the data contradict each other", "none"))
 
 

@@ -143,8 +143,8 @@ def objections(table: Sequence[Finding], evidence: Any) -> list[tuple[Status, st
 def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
     """Return the marks (N,) of all findings against settled, finished answers; zero for an answer without a finding.
 
-    An answer is `ok` if the data do not reject the model, a proof excludes other minima within `AMBIGUOUS_GAP`,
-    infinity lies outside the likelihood region, and the covariance covers.
+    An answer is `ok` under four conditions. The data do not reject the model. A proof excludes other minima within
+    `AMBIGUOUS_GAP`. Infinity is outside the likelihood region. The covariance covers.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ from optloc.solvers.verdict.minima import is_measured, station_direction, unmeas
 
 _UNFINISHED = (Status.UNBOUNDED, Status.MAX_ITERATIONS, Status.STALLED)
 
-_SHOWN = 8  # names or numbers in a sentence; nobody reads a longer list
+_SHOWN = 8  # names or numbers in a sentence: a longer list does not help
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,9 +265,9 @@ def _name_rejected(problem: Problem, pool: Pool, items: Array, reason: Array) ->
 def _hold_against_constraints(pool: Pool, cost: Array, finished: Array, marks: Array, reason: Array) -> None:
     """Mark fixes whose data contradict the constraints that hold them.
 
-    Two conditions must be true. The data agree without the constraints, and the k active constraints raise the cost by
-    more than chi-square of k degrees of freedom does once in a thousand cases. Under a robust loss the first condition
-    is dropped, since a robust loss allows gross errors.
+    Two conditions must be true. The data agree without the constraints. The k active constraints raise the cost by more
+    than the chi-square of k degrees of freedom, which noise exceeds once in a thousand cases. Under a robust loss the
+    first condition is dropped, since a robust loss allows gross errors.
     """
     assert pool.curvature is not None
     if pool.curvature.active is None:

@@ -85,7 +85,7 @@ def _without_bounds(
 
 
 def _local_covariance(problem: Problem, equations: Normal, shared: Array) -> Array | None:
-    """Return the covariance of the states of targets and walks at each epoch, or None if there are no such states."""
+    """Return the covariance of the states of targets and walks at each epoch, or None without such states."""
     names = {name for i, m in enumerate(problem.motions) for name in state_names(i, len(problem.motions), m.order)}
     names |= set(walk_names(problem))
     # these states come first in the layout
@@ -199,8 +199,9 @@ Equations = Callable[[Problem, Array], Normal]
 def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = equations_at) -> Pool:
     """Return the pool of the distinct minima of every problem: the best one first, with its curvature.
 
-    Three groups of candidates are dropped: runs to infinity if a finite minimum costs about as little (their cost is
-    kept), candidates within a tenth of a standard deviation of another, and candidates that cost too much to matter.
+    Three groups of candidates are dropped. Runs to infinity are dropped if a finite minimum costs about as little;
+    their cost is kept. The others are within a tenth of a standard deviation of a candidate, or cost too much to
+    matter.
 
     Parameters
     ----------
