@@ -121,6 +121,7 @@ def _health(problem: Problem, fix: Fix) -> Health | None:
 
 
 def _sentences(found: Diagnosis) -> Iterator[str]:
+    """Yield the findings as sentences."""
     yield f"status {', '.join(found.status)}"
     for one in found.advice:
         yield f"{one.seen}: {one.advice}"

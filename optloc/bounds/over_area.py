@@ -165,6 +165,7 @@ def _slot(problem: Problem) -> slice:
 
 
 def _places(frame: Frame, x: Array, y: Array, height: float, dimension: int, earth: bool) -> Array:
+    """Return grid points as positions (n, d) in the frame, metres."""
     if earth:
         return frame.from_geodetic(np.radians(y), np.radians((x + 180.0) % 360.0 - 180.0), np.full(len(x), height))
     return np.stack([x, y, np.full(len(x), height)][:dimension], axis=-1)

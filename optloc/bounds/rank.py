@@ -246,6 +246,7 @@ def _tied_sentences(layout: Layout, correlation: Array) -> list[str]:
 
 
 def _enumerate(names: list[str]) -> str:
+    """Return names as a part of a sentence: "a, b and c", with a limited number of names."""
     if len(names) > _SHOWN:
         names = [*names[: _SHOWN - 1], f"{len(names) - _SHOWN + 1} more"]
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))

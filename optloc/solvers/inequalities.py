@@ -309,6 +309,7 @@ def _breaks(problem: Problem, pool: Pool) -> Array:
 
 
 def _without(pool: Pool, broken: Array) -> Pool:
+    """Return a pool in which the candidates `broken` (N, q) are infeasible, with infinite cost."""
     cost = np.where(broken, np.inf, pool.cost)
     return replace(pool, cost=cost, code=np.where(broken, np.int8(Status.INFEASIBLE), pool.code))
 

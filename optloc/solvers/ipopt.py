@@ -114,6 +114,7 @@ class _ScaledProblem:
     """One problem, scaled to order one, with the compiled program of its structure."""
 
     def __init__(self, problem: Problem) -> None:
+        """Scale the problem, and find the program of its structure."""
         self.problem = problem
         shift, size = (value[0] for value in spread_of(problem))
         layout = problem.layout
@@ -139,6 +140,7 @@ class _ScaledProblem:
         self.prior = _prior(problem, unit, centre)
 
     def from_start(self, start: Array) -> tuple[Array, float, int]:
+        """Return vector (size,), cost and status of the minimum that IPOPT reaches from a start (size,)."""
         begin = (start - self.centre) / self.unit
         try:
             found = self.program.solve(begin, self.z, self.weight, self.data, prior=self.prior)
@@ -174,6 +176,7 @@ def _program(problem: Problem, data: int, rows: int) -> Program:
 
 
 def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compiled: bool) -> Program:
+    """Return a new program for a structure, see `_program`."""
     n = problem.layout.size
 
     def scaled_residual(y: Any, p: Any, z: Any) -> list[Any]:
@@ -199,12 +202,14 @@ def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compil
 
 
 def _slot_units(slots: Any, size: float) -> Array:
+    """Return the unit of each entry of slots: `size` metres for lengths and their rates, else 1."""
     # a unit that begins with m is metres, or metres per something
     units = [np.full(slot.size, size if slot.unit.startswith("m") else 1.0) for slot in slots]
     return np.concatenate([*units, np.zeros(0)])
 
 
 def _independent(problem: Problem) -> bool:
+    """Return whether all rows have independent errors."""
     return all(block.row.shape[1] == 1 for block in problem.noise.blocks)
 
 
@@ -239,6 +244,7 @@ def _add_walks(problem: Problem, mean: Array, information: Array) -> None:
 
 
 def _prior(problem: Problem, unit: Array, centre: Array) -> tuple[Array, Array]:
+    """Return the prior mean (size,) and the prior information (size, size) in scaled units."""
     layout = problem.layout
     mean, information = np.zeros(layout.size), np.zeros((layout.size, layout.size))
     for name, value, precision in prior_parts(problem):

@@ -84,6 +84,7 @@ class SolverEntry:
 
 
 def _nlp(problem: Problem, pool: Pool | None) -> Pool:
+    """Return the pool of `optloc.solvers.ipopt.nlp`."""
     from optloc.solvers.ipopt import nlp  # IPOPT is loaded on first use
 
     return nlp(problem, pool)
@@ -115,6 +116,7 @@ def compare_bounds(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def _claim(cost: float, bound: float, tight: bool, name: str) -> Claims:
+    """Return the claim from a lower bound of a relaxation; a tight bound is a global proof of the value."""
     reason = "no position costs less" if tight else f"a lower bound leaves a gap of {cost - bound:.2g}"
     text = f"{reason}; other minima were searched for, not excluded"
     proof = "global" if tight else "local"
@@ -122,10 +124,12 @@ def _claim(cost: float, bound: float, tight: bool, name: str) -> Claims:
 
 
 def _start(stage: Solver, summary: str, *, batched: bool = False) -> SolverEntry:
+    """Return the table entry of a stage that needs no fix before it."""
     return SolverEntry(None, summary, "start", stage, batched)
 
 
 def _refinement(stage: Solver, summary: str, *, batched: bool = False) -> SolverEntry:
+    """Return the table entry of a stage that improves a fix."""
     return SolverEntry(None, summary, "refinement", stage, batched)
 
 
@@ -172,6 +176,7 @@ class _Derived(dict[str, SolverEntry]):
     """Stages from other tables. A loss with a number in its name is made on demand."""
 
     def __missing__(self, name: str) -> SolverEntry:
+        """Return the stage of a loss with a number in its name."""
         loss = LOSSES[name]
         return _start(Robust(loss, states=True), loss.summary)
 
@@ -272,6 +277,7 @@ class Method:
 
 
 def _stage(word: str) -> Solver:
+    """Return the stage of a word, with its name in numerical failures."""
     return _named(word, SOLVERS[word].run)
 
 
@@ -299,6 +305,7 @@ def _note_failures(pool: Pool, name: str, failed: list[Ending], solves: int) -> 
 
 
 def _run_through(method: Method, problem: Problem, given: Pool | None) -> Pool:
+    """Return the pool after all stages of one branch; given candidates compete with its starts."""
     # a shortcut takes no starts
     first, *others = method.runs(problem.batch_shape[0]) if given is None else map(_stage, method.words)
     pool = first(problem, given)

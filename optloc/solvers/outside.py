@@ -118,6 +118,7 @@ _HELD = 1e-12
 
 
 def _lengths(explanations: Array) -> Array:
+    """Return the lengths (N,) of the tuples in an object array."""
     return np.array([len(found) for found in explanations], dtype=int)
 
 
@@ -128,6 +129,7 @@ def _claims(claims: Claims) -> Claims:
 
 
 def _verbatim(fix: Fix, items: Array) -> Array:
+    """Return an object array (N,) with the fixes of flagged items, and None for the others."""
     out = fill(len(fix), None)
     for i in np.flatnonzero(items):
         out[i] = fix[int(i)]

@@ -284,6 +284,7 @@ def run_plan_of(problem: Problem) -> RunPlan | None:
 
 
 def _plan_run(problem: Problem) -> RunPlan | None:
+    """Return a new plan for runs of the structure of a problem, or None if it cannot be planned."""
     found = folding(problem)
     if found is None or not enabled():
         return None

@@ -98,6 +98,7 @@ class Prepared:
         return fix if len(shape) == 1 else fix.reshape(shape)
 
     def _flat(self, z: Array, shape: tuple[int, ...]) -> Problem:
+        """Return a flat batch of problems with the measurements z (..., m)."""
         # A problem without batch axes takes the axes of its measurements, so only the measurements are reshaped.
         if not self.shape:
             return self.problem.with_rows(z=np.broadcast_to(z, (*shape, z.shape[-1])).reshape(-1, z.shape[-1]))

@@ -128,6 +128,7 @@ class Running:
 
 
 def _linearise(problem: Problem, at: Array, before: int, tolerance: float) -> Running:
+    """Return the running solution after a linearisation of all epochs at vectors (N, n)."""
     sums = _information(problem, at)
     x, cov, _ = _step(problem, sums, at)
     return Running(problem, x, cov, at, sums, before + 1, tolerance)
@@ -226,6 +227,7 @@ def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = N
 
 
 def _space_counts(epochs: int) -> Array:
+    """Return at most sixty numbers of epochs, denser at the start."""
     if epochs <= _POINTS:
         return np.arange(1, epochs + 1)
     # geometric spacing: an estimate changes most while its epochs are few

@@ -103,6 +103,7 @@ def status_shares(
 
 
 def _parts(count: int, trials: int) -> Iterator[Array]:
+    """Yield the numbers of positions whose trials fit in one part."""
     size = max(1, _PART // trials)
     for first in range(0, count, size):
         yield np.arange(first, min(first + size, count))

@@ -384,6 +384,7 @@ class Single:
         return rooms[shape]
 
     def _make_room(self, shape: tuple[int, ...]) -> _SingleWorkspace:
+        """Return a new workspace for a batch shape."""
         n, size, d, m = max(1, *shape, 1), self.plan.layout.size, self.load.place.shape[-1], self.problem.count
         found = tuple(blank_answer(n, *self.plan.widths))[2:]
         affine = self.map
@@ -449,6 +450,7 @@ class _SingleNotes(NamedTuple):
 def _told(
     marks: tuple[int, ...], kinds: tuple[int, ...], gaps: tuple[str, ...], shape: tuple[int, ...]
 ) -> _SingleNotes | None:
+    """Return statuses and reasons from marks, chart kinds and texts on rivals; None for the long path."""
     code = [Status(int(one)) for one in first_status(np.array(marks))]
     curved = [kind if status == Status.CURVED else None for status, kind in zip(code, kinds, strict=True)]
     said = [

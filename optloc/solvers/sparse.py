@@ -153,6 +153,7 @@ def _references(problem: Problem) -> list[int]:
 
 
 def _block_sigma(problem: Problem, block: Rows, start: int) -> Array:
+    """Return the standard deviations (..., m) of the rows of one kind, with their weights."""
     weight = np.where(block.weight > 0.0, block.weight, 1.0)
     return np.sqrt(variances(problem.noise, problem.count)[..., start : start + block.count] / weight)
 
@@ -160,6 +161,7 @@ def _block_sigma(problem: Problem, block: Rows, start: int) -> Array:
 def _lift_ranges(
     problem: Problem, block: Rows, start: int, origin: Array, scale: Array, pairs: list[int], first: int
 ) -> _SparsePart | None:
+    """Return the linear rows of range measurements of one kind, or None for other kinds."""
     model, form = MODELS[block.kind], MODELS[block.kind].ranges
     if form is None:
         return None
@@ -202,6 +204,7 @@ def _centre(m: Array, block: Rows) -> Array:
 
 
 def _lift_others(problem: Problem, block: Rows, start: int, to: Coordinates) -> _SparsePart | None:
+    """Return the linear rows of measurements without ranges of one kind, or None if it has no linear form."""
     lifted = lift_rows(problem, block, start, None, to)
     if lifted is None:
         return None
@@ -244,6 +247,7 @@ def sparse(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def _starts(problem: Problem, pool: Pool | None) -> Pool:
+    """Return the starts of `sparse` without reasons for missing ones."""
     began = perf_counter()
     if not one_position(problem):
         x = from_pieces(problem, lambda piece: fix_by(piece, lambda one: _starts(one, None)))
@@ -415,6 +419,7 @@ def _derivatives(problem: Problem, x: Array) -> tuple[Array, Array]:
 
 
 def _sigma(problem: Problem) -> Array:
+    """Return the standard deviations (N, m) of all rows, with their weights."""
     weight = np.where(problem.weight > 0.0, problem.weight, 1.0)
     sigma = np.sqrt(variances(problem.noise, problem.count) / weight)
     return np.broadcast_to(sigma, (*problem.batch_shape, problem.count))

@@ -202,10 +202,12 @@ def _widen(problem: Problem, pool: Pool) -> Pool:
 
 
 def _beside(problem: Problem, pool: Pool, fix: Fix, x: Array, began: float) -> Pool:
+    """Return the candidates of fixes together with more starts x (N, q, size)."""
     return offer(problem, pack(np.concatenate([standing(pool, fix), x], axis=1)), pool, "widen", began)
 
 
 def _subarrays(problem: Problem, fix: Fix) -> Array:
+    """Return the starts (N, q, d) of all sub-arrays and their mirror images."""
     found = subarray_starts(problem)
     return np.concatenate([found, mirror(problem, found)], axis=1)
 
@@ -341,6 +343,7 @@ def _search_starts(problem: Problem) -> Array:
 
 
 def _directions(d: int) -> Array:
+    """Return the fixed positions (96, d) of the search, in spreads of the stations from their centre."""
     rng = np.random.default_rng(_SEED)
     direction = rng.standard_normal((_PLACES, d))
     # normal deviates divided by their length are uniform on the sphere, in any dimension
@@ -350,6 +353,7 @@ def _directions(d: int) -> Array:
 
 
 def _searched_sentence(why: str) -> str:
+    """Return the remark on a searched problem, after the reason `why` of its missing start."""
     return f"{why}; best of a search from {_PLACES} positions" if why else f"best of {_PLACES} positions"
 
 
@@ -407,4 +411,5 @@ def taylor(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def _place(problem: Problem, position: Array, pool: Pool | None, name: str, began: float) -> Pool:
+    """Return positions (N, q, d) as a pool of starts, with the other unknowns filled in."""
     return offer(problem, vectors(problem, pack(position)), pool, name, began)

@@ -135,9 +135,11 @@ class Arc:
         return position, np.where(good, -0.5 * (cost - self.surface.least) - density, -np.inf), spaced
 
     def _to_position(self, z: Array) -> Array:
+        """Return the positions, metres, of node coordinates."""
         return self.surface.chart.to_position(z) if self.far else z
 
     def _lengths(self) -> Array:
+        """Return the lengths (m - 1,) of the chords between nodes."""
         return np.asarray(np.sqrt((np.diff(self.node, axis=0) ** 2).sum(-1)))
 
     def _log_width(self) -> Array:
@@ -271,6 +273,7 @@ class _Valley:
         return None, np.inf
 
     def _node(self, z: Array, cost: float, information: Array, along: Array) -> _Node:
+        """Return the node at coordinates z (d,), with one standard deviation across the curve."""
         sides = basis(along)
         values, vectors = np.linalg.eigh(sides.T @ information @ sides)
         root = vectors / np.sqrt(np.maximum(values, np.finfo(float).tiny))

@@ -304,6 +304,7 @@ class Held:
         return np.zeros((0, self.axes.shape[1]), dtype=int), step
 
     def _vectors(self, steps: Array) -> Array:
+        """Return vectors (n, size) of coordinates (n, k), moved onto the equalities."""
         points = np.repeat(self.x, len(steps), axis=0)
         points[:, self.own] += steps @ self.axes.T
         return restore(self.problem, self.face, points)

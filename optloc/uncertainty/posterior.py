@@ -82,6 +82,7 @@ class Samples:
         return np.asarray(self.position[chosen])
 
     def _demand(self, what: str) -> None:
+        """Raise InvalidProblem if a moment does not exist."""
         if not self.bounded:
             raise InvalidProblem(
                 f"infinity has density, so the {what} in metres does not exist",
@@ -312,6 +313,7 @@ def _slices(surface: RegionSurface, k: int, seed: int) -> Mixture:
 
 
 def _quantiles(values: Array, weight: Array) -> list[float]:
+    """Return the weighted quantiles of values at which slices begin and end."""
     order = np.argsort(values)
     return [float(v) for v in np.interp(_EDGES, np.cumsum(weight[order]), values[order])]
 

@@ -76,11 +76,13 @@ class Cells:
         return out
 
     def _homogeneous(self) -> Array:
+        """Return the corners (n, 2^d, 1 + d) of the cells in homogeneous coordinates."""
         d = len(self.base)
         signs = np.array([(1.0, *corner) for corner in product((-1.0, 1.0), repeat=d)])
         return np.asarray(signs @ self.edges)
 
     def _finite(self, corners: Array) -> Array:
+        """Return homogeneous corners as positions, metres; infinite where the last coordinate is zero."""
         scale = corners[..., -1:]
         with np.errstate(divide="ignore", invalid="ignore"):
             apart = np.where(corners[..., :-1] == 0.0, 0.0, corners[..., :-1] / np.maximum(scale, 0.0))
@@ -289,6 +291,7 @@ def _axes(chart: Chart) -> tuple[Array, Array]:
 
 
 def _points(surface: RegionSurface, at: Array) -> Array:
+    """Return the positions, metres, of coordinates in which the fix is Gaussian."""
     return surface.chart.to_position(at) if surface.kind == INVERSE_RANGE else at
 
 

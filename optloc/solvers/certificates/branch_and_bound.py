@@ -128,6 +128,7 @@ def _where(lower: Corner, upper: Corner) -> str:
 
 
 def _text(corner: Corner) -> str:
+    """Return the coordinates of a corner as text."""
     return "(" + ", ".join(f"{v:.6g}" for v in corner) + ")"
 
 
@@ -318,6 +319,7 @@ def _round(work: BoundWorkspace, items: Array) -> None:
 
 
 def _asked(work: BoundWorkspace, items: Array) -> ProofRequest:
+    """Return the proof requests of some fixes, with the margins, regions and known minima of this round."""
     fix, ignored, last = work.fix, work.ignored[items], len(work.margins) - 1
     gaps = work.margins[np.minimum(work.level[items, None] + np.arange(last + 1), last)]
     kappa = gaps[:, 0]
@@ -354,6 +356,7 @@ def budgets(n: int, nodes: float, effort: float) -> Array:
 
 
 def _unfinished(costs: Costs, count: int) -> str:
+    """Return the reason of an unfinished proof, with a hint if machine code is missing."""
     return UNFINISHED + (LACKS_CODE if lacks(costs, count) else "")
 
 
@@ -372,6 +375,7 @@ def _lower(work: BoundWorkspace, items: Array, why: str, *, remote: bool = False
 
 
 def _give_up(work: BoundWorkspace, items: Array, why: str) -> None:
+    """Write the final claim "unknown" with a reason for some fixes."""
     work.proven.write(items, unknown(why))
     work.proven.boxes[items] = work.spent[items]
     work.pending[items] = False
@@ -538,6 +542,7 @@ def claims_before(pool: Pool) -> Claims:
 
 
 def _count_listed(fix: Fix) -> Array:
+    """Return the number of listed alternatives of each fix, (N,)."""
     return np.asarray(np.isfinite(fix.alternatives.gap).sum(1))
 
 

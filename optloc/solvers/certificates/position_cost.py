@@ -110,6 +110,7 @@ def surfaces_of(problem: Problem, position: Array) -> tuple[Array, Array]:
 
 
 def _planes(problem: Problem, bands: list[Band], size: int) -> Array:
+    """Return the unit normals (N, e, 3) of plane constraints."""
     normals = [band.coefficients for band in bands if band.kind == "plane"]
     out = np.zeros((size, len(normals), 3))
     for i, normal in enumerate(normals):
@@ -118,6 +119,7 @@ def _planes(problem: Problem, bands: list[Band], size: int) -> Array:
 
 
 def _surface(problem: Problem, bands: list[Band], position: Array) -> Array:
+    """Return the numbers (N, w) of the surface of a height constraint; w is 0 without one."""
     levels = [band.lower for band in bands if band.kind == "height"]
     if not levels:
         return np.zeros((len(position), 0))

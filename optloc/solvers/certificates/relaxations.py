@@ -130,6 +130,7 @@ def _beyond(problem: Problem) -> str:
 
 
 def _beyond_moments(problem: Problem) -> str:
+    """Return why the moment relaxation does not cover the problem, or ""."""
     from optloc.models import MODELS
 
     for rows in problem.rows:
@@ -139,6 +140,7 @@ def _beyond_moments(problem: Problem) -> str:
 
 
 def _beyond_directions(problem: Problem) -> str:
+    """Return why the relaxation over directions does not cover the problem, or ""."""
     for rows in problem.rows:
         if rows.kind not in ("azimuth", "elevation"):
             return f"{rows.kind} rows are not angles"
@@ -149,12 +151,14 @@ def _beyond_directions(problem: Problem) -> str:
 
 
 def _nothing(problem: Problem, method: str, why: str) -> Reference:
+    """Return a reference without bounds, with one reason for all fixes."""
     size = problem.batch_shape[0]
     scope, reason = np.full(size, "", dtype=object), np.full(size, why, dtype=object)
     return Reference(method, np.full(size, np.nan), scope, reason, np.full((size, problem.dimension), np.nan))
 
 
 def _by_directions(problem: Problem, fix: Fix) -> Reference:
+    """Return the bounds of the relaxation over unit directions."""
     out, seen = _nothing(problem, "directions", ""), bearings(problem)
     assert seen is not None
     bound = angle_bounds(seen, np.where(fix.answered[:, None], fix.position, np.nan))
@@ -165,6 +169,7 @@ def _by_directions(problem: Problem, fix: Fix) -> Reference:
 
 
 def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
+    """Return the bounds of the moment relaxation; `region` is the radius of a ball, metres, or None."""
     from formulations.moment_sdp import moment_bound
 
     out, found = _nothing(problem, "moment", ""), ranges(hold_still(problem))
@@ -206,6 +211,7 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
 
 
 def _declined(found: Ranges, i: int, answered: bool) -> str:
+    """Return why the moment relaxation is not computed for problem i, or ""."""
     count = int(found.inside[i].sum())
     if not answered:
         return "there is no fix with a cost to compare"
@@ -221,10 +227,12 @@ def _nodes(found: Ranges, i: int) -> Array:
 
 
 def _scaled(found: Ranges, i: int, nodes: Array, station: Array, size: float) -> Ranged:
+    """Return the ranges of problem i in units of `size` metres."""
     covariance = found.covariance[i if len(found.covariance) > 1 else 0][np.ix_(nodes, nodes)]
     sign, offset = found.sign[i, nodes].astype(float), found.offset[i, nodes] / size
     return Ranged(station, sign, offset, covariance / size**2, bool(found.sign[i].any()))
 
 
 def _region(own: Ranged, region: float | None, size: float) -> EnclosingBox | None:
+    """Return the box around a ball of radius `region` metres, or None without a region."""
     return None if region is None else ball(own, np.zeros(own.station.shape[1]), region / size)

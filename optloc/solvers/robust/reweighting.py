@@ -253,6 +253,7 @@ class _Step:
 
 
 def _step(problem: Problem, x: Array, last: Array, face: Face, tolerance: float) -> _Step:
+    """Return one least-squares step with fixed weights from x (M, size); `last` is the step before."""
     strata = strata_of(problem, face)
     if strata is None:
         done = refine(problem, x, tolerance=_SHARE * tolerance, limit=_STEPS, face=face)

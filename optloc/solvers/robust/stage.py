@@ -120,12 +120,14 @@ class Robust:
         return in_parts(problem, work, crowd_of(problem))
 
     def _minima(self, problem: Problem, start: Array | None, stages: tuple[Stage, ...]) -> Pool:
+        """Return the minima of the loss, tested if the stage does so and found them by a search."""
         found = _minimise(problem, self.loss, start, stages)
         # given starts lead to the nearest minima only, so these are not tested
         return stated(problem, self.loss, found) if self.states and start is None else found
 
 
 def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[Stage, ...]) -> Pool:
+    """Return the settled minima of a loss, from given starts (N, q, size) or from robust starts."""
     began = perf_counter()
     pool = _minima(problem, loss, robust_starts(problem, loss) if start is None else start)
     # A flat loss has a minimum for almost every set of rows. So start from a rising loss, and try sets next to the best

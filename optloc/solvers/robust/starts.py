@@ -178,6 +178,7 @@ def _leave_out(problem: Problem, loss: Loss, clean: Array) -> Array:
 
 
 def _start_subsets(problem: Problem, loss: Loss, clean: Array) -> Array:
+    """Return the best starts (N, q, size) from closed forms of all subsets of one part of the batch."""
     item, kept = subsets(problem, clean)
     if not len(item):
         return np.full((problem.batch_shape[0], 0, problem.layout.size), np.nan)

@@ -76,10 +76,12 @@ def bearings(problem: Problem) -> Bearings | None:
 
 
 def _keys(rows: Rows) -> list[tuple[int, int]]:
+    """Return station and epoch of each row."""
     return list(zip(rows.a.tolist(), rows.epoch.tolist(), strict=True))
 
 
 def _values(problem: Problem, rows: Rows, start: int) -> tuple[Array, Array]:
+    """Return the angles (N, m), radians, and one over their standard deviations; zero for absent rows."""
     sigma = np.sqrt(variances(problem.noise, problem.count)[..., start : start + rows.count])
     shape = (problem.batch_shape[0], rows.count)
     importance = np.where(rows.weight > 0.0, np.sqrt(rows.weight) / sigma, 0.0)
@@ -316,4 +318,5 @@ def pair(problem: Problem) -> tuple[int, int] | None:
 
 
 def _once_an_epoch(rows: Rows) -> bool:
+    """Return whether each epoch has at most one of the rows."""
     return len(np.unique(rows.epoch)) == rows.count

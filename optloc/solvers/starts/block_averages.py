@@ -122,6 +122,7 @@ def _with_station_noise(problem: Problem) -> Problem:
 
 
 def _reference(problem: Problem, reference: float | None) -> float:
+    """Return the reference time of a motion, seconds; by default the first epoch."""
     return float(problem.times[0]) if reference is None else reference
 
 
@@ -163,6 +164,8 @@ def _middle(since: Array, row: Array) -> Array:
 
 
 def _average_rows(rows: Rows, mean: _Mean) -> Rows:
+    """Return the averaged rows of one kind."""
+
     def middle(values: Array, wrapped: bool) -> Array:
         sorted_, base = values[..., mean.order], np.zeros(())
         if wrapped:
@@ -181,6 +184,7 @@ def _average_rows(rows: Rows, mean: _Mean) -> Rows:
 
 
 def _stations(stations: Stations, when: _Blocks) -> Stations:
+    """Return the stations with positions, velocities and axes averaged over blocks."""
     inside = np.flatnonzero(when.place >= 0)
     coefficient = _middle(when.since[inside], when.place[inside])
     head = np.flatnonzero(np.diff(when.place[inside], prepend=-1))

@@ -95,6 +95,7 @@ class _DopplerNotes:
 
 
 def _gather(problem: Problem) -> _DopplerNotes:
+    """Return the rows in the relaxation, with groups and coefficients."""
     shared, parts = problem.layout.n_shared, list(_parts(problem))
     row, epoch, a, b, kind, rates, ranges = (np.concatenate(values) for values in zip(*parts, strict=True))
     design = np.zeros((problem.count, shared))
@@ -124,6 +125,7 @@ def _rates(rows: Rows) -> tuple[int, int]:
 
 
 def _ranges(rows: Rows) -> tuple[int, int]:
+    """Return the coefficients of the ranges at the first and second station of rows; (0, 0) without ranges."""
     # rows with an unknown emission time in each epoch are used by the refinement only
     model = MODELS[rows.kind]
     return (0, 0) if model.ranges is None or model.emission else model.ranges
@@ -173,6 +175,7 @@ def _few(problem: Problem, told: _DopplerNotes, z: Array, weight: Array) -> tupl
 
 
 def _size(problem: Problem, told: _DopplerNotes) -> int:
+    """Return the size of the lifted matrix of the relaxation with these rows."""
     _, ranges, rates = _nodes(problem, told)
     return lifted_size(problem.dimension, ranges, rates, told.design[:, told.design.any(axis=0)])
 

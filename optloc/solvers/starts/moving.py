@@ -120,6 +120,7 @@ class _MovingRows:
     """Whitened rows, and bounds of their residuals over a box of an atlas, for the best velocity at its centre."""
 
     def __init__(self, K: Array, w: Array, data: Array, rates: Array) -> None:
+        """Store whitened rows K, right sides w, and the stations of the rates."""
         self.K, self.w, self.rates, self.stations = K, w, rates, data[rates, :3]
 
     def bound(self, atlas: Atlas, nodes: Array, half: Array, d: int) -> tuple[float, float, int]:

@@ -207,6 +207,7 @@ def _sort(x: Array, cost: Array) -> tuple[Array, Array]:
 
 
 def _scatter(found: tuple[Array, Array], items: Array, count: int) -> tuple[Array, Array]:
+    """Return minima of some items as arrays for all `count` items, empty for the others."""
     x = np.full((count, *found[0].shape[1:]), np.nan)
     cost = np.full((count, found[1].shape[1]), np.inf)
     x[items], cost[items] = found
@@ -239,6 +240,7 @@ def _covariance(blocks: Problem, x: Array) -> Array:
 
 
 def _length(blocks: Problem) -> Array:
+    """Return the spread of the stations (N or 1,), metres."""
     return np.asarray(spread_of(blocks)[1])
 
 

@@ -74,6 +74,7 @@ def _isolate(problem: Problem, target: int) -> Problem:
 
 
 def _along(constraint: Band | Polygon) -> bool:
+    """Return whether a constraint holds along the whole course."""
     return isinstance(constraint, Band) and constraint.along
 
 

@@ -96,6 +96,7 @@ def candidates(problem: Problem, found: Ranges | None, pick: Pick) -> Array:
 
 
 def _pick(squared: Squared, distance: Array, point: Array | None, pick: Pick) -> Array:
+    """Return the picked points (N, q, d), scaled, of the rows weighted by distances (N, s)."""
     rows, right = _weigh(squared, distance, point)
     # with bearings only, no row contains the last coordinate, and the quadric would add false information
     linear = squared.quadric.shape == "paraboloid" and not rows[..., -1].any()
@@ -201,6 +202,7 @@ def squared_rows(problem: Problem, found: Ranges | None) -> Squared:
 
 
 def _station_nodes(problem: Problem, found: Ranges | None) -> tuple[Array, Array]:
+    """Return the positions (N, s, d) of the stations of ranges, or of all used stations, and flags of used ones."""
     position = np.broadcast_to(
         problem.stations.position, (problem.batch_shape[0], *problem.stations.position.shape[-3:])
     )
@@ -344,6 +346,7 @@ def _wide(parts: list[Any], size: int, count: int) -> Array:
 
 
 def _point(problem: Problem, rows: Rows, index: Array, to: Coordinates) -> Point:
+    """Return the scaled positions and axes of the stations `index` of rows, as components."""
     stations, still = problem.stations, np.zeros_like(rows.epoch)
     epoch = rows.epoch if stations.position.shape[-3] > 1 else still
     place = (stations.position[..., epoch, index, :] - to.origin[:, None]) / to.scale[:, None, None]
@@ -374,5 +377,6 @@ def _known(found: Ranges, rows: Rows, to: Coordinates) -> tuple[KnownLift, Known
 
 
 def _node(found: Ranges, station: int, epoch: int) -> int:
+    """Return the number of a station among the ranges; -1 if some problem lacks its range."""
     at = np.flatnonzero((found.station == station) & ((found.epoch == epoch) | (found.epoch.max(initial=0) == 0)))
     return int(at[0]) if len(at) and found.inside[:, at[0]].all() else -1

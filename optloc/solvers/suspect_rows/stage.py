@@ -483,6 +483,7 @@ def _name_closest(case: SuspectCase, outcome: Outcome) -> str:
 
 
 def _explanation(case: SuspectCase, rest: Rest, outcome: Outcome, told: _Told) -> Explanation:
+    """Return the explanation of a rest: its suspects with errors and p-values, and its fix."""
     fix = rest.fix
     p_without = float(fix.p_value)
     # errors of compass bearings are reported in the sense of the readings

@@ -232,6 +232,7 @@ def listed(rests: Sequence[Rest], groups: Sequence[Group]) -> tuple[Rest, ...]:
 
 
 def _adds_nothing(rest: Rest, size: int, other: Rest, fewer: int) -> bool:
+    """Return whether the further rows of a rest lower the cost by no more than chance."""
     if size == fewer:  # the same rows under other names: their costs differ by rounding
         return True
     return float(other.fix.cost - rest.fix.cost) <= (ROW_PRICE - AMBIGUOUS_GAP) * (size - fewer)
@@ -387,6 +388,7 @@ def _redo(problem: Problem, pool: Pool, unproven: Array, near: float, better: Ca
 
 
 def _beside(problem: Problem, start: Pool, pool: Pool) -> Pool:
+    """Return a pool of starts together with the candidates of an earlier pool."""
     x = np.concatenate([start.x, standing(pool, judge(problem, pool))], axis=1)
     return offer(problem, pack(x), None, "roots", perf_counter())
 
@@ -510,6 +512,7 @@ def _worst(problem: Problem, groups: Sequence[Group], left: Sequence[int], rest:
 
 
 def _influence(problem: Problem, groups: Sequence[Group], left: Sequence[int], x: Array) -> Influence:
+    """Return the influence of rows on the fix of one problem without some groups."""
     dropped = frozenset(groups[i].prior for i in left if groups[i].prior >= 0)
     gone = mark_rows([groups[i] for i in left], problem.count)
     return influence(leave_out(problem, gone[None]), x, dropped)
@@ -521,6 +524,7 @@ def _present(group: Group, gone: Array) -> Group:
 
 
 def _inside(one: Group, other: Group) -> bool:
+    """Return whether the rows of one group are all in another group."""
     return one.prior < 0 and other.prior < 0 and set(one.rows) <= set(other.rows)
 
 
@@ -562,4 +566,5 @@ def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fi
 
 
 def _overlap(group: Group, gone: Array) -> bool:
+    """Return whether a group has a row that is left out already."""
     return group.prior < 0 and bool(gone[list(group.rows)].any())

@@ -108,6 +108,7 @@ def list_names(parts: Sequence[str]) -> str:
 
 
 def _name_suspects(explanations: Sequence[Explanation], rest: Fix) -> str:
+    """Return the reason of a fix with one explanation, or with several that give one position."""
     explanation = explanations[0]
     parts = [f"{suspect.name}{_error(suspect)}" for suspect in explanation.suspects]
     verb = "offset estimated" if all(suspect.group == "offset" for suspect in explanation.suspects) else "left out"
@@ -121,6 +122,7 @@ def _name_suspects(explanations: Sequence[Explanation], rest: Fix) -> str:
 
 
 def _name_rivals(explanations: Sequence[Explanation]) -> str:
+    """Return the reason of a fix with explanations that give different positions."""
     common = set(explanations[0].names).intersection(*(one.names for one in explanations[1:]))
     sure = f"; {list_names(sorted(common))} in every explanation" if common else ""
     return f"several explanations pass: {_either(explanations)}{sure}"
@@ -141,10 +143,12 @@ def _error(suspect: Suspect) -> str:
 
 
 def _p(value: float) -> str:
+    """Return a p-value as text; "none" without redundancy."""
     return "none" if np.isnan(value) else f"{value:.1g}"
 
 
 def _object(value: object) -> Array:
+    """Return a value as an object array without axes."""
     out = np.empty((), dtype=object)
     out[()] = value
     return out

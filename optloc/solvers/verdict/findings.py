@@ -462,6 +462,7 @@ def _name_residuals(finished: Finished, items: Array) -> Any:
 
 
 def _name_infinity(finished: Finished, items: Array) -> Any:
+    """Return the sentences of `unbounded`: the rise of chi-square at infinity."""
     assert finished.pool.infinity is not None
     more = finished.pool.infinity[items] - finished.pool.cost[items, 0]
     rises = [f"only {rise:.2g}" if rise > _NONE else "nothing" for rise in more.tolist()]
@@ -469,15 +470,18 @@ def _name_infinity(finished: Finished, items: Array) -> Any:
 
 
 def _name_rivals(finished: Finished, items: Array) -> Any:
+    """Return the sentences of `ambiguous`: the gap of the nearest rival."""
     gaps = _apart(finished.pool, finished.gap)[items].min(1).tolist()
     return np.array([ambiguity(finished.problem, gap) for gap in gaps], dtype=object)
 
 
 def _name_search(finished: Finished, items: Array) -> Any:
+    """Return the sentences of `searched`: the remark of the search."""
     return "" if finished.pool.remark is None else finished.pool.remark[items]
 
 
 def _name_proof(finished: Finished, items: Array) -> Any:
+    """Return the sentences of `unproven`: why there is no proof of uniqueness."""
     pool = finished.pool
     if pool.loss and pool.robust is not None and pool.remark is not None:
         return np.where(pool.remark[items] == "", NOT_TRIED, pool.remark[items])
@@ -486,6 +490,7 @@ def _name_proof(finished: Finished, items: Array) -> Any:
 
 
 def _name_shape(finished: Finished, items: Array) -> Any:
+    """Return the sentences of `curved`: the coordinates in which the fix is Gaussian, if any."""
     curvature = finished.pool.curvature
     assert curvature is not None
     assert curvature.kappa is not None

@@ -150,6 +150,7 @@ def _is_determined(curvature: Curvature) -> Array:
 
 
 def _information(curvature: Curvature) -> Array:
+    """Return the information (N, n, n) of a curvature; NaN if it was not computed."""
     return np.full(curvature.covariance.shape, np.nan) if curvature.information is None else curvature.information
 
 
@@ -164,6 +165,7 @@ def _runs_away(problem: Problem, curvature: Curvature, distance: Array, lost: Ar
 
 
 def _lacking(count: int) -> str:
+    """Return the sentence for `count` missing measurements."""
     return f"there {'is 1 measurement' if count == 1 else f'are {count} measurements'} fewer than unknowns"
 
 
@@ -430,6 +432,7 @@ def _claims(pool: Pool) -> Claims:
 
 @lru_cache(maxsize=64)  # read-only views
 def _without_proof(count: int) -> Claims:
+    """Return `NO_PROOF` for `count` fixes."""
     return alike(NO_PROOF, count)
 
 

@@ -119,6 +119,7 @@ def repeated(
 
 
 def _parts(count: int) -> Iterator[Array]:
+    """Yield the numbers of fixes whose repeats fit in one part."""
     size = max(1, _PART // _REPEATS)
     for first in range(0, count, size):
         yield np.arange(first, min(first + size, count))
