@@ -96,13 +96,13 @@ def sights(problem: Problem) -> list[Sight]:
         if motion.known is not None or motion.span == "epoch":
             continue
         slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
-        epoch, station, heard, seen = _heard(problem, target)
+        epoch, station, measured, angular = _measured_by(problem, target)
         part = slice(slot.start, slot.start + 3)
-        found.append(Sight(problem.frame, part, station, place[:, epoch, station], heard, seen))
+        found.append(Sight(problem.frame, part, station, place[:, epoch, station], measured, angular))
     return found
 
 
-def _heard(problem: Problem, target: int) -> tuple[Array, Array, Array, Array]:
+def _measured_by(problem: Problem, target: int) -> tuple[Array, Array, Array, Array]:
     """Return the epochs and stations (k,) that measure a target, with flags (N, k) for any row and for an angle.
 
     Parameters
@@ -127,10 +127,10 @@ def _heard(problem: Problem, target: int) -> tuple[Array, Array, Array, Array]:
                 if model.quantity == "angle":
                     sighted[key] = sighted.get(key, none) | present[:, i]
     epoch, station = np.array(list(found), dtype=int).reshape(-1, 2).T
-    heard, seen = (np.empty((len(weight), len(found)), dtype=bool) for _ in range(2))
+    measured, angular = (np.empty((len(weight), len(found)), dtype=bool) for _ in range(2))
     for k, key in enumerate(found):
-        heard[:, k], seen[:, k] = found[key], sighted.get(key, none)
-    return epoch, station, heard, seen
+        measured[:, k], angular[:, k] = found[key], sighted.get(key, none)
+    return epoch, station, measured, angular
 
 
 def _is_blocked(point: Array, station: Array, present: Array, angular: Array, reach: float) -> Array:
@@ -172,9 +172,9 @@ def lowest_sight(problem: Problem, x: Array) -> Array:
         slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
         point = problem.frame.to_ecef(x[:, slot.start : slot.start + 3])
         up = np.stack(geodetic_normal((point[:, 0], point[:, 1], point[:, 2])), axis=-1)
-        epoch, station, heard, _ = _heard(problem, target)
+        epoch, station, measured, _ = _measured_by(problem, target)
         line = stations[:, epoch, station] - point[:, None]
-        high = heard & ((stations[:, epoch, station] ** 2).sum(-1) > (SATELLITE * WGS84_A) ** 2)
+        high = measured & ((stations[:, epoch, station] ** 2).sum(-1) > (SATELLITE * WGS84_A) ** 2)
         sine = (line * up[:, None]).sum(-1) / np.sqrt((line**2).sum(-1))
         worst = np.minimum(worst, np.where(high, sine, np.inf).min(-1, initial=np.inf))
     return np.where(np.isfinite(worst), worst, 0.0)

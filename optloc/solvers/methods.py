@@ -295,13 +295,13 @@ def _named(name: str, solver: Solver) -> Solver:
 
 def _note_failures(pool: Pool, name: str, failed: list[Ending], solves: int) -> Pool:
     """Return the pool of a stage with the number of failed back-end runs, and their reports."""
-    told = "; ".join(str(ending) for ending in list(dict.fromkeys(failed))[:_SHOWN])
+    reports = "; ".join(str(ending) for ending in list(dict.fromkeys(failed))[:_SHOWN])
     count = f"{len(failed)} of {solves} solve{'' if solves == 1 else 's'} without an answer"
-    pool = pool.without(np.flatnonzero(pool.empty), f"{name}: {count} ({told})", Status.NUMERICAL)
+    pool = pool.without(np.flatnonzero(pool.empty), f"{name}: {count} ({reports})", Status.NUMERICAL)
     if not pool.stages:
         return pool
     last = pool.stages[-1]
-    return replace(pool, stages=(*pool.stages[:-1], replace(last, detail=f"{last.detail}; {count} ({told})")))
+    return replace(pool, stages=(*pool.stages[:-1], replace(last, detail=f"{last.detail}; {count} ({reports})")))
 
 
 def _run_through(method: Method, problem: Problem, given: Pool | None) -> Pool:

@@ -220,10 +220,10 @@ class Pool:
         """Return the pool with a reason why some problems have no candidate; earlier reasons are kept."""
         blank = np.full(len(self), "", dtype=object)
         known = self.missing or NoStart(blank, np.full(len(self), int(Status.UNAVAILABLE), dtype=np.int8))
-        told, code = known.reason.copy(), known.code.copy()
-        new = items[told[items] == ""]
-        told[new], code[new] = reason, int(status)
-        return replace(self, missing=NoStart(told, code))
+        reasons, code = known.reason.copy(), known.code.copy()
+        new = items[reasons[items] == ""]
+        reasons[new], code[new] = reason, int(status)
+        return replace(self, missing=NoStart(reasons, code))
 
     def merge(self, items: Array, other: Pool, stage: Stage | None = None) -> Pool:
         """Return the pool with some problems replaced by the problems of another pool, and one more stage."""

@@ -90,7 +90,7 @@ _APART = 3.0
 # Most problems on the short path: for more problems a batch takes no longer.
 MANY = 64
 # Batch shapes for which a thread stores arrays. A stream has one or two shapes, and each takes some kilobytes.
-_ROOMS = 4
+_WORKSPACES = 4
 
 
 @dataclass(slots=True)
@@ -208,12 +208,12 @@ class Single:
         kernel = plan.kernel(n, often=self.often)
         if not usable(kernel, n) or (self.map is not None and lacks_code(n)):
             return None
-        room, size, shared = self._room(shape), plan.size, plan.shared
-        room.z[:] = z
+        workspace, size, shared = self._workspace(shape), plan.size, plan.shared
+        workspace.z[:] = z
         if self.absent is not None:
-            room.z[:, self.absent] = 0.0
-        answer = Answer(np.empty((n, size)), np.empty((n, shared, shared)), *room.found)
-        steps = kernel(*self.load[:2], room.z, self.load.place, TOLERANCE, LIMIT, False, answer)
+            workspace.z[:, self.absent] = 0.0
+        answer = Answer(np.empty((n, size)), np.empty((n, shared, shared)), *workspace.found)
+        steps = kernel(*self.load[:2], workspace.z, self.load.place, TOLERANCE, LIMIT, False, answer)
         found = [EngineResult(*numbers) for numbers in answer.number.tolist()]
         for one in found:
             # on Earth, satellite visibility decides between two minima of equal cost, on the long path
@@ -227,14 +227,14 @@ class Single:
         fixed = perf_counter()
         stages = direct_stages(n, steps, fixed - began)
         if self.map is not None:
-            if not self._proves(self.map, answer, found, room):
+            if not self._proves(self.map, answer, found, workspace):
                 return None
-            told = "global" if self.edges is None else f"within {violation_names(self.problem)}"
-            stages = (*stages, certify_stage(f"{n} {told}", fixed))
-        fix = self._judge(shape, answer, found, stages, room)
-        if fix is not None and not room.checked:
-            room.checked = self._agrees(fix, room)
-            return fix if room.checked else None
+            scope = "global" if self.edges is None else f"within {violation_names(self.problem)}"
+            stages = (*stages, certify_stage(f"{n} {scope}", fixed))
+        fix = self._judge(shape, answer, found, stages, workspace)
+        if fix is not None and not workspace.checked:
+            workspace.checked = self._agrees(fix, workspace)
+            return fix if workspace.checked else None
         return fix
 
     def _is_near_bound(self, limits: Array, answer: Answer) -> bool:
@@ -251,9 +251,9 @@ class Single:
         variance = (answer.covariance[:, :d, :d] @ normal) @ normal
         return not bool((w * w > APART * APART * variance).all())
 
-    def _proves(self, affine: Affine, answer: Answer, found: list[EngineResult], room: _SingleWorkspace) -> bool:
+    def _proves(self, affine: Affine, answer: Answer, found: list[EngineResult], workspace: _SingleWorkspace) -> bool:
         """Return whether every fix is proven over all positions; bounds and boxes are written to the workspace."""
-        asked, answered, d = room.asked, room.answered, self.load.place.shape[-1]
+        asked, answered, d = workspace.asked, workspace.answered, self.load.place.shape[-1]
         asked.known.fill(0)
         for i, one in enumerate(found):
             if one.rival_cost < inf:
@@ -262,17 +262,17 @@ class Single:
             normal = answer.normal[:, self.upward]
             asked.surface[:, UP:] = normal / np.sqrt((normal * normal).sum(-1, keepdims=True))
         for i, one in enumerate(found):
-            affine.write(room.z[i], room.costs, i)
+            affine.write(workspace.z[i], workspace.costs, i)
             asked.eps[i] = equal_cost(one.cost)
         asked.x[:] = answer.x[:, :d]
-        prove_here(room.costs, asked, answered)
+        prove_here(workspace.costs, asked, answered)
         if self.sights:
             for i in range(len(found)):
-                self._pass_hidden(room, answer.x[i], i)
-        if self.edges is not None and not self._is_inside(self.edges, answer, room):
+                self._pass_hidden(workspace, answer.x[i], i)
+        if self.edges is not None and not self._is_inside(self.edges, answer, workspace):
             return False
-        told = zip(found, *(array.tolist() for array in (answered.verdict, *answered[2:6])), strict=True)
-        for one, verdict, bound, everywhere, shown, met in told:
+        results = zip(found, *(array.tolist() for array in (answered.verdict, *answered[2:6])), strict=True)
+        for one, verdict, bound, everywhere, shown, met in results:
             if verdict != UNIQUE or not everywhere or shown != LISTED_GAP or met:
                 return False
             # If the bound does not match this cost, one of the two is wrong: the long path finds out which.
@@ -280,10 +280,10 @@ class Single:
                 return False
         return True
 
-    def _pass_hidden(self, room: _SingleWorkspace, x: Array, i: int) -> None:
+    def _pass_hidden(self, workspace: _SingleWorkspace, x: Array, i: int) -> None:
         """Prove fix number i at x (size,) again, without the minima behind the Earth that its proof found."""
-        one, d = slice(i, i + 1), room.asked.x.shape[-1]
-        costs, asked, answered = room.costs.take(one), room.asked.take(one), room.answered.take(one)
+        one, d = slice(i, i + 1), workspace.asked.x.shape[-1]
+        costs, asked, answered = workspace.costs.take(one), workspace.asked.take(one), workspace.answered.take(one)
         asked.hidden[0] = 0
         boxes = 0
         while answered.verdict[0] == OTHER and asked.hidden[0] < HIDDEN:
@@ -298,20 +298,20 @@ class Single:
             prove_here(costs, asked, answered)
         answered.boxes[0] += boxes
 
-    def _is_inside(self, edges: Edges, answer: Answer, room: _SingleWorkspace) -> bool:
+    def _is_inside(self, edges: Edges, answer: Answer, workspace: _SingleWorkspace) -> bool:
         """Return whether no point on a bound costs as little as the levels of the proofs."""
-        assert room.beside is not None
+        assert workspace.beside is not None
         if (answer.rival_cost < np.inf).any():  # low costs around a rival may reach a bound elsewhere
             return False
         d = self.load.place.shape[-1]
         x, cov = answer.x[:, :d], answer.covariance[:, :d, :d]
         numbers = (x, cov, answer.cost, answer.quantity, answer.normal)
-        return are_out_of_reach(edges, room.beside, room.costs, *numbers)
+        return are_out_of_reach(edges, workspace.beside, workspace.costs, *numbers)
 
-    def _agrees(self, fix: Fix, room: _SingleWorkspace) -> bool:
+    def _agrees(self, fix: Fix, workspace: _SingleWorkspace) -> bool:
         """Return whether the position costs equal the costs of the problem, at the fixes and near them."""
-        many = self.problem.with_rows(z=room.z.copy())
-        return self.map is None or bool(agrees(many, fix.flat(), room.costs).all())
+        many = self.problem.with_rows(z=workspace.z.copy())
+        return self.map is None or bool(agrees(many, fix.flat(), workspace.costs).all())
 
     def _judge(
         self,
@@ -319,7 +319,7 @@ class Single:
         answer: Any,
         found: list[EngineResult],
         stages: tuple[Stage, ...],
-        room: _SingleWorkspace,
+        workspace: _SingleWorkspace,
     ) -> Fix | None:
         """Return the fixes with their verdicts, or None if the reason of one of them needs the long path."""
         marks, kinds, gaps = [], [], []
@@ -330,18 +330,21 @@ class Single:
             marks.append(marks_of(one.cost > self.refuted, more, self.region, gap, one.kappa, self.map is not None))
             kinds.append(chart_kind(one.kappa, one.kappa_far))
             gaps.append(ambiguity(self.problem, gap) if gap < AMBIGUOUS_GAP else "")
-        inflation = self._inflations(answer, marks, room)
+        inflation = self._inflations(answer, marks, workspace)
         for i in inflation:
             marks[i], kinds[i] = Status.TAILS.mark, CARTESIAN if kinds[i] == CURVED else kinds[i]
-        told = _told(tuple(marks), tuple(kinds), tuple(gaps), shape)
-        if told is None:
+        notes = _notes_of(tuple(marks), tuple(kinds), tuple(gaps), shape)
+        if notes is None:
             return None
         x, covariance = (answer.x, answer.covariance) if shape else (answer.x[0], answer.covariance[0])
         inflations = np.array([inflation.get(i, 1.0) for i in range(len(found))]).reshape(shape) if inflation else None
         held, alone = active_of(self.plan, answer.multiplier), all(one.rival_cost == inf for one in found)
-        cost, claims, d = answer.cost.reshape(shape).copy(), room.claims, self.load.place.shape[-1]
+        cost, claims, d = answer.cost.reshape(shape).copy(), workspace.claims, self.load.place.shape[-1]
         if self.map is not None:
-            bound, boxes = room.answered.bound.reshape(shape).copy(), room.answered.boxes.reshape(shape).copy()
+            bound, boxes = (
+                workspace.answered.bound.reshape(shape).copy(),
+                workspace.answered.boxes.reshape(shape).copy(),
+            )
             reason = claims.reason if alone else _reasons(answer.rival_cost < np.inf, shape)
             claims = Claims(
                 claims.proof, reason, claims.method, bound, cost - bound,
@@ -350,40 +353,40 @@ class Single:
         return Fix(
             x,
             covariance,
-            code=told.code,
-            reason=told.reason,
+            code=notes.code,
+            reason=notes.reason,
             claims=claims,
             cost=cost,
             stages=stages,
-            marks=told.marks,
-            chart=Chart(told.kind, x[..., :d], covariance[..., :d, :d], room.centre, inflation=inflations),
+            marks=notes.marks,
+            chart=Chart(notes.kind, x[..., :d], covariance[..., :d, :d], workspace.centre, inflation=inflations),
             infinity=answer.infinity.reshape(shape) - cost,
-            alternatives=room.alone if alone else _rivals(answer, shape),
-            active=room.nothing if held is None else held.reshape(shape),
-            **room.kept,
+            alternatives=workspace.alone if alone else _rivals(answer, shape),
+            active=workspace.nothing if held is None else held.reshape(shape),
+            **workspace.kept,
         )
 
-    def _inflations(self, answer: Any, marks: list[int], room: _SingleWorkspace) -> dict[int, float]:
+    def _inflations(self, answer: Any, marks: list[int], workspace: _SingleWorkspace) -> dict[int, float]:
         """Return the inflations, by item number, of curved fixes whose 95 % ellipses cover simulated repeats."""
         items = [i for i, mark in enumerate(marks) if mark == Status.CURVED.mark]
         if not items or not self.repeatable:
             return {}
-        many = self.problem.with_rows(z=room.z[items]).flat()
+        many = self.problem.with_rows(z=workspace.z[items]).flat()
         found = repeat(many, answer.x[items], answer.covariance[items])
         return {i: float(one[2]) for i, one, good in zip(items, found, holds(found), strict=True) if good}
 
-    def _room(self, shape: tuple[int, ...]) -> _SingleWorkspace:
+    def _workspace(self, shape: tuple[int, ...]) -> _SingleWorkspace:
         """Return the workspace of this thread for a batch shape."""
-        rooms: dict[tuple[int, ...], _SingleWorkspace] | None = getattr(self.own, "rooms", None)
-        if rooms is None:
-            rooms = self.own.rooms = {}
-        if shape not in rooms:
-            if len(rooms) == _ROOMS:
-                rooms.clear()
-            rooms[shape] = self._make_room(shape)
-        return rooms[shape]
+        workspaces: dict[tuple[int, ...], _SingleWorkspace] | None = getattr(self.own, "workspaces", None)
+        if workspaces is None:
+            workspaces = self.own.workspaces = {}
+        if shape not in workspaces:
+            if len(workspaces) == _WORKSPACES:
+                workspaces.clear()
+            workspaces[shape] = self._make_workspace(shape)
+        return workspaces[shape]
 
-    def _make_room(self, shape: tuple[int, ...]) -> _SingleWorkspace:
+    def _make_workspace(self, shape: tuple[int, ...]) -> _SingleWorkspace:
         """Return a new workspace for a batch shape."""
         n, size, d, m = max(1, *shape, 1), self.plan.layout.size, self.load.place.shape[-1], self.problem.count
         found = tuple(blank_answer(n, *self.plan.widths))[2:]
@@ -447,20 +450,20 @@ class _SingleNotes(NamedTuple):
 
 
 @lru_cache(maxsize=256)  # fixes on the short path have few combinations of status and reason
-def _told(
+def _notes_of(
     marks: tuple[int, ...], kinds: tuple[int, ...], gaps: tuple[str, ...], shape: tuple[int, ...]
 ) -> _SingleNotes | None:
     """Return statuses and reasons from marks, chart kinds and texts on rivals; None for the long path."""
     code = [Status(int(one)) for one in first_status(np.array(marks))]
     curved = [kind if status == Status.CURVED else None for status, kind in zip(code, kinds, strict=True)]
-    said = [
+    reasons = [
         gap if status == Status.AMBIGUOUS else _SENTENCES.get((status, kind))
         for status, kind, gap in zip(code, curved, gaps, strict=True)
     ]
-    if None in said:
+    if None in reasons:
         return None
-    told = zip((code, said, marks, kinds), (np.int8, object, np.int32, np.int8), strict=True)
-    out = _SingleNotes(*(np.array(values, dtype=kind).reshape(shape) for values, kind in told))
+    columns = zip((code, reasons, marks, kinds), (np.int8, object, np.int32, np.int8), strict=True)
+    out = _SingleNotes(*(np.array(values, dtype=kind).reshape(shape) for values, kind in columns))
     for array in out:
         array.setflags(write=False)
     return out

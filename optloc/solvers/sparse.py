@@ -194,11 +194,11 @@ def _lift_ranges(
 
 def _centre(m: Array, block: Rows) -> Array:
     """Return arrival times (N, m) minus the median of their epoch: one gross error must not set the origin of time."""
-    out, heard = np.array(m), np.broadcast_to(block.weight > 0.0, m.shape)
+    out, present = np.array(m), np.broadcast_to(block.weight > 0.0, m.shape)
     for epoch in np.unique(block.epoch):
         own = block.epoch == epoch
         with np.errstate(all="ignore"):
-            middle = np.nanmedian(np.where(heard[:, own], m[:, own], np.nan), axis=1, keepdims=True)
+            middle = np.nanmedian(np.where(present[:, own], m[:, own], np.nan), axis=1, keepdims=True)
         out[:, own] -= np.where(np.isfinite(middle), middle, 0.0)
     return out
 
@@ -402,8 +402,8 @@ def _standardise(problem: Problem, x: Array, kept: Array) -> Array:
     lever = np.einsum("nmi,nij,nmj->nm", white, covariance, white)
     variance = np.where(kept, 1.0 - lever, 1.0 + lever)
     with np.errstate(invalid="ignore"):
-        told = variance > _UNCHECKED  # a row without redundancy fits with any error
-    return np.where(told, np.abs(residual) / np.sqrt(np.where(told, variance, 1.0)), 0.0)
+        checked = variance > _UNCHECKED  # a row without redundancy fits with any error
+    return np.where(checked, np.abs(residual) / np.sqrt(np.where(checked, variance, 1.0)), 0.0)
 
 
 def _derivatives(problem: Problem, x: Array) -> tuple[Array, Array]:

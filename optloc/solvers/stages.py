@@ -104,8 +104,8 @@ def explain_absence(problem: Problem, pool: Pool, word: str) -> Pool:
     forms = FORMULATIONS.values()
     own = [form for form in forms if word in form.starts] or [form for form in forms if word in form.words]
     needs = [form.needs(problem) for form in own]
-    told = needs[0] if needs and all(needs) else "finds no start from these rows"
-    return pool.without(items, f"{word} {told}: use 'auto'", Status.UNAVAILABLE)
+    reason = needs[0] if needs and all(needs) else "finds no start from these rows"
+    return pool.without(items, f"{word} {reason}: use 'auto'", Status.UNAVAILABLE)
 
 
 # Words whose starts cover all rows that any closed form covers.
@@ -395,8 +395,8 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
         x = x if turned is None else unwind(turned, x)
     weights = np.broadcast_to(problem.weight, (len(pool), problem.count))
     # face 0 has no inequalities; `bound_pool` adds candidates on other faces
-    inside, told = np.zeros(shape, dtype=int), pool.missing
-    refined = Pool(x, cost, code, inside, weights, pool.dof, pool.stages, missing=told, hidden=pool.hidden)
+    inside, missing = np.zeros(shape, dtype=int), pool.missing
+    refined = Pool(x, cost, code, inside, weights, pool.dof, pool.stages, missing=missing, hidden=pool.hidden)
     free = least_finished(refined) if problem.constraints else None
     refined = replace(bound_pool(problem, refined) if damped else refined, free=free)
     stage = Stage("lsr" if damped else "taylor", detail, perf_counter() - began)

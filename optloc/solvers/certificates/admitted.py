@@ -94,18 +94,18 @@ def certified(
     if pool.tried_before is not None:
         proven.write(same, take(pool.tried_before.proven, same))
     items, more = np.flatnonzero(asked & ~same), 0
-    pool, told, done = _prove_freely(problem, pool, items, margin, effort)
-    proven.write(items[done], take(told, done))
+    pool, claims, done = _prove_freely(problem, pool, items, margin, effort)
+    proven.write(items[done], take(claims, done))
     items, fix = items[~done], judge(problem, pool)
     for _ in range(_ROUNDS):
         if not len(items):
             break
         part, own = problem.take(items), take(pool, items)
-        told, minima = _prove_within(part, own, fix[items], margin, effort)
-        new = _beside(part, own, minima)
+        claims, minima = _prove_within(part, own, fix[items], margin, effort)
+        new = _with_minima(part, own, minima)
         better = judge(part, new)
         changed = np.flatnonzero(_is_new(fix[items], better))
-        proven.write(items, told)
+        proven.write(items, claims)
         if not has_law(problem):  # the covariance of a fix that an inequality holds describes the edge only
             proven.write(items[~is_free(problem, fix, items)], unknown(HELD))
         more += len(changed)
@@ -128,10 +128,10 @@ def _prove_freely(
     if edges is None or is_run(problem) or not len(items):
         return pool, untried(len(items)), np.zeros(len(items), dtype=bool)
     new = certified_freely(part, take(pool, items), None, margin, effort)
-    fix, told = judge(part, new), new.proven
-    assert told is not None
+    fix, claims = judge(part, new), new.proven
+    assert claims is not None
     alone = ~np.isfinite(fix.alternatives.gap).any(-1) & fix.answered & is_free(part, fix, np.arange(len(items)))
-    sure = np.flatnonzero(alone & (told.proof == GLOBAL) & told.unique & (told.margin >= margin))
+    sure = np.flatnonzero(alone & (claims.proof == GLOBAL) & claims.unique & (claims.margin >= margin))
     holds = np.zeros(len(items), dtype=bool)
     if len(sure):
         costs = eliminate_nuisance(part.take(sure))
@@ -139,7 +139,7 @@ def _prove_freely(
         holds[sure] = out_of_reach(part.take(sure), edges, costs, fix[sure], margin)
     # a better minimum that the proof found is kept
     kept = replace(new, proven=pool.proven if pool.proven is None else take(pool.proven, items))
-    return pool.merge(items, kept), told, holds
+    return pool.merge(items, kept), claims, holds
 
 
 def _is_new(fix: Fix, other: Fix) -> Array:
@@ -181,7 +181,7 @@ Minima = tuple[Array, Array, Array]
 """Vectors (n, q, size), costs (n, q) and numbers of faces (n, q); infinite costs in empty slots."""
 
 
-def _beside(problem: Problem, pool: Pool, minima: Minima) -> Pool:
+def _with_minima(problem: Problem, pool: Pool, minima: Minima) -> Pool:
     """Return settled pools with additional minima, which are already refined."""
     x, cost, face = minima
     here = np.isfinite(cost)
@@ -211,7 +211,7 @@ def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort:
         above = _least_around(known, face, len(pool))
         if not (above < margin).any():
             continue
-        along = known[face] = _know_along(problem, costs, fix, face, seeds, margin, effort)
+        along = known[face] = _explore_face(problem, costs, fix, face, seeds, margin, effort)
         own, admitted = np.maximum(above, along.rest), _is_admitted(problem, face, along)
         if number:
             # The proof does not cover every edge. If all free minima are admitted, the cost falls from an uncovered
@@ -239,7 +239,7 @@ def _least_around(known: dict[Face, Along], face: Face, size: int) -> Array:
     return np.asarray(np.max([np.full(size, -np.inf), *around], axis=0))
 
 
-def _know_along(
+def _explore_face(
     problem: Problem, costs: Costs, fix: Fix, face: Face, seeds: Array, margin: float, effort: float
 ) -> Along:
     """Return minima and bounds of n problems along a face; without minima if the whole face costs too much.
@@ -252,17 +252,17 @@ def _know_along(
     dear, boxes = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
     if len(face) > len(exact(problem)) and not unsupported(on_face(problem, face)):
         limits = admitted(problem, problem.dimension)
-        dear, boxes = _is_dear(on_face(problem, face), limits, costs, seeds, fix.cost + margin, effort)
+        dear, boxes = _is_costly(on_face(problem, face), limits, costs, seeds, fix.cost + margin, effort)
     least = np.full(n, margin)
     out = Along(np.full((n, 1, size), np.nan), np.full((n, 1), np.inf), least, least, boxes, fill(n, ""))
     rest = np.flatnonzero(~dear)
     if not len(rest):
         return out
-    some = _prove_along(problem.take(rest), fix[rest], face, seeds[rest], margin, effort)
+    some = _prove_face(problem.take(rest), fix[rest], face, seeds[rest], margin, effort)
     return overwrite(out, rest, replace(some, boxes=some.boxes + boxes[rest]))
 
 
-def _is_dear(
+def _is_costly(
     on: Problem, limits: Array, costs: Costs, seeds: Array, level: Array, effort: float
 ) -> tuple[Array, Array]:
     """Return flags (n,) of faces of equalities that cost at least a level (n,) everywhere, and the boxes used (n,).
@@ -283,7 +283,7 @@ def _is_dear(
         if not len(items):
             break
         part, own = on.take(items), costs.take(items)
-        answer = prove(own, _question(part, limits, own, x[items], cost[items] - level[items], effort))
+        answer = prove(own, _request(part, limits, own, x[items], cost[items] - level[items], effort))
         boxes[items] += answer.boxes
         # coarse rounding may make the proven bound lower than requested
         dear[items] = (answer.verdict == VALUE) & (answer.bound > level[items] - equal_cost(level[items]))
@@ -315,7 +315,7 @@ def _costs(problem: Problem, costs: Costs, x: Array) -> Array:
     return np.where(np.isfinite(cost), cost, np.inf)
 
 
-def _question(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, effort: float) -> ProofRequest:
+def _request(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, effort: float) -> ProofRequest:
     """Return the proof request: no position of a face costs less than x (n, size) by more than `less` (n,)."""
     place = x[:, state_columns(on)]
     (n, d), value = place.shape, np.zeros(len(x))
@@ -336,7 +336,7 @@ def _question(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, e
     )
 
 
-def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: float, effort: float) -> Along:
+def _prove_face(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: float, effort: float) -> Along:
     """Return minima and bounds of n problems along a face; the search for minima starts at seeds (n, q, size)."""
     began, on, limits = perf_counter(), on_face(problem, face), admitted(problem, problem.dimension)
     names = " and ".join(face_names(problem, face)) or "inside"
@@ -345,11 +345,11 @@ def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: f
     corner, reason = is_corner(problem, face), unsupported(on)
     if corner or reason:
         lost = np.full(len(seeds), -np.inf)
-        none, least = np.zeros(len(seeds), dtype=np.int64), _gain(alone.cost, fix.cost) if corner else lost
+        none, least = np.zeros(len(seeds), dtype=np.int64), _excess(alone.cost, fix.cost) if corner else lost
         # a corner is a single point, so it is its only minimum
         rest = np.where(np.isfinite(least), np.inf, -np.inf)
         return Along(*_minima(alone), least, rest, none, fill(len(seeds), UNFOLLOWED.format(names, reason)))
-    gain = _gain(alone.cost, fix.cost)
+    gain = _excess(alone.cost, fix.cost)
     # If a face costs more than the fix by the margin, its minima need no distinction. If a minimum that is not admitted
     # costs less than the fix, the proof must find all minima up to the margin above the fix. Gaps are rounded up to
     # whole numbers, so that fixes of a batch share a request.
@@ -372,7 +372,7 @@ def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: f
 
     prove(alone.answered)
     alone = judge(on, replace(pool, proven=None))
-    gain = _gain(alone.cost, fix.cost)
+    gain = _excess(alone.cost, fix.cost)
     # An unfinished proof falls back to the gap of `ambiguous`. This gap counts from the least minimum, which may cost
     # less than the fix if it is not admitted.
     enough = np.ceil(AMBIGUOUS_GAP - gain)
@@ -381,13 +381,13 @@ def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: f
         wanted = np.where(short, enough, wanted)
         prove(short)
         alone = judge(on, replace(pool, proven=None))
-        gain = _gain(alone.cost, fix.cost)
+        gain = _excess(alone.cost, fix.cost)
     sure, gap = _is_sure(proven, limits), proven.margin
     least, rest = np.where(sure, gain, -np.inf), np.where(sure, gain + gap, -np.inf)
     return Along(*_minima(alone), least, rest, proven.boxes, proven.reason)
 
 
-def _gain(cost: Array, best: Array) -> Array:
+def _excess(cost: Array, best: Array) -> Array:
     """Return the costs (n,) minus the costs of fixes; zero for differences within rounding."""
     gain = np.where(np.isfinite(cost), cost - best, -np.inf)
     return np.where(np.abs(gain) <= equal_cost(best), 0.0, gain)

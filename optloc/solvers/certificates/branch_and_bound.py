@@ -262,7 +262,7 @@ def settle(work: BoundWorkspace) -> BoundWorkspace:
         items = np.flatnonzero(work.pending)
         if not len(items):
             break
-        _round(work, items)
+        _run_round(work, items)
     _give_up(work, np.flatnonzero(work.pending), RESTLESS)
     _compare(work, asked)
     return work
@@ -278,14 +278,14 @@ def _compare(work: BoundWorkspace, items: Array) -> None:
     work.mismatched += len(off)
 
 
-def _round(work: BoundWorkspace, items: Array) -> None:
+def _run_round(work: BoundWorkspace, items: Array) -> None:
     """Run one proof for each item, and write its claim, add its minima, or lower its margin."""
     free = is_free(work.problem, work.fix, items)
     _give_up(work, items[~free], HELD)
-    asked, costs = _asked(work, items), work.costs.take(items)
+    asked, costs = _requests(work, items), work.costs.take(items)
     # Above `costs.level`, wrapping may change a residual by a whole turn, and the bounds of the proof do not hold.
     turning = free & (costs.level < work.fix.cost[items] + asked.gaps[:, 0])
-    _lower(work, items[turning], TURNS)
+    _lower_margin(work, items[turning], TURNS)
     good = np.flatnonzero(free & ~turning)
     if not len(good):
         return
@@ -296,19 +296,19 @@ def _round(work: BoundWorkspace, items: Array) -> None:
     done, beside = np.isin(answer.verdict, (UNIQUE, VALUE)), answer.met > 0
     holds = done & ~beside
     if (done & beside).any():
-        holds[done & beside] = _list(work, items[done & beside], answer.take(done & beside))
+        holds[done & beside] = _list_rivals(work, items[done & beside], answer.take(done & beside))
     _claim(work, items, asked, answer, np.flatnonzero(holds))
     short, last = answer.verdict == BUDGET, len(work.margins) - 1
     # the budget of the value alone may show what the budget of the gap did not
     below = short & (answer.gap < asked.gaps[:, 0])
     work.level[items[below]] = last - 1
-    _lower(work, items[short], _unfinished(work.costs, len(items)))
+    _lower_margin(work, items[short], _unfinished(work.costs, len(items)))
     remote = answer.verdict == UNBOUNDED
     work.level[items[remote & (answer.gap == 0.0)]] = last
-    _lower(work, items[remote], REMOTE, remote=True)
+    _lower_margin(work, items[remote], REMOTE, remote=True)
     found = np.isin(answer.verdict, (BETTER, OTHER))
     if found.any():
-        _add(work, items[found], answer.found[found], answer.verdict[found] == BETTER)
+        _add_candidates(work, items[found], answer.found[found], answer.verdict[found] == BETTER)
     fine, unclosed = answer.verdict == COARSE, answer.verdict == OPEN
     _give_up(work, items[fine], FINE)
     # on the surface of a height the boxes ran out before the proof tried a region
@@ -318,7 +318,7 @@ def _round(work: BoundWorkspace, items: Array) -> None:
     _give_up(work, items[~(done | short | remote | found | fine | unclosed)], UNSETTLED)
 
 
-def _asked(work: BoundWorkspace, items: Array) -> ProofRequest:
+def _requests(work: BoundWorkspace, items: Array) -> ProofRequest:
     """Return the proof requests of some fixes, with the margins, regions and known minima of this round."""
     fix, ignored, last = work.fix, work.ignored[items], len(work.margins) - 1
     gaps = work.margins[np.minimum(work.level[items, None] + np.arange(last + 1), last)]
@@ -360,7 +360,7 @@ def _unfinished(costs: Costs, count: int) -> str:
     return UNFINISHED + (LACKS_CODE if lacks(costs, count) else "")
 
 
-def _lower(work: BoundWorkspace, items: Array, why: str, *, remote: bool = False) -> None:
+def _lower_margin(work: BoundWorkspace, items: Array, why: str, *, remote: bool = False) -> None:
     """Lower the margin of failed proofs, then limit them to a region; give up if both were tried."""
     last = len(work.margins) - 1
     work.level[items] += 1
@@ -385,31 +385,31 @@ def _claim(work: BoundWorkspace, items: Array, asked: ProofRequest, answer: Proo
     """Write the claims of finished proofs `done` among the items."""
     proven, kappa = items[done], answer.gap[done]
     listed = (work.fix.alternatives.gap[proven] < kappa[:, None]).sum(1)
-    told = state_claims(
+    claims = state_claims(
         work.fix.cost[proven], answer.bound[done], kappa, answer.boxes[done], listed, answer.everywhere[done]
     )
-    told.asked[:] = work.limited
+    claims.asked[:] = work.limited
     for k in np.flatnonzero(~answer.everywhere[done]).tolist():
         whole = np.isnan(asked.region[done[k], 0, 0])
         corners = (asked.fallback if whole else asked.region)[done[k]]
         low, high = corners[:, np.isfinite(corners).all(0)].tolist()  # a known height is no limit of the claim
-        told.region[k] = region = tuple(low), tuple(high)
-        told.reason[k] = sentence(float(kappa[k]), int(listed[k]), region)
-    work.proven.write(proven, told)
+        claims.region[k] = region = tuple(low), tuple(high)
+        claims.reason[k] = sentence(float(kappa[k]), int(listed[k]), region)
+    work.proven.write(proven, claims)
     work.pending[proven] = False
 
 
-def _add(work: BoundWorkspace, items: Array, points: Array, better: Array) -> None:
+def _add_candidates(work: BoundWorkspace, items: Array, points: Array, better: Array) -> None:
     """Refine points (n, d) that the proofs of some fixes found, and add them to the candidates."""
-    _, changed = _compete(work, items, points[:, None])
-    _stick(work, items[~changed], points[~changed], better[~changed])
+    _, changed = _judge_with_points(work, items, points[:, None])
+    _handle_unchanged(work, items[~changed], points[~changed], better[~changed])
 
 
-def _list(work: BoundWorkspace, items: Array, answer: ProofResult) -> Array:
+def _list_rivals(work: BoundWorkspace, items: Array, answer: ProofResult) -> Array:
     """Refine the other minima of finished proofs and add them to the candidates; return which claims hold (n,)."""
     rivals = answer.rivals[:, : answer.met.max()]
     rivals = np.where((np.arange(rivals.shape[1]) < answer.met[:, None])[..., None], rivals, np.nan)
-    lower, changed = _compete(work, items, rivals)
+    lower, changed = _judge_with_points(work, items, rivals)
     fix, own = work.fix[items], state_columns(work.problem)
     known, place = fix.alternatives.x[..., own], fix.x[:, None, own]
     with np.errstate(invalid="ignore"):
@@ -417,11 +417,11 @@ def _list(work: BoundWorkspace, items: Array, answer: ProofResult) -> Array:
         near = (apart <= _SAME * np.linalg.norm(rivals - place, axis=-1, keepdims=True)).any(-1)
     holds = ~lower & fix.answered & (near | np.isnan(rivals[..., 0])).all(1)
     stuck = ~changed & ~holds
-    _stick(work, items[stuck], rivals[stuck, 0], np.zeros(stuck.sum(), dtype=bool))
+    _handle_unchanged(work, items[stuck], rivals[stuck, 0], np.zeros(stuck.sum(), dtype=bool))
     return np.asarray(holds)
 
 
-def _compete(work: BoundWorkspace, items: Array, points: Array) -> tuple[Array, Array]:
+def _judge_with_points(work: BoundWorkspace, items: Array, points: Array) -> tuple[Array, Array]:
     """Refine points (n, P, d) and judge them with the candidates of some fixes.
 
     Return flags (n,) of fixes that cost less now, and flags (n,) of fixes that changed in any way.
@@ -445,14 +445,14 @@ def _compete(work: BoundWorkspace, items: Array, points: Array) -> tuple[Array, 
     return lower, changed
 
 
-def _stick(work: BoundWorkspace, items: Array, points: Array, better: Array) -> None:
+def _handle_unchanged(work: BoundWorkspace, items: Array, points: Array, better: Array) -> None:
     """Handle points (n, d) that changed no candidate: store hidden minima, give up fixes, or lower margins."""
     stuck = np.flatnonzero(~_ignore(work, items, points))
-    _bar(work, items, points, stuck[better[stuck]])
-    _lower(work, items[stuck[~better[stuck]]], _unfinished(work.costs, len(items)))
+    _give_up_forbidden(work, items, points, stuck[better[stuck]])
+    _lower_margin(work, items[stuck[~better[stuck]]], _unfinished(work.costs, len(items)))
 
 
-def _bar(work: BoundWorkspace, items: Array, points: Array, barred: Array) -> None:
+def _give_up_forbidden(work: BoundWorkspace, items: Array, points: Array, barred: Array) -> None:
     """Give up fixes with a cheaper point that did not replace them, and write what forbids this point."""
     if not len(barred):
         return
@@ -551,10 +551,10 @@ def to_prove(pool: Pool, fix: Fix) -> tuple[Array, Array]:
     answered = fix.answered & np.isfinite(fix.cost)
     if pool.conclusion is not None:
         answered &= ~present(pool.conclusion)  # a conclusion leaves rows out
-    return answered, answered & _stands(pool.tried_before, fix)
+    return answered, answered & _is_still_valid(pool.tried_before, fix)
 
 
-def _stands(before: TriedBefore | None, fix: Fix) -> Array:
+def _is_still_valid(before: TriedBefore | None, fix: Fix) -> Array:
     """Return flags (N,) of earlier claims that are about the same minima as the fixes, so that they are still valid.
 
     Known minima stay candidates. So an equal number of minima and an equal least cost mean the same minima.

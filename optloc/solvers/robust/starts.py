@@ -73,9 +73,9 @@ def subsets(problem: Problem, clean: Array) -> tuple[Array, Array]:
     """
     present = np.broadcast_to(problem.weight > 0.0, (problem.batch_shape[0], problem.count))
     touched, single = rows_of_stations(problem), np.eye(problem.count, dtype=bool)
-    heard = np.asarray((present[:, None] & touched).any(-1))
+    measured = np.asarray((present[:, None] & touched).any(-1))
     short = np.flatnonzero(present.sum(1) <= _ROWS)
-    stations, rows = _unite(heard, touched, 3), _unite(present[short], single, 1)
+    stations, rows = _unite(measured, touched, 3), _unite(present[short], single, 1)
     wanted = ~clean[stations[0]] | (stations[2] == 1)
     item = np.concatenate([stations[0][wanted], short[rows[0]]])
     kept = present[item] & ~np.concatenate([stations[1][wanted], rows[1]])

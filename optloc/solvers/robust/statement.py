@@ -79,8 +79,8 @@ def stated(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     if not len(items):
         return pool
     part, out = problem.take(items), doubted[items]
-    good, told, repeats = _examine(part, loss, fix.x[items], out)
-    kept[items], remark[items] = good, told
+    good, reasons, repeats = _examine(part, loss, fix.x[items], out)
+    kept[items], remark[items] = good, reasons
     found = np.full((count, 3), np.nan)
     found[items] = repeats
     return replace(pool, curvature=replace(curvature, repeats=found))

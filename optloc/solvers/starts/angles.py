@@ -308,10 +308,10 @@ def pair(problem: Problem) -> tuple[int, int] | None:
     if problem.stations.position.shape[-3] > 1 or not all(_once_an_epoch(rows) for rows in problem.rows):
         return None
     ends = {(int(a), int(b)) for a, b in zip(kinds["range_sum"].a, kinds["range_sum"].b, strict=True)}
-    heard = {int(a) for kind in ("azimuth", "elevation") for a in kinds[kind].a}
-    if len(heard) != 1 or len({frozenset(end) for end in ends}) != 1:
+    receivers = {int(a) for kind in ("azimuth", "elevation") for a in kinds[kind].a}
+    if len(receivers) != 1 or len({frozenset(end) for end in ends}) != 1:
         return None
-    receiver = heard.pop()
+    receiver = receivers.pop()
     others = {a if b == receiver else b for a, b in ends if receiver in (a, b)}
     # rows may name the two stations in either order
     return (receiver, others.pop()) if len(others) == 1 else None

@@ -28,8 +28,8 @@ def dopplered(problem: Problem) -> bool:
     """Return whether the only target is a source at rest, and rows measure its range rates."""
     if len(problem.motions) != 1 or problem.stations.velocity is None:
         return False
-    motion, told = problem.motions[0], any(_rates(rows) != (0, 0) for rows in problem.rows)
-    return told and motion.known is None and motion.order == 0 and motion.span == "run"
+    motion, measured = problem.motions[0], any(_rates(rows) != (0, 0) for rows in problem.rows)
+    return measured and motion.known is None and motion.order == 0 and motion.span == "run"
 
 
 def doppler_starts(problem: Problem) -> Array:
@@ -63,7 +63,7 @@ def doppler_starts(problem: Problem) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class _DopplerNotes:
+class _DopplerRows:
     """The rows in the relaxation, for all problems of a batch: numbers (m,) or (N, m) of each.
 
     Parameters
@@ -89,12 +89,12 @@ class _DopplerNotes:
     ranges: Array
     design: Array
 
-    def take(self, index: Array) -> _DopplerNotes:
+    def take(self, index: Array) -> _DopplerRows:
         """Return some of the rows."""
-        return _DopplerNotes(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+        return _DopplerRows(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
-def _gather(problem: Problem) -> _DopplerNotes:
+def _gather(problem: Problem) -> _DopplerRows:
     """Return the rows in the relaxation, with groups and coefficients."""
     shared, parts = problem.layout.n_shared, list(_parts(problem))
     row, epoch, a, b, kind, rates, ranges = (np.concatenate(values) for values in zip(*parts, strict=True))
@@ -103,7 +103,7 @@ def _gather(problem: Problem) -> _DopplerNotes:
         mine = links.adds.column < shared
         np.add.at(design, (start + links.adds.row[mine], links.adds.column[mine]), links.adds.coefficient[mine])
     _, group = np.unique(np.stack([kind, a, b]), axis=1, return_inverse=True)
-    return _DopplerNotes(row, epoch, a, b, group.reshape(-1), rates, ranges, design[row])
+    return _DopplerRows(row, epoch, a, b, group.reshape(-1), rates, ranges, design[row])
 
 
 def _parts(problem: Problem) -> Iterator[tuple[Array, ...]]:
@@ -131,17 +131,17 @@ def _ranges(rows: Rows) -> tuple[int, int]:
     return (0, 0) if model.ranges is None or model.emission else model.ranges
 
 
-def _start(problem: Problem, i: int, every: _DopplerNotes, surface: Ellipsoid | None) -> Array:
+def _start(problem: Problem, i: int, every: _DopplerRows, surface: Ellipsoid | None) -> Array:
     """Return the points (1 + 2 d, d) of one problem."""
     one = problem.take(np.array([i]))
     z, weight = one.observed[0, every.row], np.broadcast_to(one.weight, (1, one.count))[0, every.row]
     present = (weight > 0.0) & np.isfinite(z)
-    told, z, weight = every.take(present), z[present], weight[present]
+    rows, z, weight = every.take(present), z[present], weight[present]
     nowhere = np.full((1 + 2 * problem.dimension, problem.dimension), np.nan)
-    if not told.rates.any():
+    if not rows.rates.any():
         return nowhere
-    pick, values, sigma = _few(one, told, z, weight)
-    chosen = told.take(pick)
+    pick, values, sigma = _few(one, rows, z, weight)
+    chosen = rows.take(pick)
     nodes, ranges, rates = _nodes(one, chosen)
     if sigma is None:
         scale = np.sqrt(weight)
@@ -156,43 +156,43 @@ def _start(problem: Problem, i: int, every: _DopplerNotes, surface: Ellipsoid | 
     return found if surface is None else problem.frame.from_ecef(found)
 
 
-def _few(problem: Problem, told: _DopplerNotes, z: Array, weight: Array) -> tuple[Array, Array, Array | None]:
+def _few(problem: Problem, rows: _DopplerRows, z: Array, weight: Array) -> tuple[Array, Array, Array | None]:
     """Return the numbers of the rows used, their values, and standard deviations if they are normal points."""
-    if _size(problem, told) <= SIZE:
+    if _size(problem, rows) <= SIZE:
         return np.arange(len(z)), z, None
-    time = problem.times[told.epoch]
-    parts = [np.flatnonzero(told.group == group) for group in np.unique(told.group)]
+    time = problem.times[rows.epoch]
+    parts = [np.flatnonzero(rows.group == group) for group in np.unique(rows.group)]
     # the shortest blocks that are few enough; each row adds at least one entry
     for length in range(max(2, len(z) // SIZE), 1 + max(2, *map(len, parts))):
         cut = [part[block] for part in parts for block in blocks(time[part], length)]
         pick = np.array([block[len(block) // 2] for block in cut])
-        if _size(problem, told.take(pick)) <= SIZE:
+        if _size(problem, rows.take(pick)) <= SIZE:
             break
     # for too many stations: every other block, every third block, and so on
-    steps = (step for step in range(1, len(cut)) if _size(problem, told.take(pick[::step])) <= SIZE)
-    sigma = np.sqrt(variances(problem.noise, problem.count)[..., told.row].reshape(-1, len(z))[0] / weight)
+    steps = (step for step in range(1, len(cut)) if _size(problem, rows.take(pick[::step])) <= SIZE)
+    sigma = np.sqrt(variances(problem.noise, problem.count)[..., rows.row].reshape(-1, len(z))[0] / weight)
     return normal_points(time, z, sigma, cut[:: next(steps, len(cut))])
 
 
-def _size(problem: Problem, told: _DopplerNotes) -> int:
+def _size(problem: Problem, rows: _DopplerRows) -> int:
     """Return the size of the lifted matrix of the relaxation with these rows."""
-    _, ranges, rates = _nodes(problem, told)
-    return lifted_size(problem.dimension, ranges, rates, told.design[:, told.design.any(axis=0)])
+    _, ranges, rates = _nodes(problem, rows)
+    return lifted_size(problem.dimension, ranges, rates, rows.design[:, rows.design.any(axis=0)])
 
 
-def _nodes(problem: Problem, told: _DopplerNotes) -> tuple[Array, Array, Array]:
+def _nodes(problem: Problem, rows: _DopplerRows) -> tuple[Array, Array, Array]:
     """Return the nodes (M, 2) of rows, epoch and station, and the coefficients of their ranges and rates."""
     stations = problem.stations
     assert stations.velocity is not None
     stays = stations.position.shape[-3] == 1 and stations.velocity.shape[-3] == 1
-    epoch = np.zeros_like(told.epoch) if stays else told.epoch
-    ends = np.stack([np.stack([epoch, station], axis=1) for station in (told.a, told.b)], axis=1)
+    epoch = np.zeros_like(rows.epoch) if stays else rows.epoch
+    ends = np.stack([np.stack([epoch, station], axis=1) for station in (rows.a, rows.b)], axis=1)
     known = ends[..., 1] >= 0
     nodes, at = np.unique(ends[known], axis=0, return_inverse=True)
     row, side = np.nonzero(known)
-    out = np.zeros((2, len(told.row), len(nodes)))
-    np.add.at(out[0], (row, at.reshape(-1)), told.ranges[row, side])
-    np.add.at(out[1], (row, at.reshape(-1)), told.rates[row, side])
+    out = np.zeros((2, len(rows.row), len(nodes)))
+    np.add.at(out[0], (row, at.reshape(-1)), rows.ranges[row, side])
+    np.add.at(out[1], (row, at.reshape(-1)), rows.rates[row, side])
     return nodes, out[0], out[1]
 
 

@@ -124,8 +124,8 @@ def distance_of(problem: Problem, position: Array) -> Array:
 
 def over_ground(problem: Problem) -> bool:
     """Return whether the problem has one position on Earth, and a row or a constraint may give its height."""
-    told = bool(problem.constraints) or any(rows.kind == "height" for rows in problem.rows)
-    return told and problem.frame.geodetic and problem.dimension == 3 and one_position(problem)
+    has_height = bool(problem.constraints) or any(rows.kind == "height" for rows in problem.rows)
+    return has_height and problem.frame.geodetic and problem.dimension == 3 and one_position(problem)
 
 
 def registrable(problem: Problem) -> bool:

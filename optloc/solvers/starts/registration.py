@@ -443,7 +443,7 @@ def run_of(problem: Problem) -> RegistrationRun | None:
     reference = _most_common(found.reference[found.free & (found.inside.sum(-1) > 1)])
     others = np.flatnonzero(np.arange(len(found.station)) != reference)
     sign = np.array([_most_common(found.sign[found.sign[:, i] != 0, i]) for i in others])
-    heard = (found.reference == reference)[:, None] & found.inside[:, others] & (found.sign[:, others] == sign)
+    present = (found.reference == reference)[:, None] & found.inside[:, others] & (found.sign[:, others] == sign)
     centre, spread = spread_of(problem)
     origin, length, since = centre.mean(0), float(spread.max()), elapsed(problem, 0)
     # simultaneous epochs have no duration, so the unit is arbitrary
@@ -453,10 +453,10 @@ def run_of(problem: Problem) -> RegistrationRun | None:
     course = RegistrationCourse(
         since / duration,
         (_places(problem, found.station[[reference, *others]]) - origin) / length,
-        np.where(heard, found.offset[:, others], 0.0).reshape(size, epochs, -1) / length,
+        np.where(present, found.offset[:, others], 0.0).reshape(size, epochs, -1) / length,
         sign.astype(float),
         np.moveaxis(effect[..., others], 0, -1)[None],
-        _whiten(found, others, heard).reshape(size, epochs, len(others), len(others)) * length,
+        _whiten(found, others, present).reshape(size, epochs, len(others), len(others)) * length,
         mean / length,
         sigma / length,
     )
@@ -481,10 +481,10 @@ def _places(problem: Problem, station: Array | slice = slice(None)) -> Array:
     return np.broadcast_to(place, (len(place), problem.epochs, *place.shape[2:]))
 
 
-def _whiten(found: Ranges, others: Array, heard: Array) -> Array:
+def _whiten(found: Ranges, others: Array, present: Array) -> Array:
     """Return whitening matrices (N k, s - 1, s - 1) of the offsets; zero for stations without one."""
     covariance = found.covariance[:, others][:, :, others]
-    return linalg.whitening(np.where(heard[:, :, None] & heard[:, None, :], covariance, 0.0))
+    return linalg.whitening(np.where(present[:, :, None] & present[:, None, :], covariance, 0.0))
 
 
 def _effects(problem: Problem, found: Ranges) -> tuple[Array, Array]:

@@ -60,20 +60,20 @@ _GROSS = 10.0
 _BEYOND = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.UNAVAILABLE, Status.DISCONNECTED)
 
 
-_Told = dict[int, Error]
+_GroupErrors = dict[int, Error]
 _Explained = list[tuple[Array, tuple[Group, ...], list[Outcome]]]
 
 
 @dataclass(frozen=True, slots=True)
-class _Doubted:
+class _RejectedRows:
     """Rows (N, m) that an earlier robust fix rejected, and the vectors (N, size) of that fix."""
 
     rows: Array
     x: Array
 
-    def take(self, items: Array) -> _Doubted:
+    def take(self, items: Array) -> _RejectedRows:
         """Return the entries of some problems."""
-        return _Doubted(self.rows[items], self.x[items])
+        return _RejectedRows(self.rows[items], self.x[items])
 
 
 def suspects(
@@ -135,18 +135,18 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
     began = perf_counter()
     present = np.broadcast_to(problem.weight, (len(pool), problem.count))
     rejected = np.asarray((pool.weights < _HALF) & (present > _HALF))
-    doubted = _Doubted(rejected, judge(problem, pool).x if rejected.any() else pool.x[:, 0])
+    doubted = _RejectedRows(rejected, judge(problem, pool).x if rejected.any() else pool.x[:, 0])
     if not np.array_equal(pool.weights, present):
         # a robust fix has other minima, and the test needs least squares with every row
         pool = lsr(problem, offer(problem, standing(pool, judge(problem, pool)), pool, "start", perf_counter()))
     before = pool.stages
     asked = partial(_explain, present=present, doubted=doubted, by=by)
-    louder, found = _weigh(problem, pool, asked, together)
+    larger, found = _choose_noise(problem, pool, asked, together)
     count = sum(len(items) for items, _, _ in found)
-    if louder is None:
+    if larger is None:
         pool = _with_conclusions(problem, pool, found)
     else:
-        pool = replace(pool, asked=True, conclusion=_fix_by_louder_noise(louder, found))
+        pool = replace(pool, asked=True, conclusion=_fix_with_larger_noise(larger, found))
     stage = Stage("suspects", f"{count} of {len(pool)} have contradictions", perf_counter() - began)
     return replace(pool, stages=(*before, stage))
 
@@ -165,7 +165,7 @@ def _with_conclusions(problem: Problem, pool: Pool, found: _Explained) -> Pool:
 
 
 @dataclass(frozen=True, slots=True)
-class _Louder:
+class _LargerNoise:
     """Problems with larger noise than stated, and their refined candidates.
 
     Parameters
@@ -186,27 +186,27 @@ class _Louder:
     reason: str
 
 
-def _weigh(
+def _choose_noise(
     problem: Problem, pool: Pool, asked: Callable[[Problem, Fix], _Explained], together: bool
-) -> tuple[_Louder | None, _Explained]:
+) -> tuple[_LargerNoise | None, _Explained]:
     """Return a larger noise if it is likelier for all problems together, else None; and the explanations with it."""
     fix = judge(problem, pool)
-    louder = _louder(problem, pool, fix) if together else None
-    if louder is None:
+    larger = _larger_noise(problem, pool, fix) if together else None
+    if larger is None:
         return None, asked(problem, fix)
     # with the larger noise fewer rows are suspects
-    other = judge(louder.problem, louder.pool)
-    again, present = asked(louder.problem, other), np.broadcast_to(problem.weight, fix.weights.shape)
-    more = 2.0 * (present @ np.log(louder.sizes)) / np.maximum(present.sum(1), 1.0)
+    other = judge(larger.problem, larger.pool)
+    again, present = asked(larger.problem, other), np.broadcast_to(problem.weight, fix.weights.shape)
+    more = 2.0 * (present @ np.log(larger.sizes)) / np.maximum(present.sum(1), 1.0)
     score = _score(again, other, more) + ROW_PRICE
     # a lower bound of the score with the stated noise: each fix costs at least its cost or the price of a row
     if score < np.fmin(fix.cost, ROW_PRICE)[np.isfinite(fix.cost) & (fix.dof > 0)].sum():
-        return louder, again
+        return larger, again
     found = asked(problem, fix)
-    return (louder, again) if score < _score(found, fix, np.zeros(len(more))) else (None, found)
+    return (larger, again) if score < _score(found, fix, np.zeros(len(more))) else (None, found)
 
 
-def _louder(problem: Problem, pool: Pool, fix: Fix) -> _Louder | None:
+def _larger_noise(problem: Problem, pool: Pool, fix: Fix) -> _LargerNoise | None:
     """Return the problems with the noise level that their fixes show; None if it is not larger than stated.
 
     A kind whose noise is smaller than stated keeps the stated noise: its ellipses then cover more than they promise.
@@ -228,31 +228,33 @@ def _louder(problem: Problem, pool: Pool, fix: Fix) -> _Louder | None:
     if not level.refutes or not np.isfinite(level.high[grown]).all():
         return None
     used = replace(level, factor=np.where(grown, level.high, 1.0))
-    said = [
+    sentences = [
         f"the noise of {kind} rows is {factor:.2g} ({low:.2g} to {high:.2g}) times as large as stated"
         for kind, factor, low, high, larger in zip(level.kinds, level.factor, level.low, level.high, grown, strict=True)
         if larger
     ]
     loud = used.scale(problem)
     refined = lsr(loud, offer(loud, standing(pool, fix), pool, "start", perf_counter()))
-    return _Louder(loud, refined, used.sizes(problem), f"{' and '.join(said)}: the upper end of the interval is used")
+    return _LargerNoise(
+        loud, refined, used.sizes(problem), f"{' and '.join(sentences)}: the upper end of the interval is used"
+    )
 
 
-def _fix_by_louder_noise(louder: _Louder, found: _Explained) -> Array:
+def _fix_with_larger_noise(larger: _LargerNoise, found: _Explained) -> Array:
     """Return the finished fixes (N,), an object array, of problems with larger noise than stated."""
-    problem = louder.problem
-    fix = verdict(problem, certified(problem, _with_conclusions(problem, louder.pool, found)))
+    problem = larger.problem
+    fix = verdict(problem, certified(problem, _with_conclusions(problem, larger.pool, found)))
     marks, reason = np.array(fix.marks), np.array(fix.reason)
     items = np.flatnonzero(fix.answered)
     marks[items] |= Status.RESCALED.mark
-    reason[items] = [f"{louder.reason}; {own}" if own else louder.reason for own in reason[items]]
+    reason[items] = [f"{larger.reason}; {own}" if own else larger.reason for own in reason[items]]
     out, fix = fill(len(reason), None), replace(fix, marks=marks, reason=reason)
     for i in range(len(out)):
         out[i] = fix[i]
     return out
 
 
-def _explain(problem: Problem, fix: Fix, present: Array, doubted: _Doubted, by: Sequence[GroupKind]) -> _Explained:
+def _explain(problem: Problem, fix: Fix, present: Array, doubted: _RejectedRows, by: Sequence[GroupKind]) -> _Explained:
     """Return the explanations of problems with a contradiction: item numbers, groups, and outcomes."""
     with np.errstate(invalid="ignore"):
         # at a lower cost every set has a score beyond the gap
@@ -312,7 +314,7 @@ def _alike(problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind]) ->
     return Alike(work, np.arange(len(items)), groups, fix[items])
 
 
-def _with_grown(alike: Alike, doubted: _Doubted, outcomes: list[Outcome]) -> list[Outcome]:
+def _with_grown(alike: Alike, doubted: _RejectedRows, outcomes: list[Outcome]) -> list[Outcome]:
     """Return outcomes after a search group by group, from the closest rest, for problems with too many sets."""
     dof = alike.whole.dof
     untried = [not own.rests and own.tried < most - 1 for own, most in zip(outcomes, dof, strict=True)]
@@ -343,13 +345,13 @@ def _conclude(problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: S
             proven = prove_rests(work.take(np.array(items)), groups, [chosen[i] for i in items])
             chosen |= dict(zip(items, proven, strict=True))
     rests = {i: (best, *outcomes[i].rests[1:]) for i, best in chosen.items()}
-    told = _errors(problem if arrivals is None else arrivals.problem, groups, rests)
+    group_errors = _errors(problem if arrivals is None else arrivals.problem, groups, rests)
     for i, own in rests.items():
-        out[i] = _explained(cases[i], outcomes[i], own, told[i])
+        out[i] = _explained(cases[i], outcomes[i], own, group_errors[i])
     return out
 
 
-def _grow(alike: Alike, i: int, doubted: _Doubted, start: Rest | None) -> Outcome:
+def _grow(alike: Alike, i: int, doubted: _RejectedRows, start: Rest | None) -> Outcome:
     """Return the explanations of problem i from a search group by group.
 
     Wrong rows draw the fix of all data away, perhaps to another minimum, so that right rows look wrong there. If the
@@ -431,11 +433,13 @@ def _best_rest(case: SuspectCase, outcome: Outcome) -> Rest | None:
     return best
 
 
-def _explained(case: SuspectCase, outcome: Outcome, rests: Sequence[Rest], told: Sequence[_Told]) -> Conclusion:
+def _explained(
+    case: SuspectCase, outcome: Outcome, rests: Sequence[Rest], group_errors: Sequence[_GroupErrors]
+) -> Conclusion:
     """Return the conclusion of a problem from its rests, of which the first is proven, and the errors of each rest."""
     (best, *_), (first, *others) = rests, outcome.rests
     elsewhere = [rest for rest in others if not _same_place(first.fix, rest.fix)]
-    pairs = zip(rests, told, strict=True)
+    pairs = zip(rests, group_errors, strict=True)
     explanations = tuple(_explanation(case, rest, outcome, found) for rest, found in pairs)
     spent, fix = int(case.whole.dof) - int(best.fix.dof), _in_layout(case, best.fix)
     return Conclusion(explanations, fix, _alternatives(case, best, elsewhere), spent, bool(elsewhere))
@@ -482,7 +486,7 @@ def _name_closest(case: SuspectCase, outcome: Outcome) -> str:
     return reason + (f"; {outcome.note}" if outcome.note else "")
 
 
-def _explanation(case: SuspectCase, rest: Rest, outcome: Outcome, told: _Told) -> Explanation:
+def _explanation(case: SuspectCase, rest: Rest, outcome: Outcome, error_of: _GroupErrors) -> Explanation:
     """Return the explanation of a rest: its suspects with errors and p-values, and its fix."""
     fix = rest.fix
     p_without = float(fix.p_value)
@@ -490,7 +494,7 @@ def _explanation(case: SuspectCase, rest: Rest, outcome: Outcome, told: _Told) -
     senses = np.concatenate([np.full(rows.count, rows.sense) for rows in case.work.rows])
     suspects = []
     for i in rest.left:
-        group, error = case.groups[i], told.get(i)
+        group, error = case.groups[i], error_of.get(i)
         known = outcome.p_value.get(tuple(j for j in rest.left if j != i))
         p_with = _p_with(fix, error) if known is None else known
         none = np.full(1, np.nan)
@@ -501,27 +505,29 @@ def _explanation(case: SuspectCase, rest: Rest, outcome: Outcome, told: _Told) -
     return Explanation(tuple(suspects), case.vector(fix), float(fix.cost), int(fix.dof), p_without, rest.score)
 
 
-def _errors(work: Problem, groups: Sequence[Group], rests: dict[int, tuple[Rest, ...]]) -> dict[int, list[_Told]]:
+def _errors(
+    work: Problem, groups: Sequence[Group], rests: dict[int, tuple[Rest, ...]]
+) -> dict[int, list[_GroupErrors]]:
     """Return the estimated errors of the groups that each rest leaves out, by number of the group.
 
     Rests with the same offsets have the same unknowns, so they are linearised together.
     """
-    out: dict[int, list[_Told]] = {i: [{} for _ in own] for i, own in rests.items()}
-    alike: dict[tuple[int, ...], list[tuple[int, Rest, _Told]]] = {}
+    out: dict[int, list[_GroupErrors]] = {i: [{} for _ in own] for i, own in rests.items()}
+    alike: dict[tuple[int, ...], list[tuple[int, Rest, _GroupErrors]]] = {}
     for i, own in rests.items():
-        for rest, told in zip(own, out[i], strict=True):
+        for rest, estimates in zip(own, out[i], strict=True):
             if not np.isfinite(rest.fix.x).all() or not rest.left:
                 continue
             offsets = tuple(j for j in rest.left if groups[j].offset is not None)
-            told |= {j: _offset_error(groups[j], rest.fix) for j in offsets}
+            estimates |= {j: _offset_error(groups[j], rest.fix) for j in offsets}
             if len(offsets) < len(rest.left):
-                alike.setdefault(offsets, []).append((i, rest, told))
+                alike.setdefault(offsets, []).append((i, rest, estimates))
     for offsets, members in alike.items():
         part = leave_out_of(work.take(np.array([i for i, _, _ in members])), groups, offsets)
         found = influences(part, np.stack([rest.fix.x for _, rest, _ in members]))
-        for at, (_, rest, told) in zip(found, members, strict=True):
+        for at, (_, rest, estimates) in zip(found, members, strict=True):
             others = [j for j in rest.left if j not in offsets]
-            told |= dict(zip(others, errors(at, [groups[j] for j in others]), strict=True))
+            estimates |= dict(zip(others, errors(at, [groups[j] for j in others]), strict=True))
     return out
 
 

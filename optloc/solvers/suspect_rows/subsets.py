@@ -370,9 +370,9 @@ def _is_proven(problem: Problem, pool: Pool) -> Array:
     """Return flags (N,) of rests for which a short proof shows that all minima within the listed gap are known."""
     if not enabled() or problem.constraints or is_run(problem) or is_scaled(problem):
         return np.zeros(len(pool), dtype=bool)
-    told = certified(problem, pool, effort=_SHORT).proven
-    assert told is not None
-    return np.asarray(told.unique & (told.proof == GLOBAL) & (told.margin >= LISTED_GAP))
+    claims = certified(problem, pool, effort=_SHORT).proven
+    assert claims is not None
+    return np.asarray(claims.unique & (claims.proof == GLOBAL) & (claims.margin >= LISTED_GAP))
 
 
 def _redo(problem: Problem, pool: Pool, unproven: Array, near: float, better: Callable[[Problem, Pool], Pool]) -> Pool:
@@ -498,14 +498,16 @@ def _worst(problem: Problem, groups: Sequence[Group], left: Sequence[int], rest:
     """Return the number of the group that contradicts the rest most; None if no group does so significantly."""
     if not np.isfinite(rest.x).all():
         return None
-    gone = mark_rows([groups[i] for i in left], problem.count)
-    open_ = [i for i, g in enumerate(groups) if i not in set(left) and (g.prior >= 0 or not gone[list(g.rows)].all())]
+    left_out = mark_rows([groups[i] for i in left], problem.count)
+    open_ = [
+        i for i, g in enumerate(groups) if i not in set(left) and (g.prior >= 0 or not left_out[list(g.rows)].all())
+    ]
     at = _influence(problem, groups, left, rest.x)
     small = [i for i in open_ if len(groups[i].rows) <= _LARGE]
     first = not left
     for members in [open_] if first else [small, [i for i in open_ if len(groups[i].rows) > _LARGE]]:
         if members:
-            tail = significance(at, [_present(groups[i], gone) for i in members])
+            tail = significance(at, [_present(groups[i], left_out) for i in members])
             if tail.min() < level:
                 return members[int(tail.argmin())]
     return None
@@ -514,13 +516,13 @@ def _worst(problem: Problem, groups: Sequence[Group], left: Sequence[int], rest:
 def _influence(problem: Problem, groups: Sequence[Group], left: Sequence[int], x: Array) -> Influence:
     """Return the influence of rows on the fix of one problem without some groups."""
     dropped = frozenset(groups[i].prior for i in left if groups[i].prior >= 0)
-    gone = mark_rows([groups[i] for i in left], problem.count)
-    return influence(leave_out(problem, gone[None]), x, dropped)
+    left_out = mark_rows([groups[i] for i in left], problem.count)
+    return influence(leave_out(problem, left_out[None]), x, dropped)
 
 
-def _present(group: Group, gone: Array) -> Group:
+def _present(group: Group, left_out: Array) -> Group:
     """Return a group without the rows that are left out already."""
-    return group if group.prior >= 0 else replace(group, rows=tuple(i for i in group.rows if not gone[i]))
+    return group if group.prior >= 0 else replace(group, rows=tuple(i for i in group.rows if not left_out[i]))
 
 
 def _inside(one: Group, other: Group) -> bool:
@@ -550,8 +552,8 @@ def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fi
     for i in left if len(left) <= _MOST_LEFT_OUT else ():
         others = [j for j in left if j != i]
         fix = fix_without(problem, groups, others, rest.x)
-        gone = mark_rows([groups[j] for j in others], problem.count)
-        open_ = [j for j, g in enumerate(groups) if j not in left and g.offset is None and not _overlap(g, gone)]
+        left_out = mark_rows([groups[j] for j in others], problem.count)
+        open_ = [j for j, g in enumerate(groups) if j not in left and g.offset is None and not _overlap(g, left_out)]
         if not np.isfinite(fix.x).all() or not open_:
             continue
         tail = significance(_influence(problem, groups, others, fix.x), [groups[j] for j in open_])
@@ -565,6 +567,6 @@ def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fi
     return list(found.values())
 
 
-def _overlap(group: Group, gone: Array) -> bool:
+def _overlap(group: Group, left_out: Array) -> bool:
     """Return whether a group has a row that is left out already."""
-    return group.prior < 0 and bool(gone[list(group.rows)].any())
+    return group.prior < 0 and bool(left_out[list(group.rows)].any())

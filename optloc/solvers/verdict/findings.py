@@ -219,14 +219,14 @@ def _is_unique(pool: Pool) -> Array:
     return is_proof_of_one(pool.proven, between)
 
 
-def is_proof_of_one(told: Claims, infinity: Array) -> Array:
+def is_proof_of_one(claims: Claims, infinity: Array) -> Array:
     """Return flags (...) of claims that every unlisted minimum costs more than `AMBIGUOUS_GAP` above the best.
 
     If infinity costs less than the gap (`infinity` is this difference), a proof up to infinity is enough: the finding
     `unbounded` covers the rest.
     """
-    wide = (told.margin >= AMBIGUOUS_GAP) | ((infinity > 0.0) & (infinity < AMBIGUOUS_GAP))
-    return np.asarray(told.unique & ((told.proof == GLOBAL) | told.asked) & wide)
+    wide = (claims.margin >= AMBIGUOUS_GAP) | ((infinity > 0.0) & (infinity < AMBIGUOUS_GAP))
+    return np.asarray(claims.unique & ((claims.proof == GLOBAL) | claims.asked) & wide)
 
 
 def examine(problem: Problem, pool: Pool) -> Pool:
@@ -353,9 +353,9 @@ def _infinity(problem: Problem, pool: Pool, wanted: Array, unseen: Array) -> Arr
 def centre_of(problem: Problem) -> Array:
     """Return the mean (N or 1, d) of the stations that have rows with weight, metres."""
     places = problem.stations.places
-    heard = (problem.weight > 0.0).astype(float) @ rows_of_stations(problem).T.astype(float) > 0.0
+    measured = (problem.weight > 0.0).astype(float) @ rows_of_stations(problem).T.astype(float) > 0.0
     # a moving station counts with its positions at all epochs
-    return centre_of_points(places, np.tile(heard, places.shape[-2] // problem.stations.count))
+    return centre_of_points(places, np.tile(measured, places.shape[-2] // problem.stations.count))
 
 
 def reach_of(problem: Problem, x: Array) -> Array:
@@ -456,9 +456,9 @@ def _name_residuals(finished: Finished, items: Array) -> Any:
     """Return a sentence on the residuals for each item, with the p-value; empty where the residuals fit the noise."""
     pool = finished.pool
     improbable = is_improbable(pool.cost[items, 0], pool.dof[items], DOUBT)
-    told = tail_probability(pool.cost[items, 0], pool.dof[items])
-    said = [f"the residuals are larger than the noise allows (p = {p:.1g})" for p in told]
-    return np.where(improbable, np.array(said, dtype=object), "")
+    p_values = tail_probability(pool.cost[items, 0], pool.dof[items])
+    sentences = [f"the residuals are larger than the noise allows (p = {p:.1g})" for p in p_values]
+    return np.where(improbable, np.array(sentences, dtype=object), "")
 
 
 def _name_infinity(finished: Finished, items: Array) -> Any:
@@ -485,8 +485,8 @@ def _name_proof(finished: Finished, items: Array) -> Any:
     pool = finished.pool
     if pool.loss and pool.robust is not None and pool.remark is not None:
         return np.where(pool.remark[items] == "", NOT_TRIED, pool.remark[items])
-    told = finished.proven.reason[items]
-    return NOT_TRIED if finished.pool.proven is None else np.where(told == NO_PROOF.reason, NOT_TRIED, told)
+    reason = finished.proven.reason[items]
+    return NOT_TRIED if finished.pool.proven is None else np.where(reason == NO_PROOF.reason, NOT_TRIED, reason)
 
 
 def _name_shape(finished: Finished, items: Array) -> Any:
@@ -495,9 +495,9 @@ def _name_shape(finished: Finished, items: Array) -> Any:
     assert curvature is not None
     assert curvature.kappa is not None
     inverse = chart_kind(*curvature.kappa[items].T) == INVERSE_RANGE
-    told = np.where(inverse, np.array(BENT_SENTENCE[INVERSE_RANGE], dtype=object), BENT_SENTENCE[CURVED])
+    sentences = np.where(inverse, np.array(BENT_SENTENCE[INVERSE_RANGE], dtype=object), BENT_SENTENCE[CURVED])
     pair = finished.pool.pair
-    return told if pair is None else np.where(np.isfinite(pair[items, 0]).all(-1), BOTH_SIDES, told)
+    return sentences if pair is None else np.where(np.isfinite(pair[items, 0]).all(-1), BOTH_SIDES, sentences)
 
 
 def _is_unsafe(evidence: Evidence) -> Any:

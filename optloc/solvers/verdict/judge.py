@@ -179,9 +179,9 @@ def _open(problem: Problem, information: Array) -> str:
 def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, reason: Array) -> None:
     """Write status and reason of problems without a candidate: the cause that prevents every closed-form start."""
     if pool.missing is not None:
-        told = items[pool.missing.reason[items] != ""]
-        code[told], reason[told] = pool.missing.code[told], pool.missing.reason[told]
-        items = np.setdiff1d(items, told)
+        known = items[pool.missing.reason[items] != ""]
+        code[known], reason[known] = pool.missing.code[known], pool.missing.reason[known]
+        items = np.setdiff1d(items, known)
     if not len(items):
         return
     barred = items[(code[items] == Status.INFEASIBLE) | _has_hidden(pool)[items]]
@@ -296,8 +296,8 @@ def _weigh_redundancy(pool: Pool, finished: Array, reason: Array) -> None:
         (1, "a wrong measurement would be noticed, but not identified"),
     ):
         for i in np.flatnonzero(finished & (pool.dof == dof)):
-            told = f"redundancy {dof}: {limit}"
-            reason[i] = f"{reason[i]}; {told}" if reason[i] else told
+            sentence = f"redundancy {dof}: {limit}"
+            reason[i] = f"{reason[i]}; {sentence}" if reason[i] else sentence
 
 
 _EPOCHS_SHOWN = 8  # epochs that a sentence names
@@ -324,8 +324,8 @@ def _name_misfits(problem: Problem, fix: Fix) -> Fix:
         return fix
     reason = fix.reason.copy()
     for i in items:
-        told = misfit_of(problem.take(np.array([i])), fix.x[i])
-        reason[i] = f"{reason[i]}; {told}" if reason[i] else told
+        causes = misfit_of(problem.take(np.array([i])), fix.x[i])
+        reason[i] = f"{reason[i]}; {causes}" if reason[i] else causes
     return replace(fix, reason=reason)
 
 
@@ -356,9 +356,13 @@ def judge(problem: Problem, pool: Pool) -> Fix:
     return fix
 
 
-def _concluded(problem: Problem, item: int, told: Conclusion | Fix) -> Fix:
+def _concluded(problem: Problem, item: int, conclusion: Conclusion | Fix) -> Fix:
     """Return the fix of an item with a conclusion, a flat batch of one."""
-    return told.reshape((1,)) if isinstance(told, Fix) else conclude(problem.take(np.array([item])), told)
+    return (
+        conclusion.reshape((1,))
+        if isinstance(conclusion, Fix)
+        else conclude(problem.take(np.array([item])), conclusion)
+    )
 
 
 def standing(pool: Pool, fix: Fix) -> Array:
