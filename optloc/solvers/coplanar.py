@@ -100,7 +100,7 @@ class _FoundSides:
     on_plane: Array
 
     def take(self, items: Array) -> _FoundSides:
-        """Return some entries."""
+        """Return the entries of some problems."""
         return _FoundSides(self.x[items], self.cost[items], self.on_plane[items])
 
 
@@ -159,7 +159,7 @@ class _Sides:
     on_plane: Array
 
     def take(self, items: Array) -> _Sides:
-        """Return some entries."""
+        """Return the entries of some problems."""
         return _Sides(self.x[items], self.cost[items], self.on_plane[items])
 
 

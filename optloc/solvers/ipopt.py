@@ -32,7 +32,7 @@ from optloc.solvers.stages import lsr
 from optloc.solvers.starts.block_averages import average_blocks
 from optloc.solvers.starts.position import registrable, spread_of
 from optloc.solvers.starts.registration import BLOCKS, group_alike
-from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.judge import judge, shown_candidates
 from optloc.solvers.verdict.minima import settle
 
 # "1": the C compiler of the system compiles programs; this takes seconds, for many fixes of one large structure
@@ -89,7 +89,7 @@ def _of_blocks(problem: Problem, x: Array) -> Array:
     for items in group_alike(problem):
         blocks = average_blocks(problem.take(items), BLOCKS)
         pool = nlp(blocks, begin(blocks, complete(blocks, x[items, :, :n])))
-        found = standing(pool, judge(blocks, pool))
+        found = shown_candidates(pool, judge(blocks, pool))
         width = min(found.shape[1], x.shape[1])
         out[items, :width] = complete(problem.take(items), found[:, :width, :n])
     return out

@@ -75,7 +75,7 @@ class End(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Basins:
-    """Ends of a method from many starts.
+    """Results of an iteration from many starts: which starts reach the fix.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ from optloc.solvers.robust.stage import Robust
 from optloc.solvers.sparse import sparse
 from optloc.solvers.stages import Solver
 from optloc.solvers.suspect_rows.stage import suspect
-from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.judge import judge, shown_candidates
 
 # `Choice`, `Kind`, `counting` and `using` of `formulations.backend` are exported here for layers that do not import
 # `formulations`.
@@ -144,7 +144,7 @@ _STAGES: dict[str, SolverEntry] = {
         stages.start_with("directions"), "semidefinite relaxation over unit directions (Clarabel); angles"
     ),
     "minimax": _start(
-        stages.start_with("minimax"), "least worst angle by second-order cones (Clarabel); bounded errors"
+        stages.start_with("minimax"), "smallest maximal angle by second-order cones (Clarabel); bounded errors"
     ),
     "widen": _refinement(stages.widen, "more candidates for a fix: mirror image, sub-arrays", batched=True),
     "search": _refinement(
@@ -326,7 +326,7 @@ def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
     part, (first, *others) = problem.take(items), method.runs(len(items))
     start = first(part, None)
     # earlier candidates compete, so that a branch never gives a worse answer than the branch before
-    new, before = _beside(part, start, standing(take(pool, items), fix[items])), tried_before(pool, fix, items)
+    new, before = _beside(part, start, shown_candidates(take(pool, items), fix[items])), tried_before(pool, fix, items)
     for stage in others:
         # A proof takes most of the time, so it is not repeated if the other stages found no new minimum.
         new = stage(part, replace(new, tried_before=before))

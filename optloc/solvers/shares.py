@@ -89,7 +89,7 @@ def status_shares(
     single = apart.flat().take(np.zeros(1, dtype=int))
     truth = np.asarray(truth, dtype=float)
     if trials < 1:
-        raise InvalidProblem(f"{trials} trials give no share", "trials", "take 100 or more")
+        raise InvalidProblem(f"{trials} trials are not enough", "trials", "take 100 or more")
     if truth.shape[-1:] != (single.layout.size,):
         advice = f"give {single.layout.size} numbers in the order of problem.layout"
         raise InvalidProblem(f"a truth of shape {truth.shape} does not fit the unknowns", "truth", advice)

@@ -88,7 +88,7 @@ def _broadcast_start(problem: Problem, start: Any) -> Array:
         return np.broadcast_to(vector, wanted)
     except ValueError:
         raise InvalidProblem(
-            f"start has shape {vector.shape}, not {wanted}", "start", "order it by the layout"
+            f"start has shape {vector.shape}, not {wanted}", "start", "give numbers in the order of problem.layout"
         ) from None
 
 

@@ -36,7 +36,7 @@ from optloc.solvers.starts.orientation import headings, oriented_starts, unwind
 from optloc.solvers.starts.position import along_the_valley, registrable, spread_of, subarray_starts
 from optloc.solvers.starts.registration import step_beside
 from optloc.solvers.starts.several_positions import from_pieces
-from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.judge import judge, shown_candidates
 from optloc.solvers.verdict.minima import is_measured, settle
 
 Solver = Callable[[Problem, Pool | None], Pool]
@@ -182,7 +182,7 @@ def widen(problem: Problem, pool: Pool | None) -> Pool:
 def _widen(problem: Problem, pool: Pool) -> Pool:
     """Return the candidates of a refined pool of problems of one position, and additional starts."""
     began, fix, alone = perf_counter(), judge(problem, pool), hold_still(problem.straightened())
-    seen = problem.layout.take(standing(pool, fix), "position")
+    seen = problem.layout.take(shown_candidates(pool, fix), "position")
     parts = [mirror(alone, fix.position[:, None])]
     # The mirror image is a single start, so it is always tried. The other starts are many, so they are tried only if
     # the verdict has findings.
@@ -203,7 +203,7 @@ def _widen(problem: Problem, pool: Pool) -> Pool:
 
 def _beside(problem: Problem, pool: Pool, fix: Fix, x: Array, began: float) -> Pool:
     """Return the candidates of fixes together with more starts x (N, q, size)."""
-    return offer(problem, pack(np.concatenate([standing(pool, fix), x], axis=1)), pool, "widen", began)
+    return offer(problem, pack(np.concatenate([shown_candidates(pool, fix), x], axis=1)), pool, "widen", began)
 
 
 def _subarrays(problem: Problem, fix: Fix) -> Array:

@@ -196,7 +196,7 @@ def _far_cells(chart: Chart, level: float) -> Array:
 def _held(problem: Problem, fix: Fix, plane: Array, level: float) -> Outline | None:
     """Return the outline of a region along a surface, or a strip around a region along a line."""
     assert fix.chart is not None
-    held = hold_along(problem, fix, level, FAR * float(fix.chart.distance))
+    held = cost_along(problem, fix, level, FAR * float(fix.chart.distance))
     nodes, step = held.flooded()
     if not len(nodes):
         return None
@@ -214,7 +214,7 @@ def _turned(polygon: Polygon) -> Polygon:
     return polygon if area(polygon[0]) >= 0.0 else [line[::-1] for line in polygon]
 
 
-def _strips(held: Held, plane: Array, position: Array) -> tuple[Polygon, ...]:
+def _strips(held: EqualityCost, plane: Array, position: Array) -> tuple[Polygon, ...]:
     """Return thin strips around a region along a line: without a width it would be invisible."""
     nodes, step = held.flooded()
     order = np.sort(nodes[:, 0])
@@ -231,7 +231,7 @@ def _strips(held: Held, plane: Array, position: Array) -> tuple[Polygon, ...]:
     return tuple(map(_turned, found))
 
 
-def _ends(held: Held, part: Array, step: float) -> Array:
+def _ends(held: EqualityCost, part: Array, step: float) -> Array:
     """Return the ends (2,) of an interval of nodes, at which the cost meets the level."""
     inside = np.array([part[0], part[-1]], dtype=float) * step
     outside = inside + np.array([-step, step])
@@ -243,7 +243,7 @@ def _ends(held: Held, part: Array, step: float) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class EqualityCost:
     """The cost along the surface or line of equalities, in coordinates from the fix along its principal axes.
 
     Parameters
@@ -310,7 +310,7 @@ class Held:
         return restore(self.problem, self.face, points)
 
 
-def hold_along(problem: Problem, fix: Fix, level: float, reach: float) -> Held:
+def cost_along(problem: Problem, fix: Fix, level: float, reach: float) -> EqualityCost:
     """Return the cost of a fix along the surface or line of its equalities.
 
     Parameters
@@ -336,7 +336,7 @@ def hold_along(problem: Problem, fix: Fix, level: float, reach: float) -> Held:
     least = float(profile(flat, x[None], x, passes(flat))[0][0, 0])
     others = fix.alternatives.x[:, own][fix.alternatives.gap <= q]
     starts = np.concatenate([np.zeros((1, axes.shape[1])), (others - x[0, own]) @ np.linalg.pinv(axes).T])
-    return Held(flat, face, x, own, axes, least, q, reach, starts)
+    return EqualityCost(flat, face, x, own, axes, least, q, reach, starts)
 
 
 def _flooded(inside: Callable[[Array], Array], starts: Array, step: float) -> Array | None:

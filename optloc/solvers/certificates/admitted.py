@@ -151,7 +151,7 @@ def _is_new(fix: Fix, other: Fix) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Along:
+class FaceMinima:
     """Minima and bounds of n problems along one face.
 
     Parameters
@@ -203,7 +203,7 @@ def _with_minima(problem: Problem, pool: Pool, minima: Minima) -> Pool:
 
 def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort: float) -> tuple[Claims, Minima]:
     """Return claims (n,) about fixes, and all admitted minima."""
-    sides, known, found, costs = faces(problem), dict[Face, Along](), list[Minima](), eliminate_nuisance(problem)
+    sides, known, found, costs = faces(problem), dict[Face, FaceMinima](), list[Minima](), eliminate_nuisance(problem)
     sure, boxes = np.full(len(pool), margin), np.zeros(len(pool), dtype=np.int64)
     why, seeds, tight = fill(len(pool), ""), pool.x, np.zeros(len(pool), dtype=bool)
     for number, face in enumerate(sides):
@@ -232,7 +232,7 @@ def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort:
     return claims, (x, cost, face_of)
 
 
-def _least_around(known: dict[Face, Along], face: Face, size: int) -> Array:
+def _least_around(known: dict[Face, FaceMinima], face: Face, size: int) -> Array:
     """Return lower bounds (n,) of the cost of a face minus the cost of the fixes, from faces that contain it."""
     own = set(face)
     around = [along.least for other, along in known.items() if own > {*other}]
@@ -241,7 +241,7 @@ def _least_around(known: dict[Face, Along], face: Face, size: int) -> Array:
 
 def _explore_face(
     problem: Problem, costs: Costs, fix: Fix, face: Face, seeds: Array, margin: float, effort: float
-) -> Along:
+) -> FaceMinima:
     """Return minima and bounds of n problems along a face; without minima if the whole face costs too much.
 
     Most faces are far from the region that the data support. Their proof needs few boxes, and a search for their
@@ -254,7 +254,7 @@ def _explore_face(
         limits = admitted(problem, problem.dimension)
         dear, boxes = _is_costly(on_face(problem, face), limits, costs, seeds, fix.cost + margin, effort)
     least = np.full(n, margin)
-    out = Along(np.full((n, 1, size), np.nan), np.full((n, 1), np.inf), least, least, boxes, fill(n, ""))
+    out = FaceMinima(np.full((n, 1, size), np.nan), np.full((n, 1), np.inf), least, least, boxes, fill(n, ""))
     rest = np.flatnonzero(~dear)
     if not len(rest):
         return out
@@ -336,7 +336,7 @@ def _request(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, ef
     )
 
 
-def _prove_face(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: float, effort: float) -> Along:
+def _prove_face(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: float, effort: float) -> FaceMinima:
     """Return minima and bounds of n problems along a face; the search for minima starts at seeds (n, q, size)."""
     began, on, limits = perf_counter(), on_face(problem, face), admitted(problem, problem.dimension)
     names = " and ".join(face_names(problem, face)) or "inside"
@@ -348,7 +348,7 @@ def _prove_face(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: fl
         none, least = np.zeros(len(seeds), dtype=np.int64), _excess(alone.cost, fix.cost) if corner else lost
         # a corner is a single point, so it is its only minimum
         rest = np.where(np.isfinite(least), np.inf, -np.inf)
-        return Along(*_minima(alone), least, rest, none, fill(len(seeds), UNFOLLOWED.format(names, reason)))
+        return FaceMinima(*_minima(alone), least, rest, none, fill(len(seeds), UNFOLLOWED.format(names, reason)))
     gain = _excess(alone.cost, fix.cost)
     # If a face costs more than the fix by the margin, its minima need no distinction. If a minimum that is not admitted
     # costs less than the fix, the proof must find all minima up to the margin above the fix. Gaps are rounded up to
@@ -384,7 +384,7 @@ def _prove_face(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: fl
         gain = _excess(alone.cost, fix.cost)
     sure, gap = _is_sure(proven, limits), proven.margin
     least, rest = np.where(sure, gain, -np.inf), np.where(sure, gain + gap, -np.inf)
-    return Along(*_minima(alone), least, rest, proven.boxes, proven.reason)
+    return FaceMinima(*_minima(alone), least, rest, proven.boxes, proven.reason)
 
 
 def _excess(cost: Array, best: Array) -> Array:
@@ -420,7 +420,7 @@ def _within_limits(problem: Problem, pool: Pool, limits: Array, margin: float, e
     return pool.merge(open_ones, again)
 
 
-def _is_admitted(problem: Problem, face: Face, along: Along) -> Array:
+def _is_admitted(problem: Problem, face: Face, along: FaceMinima) -> Array:
     """Return flags (n, q) of minima along a face that are minima under all constraints."""
     out = np.isfinite(along.cost)
     item, slot = np.nonzero(out)

@@ -45,7 +45,7 @@ from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
 from optloc.solvers.pool import Pool, TriedBefore, offer, pack
 from optloc.solvers.stages import lsr
-from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.judge import judge, shown_candidates
 
 # Sentences of certificates.
 
@@ -60,8 +60,8 @@ FINE = (
     "state a larger noise, or a nearer origin"
 )
 AROUND = "the region reaches around the Earth, but a proof covers one side only; give a smaller region"
-SCALED = "nothing bounds the position at all scales that the rows and priors allow"
-FAST = "nothing bounds the position at all velocities that the rows and the prior allow"
+SCALED = "the position is not bounded at all scales that the rows and priors allow"
+FAST = "the position is not bounded at all velocities that the rows and the prior allow"
 UNSETTLED = "the fix is not a strict minimum: the data do not distinguish it from its neighbourhood"
 BARRED = "a position with a lower cost exists, but {}"
 LOST = "a position with a lower cost was found, but refinement from it gave no minimum"
@@ -428,7 +428,7 @@ def _judge_with_points(work: BoundWorkspace, items: Array, points: Array) -> tup
     """
     began = perf_counter()
     part, own, before = work.problem.take(items), work.fix[items], take(work.pool, items)
-    x = pack(np.concatenate([standing(before, own), vectors(part, points)], axis=1))
+    x = pack(np.concatenate([shown_candidates(before, own), vectors(part, points)], axis=1))
     pool = keep_evidence(lsr(part, offer(part, x, before, "certify", began)), before)
     new = judge(part, pool)
     with np.errstate(invalid="ignore"):

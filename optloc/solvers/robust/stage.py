@@ -22,8 +22,8 @@ from optloc.solvers.policy import AMBIGUOUS_GAP, REJECTED
 from optloc.solvers.pool import Pool, crowd_of, in_parts, pack
 from optloc.solvers.robust.reweighting import Doubt, residuals, reweight, robust_equations, weigh_by
 from optloc.solvers.robust.starts import flip_rows, robust_starts
-from optloc.solvers.robust.statement import stated
-from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.robust.statement import check_minima
+from optloc.solvers.verdict.judge import judge, shown_candidates
 from optloc.solvers.verdict.minima import settle
 
 Minimise = Callable[[Problem, Array | None], Pool]
@@ -110,7 +110,7 @@ class Robust:
 
     def __call__(self, problem: Problem, pool: Pool | None) -> Pool:
         """Return the settled minima for a flat batch of problems; their weights are the weights of the loss."""
-        start = None if pool is None else pack(standing(pool, judge(problem, pool)))
+        start = None if pool is None else pack(shown_candidates(pool, judge(problem, pool)))
         stages = () if pool is None else pool.stages
 
         def work(some: Problem, part: slice) -> Pool:
@@ -123,7 +123,7 @@ class Robust:
         """Return the minima of the loss, tested if the stage does so and found them by a search."""
         found = _minimise(problem, self.loss, start, stages)
         # given starts lead to the nearest minima only, so these are not tested
-        return stated(problem, self.loss, found) if self.states and start is None else found
+        return check_minima(problem, self.loss, found) if self.states and start is None else found
 
 
 def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[Stage, ...]) -> Pool:
@@ -143,7 +143,7 @@ def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[S
     pool = replace(pool, stages=stages, free=free, loss=loss.name)
     found = settle(problem, pool, stage, lambda some, x: _equations(some, loss, x)[0])
     # The weights belong to a position. If the verdict shows no position, rows keep their earlier weights.
-    answered = np.asarray(np.isfinite(standing(found, judge(problem, found))[:, 0]).all(-1))
+    answered = np.asarray(np.isfinite(shown_candidates(found, judge(problem, found))[:, 0]).all(-1))
     weights = _equations(problem, loss, np.where(answered[:, None], found.x[:, 0], 0.0))[1]
     return replace(found, refined=False, weights=np.where(answered[:, None], weights, found.weights))
 

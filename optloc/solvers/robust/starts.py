@@ -24,7 +24,7 @@ from optloc.solvers.robust.reweighting import Doubt, fold_signs, weigh_by
 from optloc.solvers.stages import roots, search_widely
 from optloc.solvers.starts.position import registrable
 from optloc.solvers.starts.registration import mirror_courses, split_epochs
-from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.judge import judge, shown_candidates
 
 # Limits of the subsets. Most subsets of a problem: each takes a closed form and a few steps. Most stations for which
 # three are left out (92 sets of eight, of which 80 are taken). Most rows for which single rows are left out: with more
@@ -117,7 +117,7 @@ def robust_starts(problem: Problem, loss: Loss) -> Array:
         Its cost selects the starts.
     """
     plain = search_widely(problem)
-    pool = standing(plain, judge(problem, plain))[:, :_KEPT]
+    pool = shown_candidates(plain, judge(problem, plain))[:, :_KEPT]
     parts = [pool, _graduate(problem, pool[:, :1])]
     if one_position(problem):
         # If the cost is below the price of one row, a solution without two rows is no rival: it costs more than the

@@ -45,7 +45,7 @@ SEARCHED = "a search found the minima of the loss; there is no proof"
 NEEDS = "robust fixes are tested for one target at rest without constraints, with at most 64 rows"
 
 
-def stated(problem: Problem, loss: Loss, pool: Pool) -> Pool:
+def check_minima(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     """Return settled pools of a loss with flags of the minima that pass all tests, and reasons for the others.
 
     Parameters

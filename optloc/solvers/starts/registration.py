@@ -207,7 +207,7 @@ def _sort(x: Array, cost: Array) -> tuple[Array, Array]:
 
 
 def _scatter(found: tuple[Array, Array], items: Array, count: int) -> tuple[Array, Array]:
-    """Return minima of some items as arrays for all `count` items, empty for the others."""
+    """Return minima of some items as arrays for all `count` items, with empty slots for the others."""
     x = np.full((count, *found[0].shape[1:]), np.nan)
     cost = np.full((count, found[1].shape[1]), np.inf)
     x[items], cost[items] = found

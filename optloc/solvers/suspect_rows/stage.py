@@ -46,7 +46,7 @@ from optloc.solvers.suspect_rows.subsets import (
     rest_of,
 )
 from optloc.solvers.verdict.conclusion import Conclusion, list_names
-from optloc.solvers.verdict.judge import failed, fill, judge, standing, verdict
+from optloc.solvers.verdict.judge import failed, fill, judge, shown_candidates, verdict
 
 # A row that a robust loss gives less than half its weight is suspected first. The limit is above `REJECTED`, because
 # this is a hint only: the row is tested, and taken back if it fits.
@@ -138,7 +138,7 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
     doubted = _RejectedRows(rejected, judge(problem, pool).x if rejected.any() else pool.x[:, 0])
     if not np.array_equal(pool.weights, present):
         # a robust fix has other minima, and the test needs least squares with every row
-        pool = lsr(problem, offer(problem, standing(pool, judge(problem, pool)), pool, "start", perf_counter()))
+        pool = lsr(problem, offer(problem, shown_candidates(pool, judge(problem, pool)), pool, "start", perf_counter()))
     before = pool.stages
     asked = partial(_explain, present=present, doubted=doubted, by=by)
     larger, found = _choose_noise(problem, pool, asked, together)
@@ -234,7 +234,7 @@ def _larger_noise(problem: Problem, pool: Pool, fix: Fix) -> _LargerNoise | None
         if larger
     ]
     loud = used.scale(problem)
-    refined = lsr(loud, offer(loud, standing(pool, fix), pool, "start", perf_counter()))
+    refined = lsr(loud, offer(loud, shown_candidates(pool, fix), pool, "start", perf_counter()))
     return _LargerNoise(
         loud, refined, used.sizes(problem), f"{' and '.join(sentences)}: the upper end of the interval is used"
     )

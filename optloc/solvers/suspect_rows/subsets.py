@@ -29,7 +29,7 @@ from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, NOTICED, REFUTED
 from optloc.solvers.pool import Pool, begin, offer, pack
 from optloc.solvers.stages import fix_by, gtrs, lsr, roots, search, widen
-from optloc.solvers.verdict.judge import judge, standing, verdict
+from optloc.solvers.verdict.judge import judge, shown_candidates, verdict
 
 # Rows times sets of one problem up to which all sets of a size are tried: this takes seconds. Rows of all sets that are
 # fixed together, at 2.5 kB per row: 40 MB, and larger parts are not faster.
@@ -389,7 +389,7 @@ def _redo(problem: Problem, pool: Pool, unproven: Array, near: float, better: Ca
 
 def _beside(problem: Problem, start: Pool, pool: Pool) -> Pool:
     """Return a pool of starts together with the candidates of an earlier pool."""
-    x = np.concatenate([start.x, standing(pool, judge(problem, pool))], axis=1)
+    x = np.concatenate([start.x, shown_candidates(pool, judge(problem, pool))], axis=1)
     return offer(problem, pack(x), None, "roots", perf_counter())
 
 

@@ -59,14 +59,14 @@ class Ruling:
         Sentences.
     proven : Claims
         Claims of the proofs.
-    gone : bool array (N,)
+    no_position : bool array (N,)
         True where the position is not shown.
     """
 
     marks: Array
     reason: Array
     proven: Claims
-    gone: Array
+    no_position: Array
 
 
 def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
@@ -365,7 +365,7 @@ def _concluded(problem: Problem, item: int, conclusion: Conclusion | Fix) -> Fix
     )
 
 
-def standing(pool: Pool, fix: Fix) -> Array:
+def shown_candidates(pool: Pool, fix: Fix) -> Array:
     """Return the candidates (N, q, size) of a pool; NaN for a best candidate whose verdict shows no position."""
     if pool.curvature is None:
         return pool.x
@@ -445,8 +445,8 @@ def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
     ruling = rule(problem, pool, fix.alternatives.gap)
     assert pool.curvature is not None
     regular = pool.curvature.regular
-    unknown = ruling.gone if regular is None else ruling.gone | ~regular
-    x = np.where(ruling.gone[:, None], np.nan, fix.x)
+    unknown = ruling.no_position if regular is None else ruling.no_position | ~regular
+    x = np.where(ruling.no_position[:, None], np.nan, fix.x)
     covariance = np.where(unknown[:, None, None], np.nan, fix.cov)
     return replace(
         fix,

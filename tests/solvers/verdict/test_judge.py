@@ -10,7 +10,7 @@ from optloc import Status, assemble, measured
 from optloc.solvers.certificates.admitted import certified
 from optloc.solvers.pool import begin
 from optloc.solvers.stages import gtrs, lsr
-from optloc.solvers.verdict.judge import failed, fill, judge, rule, standing, verdict
+from optloc.solvers.verdict.judge import failed, fill, judge, rule, shown_candidates, verdict
 
 ERROR = np.array([0.5, -1.0, 2.0, -0.5, 1.0])
 
@@ -67,8 +67,8 @@ def test_a_ruling_hides_what_has_no_place():
     assert rule(problem, short, np.full((1, 0), np.inf)).gone[0]
     fix = judge(problem, short)
     assert np.isnan(fix.x).all()
-    assert np.isnan(standing(short, fix)[:, 0]).all()
-    np.testing.assert_array_equal(standing(pool, judge(problem, pool)), pool.x)
+    assert np.isnan(shown_candidates(short, fix)[:, 0]).all()
+    np.testing.assert_array_equal(shown_candidates(pool, judge(problem, pool)), pool.x)
 
 
 def test_a_numerical_failure_is_a_status_with_its_cause():
