@@ -61,10 +61,10 @@ def test_a_ruling_hides_what_has_no_place():
     problem = ranges_to(PLACE, 2.0, ERROR)
     pool = settled(problem)
     ruling = rule(problem, pool, np.full((1, 0), np.inf))
-    assert not ruling.gone[0]
+    assert not ruling.no_position[0]
     assert ruling.marks[0] & Status.UNPROVEN.mark
     short = replace(pool, dof=np.array([-1]))
-    assert rule(problem, short, np.full((1, 0), np.inf)).gone[0]
+    assert rule(problem, short, np.full((1, 0), np.inf)).no_position[0]
     fix = judge(problem, short)
     assert np.isnan(fix.x).all()
     assert np.isnan(shown_candidates(short, fix)[:, 0]).all()
