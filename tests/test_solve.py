@@ -231,7 +231,7 @@ def test_groups_without_a_common_station_are_named_and_searched():
     problem = simulate(assemble(place, measured("tdoa", a=[0, 2], b=[1, 3], sigma=1.0)), TARGET[2], 1)
     fix = solve(problem, "gtrs+lsr")
     assert fix.status == Status.DISCONNECTED
-    assert fix.reason == "no row links {north, east} with {south, west}"
+    assert fix.reason == "no measurement links {north, east} with {south, west}"
     # two differences do fix a point of the plane: a search finds the right one
     fix = solve(problem)
     assert fix.status in (Status.OK, Status.AMBIGUOUS)

@@ -1,4 +1,4 @@
-"""Explanations of a fix that cannot be used as it is."""
+"""Explanations of a fix that you cannot use without further checks."""
 
 from typing import TYPE_CHECKING
 

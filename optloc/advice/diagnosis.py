@@ -1,4 +1,4 @@
-"""All checks of a fix at once: advice, observability, reliability, and the health of stations over many fixes."""
+"""All checks of a fix together: advice, observability, reliability, and the health of stations over many fixes."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.station_health.stations import Health, health
 
-# Fixes below which statistics of stations say little: with ten the sigma of a noise level is a quarter of it.
+# Least number of fixes for statistics of stations: with ten fixes the standard error of a noise level is a quarter of
+# it.
 _FEW = 10
-# Fixes of a batch that are advised on one by one: each takes some ten milliseconds.
+# Most fixes of a batch that get advice: each takes about ten milliseconds.
 _ADVISED = 20
 
 
@@ -31,15 +32,15 @@ class Diagnosis:
     Parameters
     ----------
     status : tuple of str
-        The label of each status that occurs, with its number of fixes where there are several.
+        Label of each status that occurs; for several fixes with the number of fixes.
     advice : tuple of Advice
-        Possible causes, and remedies. Of a batch: for the first twenty fixes that are not ``ok``, each once.
+        Possible causes, and remedies. For a batch: for the first twenty fixes that are not ``ok``, without repetitions.
     observability : Observability, optional
-        Unknowns that data and priors determine. None for a batch, and where there is no fix.
+        Unknowns that data and priors determine. None for a batch, and without a fix.
     reliability : Reliability, optional
-        The error of each station that goes unnoticed, and what it does. None for a batch, and where there is no fix.
+        For each station the error that would not be noticed, and its effect. None for a batch, and without a fix.
     health : Health, optional
-        Statistics of stations over the fixes. None below ten fixes, and where they do not check each other.
+        Statistics of stations over the fixes. None for fewer than ten fixes, and if stations do not check each other.
     """
 
     status: tuple[str, ...]
@@ -59,7 +60,7 @@ class Diagnosis:
 
 
 def diagnose(problem: Problem, fix: Fix) -> Diagnosis:
-    """Return the causes of a status, the unknowns that the data determine, and the errors that go unnoticed.
+    """Return the causes of a status, the unknowns that the data determine, and the errors that would not be noticed.
 
     Parameters
     ----------
@@ -76,7 +77,7 @@ def diagnose(problem: Problem, fix: Fix) -> Diagnosis:
     Raises
     ------
     InvalidProblem
-        Where the fix is not one of this problem.
+        If the fix does not belong to this problem.
     """
     label = [status.label for status in np.ravel(fix.statuses)]
     counts = tuple(name if len(label) == 1 else f"{name}: {label.count(name)}" for name in dict.fromkeys(label))
@@ -92,13 +93,15 @@ def diagnose(problem: Problem, fix: Fix) -> Diagnosis:
 
 
 def _advice(problem: Problem, fix: Fix) -> Iterator[Advice]:
-    """Yield the advice on each fix that is not ok; equal advice once."""
+    """Yield the advice on each fix that is not ok, without repetitions."""
     if not problem.batch_shape:
         yield from advise(problem, fix)
         return
     if fix.shape != problem.batch_shape:
         raise InvalidProblem(
-            f"fixes of shape {fix.shape} for problems of shape {problem.batch_shape}", "fix", "give its own"
+            f"fixes of shape {fix.shape} for problems of shape {problem.batch_shape}",
+            "fix",
+            "give the fix of this problem",
         )
     flat, fixes = problem.flat(), fix.flat()
     doubtful = np.flatnonzero(fixes.code != Status.OK)[:_ADVISED]
@@ -107,7 +110,7 @@ def _advice(problem: Problem, fix: Fix) -> Iterator[Advice]:
 
 
 def _health(problem: Problem, fix: Fix) -> Health | None:
-    """Return the statistics of stations; None where the fixes are few or do not check each other."""
+    """Return the statistics of stations; None for few fixes, or if stations do not check each other."""
     many = int(np.prod(problem.batch_shape)) if problem.batch_shape else problem.epochs
     if many < _FEW or not (problem.batch_shape or separable(problem)):
         return None
@@ -118,6 +121,7 @@ def _health(problem: Problem, fix: Fix) -> Health | None:
 
 
 def _sentences(found: Diagnosis) -> Iterator[str]:
+    """Yield the findings as sentences."""
     yield f"status {', '.join(found.status)}"
     for one in found.advice:
         yield f"{one.seen}: {one.advice}"
@@ -130,6 +134,6 @@ def _sentences(found: Diagnosis) -> Iterator[str]:
             if np.isinf(least)
         ]
         if weak:
-            yield f"no other row checks {', '.join(weak)}"
+            yield f"no other measurement checks {', '.join(weak)}"
     if found.health is not None:
         yield from found.health.sentences

@@ -1,4 +1,4 @@
-"""How good a fix can be: the bound, what is observable, maps of both."""
+"""Accuracy limits of a fix: the Cramer-Rao bound, observability, and maps of the bound."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""The Cramer-Rao bound: what no unbiased estimate can beat."""
+"""The Cramer-Rao bound: the least covariance of an unbiased estimate."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from optloc.problem.epochs import cut, has_correlated_epochs, windows
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
 
-# Rounding errors of a sum of squares are 1e-16 of the whole; four decades are left for sums over long runs.
+# Rounding errors of a sum of squares are 1e-16 of the whole; sums over long runs lose up to four more digits.
 OPEN = 1e-12
-"""Share of its information, scaled to one, below which a combination of unknowns counts as open."""
+"""Share of its information, scaled to one, below which a combination of unknowns counts as undetermined."""
 
 
 def crlb(problem: Problem, truth: Array) -> Array:
     """Return the Cramer-Rao lower bound of the shared unknowns.
 
-    The inverse of the same normal matrix that refines a fix, taken at the truth; unknowns local to an epoch are
-    eliminated, priors count as information, and equalities such as an exact height leave their tangent space.
+    It is the inverse of the normal matrix at the truth. Unknowns that are local to an epoch are eliminated, and priors
+    count as information. Equalities such as an exact height limit the bound to their tangent space.
 
     Parameters
     ----------
@@ -39,12 +39,12 @@ def crlb(problem: Problem, truth: Array) -> Array:
     Returns
     -------
     array (..., n, n)
-        Covariance bound in SI units; NaN where the geometry is singular.
+        Covariance bound in SI units; NaN if the geometry is singular.
 
     Raises
     ------
     InvalidProblem
-        Where nothing is unknown.
+        If nothing is unknown.
 
     References
     ----------
@@ -69,13 +69,13 @@ class Course:
     Parameters
     ----------
     counts : int array (q,)
-        How many epochs count.
+        Numbers of epochs used.
     times : array (q,)
-        Seconds of the last of them.
+        Time of the last epoch used, seconds.
     covariance : array (q, n, n)
-        Bound of the shared unknowns in SI units; NaN where they are not yet determined.
+        Bound of the shared unknowns in SI units; NaN where they are not determined yet.
     layout : Layout
-        What each entry means.
+        Names and units of the entries.
     """
 
     counts: Array
@@ -90,7 +90,7 @@ class Course:
         return np.asarray(np.sqrt(variance))
 
     def total(self, name: str) -> Array:
-        """Return the root of the sum of variances (q,) of a named unknown: of a position, its error in space."""
+        """Return the root of the sum of variances (q,) of a named unknown: for a position, its error in space."""
         return np.asarray(np.linalg.norm(self.sigma(name), axis=-1))
 
 
@@ -99,9 +99,9 @@ def crlb_course(
 ) -> Course:
     """Return the Cramer-Rao bound after the first 1, 2, ... epochs of a run.
 
-    What every epoch says of the shared unknowns, its own unknowns eliminated, adds up; the prior counts once. Time is
-    proportional to the number of epochs, and memory beyond the answer does not depend on it; with biases that walk time
-    is proportional to the sum of the counts.
+    The information of each epoch about the shared unknowns adds up, after its local unknowns are eliminated; the prior
+    counts once. Time is proportional to the number of epochs, and memory beyond the answer does not depend on it. With
+    biases that walk, time is proportional to the sum of the counts.
 
     Parameters
     ----------
@@ -112,12 +112,12 @@ def crlb_course(
     counts : sequence of int, optional
         Numbers of epochs, 1 to k; all by default.
     known : sequence of str
-        Names of shared unknowns that are taken as known; their bound is zero.
+        Names of shared unknowns that count as known; their bound is zero.
 
     Raises
     ------
     InvalidProblem
-        Where noise ties the epochs together, a count is out of range, or a name is unknown.
+        If noise correlates the epochs, a count is out of range, or a name is unknown.
 
     References
     ----------
@@ -125,12 +125,14 @@ def crlb_course(
     """
     x, layout, k = np.asarray(truth, dtype=float), problem.layout, problem.epochs
     if has_correlated_epochs(problem):
-        advice = "ask for the bound of the whole run"
-        raise InvalidProblem("noise correlates the epochs, so that what they say does not add up", "noise", advice)
+        advice = "compute the bound of the whole run"
+        raise InvalidProblem(
+            "the noise correlates the epochs, so that their information does not add up", "noise", advice
+        )
     chosen = np.arange(1, k + 1) if counts is None else np.asarray(counts, dtype=np.int64)
     if chosen.ndim != 1 or not len(chosen) or chosen.min() < 1 or chosen.max() > k:
         raise InvalidProblem(f"the counts are not among 1 to {k}", "counts", "give numbers of epochs")
-    # walks tie each epoch to the next: what the first ones say is asked of them alone
+    # walks link each epoch to the next, so each count needs a separate sum
     total, size = (_totals_of_walks if walks(problem) else _totals)(problem, x, chosen)
     prior = shared_priors(problem)
     bound = _inverse(total + prior, size + np.diagonal(prior), free_directions(problem, x, known))
@@ -138,7 +140,7 @@ def crlb_course(
 
 
 def free_directions(problem: Problem, x: Array, known: Sequence[str] = ()) -> Array:
-    """Return a basis (n, p) of what equalities, at a vector (size,), and names that are known leave free."""
+    """Return a basis (n, p) of the directions that equalities, at a vector (size,), and known names leave free."""
     layout, held = problem.layout, exact(problem)
     fixed = np.zeros(layout.n_shared, dtype=bool)
     for slot in (layout.find(name)[0] for name in known):
@@ -146,19 +148,19 @@ def free_directions(problem: Problem, x: Array, known: Sequence[str] = ()) -> Ar
     eye = np.eye(layout.n_shared)
     if not held:
         return eye[:, ~fixed]
-    # names that are known are equalities too: the tangent space of both at once
+    # known names are equalities too: the tangent space of both
     gradients = levels(problem.flat(), held, x[None])[1]
     across = np.concatenate([gradients, eye[None, fixed]], axis=1)
     return np.asarray(linalg.tangent(across, np.ones((1, len(eye)))).along[0])
 
 
 def _totals(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
-    """Return what the first epochs say together (q, n, n), and its diagonal (q, n) before anything was eliminated."""
+    """Return the information of the first epochs (q, n, n), and its diagonal (q, n) before elimination."""
     n = problem.layout.n_shared
     total, size = np.zeros((len(counts), n, n)), np.zeros((len(counts), n))
     so_far, size_so_far = np.zeros((n, n)), np.zeros(n)
     for first, each, known in _each_epoch(problem, x):
-        # sums within a stretch of epochs, carried over from stretch to stretch: memory does not grow with the run
+        # sums within a part of the run, carried over to the next part, so that memory does not grow with the run
         sums, sizes = so_far + np.cumsum(each, axis=0), size_so_far + np.cumsum(known, axis=0)
         inside = np.flatnonzero((counts > first) & (counts <= first + len(each)))
         total[inside], size[inside] = sums[counts[inside] - first - 1], sizes[counts[inside] - first - 1]
@@ -167,7 +169,7 @@ def _totals(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
 
 
 def _totals_of_walks(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
-    """Return what `_totals` does where epochs do not add up: time grows with each count asked for."""
+    """Return the result of `_totals` for epochs that do not add up; time grows with each count."""
     n, length = problem.layout.n_shared, problem.layout.n_local
     total, size = np.zeros((len(counts), n, n)), np.zeros((len(counts), n))
     for i, count in enumerate(counts.tolist()):
@@ -178,14 +180,14 @@ def _totals_of_walks(problem: Problem, x: Array, counts: Array) -> tuple[Array, 
 
 
 def _each_epoch(problem: Problem, x: Array) -> Iterator[tuple[int, Array, Array]]:
-    """Yield the first epoch of stretches, what each epoch says of the shared unknowns (k, n, n), and its size.
+    """Yield the first epoch of a part, the information (k, n, n) of its epochs, and the size of this information.
 
-    The size is the diagonal (k, n) before elimination.
+    The information is about the shared unknowns. The size is its diagonal (k, n) before elimination.
     """
     n = problem.layout.n_shared
     for first, last, part in windows(problem):
         linear = linearise(part, x)
-        # as if every epoch had all unknowns to itself: the local blocks are then what each epoch says
+        # all unknowns count as local to each epoch, so that the local blocks are the information of the epochs
         both = np.concatenate([linear.shared, linear.local], axis=-1)
         own = Linear(linear.residual, linear.shared[..., :0], both, linear.epoch - first, linear.noise)
         gram = normal(own, last - first).local
@@ -196,24 +198,24 @@ def _each_epoch(problem: Problem, x: Array) -> Iterator[tuple[int, Array, Array]
         yield first, shared_information(with_local_priors(problem, equations)), np.diagonal(gram[:, :n, :n], 0, -2, -1)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what leaves the numbers is answered by NaN
+@np.errstate(over="ignore", invalid="ignore")  # an overflow becomes NaN
 def _inverse(information: Array, size: Array, basis: Array) -> Array:
-    """Return inverses (q, n, n) on a basis (n, p), NaN where a combination is open.
+    """Return inverses (q, n, n) on a basis (n, p), NaN for an undetermined combination.
 
-    `size` (q, n), the diagonal before elimination, tells what rounding leaves of zero.
+    `size` (q, n), the diagonal before elimination, sets the rounding error of zero.
     """
-    # scaled by what was there before elimination: what elimination leaves of nothing is rounding, not information
+    # scaled by the diagonal before elimination: a small remainder is rounding, not information
     inner, size = basis.T @ information @ basis, size @ basis**2
     inverse, _ = linalg.inverse(inner)
     scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
     scaled = inner * scale[..., :, None] * scale[..., None, :]
-    finite = np.asarray(np.isfinite(scaled).all((-1, -2)))  # beyond all numbers is as good as open
+    finite = np.asarray(np.isfinite(scaled).all((-1, -2)))  # an overflow counts as undetermined
     weakest = np.linalg.eigvalsh(np.where(finite[..., None, None], scaled, 0.0)).min(-1, initial=1.0)
     return np.where((finite & (weakest > OPEN))[..., None, None], basis @ inverse @ basis.T, np.nan)
 
 
 def with_local_priors(problem: Problem, equations: Normal) -> Normal:
-    """Return equations of the data with what is known of the unknowns of single epochs, such as station errors."""
+    """Return equations of the data plus the priors of local unknowns, such as station errors."""
     local = equations.local.copy()
     for name, _, precision in prior_parts(problem):
         slot, shared = problem.layout.find(name)
@@ -236,11 +238,11 @@ def shared_priors(problem: Problem) -> Array:
 
 
 def shared_information(equations: Normal) -> Array:
-    """Return the information (..., n, n) of the shared unknowns; an epoch that leaves some of its own open counts too.
+    """Return the information (..., n, n) of the shared unknowns; an epoch with undetermined local unknowns counts too.
 
-    Where all local blocks are regular it is that of `optloc.linear.normal.marginal`.
+    If all local blocks are regular, it equals the information of `optloc.linear.normal.marginal`.
     """
-    # a root of the pseudo-inverse: directions of local unknowns that no row sees take nothing away
+    # root of the pseudo-inverse: directions of local unknowns that no row measures remove no information
     root, _ = linalg.root(equations.local)
     seen = equations.cross @ root
     return np.asarray(equations.shared - (seen @ np.swapaxes(seen, -1, -2)).sum(-3))

@@ -1,4 +1,4 @@
-"""Maps of the Cramer-Rao bound: how accurate a fix can be, depending on where the target is."""
+"""Maps of the Cramer-Rao bound: the best possible accuracy of a fix, as a function of the target's position."""
 
 from __future__ import annotations
 
@@ -15,33 +15,34 @@ from optloc.problem.layout import state_names
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
 
-# Places linearised together: enough that numpy's calls do not count, some ten megabytes for hundreds of rows.
+# Positions that are linearised together: enough to hide the overhead of numpy calls, with about ten megabytes for
+# hundreds of rows.
 _AT_ONCE = 2000
-# Degrees beyond which a map is cut: a plate of longitude and latitude has no end at the poles.
+# Latitude, degrees, at which a map ends: a grid of longitude and latitude has no edge at the poles.
 _POLE = 89.0
-# Degrees of latitude up to which a map is squeezed by the cosine; beyond, a side in longitude would go round the Earth.
+# Latitude, degrees, up to which the cosine scales longitudes; beyond, a side of the map would go around the Earth.
 _SQUEEZED = 85.0
-_LEAST = (1e-3, 1.0)  # least side of a map, about 100 m in degrees, or 1 m: a single point has none
+_LEAST = (1e-3, 1.0)  # least side of a map, about 100 m in degrees, or 1 m: a single point has no side
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Places of a map, at one height.
+    """Positions of a map, at one height.
 
     Parameters
     ----------
     x, y : array (nx,), (ny,)
         Longitude and latitude in degrees on Earth, else metres of the frame.
     height : float
-        Above the ellipsoid on Earth, else the third coordinate; 0 in the plane; metres.
+        Height above the ellipsoid on Earth, else the third coordinate; 0 in the plane; metres.
     places : array (ny nx, d)
-        Metres, in the frame; x varies fastest.
+        Positions in the frame, metres; x varies fastest.
     slot : slice
-        Of the position among the shared unknowns.
+        Slice of the position in the shared unknowns.
     stations : array (s, 2)
-        As x and y.
+        Stations in the units of x and y.
     names : tuple of s str
-        Of the stations.
+        Names of the stations.
     geodetic : bool
         Whether x and y are degrees.
     """
@@ -57,22 +58,22 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Return the numbers of rows and columns of places."""
+        """Return the numbers of rows and columns of the grid."""
         return len(self.y), len(self.x)
 
 
 @dataclass(frozen=True, slots=True)
 class BoundMap(Grid):
-    """The bound of the position over a grid of places.
+    """The bound of the position over a grid of positions.
 
     Parameters
     ----------
     sigma : array (ny, nx)
         Root of the trace of the bound of the position, metres; NaN where the geometry is singular.
     horizontal, vertical : array (ny, nx)
-        The same of its plan, and of its height (NaN in the plane).
+        The same for the horizontal coordinates, and for the height (NaN in the plane).
     row : float
-        Root mean square standard deviation of a row, metres; NaN where not all rows are lengths.
+        Root mean square standard deviation of a row, metres; NaN if not all rows are lengths.
     """
 
     sigma: Array
@@ -89,27 +90,27 @@ class BoundMap(Grid):
 def bound_map(
     problem: Problem, truth: Array, x: Array, y: Array, height: float = 0.0, *, geodetic: bool | None = None
 ) -> BoundMap:
-    """Return the Cramer-Rao bound of a target that is at every point of a grid.
+    """Return the Cramer-Rao bound of a target at every point of a grid.
 
-    Noise, station errors and biases count as the problem has them.
+    Noise, station errors and biases are taken from the problem.
 
     Parameters
     ----------
     problem : Problem
-        A single problem of one target that is sought; of a batch, the first. Its measurements do not matter.
+        A single problem with one unknown target; of a batch, the first. Its measurements do not matter.
     truth : array (size,)
-        True parameter vector; its position is replaced by the points of the grid.
+        True parameter vector; the points of the grid replace its position.
     x, y : array (nx,), (ny,)
         Longitudes and latitudes in degrees on Earth, else metres of the frame.
     height : float
-        Of the target, metres: above the ellipsoid, or its third coordinate.
+        Height of the target, metres: above the ellipsoid, or its third coordinate.
     geodetic : bool, optional
         Whether x and y are degrees; by default in three-dimensional frames of the Earth.
 
     Raises
     ------
     InvalidProblem
-        Where no position or more than one is sought, or every epoch of a run has one of its own.
+        If no target or several targets are unknown, or every epoch of a run has a separate position.
     """
     grid = grid_of(problem, x, y, height, geodetic)
     single = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
@@ -120,7 +121,7 @@ def bound_map(
         bound = np.asarray(crlb(single, vectors[first : first + _AT_ONCE]))
         parts.append(bound[..., grid.slot, grid.slot])
     covariance = np.concatenate(parts)
-    # in east, north and up at each place: plan and height are of the place, not of the frame
+    # east, north and up at each position, since the axes of the frame differ from them
     axes = problem.frame.enu_axes(grid.places)
     variance = np.maximum(np.diagonal(axes @ covariance @ np.swapaxes(axes, -1, -2), axis1=-2, axis2=-1), 0.0)
     plan = np.sqrt(variance[:, :2].sum(-1))
@@ -143,34 +144,35 @@ def grid_of(problem: Problem, x: Array, y: Array, height: float, geodetic: bool 
     places = _places(problem.frame, east.ravel(), north.ravel(), height, problem.dimension, earth)
     stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
     marks = map_coordinates(problem.frame, stations, earth)[:, :2]
-    if earth:  # a map across the date line has longitudes beyond 180 degrees, and its stations have, too
+    if earth:  # a map across the date line has longitudes beyond 180 degrees, so its stations need them too
         marks[:, 0] = (marks[:, 0] - np.mean(x) + 180.0) % 360.0 - 180.0 + np.mean(x)
     return Grid(x, y, float(height), places, slot, marks, problem.stations.names, earth)
 
 
 def _slot(problem: Problem) -> slice:
-    """Return where the position of the one target that is sought stands in the shared unknowns."""
+    """Return the slice of the position of the unknown target in the shared unknowns."""
     sought = [i for i, motion in enumerate(problem.motions) if motion.known is None]
-    advice = "map the bound of a file with one target"
+    advice = "use a file with one unknown target"
     if len(sought) != 1:
-        raise InvalidProblem(f"{len(sought)} targets are sought, and a map moves one", "map", advice)
+        raise InvalidProblem(f"{len(sought)} targets are unknown, and a map needs one", "map", advice)
     motion = problem.motions[sought[0]]
     name = state_names(sought[0], len(problem.motions), motion.order)[0]
     slot, shared = problem.layout.find(name)
     if not shared:
         advice = "give the target a motion, or map one epoch"
-        raise InvalidProblem("every epoch has a position of its own", "map", advice)
+        raise InvalidProblem("every epoch has a separate position", "map", advice)
     return slice(slot.start, slot.start + slot.size)
 
 
 def _places(frame: Frame, x: Array, y: Array, height: float, dimension: int, earth: bool) -> Array:
+    """Return grid points as positions (n, d) in the frame, metres."""
     if earth:
         return frame.from_geodetic(np.radians(y), np.radians((x + 180.0) % 360.0 - 180.0), np.full(len(x), height))
     return np.stack([x, y, np.full(len(x), height)][:dimension], axis=-1)
 
 
 def map_coordinates(frame: Frame, position: Array, earth: bool) -> Array:
-    """Return positions (n, d) as longitude, latitude (deg) and height (m) where they are on Earth, else as they are."""
+    """Return positions (n, d) as longitude, latitude (deg) and height (m) on Earth, else unchanged."""
     if not earth:
         return position
     lat, lon, height = frame.to_geodetic(position)
@@ -178,14 +180,14 @@ def map_coordinates(frame: Frame, position: Array, earth: bool) -> Array:
 
 
 def _deviation(problem: Problem) -> float:
-    """Return the root mean square standard deviation of the rows, NaN where they are not all lengths."""
+    """Return the root mean square standard deviation of the rows, metres; NaN if not all rows are lengths."""
     if {MODELS[rows.kind].quantity for rows in problem.rows} != {"length"}:
         return float("nan")
     return float(np.sqrt(np.mean(variances(problem.noise, problem.count))))
 
 
 def extent(problem: Problem, places: Array | None = None, *, widen: float = 0.5) -> tuple[float, float, float, float]:
-    """Return x and y limits that hold stations and places (n, d), widened on every side by a share of the larger side.
+    """Return x and y limits around stations and positions (n, d), widened on every side by a share of the larger side.
 
     Degrees in three-dimensional frames of the Earth, else metres.
     """
@@ -193,7 +195,7 @@ def extent(problem: Problem, places: Array | None = None, *, widen: float = 0.5)
     stations = problem.stations.position.reshape(-1, problem.dimension)
     points = stations if places is None else np.concatenate([stations, places])
     flat = map_coordinates(problem.frame, points[np.isfinite(points).all(-1)], earth)[:, :2]
-    if earth:  # longitudes as one piece, also across the date line
+    if earth:  # one interval of longitudes, also across the date line
         flat[:, 0] = (flat[:, 0] - flat[0, 0] + 180.0) % 360.0 - 180.0 + flat[0, 0]
     low, high = flat.min(0), flat.max(0)
     squeeze = np.array([np.cos(np.radians(np.clip(flat[:, 1].mean(), -_SQUEEZED, _SQUEEZED))) if earth else 1.0, 1.0])

@@ -1,4 +1,4 @@
-"""What the data say about each unknown, what the priors say, and which combinations stay open."""
+"""Observability: the information of data and priors about each unknown, and the combinations that stay undetermined."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from optloc.kernels.sums import summed
 from optloc.problem.layout import Layout, Slot
 from optloc.problem.problem import Problem
 
-# Known alone, either of two unknowns that correlated would be known seven times as well: 1 / sqrt(1 - 0.99^2).
+# Two unknowns with this correlation would each be known seven times as well if the other were known: 1 / sqrt(1 -
+# 0.99^2).
 TIED = 0.99
-"""Correlation from which a bias counts as hard to tell from another unknown."""
+"""Correlation from which a bias is reported as hard to separate from another unknown."""
 
-_SHOWN = 8  # names in one sentence, the rest as a number: a line of text
-_FEW = 2  # combinations that are spelt out; more of them only confuse, and the names of those involved are told
-_NOTHING = 1e-6  # part of a unit vector below which it is rounding, which eigenvectors of close eigenvalues share out
-_ROUNDED = 1e-5  # the same after elimination, which magnifies it
-_ALIKE = 1e-4  # relative difference of two changes that are told as one common change, as printed to three digits
+_SHOWN = 8  # names in one sentence, a line of text; the rest is counted
+_FEW = 2  # combinations that are written out; for more, only the names of the unknowns are listed
+_NOTHING = 1e-6  # entries of a unit vector below this are rounding, which eigenvectors of close eigenvalues share
+_ROUNDED = 1e-5  # the same after elimination, which magnifies rounding
+_ALIKE = 1e-4  # relative difference of changes that are reported as one common change, as printed to three digits
 
 
 @dataclass(frozen=True, slots=True)
 class Observability:
-    """What is known of each shared unknown of a problem, from what.
+    """Standard deviations of the shared unknowns of a problem, from data, from priors, and from both.
 
     Parameters
     ----------
@@ -35,17 +36,17 @@ class Observability:
     units : tuple of n str
         Their SI units.
     data : array (n,)
-        Standard deviation from the measurements alone; infinite where they leave the unknown open.
+        Standard deviation from the measurements alone; infinite if they do not determine the unknown.
     prior : array (n,)
-        Standard deviation of the prior; infinite where there is none.
+        Standard deviation of the prior; infinite without a prior.
     posterior : array (n,)
         Standard deviation from both.
     rank : int
         Number of combinations of the unknowns that the measurements determine.
     open : tuple of str
-        Sentences that name the combinations that the measurements leave open.
+        Sentences that name the combinations that the measurements do not determine.
     tied : tuple of str
-        One sentence for each group of unknowns, biases among them, that are hard to tell apart even so.
+        One sentence for each group of determined unknowns, biases among them, that are hard to separate.
     """
 
     labels: tuple[str, ...]
@@ -59,10 +60,10 @@ class Observability:
 
     @property
     def from_data(self) -> Array:
-        """Return the share (n,) of what is known that the measurements contribute.
+        """Return the share (n,) of the information that the measurements contribute.
 
-        One less the posterior variance over the prior one: 0 where the prior says it all, 1 without a prior, NaN where
-        nothing is known.
+        It is one minus the posterior variance over the prior variance: 0 if the prior gives all information, 1 without
+        a prior, NaN for an undetermined unknown.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             left = np.where(np.isinf(self.prior), 0.0, (self.posterior / self.prior) ** 2)
@@ -70,24 +71,24 @@ class Observability:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Return what is not separable, one sentence each; empty where everything is."""
+        """Return one sentence for each set of inseparable unknowns; empty if all unknowns are separable."""
         return (*self.open, *self.tied)
 
 
 def observability(problem: Problem, x: Array) -> Observability:
-    """Return what the data and the priors say about each shared unknown of a problem.
+    """Return the information of the data and of the priors about each shared unknown of a problem.
 
-    The normal matrix of the measurements at x, unknowns of single epochs eliminated and columns scaled, is taken apart
-    into its eigenvectors: those of eigenvalue zero are combinations of unknowns that no measurement sees, all others
-    have a finite variance. Errors of station positions that last one epoch, and equality constraints, count with the
-    measurements; priors of shared unknowns do not.
+    The method takes the normal matrix of the measurements at x, eliminates unknowns of single epochs and scales its
+    columns. Eigenvectors with eigenvalue zero are combinations of unknowns that no measurement determines; all others
+    have a finite variance. Station errors that last one epoch, and equality constraints, count with the measurements;
+    priors of shared unknowns do not.
 
     Parameters
     ----------
     problem : Problem
         A single problem.
     x : array (size,)
-        Where it is linearised: a fix, or a truth.
+        Point of linearisation: a fix, or a truth.
 
     Returns
     -------
@@ -107,7 +108,7 @@ def observability(problem: Problem, x: Array) -> Observability:
     precision = shared_priors(problem)
     data = _take_apart(information, size, basis)
     both = _take_apart(information + precision, size + precision, basis)
-    shown = np.isfinite(data.sigma)  # what is open is named as such
+    shown = np.isfinite(data.sigma)  # undetermined unknowns have sentences of another kind
     return Observability(
         layout.labels(),
         tuple(slot.unit for slot in layout.shared for _ in range(slot.size)),
@@ -121,13 +122,13 @@ def observability(problem: Problem, x: Array) -> Observability:
 
 
 def open_sentences(layout: Layout, information: Array) -> tuple[str, ...]:
-    """Return sentences that name the combinations of shared unknowns on which an information matrix is silent."""
+    """Return sentences that name the combinations of shared unknowns without information in a matrix (n, n)."""
     return tuple(_open_sentences(layout, _take_apart(information, information, np.eye(layout.n_shared))))
 
 
 @dataclass(frozen=True, slots=True)
 class _InformationParts:
-    """Standard deviations (n,), correlations (n, n), and a basis (q, n) of what is open, in units of `reach` (n,)."""
+    """Standard deviations (n,), correlations (n, n), and an undetermined basis (q, n) over `reach` (n,)."""
 
     sigma: Array
     correlation: Array
@@ -136,11 +137,11 @@ class _InformationParts:
 
 
 def _take_apart(information: Array, size: Array, basis: Array) -> _InformationParts:
-    """Return what information (n, n) on a basis (n, p) determines.
+    """Return the parts of information (n, n) on a basis (n, p): determined and undetermined combinations.
 
-    `size` is the information before anything was eliminated: its rounding errors decide what counts as zero.
+    `size` is the information before elimination; its rounding errors decide what counts as zero.
     """
-    # columns scaled to unit information, so that metres and seconds compare; then eigenvectors, open ones and others
+    # columns are scaled to unit information, so that metres and seconds are comparable
     weight = np.sqrt(np.einsum("ip,ij,jp->p", basis, size, basis).clip(0.0))
     basis = basis / np.where(weight > 0.0, weight, 1.0)
     values, vectors = np.linalg.eigh(basis.T @ information @ basis)
@@ -150,7 +151,7 @@ def _take_apart(information: Array, size: Array, basis: Array) -> _InformationPa
     shut = values > OPEN
     known, null = directions[:, shut] / np.sqrt(values[shut]), directions[:, ~shut] / reach
     sigma = np.linalg.norm(known, axis=-1)
-    # an unknown that takes part in any open combination is open itself
+    # an unknown in an undetermined combination is undetermined
     loose = (np.abs(null) > _NOTHING).any(-1)
     unit = known / np.where(sigma > 0.0, sigma, 1.0)[:, None]
     correlation = np.where(loose[:, None] | loose, 0.0, unit @ unit.T)
@@ -158,7 +159,7 @@ def _take_apart(information: Array, size: Array, basis: Array) -> _InformationPa
 
 
 def _open_sentences(layout: Layout, parts: _InformationParts) -> Iterator[str]:
-    """Yield sentences that name what is open: a common change of a family first, then what is left."""
+    """Yield sentences on undetermined combinations: common changes of all members of a bias first, then others."""
     common = np.array([_entries(layout, slot) for slot in layout.shared if slot.members]).reshape(-1, layout.n_shared)
     found = [row for row in common / parts.reach if _inside(row, parts.open)]
     for row in found:
@@ -168,7 +169,7 @@ def _open_sentences(layout: Layout, parts: _InformationParts) -> Iterator[str]:
         yield from (_open_sentence(layout, row * parts.reach) for row in rest)
     else:
         names = [label for label, used in zip(layout.labels(), np.asarray(rest.any(0)), strict=True) if used]
-        yield f"the data leave {len(rest)} combinations of {_enumerate(names)} open"
+        yield f"the data do not determine {len(rest)} combinations of {_enumerate(names)}"
 
 
 def _entries(layout: Layout, slot: Slot) -> Array:
@@ -178,17 +179,17 @@ def _entries(layout: Layout, slot: Slot) -> Array:
 
 
 def _inside(row: Array, basis: Array) -> bool:
-    """Return whether a vector (n,) lies in the span of a basis (q, n)."""
+    """Return whether a vector (n,) is in the span of a basis (q, n)."""
     away = row - np.linalg.lstsq(basis.T, row, rcond=None)[0] @ basis
     return float(np.linalg.norm(away)) < _NOTHING * float(np.linalg.norm(row))
 
 
 def _without(basis: Array, found: list[Array]) -> Array:
-    """Return a basis (q - f, n) of what a basis (q, n) spans beside f vectors within it."""
+    """Return a basis (q - f, n) of the span of a basis (q, n), orthogonal to f vectors in this span."""
     if not found:
         return basis
     taken, _ = np.linalg.qr(np.array(found).T)
-    # the projection off what was found has the rank that is left
+    # the projection orthogonal to the vectors has the remaining rank
     _, _, right = np.linalg.svd(basis - basis @ taken @ taken.T)
     return np.asarray(right[: len(basis) - len(found)])
 
@@ -197,7 +198,7 @@ def _reduce(rows: Array) -> Array:
     """Return a basis (q, n) of the same space in which each row has an entry of one that no other row has."""
     rows = rows.copy()
     for i in range(len(rows)):
-        # Gauss-Jordan with full pivoting: the largest entry that is left becomes one, and the only one of its column
+        # Gauss-Jordan with full pivoting: the largest remaining entry becomes one, and the only one of its column
         at, pivot = divmod(int(np.argmax(np.abs(rows[i:]))), rows.shape[1])
         rows[[i, i + at]] = rows[[i + at, i]]
         rows[i] /= rows[i, pivot]
@@ -207,7 +208,7 @@ def _reduce(rows: Array) -> Array:
 
 
 def _open_sentence(layout: Layout, direction: Array) -> str:
-    """Return the sentence of a combination (n,) of unknowns that no measurement sees."""
+    """Return the sentence on a combination (n,) of unknowns that no measurement determines."""
     labels, names, amounts = layout.labels(), [], []
     for slot in layout.shared:
         unit = "" if slot.unit == "1" else slot.unit
@@ -220,12 +221,12 @@ def _open_sentence(layout: Layout, direction: Array) -> str:
             amounts += [(float(value), unit) for value in part[part != 0.0]]
     values = np.array([value for value, _ in amounts])
     if len(names) == 1 and not names[0].startswith("every "):
-        return f"the data do not show {names[0]}"
+        return f"the data do not determine {names[0]}"
     if len({unit for _, unit in amounts}) == 1 and np.allclose(values, values[0], rtol=_ALIKE):
-        return f"the data do not show a common change of {_enumerate(names)}"
+        return f"the data do not determine a common change of {_enumerate(names)}"
     values = values / values[0]
     shown = [f"{name} by {v:+.3g} {u}".rstrip() for name, v, (_, u) in zip(names, values, amounts, strict=True)]
-    return f"the data do not show a change of {_enumerate(shown)}"
+    return f"the data do not determine a change of {_enumerate(shown)}"
 
 
 def _tied_sentences(layout: Layout, correlation: Array) -> list[str]:
@@ -240,13 +241,12 @@ def _tied_sentences(layout: Layout, correlation: Array) -> list[str]:
         members = np.flatnonzero(group == number)
         if len(members) > 1:
             most = np.abs(np.triu(correlation[np.ix_(members, members)], 1)).max()
-            found.append(
-                f"hard to tell apart: {_enumerate([labels[i] for i in members])} (correlated up to {most:.5f})"
-            )
+            found.append(f"hard to separate: {_enumerate([labels[i] for i in members])} (correlated up to {most:.5f})")
     return found
 
 
 def _enumerate(names: list[str]) -> str:
+    """Return names as a part of a sentence: "a, b and c", with a limited number of names."""
     if len(names) > _SHOWN:
         names = [*names[: _SHOWN - 1], f"{len(names) - _SHOWN + 1} more"]
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))

@@ -1,8 +1,9 @@
-"""Back ends that a study may ask for: conic solvers of cvxpy, nonlinear ones of CasADi, least squares.
+"""Back ends that a study may use: conic solvers of cvxpy, nonlinear solvers of CasADi, least squares.
 
-A library that lists a solver does not say that it works: some end the process, some raise an error of their own for
-every program, some never end where there is no solution, some call that a success. So each is tried once, in a process
-apart, on programs with and without a solution (`formulations.backend_trial`), and only those that pass are listed.
+A library may list a solver that does not work. Some solvers end the process, and some raise an error for
+every program. Without a solution, some solvers never end, and some report a success. So each solver is tried once,
+in a separate process, on programs with and without a solution (`formulations.backend_trial`). Only solvers that pass
+are listed.
 """
 
 from __future__ import annotations
@@ -23,22 +24,22 @@ from typing import Literal
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.kernels.code_cache import folder
 
-# Seconds in which a solver ends on programs of two unknowns, which take milliseconds; and to begin a process.
+# Seconds that a solver may take for programs of two unknowns, which take milliseconds; and seconds to start a process.
 _PATIENCE, _START = 5.0, 60.0
-# How lines of the trial begin, as in `formulations.backend_trial`.
+# First words of the lines of the trial, as in `formulations.backend_trial`.
 _SAID = ("backend-passed", "backend-failed")
 
 
 @dataclass(frozen=True, slots=True)
 class Backend:
-    """A solver that is installed.
+    """An installed solver.
 
     Parameters
     ----------
     kind : "conic", "nonlinear" or "least squares"
-        What it solves.
+        Programs that it solves.
     version : str
-        Its version; that of the library that ships it where it has none of its own.
+        Its version, or the version of the library that includes it.
     summary : str
         One line for listings.
     """
@@ -48,7 +49,7 @@ class Backend:
     summary: str
 
 
-# Where cvxpy's name of a solver is not that of its package.
+# Packages of solvers whose name in cvxpy differs.
 _PACKAGES = {"COPT": "coptpy", "CUCLARABEL": "juliacall", "GUROBI": "gurobipy", "MOSEK": "Mosek", "SDPA": "sdpa-python"}
 _NONLINEAR = {
     "ipopt": "interior point with line search (Waechter, Biegler 2006)",
@@ -67,7 +68,7 @@ _NONLINEAR = {
 
 
 def version_of(package: str) -> str:
-    """Return the version of an installed distribution, "?" where it has none."""
+    """Return the version of an installed distribution; "?" if it is unknown."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -76,19 +77,19 @@ def version_of(package: str) -> str:
 
 @cache
 def installed() -> dict[str, Backend]:
-    """Return every back end that its library lists here, whether it works or not, by the name in study files."""
+    """Return every back end that its library lists here, working or not, by the name in study files."""
     import casadi
     import cvxpy
     from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC
 
     found: dict[str, Backend] = {}
-    # Studies compare solvers of cones: those that have neither kind cannot take any program of this package.
+    # a solver with neither kind of cones cannot solve any program of this package
     for name in sorted(set(cvxpy.installed_solvers()) & set(SOLVER_MAP_CONIC)):
         cones = {cone.__name__.removeprefix("Svec") for cone in SOLVER_MAP_CONIC[name].SUPPORTED_CONSTRAINTS}
         powers = [word for word, cone in (("cones of order 2", "SOC"), ("semidefinite cones", "PSD")) if cone in cones]
         if powers:
             found[name] = Backend("conic", version_of(_PACKAGES.get(name, name.lower())), " and ".join(powers))
-    # CasADi can only be asked plugin by plugin: it has no list.
+    # CasADi has no list of plugins, so each name is tested
     for name, summary in _NONLINEAR.items():
         if casadi.has_nlpsol(name):
             found[name] = Backend("nonlinear", f"CasADi {version_of('casadi')}", summary)
@@ -99,18 +100,18 @@ def installed() -> dict[str, Backend]:
 
 @cache
 def backends() -> dict[str, Backend]:
-    """Return every back end that works here, by the name that a study file uses."""
+    """Return every back end that works here, by the name in study files."""
     faults = faults_of({name: entry.kind for name, entry in installed().items() if entry.kind != "least squares"})
     return {name: entry for name, entry in installed().items() if not faults.get(name)}
 
 
 def kind_of(name: str) -> Literal["conic", "nonlinear"]:
-    """Return what an installed back end solves, which nobody tries again for that."""
+    """Return the kind of programs that an installed back end solves, without a trial."""
     return "conic" if installed()[name].kind == "conic" else "nonlinear"
 
 
 def backend_kind(name: str, where: str) -> Literal["conic", "nonlinear"]:
-    """Return what a back end solves; raise InvalidProblem where it is unknown, not installed, or does not work here."""
+    """Return the kind of programs that a back end solves; raise InvalidProblem if it is unknown, missing or broken."""
     here = {key: entry.kind for key, entry in installed().items() if entry.kind != "least squares"}
     working = [key for key in backends() if key in here]
     if name not in here:
@@ -118,21 +119,23 @@ def backend_kind(name: str, where: str) -> Literal["conic", "nonlinear"]:
 
         known = {*_NONLINEAR, *cvxpy.settings.SOLVERS} - set(here)
         if name in known:
-            advice = f"install it; here are {', '.join(working)}"
+            advice = f"install it, or use one of {', '.join(working)}"
             raise InvalidProblem(f"the solver {name!r} is not installed, or cannot solve these cones", where, advice)
         raise InvalidProblem(f"unknown solver {name!r}", where, nearest(name, working))
     if name not in working:
         fault = faults_of(here)[name]
-        raise InvalidProblem(f"the solver {name!r} does not work here: {fault}", where, f"take {', '.join(working)}")
+        raise InvalidProblem(
+            f"the solver {name!r} does not work here: {fault}", where, f"use one of {', '.join(working)}"
+        )
     return kind_of(name)
 
 
-# The trial of solvers, kept on disk: it takes some seconds.
+# The results of the trial are stored on disk, since it takes some seconds.
 
 
 @cache
 def _faults(kinds: tuple[tuple[str, str], ...]) -> dict[str, str]:
-    """Return what is wrong with each back end; empty where it works."""
+    """Return the fault of each back end; "" for one that works."""
     place = folder()
     file = None if place is None else place / f"backends-{_key(kinds)}.json"
     if file is not None:
@@ -145,17 +148,17 @@ def _faults(kinds: tuple[tuple[str, str], ...]) -> dict[str, str]:
         with suppress(OSError):
             own = file.with_suffix(f".{os.getpid()}")
             own.write_text(json.dumps(found), encoding="utf-8")
-            own.replace(file)  # all at once: another process reads the whole of it or nothing
+            own.replace(file)  # an atomic replacement: another process never reads a partial file
     return found
 
 
 def faults_of(kinds: Mapping[str, str]) -> dict[str, str]:
-    """Return what is wrong with each back end, given by name and kind; empty where it works."""
+    """Return the fault of each back end, given by name and kind; "" for one that works."""
     return dict(_faults(tuple(sorted(kinds.items()))))
 
 
 def _key(kinds: tuple[tuple[str, str], ...]) -> str:
-    """Return what the outcome depends on, as a digest: names, versions, and the programs of the trial."""
+    """Return a digest of everything that the results depend on: names, versions, and the programs of the trial."""
     here = Path(__file__).parent
     programs = [path.read_text(encoding="utf-8") for path in sorted((here.parents[1] / "formulations").glob("*.py"))]
     libraries = [version_of(name) for name in ("casadi", "cvxpy", "numpy")]
@@ -165,23 +168,23 @@ def _key(kinds: tuple[tuple[str, str], ...]) -> str:
 
 
 def try_in_process(kinds: dict[str, str]) -> dict[str, str]:
-    """Return what is wrong with back ends, given by name and kind, after a trial in a process apart.
+    """Return the faults of back ends, given by name and kind, from a trial in a separate process.
 
-    A new process begins behind a solver that ends one.
+    If a solver ends the process, a new process tries the remaining solvers.
     """
     left, found = dict(kinds), dict[str, str]()
     while left:
         done = _one_process(left)
         found |= done
         left = {name: kind for name, kind in left.items() if name not in found}
-        if left and not done:  # nobody was reached: what is wrong is not a solver
-            found |= dict.fromkeys(left, "it could not be tried")
+        if left and not done:  # no solver was reached, so the fault is not in a solver
+            found |= dict.fromkeys(left, "the trial did not run")
             break
     return found
 
 
 def _one_process(kinds: dict[str, str]) -> dict[str, str]:
-    """Return the outcomes of those that one process reaches; the one in which it ends is named with how."""
+    """Return the faults of the back ends that one process reaches, including the one that ends the process."""
     root = str(Path(__file__).resolve().parents[2])
     path = os.pathsep.join([root, *(place for place in sys.path if place)])
     process = subprocess.Popen(  # noqa: S603  (this interpreter, and a module of this package)

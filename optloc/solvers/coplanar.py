@@ -1,4 +1,4 @@
-"""Targets near the plane of all stations: both sides of it are two minima, or one region.
+"""Targets near the plane of all stations: the two sides of the plane are two minima, or one likelihood region.
 
 The data separate mirror images only if the cost on the plane between them is clearly higher. Otherwise both belong to
 one region.
@@ -32,11 +32,11 @@ from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.verdict.minima import measure_curvature, smallest_pivot
 
 APART = 20.0
-"""Standard deviations of w from the plane beyond which no region reaches across: they are ten of q."""
+"""Standard deviations of the distance w from the plane beyond which no region reaches across: ten of q = w^2."""
 
 
 def join_sides(problem: Problem, pool: Pool) -> Pool:
-    """Return a settled pool in which both sides of the plane of coplanar stations are one region, where they are.
+    """Return a settled pool in which both sides of the plane of the stations are one region, if the data allow both.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def join_sides(problem: Problem, pool: Pool) -> Pool:
     items, across, own, found, sides = items[met], across.take(met), take(own, met), found.take(met), sides.take(met)
     fresh = _as_pool(problem.take(items), across, own, found, sides)
     joined = int(_is_joined(found, sides).sum())
-    stage = Stage("fold", f"{joined} of {len(items)} on both sides of the plane at once", perf_counter() - began)
+    stage = Stage("fold", f"{joined} of {len(items)} include both sides of the plane", perf_counter() - began)
     return pool.merge(items, fresh, stage)
 
 
@@ -83,7 +83,7 @@ def _is_near(problem: Problem, pool: Pool) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _FoundSides:
-    """Minima of N problems over the place in the plane and q, the cheapest first.
+    """Minima of N problems over the position in the plane and q, the squared distance from it; the cheapest first.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class _FoundSides:
     on_plane: Array
 
     def take(self, items: Array) -> _FoundSides:
-        """Return some entries."""
+        """Return the entries of some problems."""
         return _FoundSides(self.x[items], self.cost[items], self.on_plane[items])
 
 
@@ -124,7 +124,7 @@ def _minima(across: Across, pool: Pool) -> _FoundSides:
 
 
 def _distinct(across: Across, x: Array, cost: Array) -> Array:
-    """Return a mask (N, r) of minima, the cheapest first: within the listed gap, and no repetition."""
+    """Return a mask (N, r) of distinct minima within the listed gap; minima are in ascending order of cost."""
     n = across.problem.layout.n_shared
     information, _ = information_in_square(across, np.where(np.isfinite(x[:, 0]), x[:, 0], 0.0))
     folded = np.array(x[..., :n])
@@ -142,14 +142,14 @@ def _distinct(across: Across, x: Array, cost: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _Sides:
-    """Minima on both sides of the plane: two slots for each of `_FoundSides`, the likelier side first.
+    """Minima on both sides of the plane: two slots for each minimum of `_FoundSides`, the likelier side first.
 
     Parameters
     ----------
     x : array (N, 2r, size)
         In space; NaN in empty slots.
     cost : array (N, 2r)
-        Infinite in empty slots, and where a constraint or the Earth is in the way.
+        Infinite in empty slots, and for minima that a constraint forbids or the Earth hides.
     on_plane : bool array (N,)
         Whether the first minimum is in the plane.
     """
@@ -159,7 +159,7 @@ class _Sides:
     on_plane: Array
 
     def take(self, items: Array) -> _Sides:
-        """Return some entries."""
+        """Return the entries of some problems."""
         return _Sides(self.x[items], self.cost[items], self.on_plane[items])
 
 
@@ -168,7 +168,7 @@ def _sides(problem: Problem, across: Across, found: _FoundSides) -> _Sides:
     count, slots, size = found.x.shape
     x, cost = np.full((count, 2 * slots, size), np.nan), np.full((count, 2 * slots), np.inf)
     off = found.x[..., across.part.stop - 1] > across.least[:, None]
-    # the upper side first, as the verdict has it
+    # the upper side first, as in the verdict
     upward = np.where(across.axes[:, -1, -1] < 0.0, -1.0, 1.0)
     for slot in range(slots):
         flat = np.array(found.x[:, slot])
@@ -180,7 +180,7 @@ def _sides(problem: Problem, across: Across, found: _FoundSides) -> _Sides:
                 known = np.where(there[:, None], at, 0.0)
                 there &= (violation(problem, known) <= TOLERANCE) & ~is_hidden(problem, known)
             x[there, 2 * slot + side], cost[there, 2 * slot + side] = at[there], found.cost[there, slot]
-    # of two sides that are one admitted, it comes first
+    # if constraints admit only the second side, it becomes the first
     swap = ~np.isfinite(cost[:, 0]) & np.isfinite(cost[:, 1])
     x[swap, :2], cost[swap, :2] = x[swap, 1::-1], cost[swap, 1::-1]
     return _Sides(x, cost, ~off[:, 0])
@@ -213,7 +213,7 @@ def _as_pool(problem: Problem, across: Across, own: Pool, found: _FoundSides, si
 
 
 def _held(across: Across, own: Pool, least: Array) -> Array:
-    """Return the minima (N, q) that a constraint holds off the plane, within the listed gap of the least cost (N,)."""
+    """Return a mask (N, q) of minima that a constraint holds off the plane, with costs within the listed gap."""
     away = own.x[..., across.part] - across.centre[:, None]
     w = np.abs((away * across.axes[:, None, :, -1]).sum(-1))
     with np.errstate(invalid="ignore"):
@@ -222,7 +222,7 @@ def _held(across: Across, own: Pool, least: Array) -> Array:
 
 
 def _curvature(problem: Problem, across: Across, found: _FoundSides, x: Array, joined: Array) -> Curvature:
-    """Return the curvature at minima x (N, size): of a joined region with the second moment of both sides about it."""
+    """Return the curvature at minima x (N, size); for a joined region with the second moment of both sides about x."""
     with np.errstate(all="ignore"):
         at = measure_curvature(problem, equations_at(problem, x), x, np.zeros(len(x), dtype=int))
     covariance, kappa = at.covariance.copy(), np.full((len(x), 2), np.nan)
@@ -234,7 +234,7 @@ def _curvature(problem: Problem, across: Across, found: _FoundSides, x: Array, j
     square, regular = linalg.inverse(information)
     own = across.part.stop - 1
     _, end = interval_across(across, best, found.cost[items, 0])
-    # both sides are alike: the distance has no correlation with anything
+    # both sides are symmetric, so the distance from the plane is not correlated with other unknowns
     square[:, own], square[:, :, own] = 0.0, 0.0
     square[:, own, own] = (end / np.sqrt(JOINED)) ** 2 + best[:, own] ** 2
     turn = np.broadcast_to(np.eye(information.shape[-1]), information.shape).copy()

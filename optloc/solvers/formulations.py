@@ -1,4 +1,4 @@
-"""The optimisation problems behind the starts and bounds: what each serves, how it starts a fix, what it bounds."""
+"""Table of the optimisation problems behind starts and bounds: their kinds, starts, bounds and sources."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from optloc.solvers.starts.squared_range import hull, minimum, shor, stationary_
 
 @dataclass(frozen=True, slots=True)
 class Formulation:
-    """An optimisation problem of the package `formulations`, and how a problem is put to it.
+    """An optimisation problem of the package `formulations`, and how optloc uses it.
 
     Parameters
     ----------
     summary : str
         What it minimises.
     kinds : str
-        Measurement kinds it serves.
+        Measurement kinds it supports.
     tight : str
         How good its answer is.
     cost : str
@@ -38,18 +38,19 @@ class Formulation:
     source : str
         Publication.
     serves : callable
-        Tells of a flat batch of problems whether `starts` may be asked: problems of one position by default.
+        Maps a flat batch of problems to True if `starts` supports them; by default problems of one position.
     starts : dict of str to callable
-        By word of a method, what maps a flat batch of N problems to candidates: of one static target with nothing else
-        unknown to positions (N, q, d), metres, else to full vectors (N, q, size); NaN where there is none. Words may
-        be shared: the stage takes the candidates of all formulations that serve.
+        For each word of a method a callable that maps a flat batch of N problems to candidates; NaN in empty slots. For
+        one static target without other unknowns the candidates are positions (N, q, d), metres, else full vectors (N,
+        q, size). Several formulations may have the same word: the stage takes the candidates of all that support the
+        problem.
     bound : callable, optional
         Maps a flat batch of problems and their fixes to lower bounds of the maximum-likelihood cost.
     words : tuple of str
-        Other words of a method behind which it stands.
+        Other words of a method that use the formulation.
     needs : callable
-        Maps problems that it gave no start to what it needs and they lack, as a sentence without its subject, such as
-        "starts from azimuths"; to "" where they lack nothing that is known.
+        Maps problems without a start from this formulation to the missing input, as a sentence without its subject,
+        such as "starts from azimuths". It returns "" if no input is known to be missing.
     """
 
     summary: str
@@ -68,7 +69,7 @@ def _from_bearings(locate: Callable[[Bearings], Array]) -> Callable[[Problem], A
     """Return a start from the bearings of a problem."""
 
     def start(problem: Problem) -> Array:
-        # a slot of NaN where no azimuth was measured: other formulations may start the rows
+        # NaN without azimuths: other formulations may start the rows
         seen = bearings(problem)
         nowhere = np.full((problem.batch_shape[0], 1, problem.dimension), np.nan)
         return nowhere if seen is None else locate(seen)
@@ -77,13 +78,13 @@ def _from_bearings(locate: Callable[[Bearings], Array]) -> Callable[[Problem], A
 
 
 def _needs_sight(problem: Problem) -> str:
-    """Return what is needed where no azimuth is measured."""
+    """Return the missing input, as of `Formulation.needs`, if no azimuth is measured."""
     kinds = dict.fromkeys(rows.kind for rows in problem.rows)
     return "" if "azimuth" in kinds else f"starts from azimuths, and these rows are {' and '.join(kinds)}"
 
 
 def _needs_bearings(problem: Problem) -> str:
-    """Return what is needed where fewer than two stations measure whole bearings."""
+    """Return the missing input, as of `Formulation.needs`, if fewer than two stations measure complete bearings."""
     wanted = ("azimuth", "elevation")[: problem.dimension - 1]
     seen = [
         {
@@ -101,12 +102,14 @@ def _needs_bearings(problem: Problem) -> str:
 
 
 def _needs_directions(problem: Problem) -> str:
-    """Return what is needed where directions are not those of space."""
+    """Return the missing input, as of `Formulation.needs`, if directions are in a plane or bearings are incomplete."""
     plane = problem.dimension == 2
-    return "relaxes directions in space, and these rows are in a plane" if plane else _needs_bearings(problem)
+    return (
+        "relaxes directions in three dimensions, and these rows are in a plane" if plane else _needs_bearings(problem)
+    )
 
 
-# both are refined on block averages; only where they begin differs
+# both are refined on block averages and differ in their starts
 _start_run, _start_relaxed_run = partial(run_starts, begin=closed_form), partial(run_starts, begin=relax_run)
 
 _RANGES = "range, toa, tdoa, range_sum; azimuth, elevation and groa rows linear in (x, r)"
@@ -134,13 +137,13 @@ _PROGRAMS: dict[str, Formulation] = {
     "squared_range_conic: hull": Formulation(
         "second-order cone relaxation |x| <= r of the same problem",
         _RANGES,
-        "a lower bound; tight where the linear fit violates |x| <= r, about half of all TDOA cases",
+        "a lower bound; tight if the linear fit violates |x| <= r, about half of all TDOA cases",
         "0.2 ms",
         "convex hull of the cone",
         starts={"socp": partial(squared_range_starts, pick=hull)},
     ),
     "sparse_errors": Formulation(
-        "linear rows with gross errors of a few, priced by the sum of their sizes, on the cones of the ranges",
+        "linear rows with a few gross errors, whose sizes are penalised, on the cones of the ranges",
         _RANGES,
         "convex, not exact: a start and a guess of the wrong rows; from about 20 stations both are good",
         "1 ms",
@@ -148,7 +151,7 @@ _PROGRAMS: dict[str, Formulation] = {
         words=("sparse",),
     ),
     "range_height": Formulation(
-        "ranges known up to one unknown meet an ellipsoid: a quartic, with horizon",
+        "ranges with one common unknown, on an ellipsoid: a quartic, with horizon",
         "tdoa, toa, range_sum with a known height",
         "exact: all points that fit",
         "0.1 ms",
@@ -157,9 +160,9 @@ _PROGRAMS: dict[str, Formulation] = {
         starts={"gtrs": height_starts, "roots": height_starts, "socp": height_starts},
     ),
     "range_height_conic": Formulation(
-        "3 x 3 lift after elimination of the range differences, nearest to the point below the satellites",
+        "3 x 3 lift after elimination of the range differences, nearest to the subsatellite point",
         "two differences and a height",
-        "rank one within 25 degrees of the point below",
+        "rank one within 25 degrees of the subsatellite point",
         "1 ms",
         "Shor 1987",
         serves=over_ground,
@@ -175,7 +178,7 @@ _PROGRAMS: dict[str, Formulation] = {
         needs=_needs_sight,
     ),
     "bearing_course": Formulation(
-        "the same for a target on a polynomial course, over all epochs at once; one station that turns may do",
+        "the same for a target on a polynomial course, over all epochs; one turning station may be enough",
         "azimuth, elevation of a moving target",
         "asymptotically unbiased; as good as maximum likelihood to 0.1 %",
         "0.5 ms for 100 angles",
@@ -183,7 +186,7 @@ _PROGRAMS: dict[str, Formulation] = {
         words=("gtrs", "roots", "wiv"),
     ),
     "direction_sdp": Formulation(
-        "unknown unit directions that meet in a point, lifted; with a minorant a bound of the angular cost",
+        "lifted unit directions that meet in a point; with a minorant a lower bound of the angular cost",
         "azimuth and elevation",
         "100 % to 20 mrad, 98 % at 50 mrad",
         "2 ms two stations, 10 ms four",
@@ -194,7 +197,7 @@ _PROGRAMS: dict[str, Formulation] = {
         needs=_needs_directions,
     ),
     "moment_sdp": Formulation(
-        "order-2 moments of position and range errors in a box: a lower bound of the likelihood's cost",
+        "order-2 moments of position and range errors in a box: a lower bound of the maximum-likelihood cost",
         "range, toa, tdoa, range_sum",
         "89-100 % to 30 m",
         "50 ms five stations, 100 ms six",
@@ -203,7 +206,7 @@ _PROGRAMS: dict[str, Formulation] = {
         words=("bound",),
     ),
     "minimax_cone": Formulation(
-        "least worst angle by bisection over second-order cones; proves that bounds contradict each other",
+        "smallest maximal angle, by bisection over second-order cones; proves contradictions of bounds",
         "azimuth, elevation with bounded errors",
         "exact for its own cost",
         "10 ms",
@@ -220,7 +223,7 @@ _PROGRAMS: dict[str, Formulation] = {
         words=("gtrs", "roots"),
     ),
     "registration": Formulation(
-        "place, course and biases of a run: reference ranges projected out, then tied to the lifted course",
+        "position, course and biases of a run: reference ranges projected out, then linked to the lifted course",
         "tdoa, toa, range_sum of moving stations or a moving target",
         "exact without noise; with noise a start near the bound",
         "0.3 ms",
@@ -229,7 +232,7 @@ _PROGRAMS: dict[str, Formulation] = {
         starts={"gtrs": _start_run, "roots": _start_run, "socp": _start_run},
     ),
     "registration_sdp": Formulation(
-        "the same lifted with its reference ranges; price on the trace, prior on the biases",
+        "the same, lifted with its reference ranges; penalty on the trace, prior on the biases",
         "tdoa, toa of moving stations",
         "never tight: a start",
         "0.5 s",
@@ -238,9 +241,9 @@ _PROGRAMS: dict[str, Formulation] = {
         starts={"sdp": _start_relaxed_run},
     ),
     "doppler_sdp": Formulation(
-        "place, ranges, unknown rates and their products lifted; weighted by the ranges of the pass before",
+        "position, ranges, unknown rates and their products, lifted; weighted by the ranges of the pass before",
         "range_rate, fdoa of a source at rest, with tdoa, range, range_sum and a known height",
-        "never tight: a start, seldom the only minimum; many rows are joined to normal points",
+        "never tight: a start, rarely the only minimum; many rows are averaged to normal points",
         "10 ms four stations, 0.1 s a pass of a satellite",
         "Song et al. 2025; Wang, Li, Ansari 2013",
         serves=has_doppler_of_rest,
@@ -256,8 +259,8 @@ _PROGRAMS: dict[str, Formulation] = {
     "nuclear_norm": Formulation(
         "times of emission whose centred squared arrivals have the least nuclear norm, then the least truncated one: a "
         "baseline for studies, never a default",
-        "toa of stations and pulses at unknown places, none missing, one clock",
-        "never by the nuclear norm alone; truncated it is exact without noise where its passes arrive",
+        "toa of stations and pulses at unknown positions, none missing, one clock",
+        "never with the nuclear norm alone; truncated, it is exact without noise if its passes converge",
         "0.5 s for 12 stations and 20 pulses",
         "Fazel 2002; Jiang, Kuang, Astrom 2013",
     ),
@@ -274,5 +277,6 @@ _PROGRAMS: dict[str, Formulation] = {
 FORMULATIONS: Registry[Formulation] = Registry(
     "optloc.formulations", lambda value: isinstance(value, Formulation), _PROGRAMS
 )
-"""Formulations by name: add one with one file and one entry, or from another package with an entry point of
-``optloc.formulations``."""
+"""Formulations by name. A new one needs one file and one entry, or an entry point of ``optloc.formulations`` in another
+package.
+"""

@@ -1,4 +1,7 @@
-"""What an answer must meet: inequalities, whose faces are all tried, and a line of sight that the Earth leaves free."""
+"""Conditions that an answer must meet: inequalities, and lines of sight that the Earth does not block.
+
+If the best candidate breaks an inequality, the cost is minimised along every face of the inequalities.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +29,12 @@ from optloc.solvers.pool import Pool
 
 
 def is_hidden(problem: Problem, x: Array, reach: float = 0.0) -> Array:
-    """Return which vectors x (N, size) place a target behind the Earth as seen from a station that hears it.
+    """Return flags (N,) of vectors x (N, size) whose target the Earth hides from a station with a row of it.
 
-    One end of the line is in space, above 100 km: no wave passes through the Earth and leaves it. Or the row is an
-    angle: a bearing follows the line of sight. The straight line may pass 5 km below the ellipsoid to a satellite, and
-    50 km from the ground. For all other rows the Earth hides nothing between two points on the ground: waves of
-    earthquakes pass through it, and radio waves go around it.
+    Two kinds of lines are tested. First, lines with one end in space, above 100 km: no wave passes through the Earth
+    into space. Second, lines of rows that are angles: a bearing follows the line of sight. The straight line to a
+    satellite may pass 5 km below the ellipsoid, a line to the ground 50 km. All other rows may connect any two points
+    on the ground: waves of earthquakes pass through the Earth, and radio waves go around it.
 
     Parameters
     ----------
@@ -50,20 +53,20 @@ def is_hidden(problem: Problem, x: Array, reach: float = 0.0) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """The lines of sight of a target to its k stations.
+    """The lines of sight from a target to its k stations.
 
     Parameters
     ----------
     frame : Frame
-        Of the vectors.
+        Frame of the vectors.
     part : slice
-        Where its position is in a vector.
+        Slice of a vector that holds the position of the target.
     station : int array (k,)
         Numbers of the stations.
     place : array (N, k, 3)
-        Where they are, Earth-centred, in coordinates in which the ellipsoid is the unit sphere.
+        Earth-centred positions of the stations, scaled so that the ellipsoid is the unit sphere.
     present, angular : bool array (N, k)
-        Whether they have a row in a problem, and whether it has an angle.
+        Whether they have a row in a problem, and whether they have an angle.
     """
 
     frame: Frame
@@ -74,17 +77,17 @@ class Sight:
     angular: Array
 
     def blocked(self, x: Array, reach: float = 0.0) -> Array:
-        """Return to which stations (N, k) the Earth blocks the sight of vectors x (N, size), see `is_hidden`."""
+        """Return flags (N, k) of stations that the Earth hides from vectors x (N, size), see `is_hidden`."""
         point = self.frame.to_ecef(x[:, self.part]) * _STRETCH
         return _is_blocked(point[:, None], self.place, self.present, self.angular, reach * float(_STRETCH.max()))
 
 
-# Stretched along the axis the ellipsoid is the unit sphere, and lines stay lines.
+# Factors that turn the ellipsoid into the unit sphere; straight lines stay straight.
 _STRETCH = np.array([1.0, 1.0, 1.0 / (1.0 - WGS84_F)]) / WGS84_A
 
 
 def sights(problem: Problem) -> list[Sight]:
-    """Return the lines of sight of all targets of a flat batch; none in plain Cartesian frames."""
+    """Return the lines of sight of all targets of a flat batch; empty in plain Cartesian frames."""
     if not problem.frame.geodetic or problem.dimension != 3:
         return []
     found, position = list[Sight](), problem.stations.position
@@ -93,14 +96,14 @@ def sights(problem: Problem) -> list[Sight]:
         if motion.known is not None or motion.span == "epoch":
             continue
         slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
-        epoch, station, heard, seen = _heard(problem, target)
+        epoch, station, measured, angular = _measured_by(problem, target)
         part = slice(slot.start, slot.start + 3)
-        found.append(Sight(problem.frame, part, station, place[:, epoch, station], heard, seen))
+        found.append(Sight(problem.frame, part, station, place[:, epoch, station], measured, angular))
     return found
 
 
-def _heard(problem: Problem, target: int) -> tuple[Array, Array, Array, Array]:
-    """Return epochs and stations (k,) that measure a target, in which problems (N, k), and in which by an angle.
+def _measured_by(problem: Problem, target: int) -> tuple[Array, Array, Array, Array]:
+    """Return the epochs and stations (k,) that measure a target, with flags (N, k) for any row and for an angle.
 
     Parameters
     ----------
@@ -124,14 +127,14 @@ def _heard(problem: Problem, target: int) -> tuple[Array, Array, Array, Array]:
                 if model.quantity == "angle":
                     sighted[key] = sighted.get(key, none) | present[:, i]
     epoch, station = np.array(list(found), dtype=int).reshape(-1, 2).T
-    heard, seen = (np.empty((len(weight), len(found)), dtype=bool) for _ in range(2))
+    measured, angular = (np.empty((len(weight), len(found)), dtype=bool) for _ in range(2))
     for k, key in enumerate(found):
-        heard[:, k], seen[:, k] = found[key], sighted.get(key, none)
-    return epoch, station, heard, seen
+        measured[:, k], angular[:, k] = found[key], sighted.get(key, none)
+    return epoch, station, measured, angular
 
 
 def _is_blocked(point: Array, station: Array, present: Array, angular: Array, reach: float) -> Array:
-    """Return whether the line from point to station dips too deep; unit sphere coordinates.
+    """Return flags (...) of lines from point to station that pass too deep below the surface; unit sphere coordinates.
 
     Parameters
     ----------
@@ -140,23 +143,23 @@ def _is_blocked(point: Array, station: Array, present: Array, angular: Array, re
     present, angular : bool array (...)
         Whether the station has a row, and whether it has an angle.
     reach : float
-        How much deeper it has to dip.
+        Further depth that a line must reach to count.
     """
     satellite = (station**2).sum(-1) > SATELLITE**2
     limit = np.where(satellite, GRAZE, GROUND)
     line = station - point
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         outside = angular | satellite | ((point**2).sum(-1) > SATELLITE**2)
-        # the point of the segment next to the centre; at its ends nothing lies in between
+        # the point of the segment nearest to the centre; if it is the far end, nothing is in between
         share = np.clip(-(point * line).sum(-1) / (line**2).sum(-1), 0.0, 1.0)
         nearest = ((point + share[..., None] * line) ** 2).sum(-1)
     return np.asarray(present & outside & (share > 0.0) & (nearest < (limit - reach) ** 2))
 
 
 def lowest_sight(problem: Problem, x: Array) -> Array:
-    """Return the sine of the lowest elevation (N,) at which targets x (N, size) see satellites that hear them.
+    """Return the sine (N,) of the lowest elevation of a satellite with rows, as seen from targets x (N, size).
 
-    Zero in plain Cartesian frames and without satellites: a rule to order positions that fit equally well.
+    Zero in plain Cartesian frames and without satellites. It ranks positions that fit equally well.
     """
     worst = np.full(len(x), np.inf)
     if not problem.frame.geodetic or problem.dimension != 3:
@@ -169,9 +172,9 @@ def lowest_sight(problem: Problem, x: Array) -> Array:
         slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
         point = problem.frame.to_ecef(x[:, slot.start : slot.start + 3])
         up = np.stack(geodetic_normal((point[:, 0], point[:, 1], point[:, 2])), axis=-1)
-        epoch, station, heard, _ = _heard(problem, target)
+        epoch, station, measured, _ = _measured_by(problem, target)
         line = stations[:, epoch, station] - point[:, None]
-        high = heard & ((stations[:, epoch, station] ** 2).sum(-1) > (SATELLITE * WGS84_A) ** 2)
+        high = measured & ((stations[:, epoch, station] ** 2).sum(-1) > (SATELLITE * WGS84_A) ** 2)
         sine = (line * up[:, None]).sum(-1) / np.sqrt((line**2).sum(-1))
         worst = np.minimum(worst, np.where(high, sine, np.inf).min(-1, initial=np.inf))
     return np.where(np.isfinite(worst), worst, 0.0)
@@ -180,12 +183,12 @@ def lowest_sight(problem: Problem, x: Array) -> Array:
 Descend = Callable[[Problem, Array, Array, Face], tuple[Array, Array, Array]]
 """Maps problems, starts (M, size), the problem of each start (M,) and a face to points, costs and statuses there."""
 
-# Candidates from which each face is searched: the cheapest ones that break a constraint lie beyond the face that will
-# hold, and its minimum is next to one of them. Each costs a refinement on every face.
+# Starts on each face: the cheapest candidates. Those that break a constraint are beyond the face that will be active,
+# and its minimum is next to one of them. Each start takes a refinement on every face.
 _STARTS = 3
 
 
-# As many steps as `lsr` takes: minima on a face must be as finished as minima inside.
+# As many steps as in `lsr`: minima on a face must converge as well as minima inside.
 _STEPS = 100
 
 
@@ -200,26 +203,28 @@ def by_least_squares(problem: Problem, start: Array, item: Array, face: Face) ->
 
 
 def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares) -> Pool:
-    """Return the feasible candidates of a flat batch, with those on faces added where the cheapest breaks a constraint.
+    """Return the feasible candidates of a flat batch, with candidates on faces if the cheapest breaks a constraint.
 
-    A target that the Earth hides from a station which hears it is not feasible either.
+    A target that the Earth hides from a station with a row of it is not feasible either.
 
-    Every set of inequalities that can hold with equality together is a face. The cost is minimised on each from the
-    cheapest candidates, and what is feasible competes: the cheapest meets the conditions of Karush, Kuhn and Tucker.
+    A face is a set of inequalities that can hold with equality together. The cost is minimised on each face from the
+    cheapest candidates, and the feasible results compete. The cheapest one meets the conditions of Karush, Kuhn and
+    Tucker.
 
     Parameters
     ----------
     problem : Problem
         N problems with constraints.
     pool : Pool
-        Refined under the equalities alone.
+        Refined under the equalities only.
     descend : callable
-        Minimises the cost of the pool on a face: of problems, starts, the problem of each start, and the face.
+        Minimises the cost of the pool on a face; its arguments are problems, starts, the problem of each start, and the
+        face.
 
     Returns
     -------
     Pool
-        Infeasible ones have infinite cost and status `infeasible`.
+        Infeasible candidates have infinite cost and status `infeasible`.
     """
     broken = _breaks(problem, pool)
     if not broken.any():
@@ -228,18 +233,18 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
 
 
 def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Pool:
-    """Return the pool of `bound_pool` where some candidates (N, q) are broken."""
+    """Return the pool of `bound_pool` for candidates of which `broken` (N, q) break a constraint."""
     sides = faces(problem)
     first = np.argmin(np.where(np.isfinite(pool.cost), pool.cost, np.inf), axis=1)
     needy = np.flatnonzero(broken[np.arange(len(first)), first])
     refused = np.where(broken & (pool.code == Status.OK) & _fits(pool, pool.cost), pool.cost, np.inf)
     kept = replace(_without(pool, broken), hidden=_first_told(_name_hidden(problem, pool.x, refused), pool.hidden))
-    # where the cheapest is feasible it is the answer, and without inequalities there is no other face
+    # a feasible cheapest candidate is the answer, and without inequalities there is no other face
     if not len(needy) or sides == [exact(problem)]:
         return kept
     starts, strata = _cheapest(pool, needy), strata_of(problem)
     starts = starts if strata is None else in_every_layer(strata, starts)
-    # face 0 has no inequality: what lies on it is in the pool already
+    # face 0 has no inequality, and its minima are in the pool already
     on_faces = [_on_face(problem, sides, number, needy, starts, descend) for number in range(1, len(sides))]
     size, width = len(pool.x), starts.shape[1] * len(on_faces)
     x = np.full((size, width, pool.x.shape[-1]), np.nan)
@@ -264,9 +269,10 @@ def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Poo
 
 
 def _keep_misfits(problem: Problem, before: Pool, broken: Array, pool: Pool) -> Pool:
-    """Return a pool with minima that fit badly behind the Earth, where no minimum in sight was found.
+    """Return a pool that keeps misfits behind the Earth for problems without a visible minimum.
 
-    A wrong row may move the best minimum of a good network there: then the misfit is the reason, not the horizon.
+    A wrong row may move the best minimum of a good network behind the Earth. Then the reason is the misfit, not the
+    horizon.
     """
     unseen = ~((pool.code == Status.OK) & np.isfinite(pool.cost)).any(1)
     back = broken & unseen[:, None] & (before.code == Status.OK) & ~_fits(before, before.cost)
@@ -281,19 +287,19 @@ def _keep_misfits(problem: Problem, before: Pool, broken: Array, pool: Pool) -> 
 
 
 def _fits(pool: Pool, cost: Array) -> Array:
-    """Return which costs (N, q) noise explains; all of a pool with a loss, whose costs have no such test."""
+    """Return flags (N, q) of costs that noise explains; all True for a robust loss, which has no chi-square test."""
     if pool.loss:
         return np.ones(cost.shape, dtype=bool)
     return ~(tail_probability(cost, pool.dof[:, None]) < P_MISFIT)
 
 
 def without_broken(problem: Problem, pool: Pool) -> Pool:
-    """Return candidates of which those that break a constraint, or are hidden, have infinite cost."""
+    """Return a pool in which candidates that break a constraint, or are hidden, have infinite cost."""
     return _without(pool, _breaks(problem, pool))
 
 
 def _breaks(problem: Problem, pool: Pool) -> Array:
-    """Return which candidates break a constraint, or stand where the Earth hides them from a station."""
+    """Return flags (N, q) of candidates that break a constraint, or that the Earth hides from a station."""
     broken = np.zeros(pool.cost.shape, dtype=bool)
     item, slot = np.nonzero(np.isfinite(pool.x).all(-1))
     if len(item) and (problem.constraints or problem.frame.geodetic):
@@ -303,12 +309,13 @@ def _breaks(problem: Problem, pool: Pool) -> Array:
 
 
 def _without(pool: Pool, broken: Array) -> Pool:
+    """Return a pool in which the candidates `broken` (N, q) are infeasible, with infinite cost."""
     cost = np.where(broken, np.inf, pool.cost)
     return replace(pool, cost=cost, code=np.where(broken, np.int8(Status.INFEASIBLE), pool.code))
 
 
 def _cheapest(pool: Pool, items: Array) -> Array:
-    """Return the cheapest candidates (items, q, size) of some problems; NaN where there are fewer."""
+    """Return the cheapest candidates (items, q, size) of some problems; NaN in empty slots."""
     order = np.argsort(pool.cost[items], axis=1, kind="stable")[:, :_STARTS]
     x = np.take_along_axis(pool.x[items], order[..., None], axis=1)
     good = np.isfinite(np.take_along_axis(pool.cost[items], order, axis=1))
@@ -318,14 +325,14 @@ def _cheapest(pool: Pool, items: Array) -> Array:
 def _on_face(
     problem: Problem, sides: list[Face], number: int, items: Array, starts: Array, descend: Descend
 ) -> tuple[Array, ...]:
-    """Return x, cost, code and face (items, q) of the minima on one face, and the costs of those that are refused."""
+    """Return x, cost, code and face (items, q) of the minima on one face, and the costs of infeasible minima."""
     shape = starts.shape[:2]
     cost, code = np.full(shape, np.inf), np.full(shape, int(Status.INFEASIBLE), dtype=np.int8)
     x = np.array(starts)
     row, slot = np.nonzero(np.isfinite(starts).all(-1))
     x[row, slot], found, status = descend(problem, starts[row, slot], items[row], sides[number])
     part = problem.take(items[row])
-    # a minimum on a face may break another constraint; the face of both is tried as well
+    # a minimum on a face may break another constraint; the face of both constraints is tried too
     inside = (violation(part, x[row, slot]) <= TOLERANCE) & ~is_hidden(part, x[row, slot]) & np.isfinite(found)
     cost[row, slot] = np.where(inside, found, np.inf)
     code[row, slot] = np.where(inside, status, np.int8(Status.INFEASIBLE))
@@ -335,10 +342,10 @@ def _on_face(
 
 
 def is_minimum(problem: Problem, face: Face, x: Array) -> Array:
-    """Return a flag (N,) for each minimum along a face (N, size) that is a minimum of all admitted positions.
+    """Return flags (N,) of minima x (N, size) along a face that are minima of all admitted positions.
 
-    It meets every constraint, the Earth hides it from no station with a row of it, and the cost grows inwards from the
-    face: the conditions of Karush, Kuhn and Tucker.
+    The minimum must meet every constraint and be visible from every station with a row of it. The cost must grow from
+    the face inwards: the conditions of Karush, Kuhn and Tucker.
     """
     good = (violation(problem, x) <= TOLERANCE) & ~is_hidden(problem, x)
     if len(x) and len(face) > len(exact(problem)):
@@ -352,7 +359,7 @@ _BESIDE = 1e-6
 
 
 def _inwards(problem: Problem, face: Face, x: Array) -> Array:
-    """Return points (N, size) a little inside of a face: on a plane of symmetry a saddle has no slope."""
+    """Return points (N, size) slightly inside a face: on a plane of symmetry a saddle has no slope."""
     gradients = levels(problem, face, x)[1]
     sense = np.array([outwards(problem, level) for level in face])
     away = (sense[:, None] * gradients).sum(1)
@@ -368,10 +375,10 @@ def _inwards(problem: Problem, face: Face, x: Array) -> Array:
 
 
 def _falls(problem: Problem, sides: list[Face], inside: Array, x: Array, cost: Array, face: Array) -> Array:
-    """Return a flag for each minimum on a face (N, q) from which the cost falls inwards, unless it is the least found.
+    """Return flags (N, q) of minima on faces from which the cost falls inwards, except for the cheapest minimum.
 
-    `inside` (N,) is the least cost of a minimum on no face. The least of all minima is one of all that is admitted. A
-    descent may have missed it: then the best that was found stays.
+    `inside` (N,) is the least cost of a minimum on no face. The cheapest of all minima is always a minimum of the
+    admitted positions. If a descent missed it, the best minimum found is kept.
     """
     held = np.zeros(cost.shape, dtype=bool)
     for number in range(1, len(sides)):
@@ -381,16 +388,16 @@ def _falls(problem: Problem, sides: list[Face], inside: Array, x: Array, cost: A
     return np.asarray(~held & (cost >= least[:, None]))
 
 
-# What the Earth hides is told, not dropped.
+# Sentences about hidden minima.
 
-# Minima that a sentence places, and stations that it names for each; the others are counted.
+# Minima that a sentence locates, and stations that it names for each; further ones are counted.
 _PLACED, _NAMED = 2, 3
-# Two refinements of one minimum differ by less, relative to coordinates from the Earth's centre.
+# Relative tolerance for two refinements of one minimum, in Earth-centred coordinates.
 _SAME = 1e-6
 
 
 def _name_hidden(problem: Problem, x: Array, cost: Array) -> Array | None:
-    """Return what lies behind the Earth and breaks no constraint, in words (N,), or None in plain Cartesian frames.
+    """Return sentences (N,) about minima behind the Earth that break no constraint, or None in plain Cartesian frames.
 
     Parameters
     ----------
@@ -399,7 +406,7 @@ def _name_hidden(problem: Problem, x: Array, cost: Array) -> Array | None:
     x : array (N, q, size)
         Candidates.
     cost : array (N, q)
-        Their costs; infinite for those that are not refused.
+        Their costs; infinite for candidates that were not refused.
     """
     if not problem.frame.geodetic or problem.dimension != 3:
         return None
@@ -414,12 +421,12 @@ def _name_hidden(problem: Problem, x: Array, cost: Array) -> Array | None:
 
 
 def _first_told(one: Array | None, other: Array | None) -> Array | None:
-    """Return the words (N,) of one where it has some, else of the other."""
+    """Return the sentences (N,) of `one`, and of `other` where `one` is empty."""
     return one if one is None or other is None else np.where(one != "", one, other)
 
 
 def _describe(problem: Problem, x: Array, cost: Array, item: int) -> str:
-    """Return a sentence on the minima (q, size) of problem `item` behind the Earth: costs, places, stations."""
+    """Return a sentence about the minima (q, size) of problem `item` behind the Earth: costs, positions, stations."""
     names = {motion: state_names(motion, len(problem.motions), 0)[0] for motion in range(len(problem.motions))}
     slots = [slot for slot in problem.layout.shared if slot.name in names.values()]
     kept: list[int] = []
@@ -427,9 +434,9 @@ def _describe(problem: Problem, x: Array, cost: Array, item: int) -> str:
         if not any(np.abs(x[i] - x[j]).max() <= _SAME * np.abs(x[j]).max() for j in kept):
             kept.append(int(i))
     lines = (
-        f"{len(kept)} minima, the best of cost {cost[kept[0]]:.3g}, have stations below their horizon"
+        f"{len(kept)} minima, the best with chi-square {cost[kept[0]]:.3g}, have stations below their horizon"
         if len(kept) > 1
-        else f"the only minimum found, of cost {cost[kept[0]]:.3g}, has stations below its horizon"
+        else f"the only minimum found, with chi-square {cost[kept[0]]:.3g}, has stations below its horizon"
     )
     places = []
     for j in kept[:_PLACED]:
@@ -451,5 +458,5 @@ def _below(problem: Problem, x: Array, item: int) -> str:
 
 
 def least_finished(pool: Pool) -> Array:
-    """Return the least cost (N,) of the finished candidates; infinite where there is none."""
+    """Return the least cost (N,) of the finished candidates; infinite without one."""
     return np.asarray(np.where(pool.code == Status.OK, pool.cost, np.inf).min(1, initial=np.inf))

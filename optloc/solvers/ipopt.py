@@ -1,4 +1,7 @@
-"""The maximum-likelihood problem as a nonlinear program for IPOPT: a second opinion on the refinement, one by one."""
+"""The stage "nlp": the maximum-likelihood problem as a nonlinear program for IPOPT, one problem at a time.
+
+It checks the refinement by an independent solver.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ from optloc.solvers.starts.registration import BLOCKS, group_alike
 from optloc.solvers.verdict.judge import judge, surviving_candidates
 from optloc.solvers.verdict.minima import settle
 
-# "1" has programs compiled by the system's C compiler: worth its seconds for many fixes of one large structure
+# "1": the C compiler of the system compiles programs; this takes seconds, for many fixes of one large structure
 _COMPILE = "OPTLOC_COMPILE_NLP"
 
 
@@ -44,25 +47,25 @@ def nlp(problem: Problem, pool: Pool | None) -> Pool:
     problem : Problem
         Flat batch of N problems.
     pool : Pool
-        Where to start.
+        Starts.
 
     Returns
     -------
     Pool
-        Settled; of a long run, the answers for its block averages, refined on all epochs by least squares.
+        Settled. For a long run IPOPT solves block averages, and least squares refines the answers on all epochs.
     """
     if pool is None:
-        raise InvalidProblem("nlp improves a start", "method", "give start= or a method such as 'gtrs+nlp'")
+        raise InvalidProblem("nlp needs a start", "method", "give start= or a method such as 'gtrs+nlp'")
     began = perf_counter()
-    # a program of thousands of rows is slow to build and to solve; least squares behind it has all epochs
+    # a program with thousands of rows is slow to build and to solve; the least squares after it use all epochs
     if is_registration_run(problem) and problem.epochs >= 2 * BLOCKS:
         return lsr(problem, offer(problem, _of_blocks(problem, pool.x), pool, "nlp", began))
-    # IPOPT sees one covariance: station errors of an epoch are noise to it
+    # IPOPT gets one covariance, so station errors of an epoch become noise
     problem = with_station_noise(problem)
     x, shape = pool.x.copy(), pool.x.shape[:2]
     cost, code = np.full(shape, np.inf), np.full(shape, int(Status.NUMERICAL), dtype=np.int8)
     item, slot = pool.occupied
-    # one by one: a program is built for a structure and fed the numbers of each problem
+    # one by one: a program belongs to a structure and takes the numbers of each problem
     for i in np.unique(item):
         one = problem.take(np.array([i]))
         solver = _ScaledProblem(one)
@@ -73,15 +76,15 @@ def nlp(problem: Problem, pool: Pool | None) -> Pool:
         part, points = problem.take(item), x[item, slot]
         face[item, slot] = face_of(part, points) if problem.constraints else 0
         code[item, slot] = _stationary(part, points, code[item, slot], face[item, slot])
-    cost[code == Status.NUMERICAL] = np.inf  # a start on a station has no gradient, and IPOPT's last word is no point
+    cost[code == Status.NUMERICAL] = np.inf  # for instance a start on a station
     weights = np.broadcast_to(problem.weight, (len(pool), problem.count))
     found = without_broken(problem, Pool(x, cost, code, face, weights, pool.dof, pool.stages, missing=pool.missing))
     settled = settle(problem, found, Stage("nlp", f"{len(item)} programs", perf_counter() - began))
-    return replace(settled, refined=False)  # least squares has the last word where it follows
+    return replace(settled, refined=False)  # not refined, so that a following "lsr" runs
 
 
 def _of_blocks(problem: Problem, x: Array) -> Array:
-    """Return the answers (N, C, size) for the block averages of runs from their candidates."""
+    """Return the answers (N, C, size) for the block averages of runs, started from candidates x (N, C, size)."""
     n, out = problem.layout.n_shared, np.full(x.shape, np.nan)
     for items in group_alike(problem):
         blocks = average_blocks(problem.take(items), BLOCKS)
@@ -93,7 +96,7 @@ def _of_blocks(problem: Problem, x: Array) -> Array:
 
 
 def _stationary(problem: Problem, x: Array, code: Array, face: Array) -> Array:
-    """Return `ok` where the next Gauss-Newton step is shorter than 1e-5 sigma, whatever IPOPT calls its own ending."""
+    """Return codes with `ok` where the next Gauss-Newton step is shorter than 1e-5 sigma, for every report of IPOPT."""
     sides, out = faces(problem) if problem.constraints else [()], np.array(code)
     for number in np.unique(face):
         items = np.flatnonzero(face == number)
@@ -108,17 +111,17 @@ def _stationary(problem: Problem, x: Array, code: Array, face: Array) -> Array:
 
 
 class _ScaledProblem:
-    """One problem in units of its own size, with the compiled program of its structure."""
+    """One problem, scaled to order one, with the compiled program of its structure."""
 
     def __init__(self, problem: Problem) -> None:
+        """Scale the problem, and find the program of its structure."""
         self.problem = problem
         shift, size = (value[0] for value in spread_of(problem))
         layout = problem.layout
         unit = np.concatenate(
             [_slot_units(layout.shared, size), np.tile(_slot_units(layout.local, size), layout.epochs)]
         )
-        # positions count from the stations' centre, everything else from zero; lengths and speeds in the stations'
-        # spread
+        # Positions are relative to the centre of the stations, and lengths and speeds are in spreads of the stations.
         centre = np.zeros(layout.size)
         for found in (layout.shared, layout.local):
             for place in found:
@@ -137,10 +140,11 @@ class _ScaledProblem:
         self.prior = _prior(problem, unit, centre)
 
     def from_start(self, start: Array) -> tuple[Array, float, int]:
+        """Return vector (size,), cost and status of the minimum that IPOPT reaches from a start (size,)."""
         begin = (start - self.centre) / self.unit
         try:
             found = self.program.solve(begin, self.z, self.weight, self.data, prior=self.prior)
-        except SolverError:  # of this candidate alone; `recording` has its text
+        except SolverError:  # only this candidate failed; `recording` has the message
             return start, np.inf, int(Status.NUMERICAL)
         code = (
             Status.OK if found.success else Status.MAX_ITERATIONS if "Iteration" in found.status else Status.NUMERICAL
@@ -148,16 +152,17 @@ class _ScaledProblem:
         return found.x * self.unit + self.centre, found.cost, int(code)
 
 
-# Programs take up to a second to build, and some megabytes each: a study of many layouts must not keep them all.
+# Programs take up to a second to build, and some megabytes each: the cache limits the memory of studies of many
+# layouts.
 _PROGRAMS = Cache[Program](64)
-# Iterations of IPOPT at most: far more than a start near a minimum takes, and one that runs away never ends.
+# Most iterations of IPOPT: far more than a start near a minimum takes; a start that runs to infinity never ends.
 _ITERATIONS = 200
-# Squared length of the next Gauss-Newton step, in sigma, at a minimum: IPOPT calls some such endings unfinished.
+# Squared length of the next Gauss-Newton step, in sigma, at a minimum: IPOPT reports some of these ends as unfinished.
 _STATIONARY = 1e-10
 
 
 def _program(problem: Problem, data: int, rows: int) -> Program:
-    """Return the program of a structure, whose parameters are so many data, `rows` of them those of the rows."""
+    """Return the program of a structure with `data` parameters, of which `rows` belong to the rows."""
     choice, compiled = choice_for("nonlinear"), os.environ.get(_COMPILE, "") == "1"
     s = problem.stations
     shapes = tuple(None if a is None else a.shape[-3:] for a in (s.position, s.velocity, s.axes))
@@ -165,12 +170,13 @@ def _program(problem: Problem, data: int, rows: int) -> Program:
         (bool(np.all(b.lower == b.upper)), bool(np.isfinite(b.lower).all()), bool(np.isfinite(b.upper).all()))
         for b in conjunction(problem)
     )
-    # what the program is made of, but no number that it is fed with
+    # everything that shapes the program, but none of its input numbers
     key = (problem.structure, data, shapes, limits, None if choice is None else choice.key, compiled)
     return _PROGRAMS.find(key, lambda: _build(problem, data, rows, choice, compiled))
 
 
 def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compiled: bool) -> Program:
+    """Return a new program for a structure, see `_program`."""
     n = problem.layout.size
 
     def scaled_residual(y: Any, p: Any, z: Any) -> list[Any]:
@@ -189,24 +195,26 @@ def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compil
         equalities=equal,
         inequalities=more,
         diagonal=_independent(problem),
-        settings={"bound_relax_factor": 0.0, "max_iter": _ITERATIONS},  # by default constraints give way by 1e-8
+        settings={"bound_relax_factor": 0.0, "max_iter": _ITERATIONS},  # by default IPOPT relaxes constraints by 1e-8
         choice=choice,
         compiled=compiled,
     )
 
 
 def _slot_units(slots: Any, size: float) -> Array:
+    """Return the unit of each entry of slots: `size` metres for lengths and their rates, else 1."""
     # a unit that begins with m is metres, or metres per something
     units = [np.full(slot.size, size if slot.unit.startswith("m") else 1.0) for slot in slots]
     return np.concatenate([*units, np.zeros(0)])
 
 
 def _independent(problem: Problem) -> bool:
+    """Return whether all rows have independent errors."""
     return all(block.row.shape[1] == 1 for block in problem.noise.blocks)
 
 
 def _whitening(problem: Problem) -> Array:
-    """Return the whitening matrix, or the weights alone where errors are independent."""
+    """Return the whitening matrix, or the weights alone if errors are independent."""
     rows = problem.count
     matrix = np.zeros(rows if _independent(problem) else (rows, rows))
     for whitener in whiten(problem.noise, problem.weight):
@@ -220,7 +228,7 @@ def _whitening(problem: Problem) -> Array:
 
 
 def _add_walks(problem: Problem, mean: Array, information: Array) -> None:
-    """Add what walks say to prior means and information: their steps are zero, of which none moves the mean."""
+    """Add the walks of biases to prior means and information: the steps of a walk are zero on average."""
     layout = problem.layout
     walked = chain_at(problem, np.zeros((1, layout.size)))
     starts = layout.n_shared + layout.n_local * np.arange(layout.epochs)
@@ -229,13 +237,14 @@ def _add_walks(problem: Problem, mean: Array, information: Array) -> None:
     information[own[:-1, :, None], own[1:, None, :]] += walked.link
     information[own[1:, :, None], own[:-1, None, :]] += walked.link.mT
     for bias in walks(problem):
-        # a walk from its prior mean that takes no steps costs nothing
+        # a walk that stays at its prior mean costs nothing
         if bias.sigma is not None:
             place = starts[:, None] + state_columns(layout, bias)[:, 0]
             mean[place] = np.ravel(bias.mean)
 
 
 def _prior(problem: Problem, unit: Array, centre: Array) -> tuple[Array, Array]:
+    """Return the prior mean (size,) and the prior information (size, size) in scaled units."""
     layout = problem.layout
     mean, information = np.zeros(layout.size), np.zeros((layout.size, layout.size))
     for name, value, precision in prior_parts(problem):

@@ -1,4 +1,4 @@
-"""The cost of a problem over the place of its target, everything else at the values that fit best."""
+"""The cost of a problem as a function of the position, and the basins of attraction of iterations."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from optloc.linear.vectors import vectors
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 
-# Steps at most: places far from any fit take their time, most others a dozen.
+# Most steps: positions far from every fix take many, most others a dozen.
 _STEPS = 100
-# Length of the last step, standard deviations: it changes the cost by far less than a contour or colour shows.
+# Length of the last step, standard deviations: its effect on the cost is far below a contour or a colour.
 _SETTLED = 1e-4
-# Standard deviations within which an iteration has reached a fix.
+# Distance in standard deviations within which an iteration has reached a fix.
 _SAME = 0.1
 
 
 def profile_cost(problem: Problem, x: Array, places: Array, held: Array) -> Array:
-    """Return the profile of the maximum-likelihood cost over places.
+    """Return the profile of the maximum-likelihood cost over positions.
 
-    Coordinates of the position that are not held, velocities, biases and the unknowns of single epochs take, by damped
-    Gauss-Newton steps from `x`, the values that fit best at each place.
+    The other unknowns are velocities, biases, unknowns of single epochs, and coordinates that are not fixed. At each
+    position they take their best values, by damped Gauss-Newton steps from `x`.
 
     Parameters
     ----------
     problem : Problem
-        A flat batch of one problem with one target that is sought.
+        A flat batch of one problem with one unknown target.
     x : array (size,)
-        Parameter vector that the search for the others begins at, for instance that of a fix.
+        Parameter vector that starts the search for the other unknowns, for instance a fix.
     places : array (N, d)
         Positions, metres.
     held : array (c, d)
-        Directions along which the position stays at its place, such as east and north.
+        Directions along which the position is fixed, such as east and north.
 
     Returns
     -------
@@ -59,14 +59,14 @@ def profile_cost(problem: Problem, x: Array, places: Array, held: Array) -> Arra
     return refine(many, vectors, tolerance=_SETTLED, limit=_STEPS, face=exact(many)).cost
 
 
-# Where iterations from many starts end: reached, at another minimum, or nowhere.
+# Ends of iterations from many starts: the fix, another minimum, or no minimum.
 
 ITERATIONS = {"taylor": False, "lsr": True}
-"""Iterations from a guess, and whether their steps are damped."""
+"""Iterations from a start, and whether their steps are damped."""
 
 
 class End(IntEnum):
-    """How an iteration ended."""
+    """The way in which an iteration ended."""
 
     REACHED = 0
     ELSEWHERE = 1
@@ -75,36 +75,36 @@ class End(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Basins:
-    """Where a method leads from many starts.
+    """Results of an iteration from many starts: which starts reach the fix.
 
     Parameters
     ----------
     method : str
         A key of `ITERATIONS`.
     ends : int array (...)
-        `End` of each start: the fix was reached, another stationary point was, or the iteration ran away, circled or
-        stopped where the geometry is singular.
+        `End` of each start: at the fix, at another stationary point, or at no point. The latter means that the
+        iteration ran to infinity, circled, or stopped at a singular geometry.
     """
 
     method: str
     ends: Array
 
     def share(self, end: End) -> float:
-        """Return the share of starts that ended in one way."""
+        """Return the share of starts with a given end."""
         return float((self.ends == end).mean())
 
 
 def basins(problem: Problem, fix: Fix, places: Array, method: str = "taylor") -> Basins:
-    """Return where iterations from given places end.
+    """Return the ends of iterations from given positions.
 
-    A start is a position; emission times begin at what fits it, everything else at its prior mean or zero.
+    A start is a position. Emission times start at the values that fit it, other unknowns at their prior mean or zero.
 
     Parameters
     ----------
     problem : Problem
-        A single problem with one target that stands for the run.
+        A single problem with one target whose state lasts the run.
     fix : Fix
-        Its fix: what should be reached, to a tenth of a standard deviation.
+        Its fix, which an iteration reaches if it ends within a tenth of a standard deviation.
     places : array (..., d)
         Starting positions, metres.
     method : str
@@ -123,7 +123,7 @@ def basins(problem: Problem, fix: Fix, places: Array, method: str = "taylor") ->
     if method not in ITERATIONS:
         raise InvalidProblem(f"unknown iteration {method!r}", "method", f"use one of {', '.join(ITERATIONS)}")
     if not np.isfinite(fix.x).all() or not np.isfinite(fix.cov).all():
-        raise InvalidProblem("there is no fix that a start could reach", "fix", "see its status for the reason")
+        raise InvalidProblem("there is no fix for a start to reach", "fix", "see its status for the reason")
     flat = problem.flat()
     starts = vectors(flat, places.reshape(1, -1, places.shape[-1]))[0]
     done = refine(flat, starts, item=np.zeros(len(starts), dtype=int), damped=ITERATIONS[method])

@@ -76,6 +76,7 @@ def strata_of(problem: Problem, face: Face = ()) -> Strata | None:
 
 
 def _holds_depth(problem: Problem, level: Level) -> bool:
+    """Return whether a constraint determines the third coordinate of the target."""
     band = problem.constraints[level.constraint]
     if not isinstance(band, Band):
         return False

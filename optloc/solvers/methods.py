@@ -1,4 +1,4 @@
-"""Methods: pipelines as data, made of words that name stages."""
+"""Methods: pipelines of stages, written as words such as "gtrs+lsr"."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ from optloc.solvers.stages import Solver
 from optloc.solvers.suspect_rows.stage import suspect
 from optloc.solvers.verdict.judge import judge, surviving_candidates
 
-# The back end that holds for a stretch of code (`formulations.backend`), for layers that know formulations from here.
+# `Choice`, `Kind`, `counting` and `using` of `formulations.backend` are exported here for layers that do not import
+# `formulations`.
 __all__ = [
     "FORMULATIONS",
     "METHODS",
@@ -59,12 +60,12 @@ class SolverEntry:
     summary : str
         One line for listings.
     role : "start" or "refinement"
-        Whether it needs no fix before it, or improves one.
+        Whether it needs no fix before it, or improves a fix.
     stage : callable, optional
-        ``(problem, pool or None) -> pool``: takes the place of `solver` among optloc's own stages.
+        ``(problem, pool or None) -> pool``: replaces `solver` for optloc's own stages.
     batched : bool
-        Whether it works on a batch at a time. Any other is taken to go one by one: too small a chunk of a study costs a
-        file, too large a one the work of minutes when a run is stopped.
+        Whether it solves a batch at a time; other solvers go one by one. A study sizes its chunks by this: too small a
+        chunk costs a file, and too large a chunk loses minutes of work when a run is stopped.
     """
 
     solver: FixSolver | None
@@ -83,7 +84,8 @@ class SolverEntry:
 
 
 def _nlp(problem: Problem, pool: Pool | None) -> Pool:
-    from optloc.solvers.ipopt import nlp  # IPOPT is loaded when it is used
+    """Return the pool of `optloc.solvers.ipopt.nlp`."""
+    from optloc.solvers.ipopt import nlp  # IPOPT is loaded on first use
 
     return nlp(problem, pool)
 
@@ -91,10 +93,11 @@ def _nlp(problem: Problem, pool: Pool | None) -> Pool:
 def compare_bounds(problem: Problem, pool: Pool | None) -> Pool:
     """Return a pool whose certificates compare costs with the lower bound of a relaxation: the stage "bound".
 
-    The first formulation whose bound holds for the rows decides; fixes that are proven already stay as they are.
+    The first formulation with a bound for the rows is used. Certificates of fixes that are already proven do not
+    change.
     """
     if pool is None:
-        raise InvalidProblem("bound examines a fix", "method", "put it behind a refinement")
+        raise InvalidProblem("bound needs a fix", "method", "put it after a refinement, as in 'gtrs+lsr+bound'")
     began, fix = perf_counter(), judge(problem, pool)
     for formulation in FORMULATIONS.values():
         found = None if formulation.bound is None else formulation.bound(problem, fix)
@@ -104,7 +107,7 @@ def compare_bounds(problem: Problem, pool: Pool | None) -> Pool:
         proven = claims_before(pool)
         for i in known:
             before = fix.claims.proof[i]
-            # a proof of the whole space stays, one of a region gives way only to a tight bound
+            # a global proof stays; a proof over a region is replaced only by a tight bound
             if before != GLOBAL and (tight[i] or before != REGION):
                 proven.write(i, _claim(float(fix.cost[i]), float(found.bound[i]), bool(tight[i]), found.method))
         stage = Stage("bound", f"{int(tight[known].sum())} of {len(tight)} proven", perf_counter() - began)
@@ -113,17 +116,20 @@ def compare_bounds(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def _claim(cost: float, bound: float, tight: bool, name: str) -> Claims:
-    reason = "no position has a lower chi-square" if tight else f"a lower bound leaves a gap of {cost - bound:.2g}"
+    """Return the claim from a lower bound of a relaxation; a tight bound is a global proof of the value."""
+    reason = "no position costs less" if tight else f"a lower bound leaves a gap of {cost - bound:.2g}"
     text = f"{reason}; other minima were searched for, not excluded"
     proof = "global" if tight else "local"
     return claim(Certificate(proof, text, f"{name.removesuffix('s')} relaxation", bound, cost - bound))
 
 
 def _start(stage: Solver, summary: str, *, batched: bool = False) -> SolverEntry:
+    """Return the table entry of a stage that needs no fix before it."""
     return SolverEntry(None, summary, "start", stage, batched)
 
 
 def _refinement(stage: Solver, summary: str, *, batched: bool = False) -> SolverEntry:
+    """Return the table entry of a stage that improves a fix."""
     return SolverEntry(None, summary, "refinement", stage, batched)
 
 
@@ -132,26 +138,30 @@ _STAGES: dict[str, SolverEntry] = {
     "roots": _start(stages.roots, "every stationary point of the squared-range problem", batched=True),
     "sdp": _start(stages.start_with("sdp"), "Shor's semidefinite relaxation of the squared-range problem (Clarabel)"),
     "socp": _start(stages.start_with("socp"), "second-order cone relaxation of the squared-range problem (Clarabel)"),
-    "sparse": _start(sparse, "convex start in which a few rows are grossly wrong, and the fix without them (Clarabel)"),
+    "sparse": _start(sparse, "convex start for a few gross errors, and the fix without these rows (Clarabel)"),
     "wiv": _start(stages.start_with("wiv"), "pseudo-linear angles with an instrumental-variable pass", batched=True),
     "directions": _start(
         stages.start_with("directions"), "semidefinite relaxation over unit directions (Clarabel); angles"
     ),
     "minimax": _start(
-        stages.start_with("minimax"), "least worst angle by second-order cones (Clarabel); bounded errors"
+        stages.start_with("minimax"), "smallest maximal angle by second-order cones (Clarabel); bounded errors"
     ),
-    "widen": _refinement(stages.add_candidates, "more candidates beside a fix: mirror image, sub-arrays", batched=True),
+    "widen": _refinement(stages.add_candidates, "more candidates for a fix: mirror image, sub-arrays", batched=True),
     "search": _refinement(
         stages.search,
-        "a search for problems still without an answer: by boxes where a proof bounds them, or from many places",
+        "a search for problems without an answer: over boxes if a proof bounds them, or from many positions",
         batched=True,
     ),
     "lsr": _refinement(stages.lsr, "damped Taylor least squares (Gauss-Newton) from every candidate", batched=True),
     "nlp": _refinement(_nlp, "the maximum-likelihood cost by IPOPT from every candidate"),
     "certify": _refinement(
-        certified, "branch and bound: proven best, and no other minimum has a similar chi-square", batched=True
+        certified,
+        "branch and bound: proves that no position costs less, and that no other minimum comes near",
+        batched=True,
     ),
-    "value": _refinement(value_certified, "the same for the cost alone, without other minima: quicker", batched=True),
+    "value": _refinement(
+        value_certified, "a faster proof for the cost alone, which does not exclude other minima", batched=True
+    ),
     "bound": _refinement(compare_bounds, "compares the cost with the bound of a relaxation (Clarabel): angles, ranges"),
     "suspects": _refinement(
         suspect, "leaves out the stations, rows and priors that contradict the rest, and names them"
@@ -163,15 +173,16 @@ _STAGES: dict[str, SolverEntry] = {
 
 
 class _Derived(dict[str, SolverEntry]):
-    """Stages of what other tables hold, also of losses that are made of what their name says."""
+    """Stages from other tables. A loss with a number in its name is made on demand."""
 
     def __missing__(self, name: str) -> SolverEntry:
+        """Return the stage of a loss with a number in its name."""
         loss = LOSSES[name]
         return _start(Robust(loss, states=True), loss.summary)
 
 
 def _derive() -> Mapping[str, SolverEntry]:
-    """Return the stages that follow from other tables: of each loss, and of each start of a formulation."""
+    """Return the stages that follow from other tables: one per loss, and one per start of a formulation."""
     out = _Derived({name: _start(Robust(loss, states=True), loss.summary) for name, loss in LOSSES.items()})
     for formulation in FORMULATIONS.values():
         for word in formulation.starts:
@@ -183,10 +194,10 @@ SOLVERS: Registry[SolverEntry] = Registry(
     "optloc.solvers", lambda value: isinstance(value, SolverEntry), _STAGES, _derive
 )
 
-# Beginnings of methods for which there is a stage that does the same in one.
+# First stages of methods that one combined stage replaces, with the same result.
 SHORTCUTS: Mapping[tuple[str, ...], PlannedStages] = {("gtrs", "lsr"): PlannedStages()}
 
-# What stands behind "|" is for the problems of which not everything is proven by then.
+# The method after "|" runs for problems that are not fully proven by then.
 METHODS = {
     "auto": "gtrs+lsr+certify|roots+lsr+widen+lsr+search+certify",
     "searched": "roots+lsr+widen+lsr+search",
@@ -194,23 +205,23 @@ METHODS = {
     "robust": "roots+lsr+widen+lsr+search+suspects+certify",
 }
 
-# Endings of back ends that a sentence names; more are not read.
+# Endings of back ends that a sentence names: a longer list does not help.
 _SHOWN = 3
 
-# More candidates change nothing about these, so that nobody has to prove them.
+# Statuses that more candidates do not change, so no proof is needed.
 _SETTLED = (Status.REJECTED, Status.TOO_FEW_ROWS)
 
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A pipeline: stages one after the other, and what takes over where they leave something to prove.
+    """A pipeline of stages, and a second pipeline for problems that the first does not prove.
 
     Parameters
     ----------
     words : tuple of str
         Names of the stages, keys of `SOLVERS`.
     then : Method, optional
-        For the problems of which not everything is proven by then; what was found competes in it.
+        Method for the problems that are not fully proven; minima found before stay candidates.
     """
 
     words: tuple[str, ...]
@@ -228,7 +239,7 @@ class Method:
 
     @property
     def branches(self) -> Iterator[Method]:
-        """Yield the method and all that take over from it."""
+        """Yield the method and all methods that follow it."""
         method: Method | None = self
         while method is not None:
             yield method
@@ -236,11 +247,11 @@ class Method:
 
     @property
     def entries(self) -> list[SolverEntry]:
-        """Return what its words name, those of all branches."""
+        """Return the table entries of its words, from all branches."""
         return [SOLVERS[word] for branch in self.branches for word in branch.words]
 
     def runs(self, count: int) -> list[Solver]:
-        """Return the stages for so many problems, in as few as do the same."""
+        """Return the stages for `count` problems, with combined stages where available."""
         for words, short in SHORTCUTS.items():
             name = "+".join(words)
             if shortcut(self):
@@ -252,11 +263,11 @@ class Method:
     def __call__(self, problem: Problem, pool: Pool | None = None) -> Pool:
         """Return the pool of a flat batch of problems.
 
-        Problems beyond the scope of the proof take the last branch alone. So do runs, whose proof takes longer than all
-        starts, and rows with an unknown factor, which closed forms take for one.
+        Three groups of problems take the last branch only. Problems beyond the scope of the proof have no proof. The
+        proof of a run takes longer than all starts. Closed forms set an unknown factor of rows to one.
         """
         branches = list(self.branches)
-        # its first branch would end without a proof, or with one that is made again, and be done for nothing
+        # the first branch would end without a proof, or with a proof that the last branch repeats
         if len(branches) > 1 and (why_unsupported(problem) or is_run(problem) or is_scaled(problem)):
             branches = branches[-1:]
         pool = _run_through(branches[0], problem, pool)
@@ -266,11 +277,12 @@ class Method:
 
 
 def _stage(word: str) -> Solver:
+    """Return the stage of a word, with its name in numerical failures."""
     return _named(word, SOLVERS[word].run)
 
 
 def _named(name: str, solver: Solver) -> Solver:
-    """Return a stage whose numerical failures say where they happened."""
+    """Return a stage whose numerical failures report the name of the stage."""
 
     def stage(problem: Problem, pool: Pool | None) -> Pool:
         with noting_place(name), recording() as endings:
@@ -282,22 +294,23 @@ def _named(name: str, solver: Solver) -> Solver:
 
 
 def _note_failures(pool: Pool, name: str, failed: list[Ending], solves: int) -> Pool:
-    """Return the pool of a stage that says how often its back ends ended without an answer, and what they report."""
-    told = "; ".join(str(ending) for ending in list(dict.fromkeys(failed))[:_SHOWN])
+    """Return the pool of a stage with the number of failed back-end runs, and their reports."""
+    reports = "; ".join(str(ending) for ending in list(dict.fromkeys(failed))[:_SHOWN])
     count = f"{len(failed)} of {solves} solve{'' if solves == 1 else 's'} without an answer"
-    pool = pool.without(np.flatnonzero(pool.empty), f"{name}: {count} ({told})", Status.NUMERICAL)
+    pool = pool.without(np.flatnonzero(pool.empty), f"{name}: {count} ({reports})", Status.NUMERICAL)
     if not pool.stages:
         return pool
     last = pool.stages[-1]
-    return replace(pool, stages=(*pool.stages[:-1], replace(last, detail=f"{last.detail}; {count} ({told})")))
+    return replace(pool, stages=(*pool.stages[:-1], replace(last, detail=f"{last.detail}; {count} ({reports})")))
 
 
 def _run_through(method: Method, problem: Problem, given: Pool | None) -> Pool:
+    """Return the pool after all stages of one branch; given candidates compete with its starts."""
     # a shortcut takes no starts
     first, *others = method.runs(problem.batch_shape[0]) if given is None else map(_stage, method.words)
     pool = first(problem, given)
     if given is not None and pool.curvature is None:
-        # what is given competes with the starts that a stage makes
+        # the given candidates compete with the starts of the stage
         pool = _beside(problem, pool, given.x)
     for stage in others:
         pool = stage(problem, pool)
@@ -305,42 +318,42 @@ def _run_through(method: Method, problem: Problem, given: Pool | None) -> Pool:
 
 
 def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
-    """Return a pool whose unproven problems went through a method, beside what was found before."""
+    """Return a pool whose unproven problems went through a method, together with the candidates found before."""
     fix = judge(problem, pool)
     items = np.flatnonzero(is_unproven(fix))
     if not len(items):
         return pool
     part, (first, *others) = problem.take(items), method.runs(len(items))
     start = first(part, None)
-    # what was found competes: a branch never answers worse than the one before
+    # earlier candidates compete, so that a branch never gives a worse answer than the branch before
     new, before = (
         _beside(part, start, surviving_candidates(take(pool, items), fix[items])),
         tried_before(pool, fix, items),
     )
     for stage in others:
-        # a proof takes most of the time, and is not made again where all else found nothing new
+        # A proof takes most of the time, so it is not repeated if the other stages found no new minimum.
         new = stage(part, replace(new, tried_before=before))
     return replace(pool.merge(items, replace(new, tried_before=None)), stages=(*pool.stages, *new.stages))
 
 
 def _beside(problem: Problem, start: Pool, x: Array) -> Pool:
-    """Return a pool of starts with more of them (N, q, size) beside it."""
+    """Return a pool of starts with additional starts (N, q, size)."""
     both = pack(np.concatenate([start.x, x], axis=1))
     return replace(offer(problem, both, None, "", perf_counter()), stages=start.stages, missing=start.missing)
 
 
 def is_unproven(fix: Fix) -> Array:
-    """Return which fixes (N,) could still change: no proof that all minima within the listed gap are known."""
+    """Return flags (N,) of fixes that could still change: no proof that all minima within the listed gap are known."""
     sure = (fix.claims.proof == GLOBAL) & (fix.claims.margin >= LISTED_GAP)
     return np.asarray(~sure & ~np.isin(fix.code, _SETTLED))
 
 
 def shortcut(method: Method) -> bool:
-    """Return whether a method is one that a single stage does, so that it may be prepared."""
+    """Return whether one combined stage does the whole method, so that it can be prepared."""
     return method.then is None and method.words in SHORTCUTS
 
 
 def is_quick(problem: Problem, method: str) -> bool:
-    """Return whether a method begins with stages that a plan serves: most fixes then take microseconds."""
+    """Return whether a method begins with stages that a plan replaces; most fixes then take microseconds."""
     words = Method.parse(method).words
     return any(words[: len(own)] == own for own in SHORTCUTS) and plan_of(problem) is not None

@@ -1,4 +1,4 @@
-"""What comes from outside: fixes as pools, and solvers that take and return fixes as stages."""
+"""Adapters for external solvers and fixes: a fix as a pool, and a solver of fixes as a stage."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from optloc.solvers.verdict.judge import filled_objects, judge, verdict
 from optloc.solvers.verdict.minima import settle
 
 FixSolver = Callable[[Problem, Fix | None], Fix]
-"""A solver as others write it: it maps a flat batch of problems, and their fixes or None, to fixes."""
+"""An external solver: it maps a flat batch of problems, and their fixes or None, to fixes."""
 
 
 def adapt(solver: FixSolver) -> Solver:
-    """Return a solver of others as a stage."""
+    """Return an external solver as a stage."""
 
     def stage(problem: Problem, pool: Pool | None) -> Pool:
         fix = solver(problem, None if pool is None else judge(problem, pool))
@@ -34,27 +34,27 @@ def adapt(solver: FixSolver) -> Solver:
 
 
 def given(problem: Problem, start: Any) -> Fix:
-    """Return given starts (N, size) or (N, q, size) of a flat batch as fixes that nobody has refined."""
+    """Return given starts (N, size) or (N, q, size) of a flat batch as unrefined fixes."""
     return judge(problem, begin(problem, np.asarray(start, dtype=float)))
 
 
 def judge_points(problem: Problem, start: Array, x: Array, cost: Array, code: Array, stage: Stage) -> Fix:
-    """Return the verdict on points that a solver of others has reached.
+    """Return the fixes, with verdicts, at the points that an external solver reached.
 
     Parameters
     ----------
     problem : Problem
         Flat batch of N problems.
     start : array (N, size) or (N, q, size)
-        Where it began.
+        Starts of the solver.
     x : array (N, q, size)
-        Where it ended.
+        Final points.
     cost : array (N, q)
-        Cost there; infinite where it ended nowhere.
+        Cost at the final points; infinite where the solver failed.
     code : int array (N, q)
-        `Status` that it claims.
+        `Status` that the solver reports.
     stage : Stage
-        What it did.
+        Description of the solver.
     """
     faces = np.zeros(cost.shape, dtype=int)
     found = replace(begin(problem, start), x=x, cost=cost, code=code.astype(np.int8), face=faces)
@@ -62,14 +62,14 @@ def judge_points(problem: Problem, start: Array, x: Array, cost: Array, code: Ar
 
 
 def accept(problem: Problem, fix: Fix) -> Pool:
-    """Return fixes of a flat batch as a pool whose verdict they are.
+    """Return a pool from fixes of a flat batch; the verdict on this pool is the fixes again.
 
-    Starts stay starts. What a verdict cannot find in the numbers of a fix (why there is no answer, what was left out)
-    is taken over word for word.
+    Starts stay starts. Some contents of a fix do not follow from its numbers, such as the cause of a missing answer or
+    the rows left out. The pool holds these fixes unchanged.
     """
     x = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
     shape = x.shape[:2]
-    # nobody has refined them: a verdict would call them minima
+    # unrefined starts need a separate pool: a verdict would treat them as minima
     if np.isnan(fix.cost).all() and (fix.code == Status.UNREFINED).any():
         code = np.full(shape, int(Status.UNAVAILABLE), dtype=np.int8)
         missing = NoStart(np.where(fix.code == Status.UNREFINED, "", fix.reason), fix.code)
@@ -79,10 +79,10 @@ def accept(problem: Problem, fix: Fix) -> Pool:
     # empty slots have infinite gaps
     listed = np.where(np.isfinite(fix.alternatives.gap), int(Status.OK), int(Status.UNAVAILABLE))
     known = np.asarray(np.isfinite(fix.cov).all((-1, -2)))
-    # a fix keeps its covariance alone: what is weak is not known of it, and not needed, as its verdict stands
+    # A fix keeps its covariance, not its smallest pivot. The pivot is not needed, since the status does not change.
     covariance = np.where(known[:, None, None], fix.cov, np.eye(fix.cov.shape[-1]))
     information, regular = linalg.inverse(covariance)
-    if fix.active is not None:  # what constraints hold has no variance: that is no sign of rows that leave it open
+    if fix.active is not None:  # zero variance here comes from a constraint, not from missing rows
         held = np.flatnonzero(_lengths(fix.active) > 0)
         information[held], regular[held] = np.linalg.pinv(covariance[held], _HELD, hermitian=True), True
     marks = np.zeros(len(fix.code), dtype=int) if fix.marks is None else fix.marks
@@ -90,7 +90,7 @@ def accept(problem: Problem, fix: Fix) -> Pool:
     robust = marks & Status.ROBUST.mark != 0
     whole = np.array_equal(fix.weights, np.broadcast_to(problem.weight, fix.weights.shape)) and not robust.any()
     verbatim = ~fix.answered if fix.explanations is None else ~fix.answered | (_lengths(fix.explanations) > 0)
-    # it has another noise than the problem
+    # a rescaled fix has a noise that differs from the problem's
     verbatim = verbatim | (marks & Status.RESCALED.mark != 0)
     return Pool(
         x,
@@ -113,21 +113,23 @@ def accept(problem: Problem, fix: Fix) -> Pool:
     )
 
 
-# Share of the largest variance below which one is the rounding of none.
+# Variances below this share of the largest variance are rounding errors of zero.
 _HELD = 1e-12
 
 
 def _lengths(explanations: Array) -> Array:
+    """Return the lengths (N,) of the tuples in an object array."""
     return np.array([len(found) for found in explanations], dtype=int)
 
 
 def _claims(claims: Claims) -> Claims:
-    """Return claims of which those that say nothing are as if nobody had tried."""
+    """Return the claims, with empty claims marked as not tried."""
     nothing = (claims.reason == NO_PROOF.reason) | (claims.reason == NO_ANSWER.reason)
     return merged_claims(nothing, empty_claims(len(nothing)), claims)
 
 
 def _verbatim(fix: Fix, items: Array) -> Array:
+    """Return an object array (N,) with the fixes of flagged items, and None for the others."""
     out = filled_objects(len(fix), None)
     for i in np.flatnonzero(items):
         out[i] = fix[int(i)]

@@ -1,4 +1,4 @@
-"""Fixes by plans; what is not plainly good takes the stages of the long way."""
+"""Fixes by plans of the engine. Fixes with a complication take the stages of the method."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from optloc.solvers.verdict.minima import likelihood_of, measure_curvature
 
 @dataclass(frozen=True, slots=True)
 class PlannedStages:
-    """The stages "gtrs" and "lsr" as one, by a plan where there is one.
+    """The stages "gtrs" and "lsr" combined, by a plan of the engine if there is one.
 
     Parameters
     ----------
     alone : bool
-        Whether nothing follows: then the mirror image of the start is refined on the way of the stages, too. What
-        follows otherwise looks for other minima by itself.
+        Whether no stage follows. Then the stages also refine the mirror image of the start. Otherwise the later stages
+        search for other minima.
     """
 
     alone: bool = False
@@ -73,32 +73,32 @@ def settle_by_plan(
     refinement: Callable[[Problem, Pool], Pool] = lsr_with_mirror,
     threads: int | None = None,
 ) -> Pool:
-    """Return the settled pools of measurements: by a plan where the answer is plain, else by other means.
+    """Return the settled pools of measurements: by a plan, or by stages for answers with a complication.
 
     Parameters
     ----------
     plan : Plan
-        Of the problems.
+        Plan of the problems.
     load : Load
-        Of the plan.
+        Arguments of the plan.
     z : array (N, m)
         Measurements.
     problems_at : callable
-        Maps the numbers of problems whose answer is not plain to the problems.
+        Maps the numbers of problems whose answer has a complication to the problems.
     refinement : callable
-        What takes the starts of those that are not plain by any means.
+        Refines the starts of the problems that the plan cannot settle.
     threads : int, optional
-        At most so many; as many as `optloc.base.threads.thread_count` says if absent.
+        Most threads; by default the value of `optloc.base.threads.thread_count`.
     """
     began = perf_counter()
     answer, steps = plan.run(load, z, threads)
     left = np.flatnonzero(~answer.settled)
     if not len(left):
         return _with_sides(_pool(plan, _preferred(answer, problems_at), steps, began), problems_at)
-    # most of what is left lacks nothing but a start: the eigenvalues of its pencil give one
+    # most of these problems only need another start, which the eigenvalues of the pencil give
     some = problems_at(left)
     start = in_parts(some, lambda part, _: gtrs(part, None))
-    alone = np.isfinite(start.x).all(-1).sum(1) == 1  # where there are several, all of them compete
+    alone = np.isfinite(start.x).all(-1).sum(1) == 1  # if there are several starts, all of them compete
     more, again = plan.run(load.take(left), z[left], threads, np.where(alone[:, None], start.x[:, 0], np.nan))
     for whole, part in zip(answer, more, strict=True):
         whole[left] = part
@@ -111,7 +111,7 @@ def settle_by_plan(
 
 
 def _preferred(answer: Answer, problems_at: Callable[[Array], Problem]) -> Answer:
-    """Return the answer with the likelier by its place of two minima that cost the same, as the verdict has it."""
+    """Return the answer in which the likelier position comes first if two minima cost the same, as in the verdict."""
     tied = np.flatnonzero(answer.settled & (np.abs(answer.rival_cost - answer.cost) <= equal_cost(answer.cost)))
     if not len(tied):
         return answer
@@ -126,12 +126,12 @@ def _preferred(answer: Answer, problems_at: Callable[[Array], Problem]) -> Answe
     number[items, COST_OF_FIX], number[items, COST_OF_RIVAL] = answer.rival_cost[items], answer.cost[items]
     at = x[items]
     covariance[items] = measure_curvature(some, equations_at(some, at), at, np.zeros(len(at), dtype=int)).covariance
-    number[items, KAPPA:] = np.nan  # the verdict looks at its shape
+    number[items, KAPPA:] = np.nan  # the verdict computes the shape
     return answer._replace(x=x, rival=rival, number=number, covariance=covariance)
 
 
 def _pool(plan: Plan, answer: Answer, steps: int, began: float) -> Pool:
-    """Return the pool of fixes that were found directly, with a second slot where some have a rival."""
+    """Return the pool of fixes from a plan, with a second slot if some fixes have a rival."""
     count, seconds = len(answer.cost), perf_counter() - began
     rivalled = np.isfinite(answer.rival_cost) & answer.settled
     x, cost = answer.x[:, None], answer.cost[:, None]
@@ -140,7 +140,7 @@ def _pool(plan: Plan, answer: Answer, steps: int, began: float) -> Pool:
         rival = np.where(rivalled[:, None], answer.rival, np.nan)
         x = np.concatenate([x, rival[:, None]], axis=1)
         cost = np.stack([answer.cost, np.where(rivalled, answer.rival_cost, np.inf)], axis=1)
-        # an empty slot is one that nobody has refined
+        # an empty slot has no refinement
         second = np.where(rivalled, np.int8(Status.OK), np.int8(Status.UNAVAILABLE))
         code = np.concatenate([code, second[:, None]], axis=1)
     return Pool(
@@ -160,7 +160,7 @@ def _pool(plan: Plan, answer: Answer, steps: int, began: float) -> Pool:
 
 
 def _with_sides(pool: Pool, problems_at: Callable[[Array], Problem]) -> Pool:
-    """Return a settled pool in which both sides of the plane of the stations are one region, where they are."""
+    """Return a settled pool in which both sides of the plane of the stations are one region, if the data allow both."""
     assert pool.curvature is not None
     assert pool.curvature.kappa is not None
     assert pool.plain is not None
@@ -174,7 +174,7 @@ def _with_sides(pool: Pool, problems_at: Callable[[Array], Problem]) -> Pool:
 
 
 def active_of(plan: Plan, multiplier: Array) -> Array | None:
-    """Return the constraints (N,) that hold fixes, with their multipliers (N, k); None where none does."""
+    """Return the constraints (N,) that hold fixes, with their multipliers (N, k); None if no constraint does."""
     if not plan.held:
         return None
     out = np.empty(len(multiplier), dtype=object)
@@ -187,11 +187,11 @@ _STARTED = Stage("gtrs", "1 candidates at most", 0.0)
 
 
 def planned_stages(count: int, steps: int, seconds: float) -> tuple[Stage, ...]:
-    """Return the stages that so many fixes went through at once, and the most steps that one took."""
+    """Return the stages of `count` fixes from a plan, with the largest number of steps."""
     return _STARTED, Stage("lsr", f"{count} candidates, {steps} steps at most", seconds)
 
 
-# Runs of targets that are free at each epoch: the plan of an epoch starts them, and one call refines them together.
+# Runs of targets that are free at each epoch: the plan of an epoch starts them, and one call refines all epochs.
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,13 +203,13 @@ class RunPlan:
     rows : int array (k, r)
         Rows of each epoch.
     epoch : Plan
-        Of an epoch without biases.
+        Plan of an epoch without biases.
     load : Load
-        Of this plan.
+        Arguments of this plan.
     added, gain : array (r,)
-        Known biases and corrections of the rows of an epoch, and scales.
+        Known biases plus corrections of the rows of an epoch, and known scales.
     columns : int array (l,)
-        Entry of an epoch's fix for each unknown of an epoch; -1 for none.
+        Entry of the fix of an epoch for each unknown of an epoch; -1 without an entry.
     x : array (size,)
         Start of all other unknowns.
     runs : PackedRuns
@@ -232,7 +232,7 @@ class RunPlan:
     dof: int
 
     def settle(self, problem: Problem, otherwise: Callable[[Problem], Pool]) -> Pool:
-        """Return the settled pools of a flat batch of N runs; those that are not plainly good take another way."""
+        """Return the settled pools of a flat batch of N runs; `otherwise` settles runs with a complication."""
         from optloc.kernels.runs import fixed_runs
 
         began, count = perf_counter(), problem.batch_shape[0]
@@ -270,9 +270,9 @@ _RUNS = Cache["RunPlan | None"](64)
 
 
 def run_plan_of(problem: Problem) -> RunPlan | None:
-    """Return the plan of runs of one target that is free at each epoch, or None where they have none.
+    """Return the plan of runs of one target that is free at each epoch, or None without a plan.
 
-    Stations stay, and a batch differs in measurements alone.
+    The stations must be at rest, and a batch may differ in measurements only.
     """
     motion = problem.motions[0]
     free = len(problem.motions) == 1 and (motion.order, motion.span) == (0, "epoch") and motion.known is None
@@ -284,6 +284,7 @@ def run_plan_of(problem: Problem) -> RunPlan | None:
 
 
 def _plan_run(problem: Problem) -> RunPlan | None:
+    """Return a new plan for runs of the structure of a problem, or None if it cannot be planned."""
     found = folding(problem)
     if found is None or not enabled():
         return None

@@ -1,4 +1,7 @@
-"""The pool: the candidates that stages hand on, and what is known of them; only the verdict makes a fix of it."""
+"""The pool: the candidates of a batch of problems, with costs, weights and proofs, which stages pass on.
+
+Only the verdict turns a pool into fixes.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +25,10 @@ from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 
 PART = 2**15
-"""Problems that are worked on at a time: beyond it arrays of a part no longer fit the caches and memory grows."""
+"""Problems per part of a batch: for more the arrays of a part exceed the caches, and memory grows."""
 
-# Rows that are worked on at a time where each problem has dozens of candidates: a row takes some 20 kB, so that each
-# thread takes 80 MB. Parts of twice the size are not faster.
+# Rows per part if each problem has dozens of candidates: a row takes about 20 kB, so each thread takes 80 MB. Parts of
+# twice the size are not faster.
 _ROWS = 2**12
 
 Answer = TypeVar("Answer", "Pool", Fix)
@@ -33,32 +36,32 @@ Answer = TypeVar("Answer", "Pool", Fix)
 
 @dataclass(frozen=True, slots=True)
 class Curvature:
-    """What the normal equations say at the best candidates of a flat batch of N problems.
+    """Numbers from the normal equations at the best candidates of a flat batch of N problems.
 
     Parameters
     ----------
     covariance : array (N, n, n)
         Inverse of the information on the tangent space of the constraints that hold with equality.
     information : array (N, n, n), optional
-        Of the shared unknowns, local ones eliminated.
+        Information of the shared unknowns; local unknowns are eliminated.
     regular : bool array (N,), optional
-        Whether that inverse exists; it does where this is not said.
+        Whether that inverse exists; None means that all exist.
     weakest : array (N,), optional
-        Smallest squared pivot of the information scaled to a unit diagonal: near zero means a direction is open.
+        Smallest squared pivot of the information scaled to a unit diagonal; near zero a direction is undetermined.
     active : object array (N,), optional
         Tuples of `Active` constraints.
     local : array (N, k, p, p), optional
-        Covariance of the states that targets have at each epoch of a run.
+        Covariance of the states of targets at each epoch of a run.
     kappa : array (N, 2), optional
-        By how much the cost departs from that of a Gaussian three sigma away, in metres and in inverse range
-        (`optloc.model_checks.shape`); NaN where nobody has looked.
+        Departure of the cost from a Gaussian's at three sigma, in metres and in inverse range
+        (`optloc.model_checks.shape`); NaN if not computed.
     repeats : array (N, 3), optional
-        Shares of repeated measurements whose ellipses hold, and the inflation with which 95 % would
+        Shares of repeated measurements whose ellipses contain the truth, and the inflation with which 95 % would
         (`optloc.solvers.verdict.repeats`); NaN if not tried.
     free : array (N, n, n), optional
-        Covariance without the inequalities that hold fixes; NaN where none does, or where it does not exist.
+        Covariance without the inequalities that hold fixes; NaN if no inequality does, or if it does not exist.
     shift : array (N, n), optional
-        Mean without these inequalities by the quadratic model, less the fix; NaN likewise.
+        Mean without these inequalities in the quadratic model, minus the fix; NaN in the same cases.
     """
 
     covariance: Annotated[Array, Axes(2)]
@@ -75,16 +78,16 @@ class Curvature:
 
 @dataclass(frozen=True, slots=True)
 class TriedBefore:
-    """What a branch before has tried to prove of N fixes, and of what it was tried.
+    """Proofs of N fixes that an earlier branch of a method tried.
 
     Parameters
     ----------
     cost : array (N,)
-        Of the fixes.
+        Costs of the fixes.
     listed : int array (N,)
-        How many other minima were known.
+        Numbers of other known minima.
     proven : Claims
-        What came of it.
+        Results of the proofs.
     """
 
     cost: Annotated[Array, Axes(0)]
@@ -94,14 +97,14 @@ class TriedBefore:
 
 @dataclass(frozen=True, slots=True)
 class NoStart:
-    """Why N problems have no candidate, where a stage knows it.
+    """Why N problems have no candidate, if a stage reports it.
 
     Parameters
     ----------
     reason : object array (N,)
-        A sentence; "" where nothing is known.
+        A sentence; "" without a report.
     code : int array (N,)
-        `Status`: unavailable where the method does not start such rows, numerical where its back end failed.
+        `Status`: unavailable if the method does not start such rows, numerical if its back end failed.
     """
 
     reason: Annotated[Array, Axes(0, empty="")]
@@ -110,17 +113,17 @@ class NoStart:
 
 @dataclass(frozen=True, slots=True)
 class Pool:
-    """Candidates of a flat batch of N problems, q slots each, with the evidence that stages have gathered.
+    """Candidates of a flat batch of N problems, q slots each, with the evidence from the stages.
 
-    Once it is settled (`optloc.solvers.verdict.minima.settle`) the best candidate is in the first slot, and the other
-    minima that the data allow follow, cheapest first.
+    In a settled pool (`optloc.solvers.verdict.minima.settle`) the first slot holds the best candidate. The other minima
+    that the data allow follow, cheapest first.
 
     Parameters
     ----------
     x : array (N, q, size)
         Parameter vectors; NaN in empty slots.
     cost : array (N, q)
-        NaN of a start, infinite in empty slots and where a constraint forbids a candidate.
+        Costs; NaN for a start, infinite in empty slots and for candidates that a constraint forbids.
     code : int array (N, q)
         `Status` of their refinement.
     face : int array (N, q)
@@ -130,42 +133,42 @@ class Pool:
     dof : int array (N,)
         Degrees of freedom.
     stages : tuple of Stage
-        What was done.
+        Stages that ran.
     refined : bool
-        Whether least squares has refined all that is in it.
+        Whether least squares has refined all candidates.
     curvature : Curvature, optional
-        At the candidates in the first slots; None before anything is settled.
+        At the candidates in the first slots; None before the pool is settled.
     plain : bool array (N,), optional
-        Where nothing stands against the best candidate: near, regular, finished and without a rival.
+        True if there is no finding against the best candidate: it is near, regular, finished and has no rival.
     infinity : array (N,), optional
-        Least cost known of positions ever farther away; infinite where they cost ever more, NaN where nobody has
-        looked.
+        Least known cost of positions at ever larger distances; infinite if the cost keeps growing, NaN if not computed.
     free : array (N,), optional
-        Least cost without the inequalities, where there are some.
+        Least cost without the inequalities, if there are any.
     pair : array (N, 2, size), optional
-        Two minima that are mirror images and belong to one likelihood region: neither is a rival of the other; NaN
-        otherwise.
+        Two minima that are mirror images within one likelihood region, so that neither is a rival of the other; NaN
+        without such a pair.
     loss : str
-        Name of the loss that doubts rows, or "" where all are believed.
+        Name of the robust loss that lowers weights of rows, or "" for least squares.
     robust : bool array (N,), optional
-        Where the minima of a loss were searched, the rows that count prove the place, and ellipses of repeats hold.
+        True if the minima of a robust loss were searched, the rows with weight prove the position, and ellipses of
+        repeats cover.
     searched : bool array (N,), optional
-        Where the candidates are the best of a search, not of starts that are known to be safe.
+        True if the candidates come from a search instead of safe starts.
     remark : object array (N,), optional
-        What a stage has to say beside the status.
+        Remark of a stage that adds to the status.
     proven : Claims, optional
-        What is proven of the best candidates; None where nobody has tried for any.
+        Claims about the best candidates; None if no proof was tried.
     tried_before : TriedBefore, optional
-        What a branch before has tried to prove: it stands where nothing new was found.
+        Proofs of an earlier branch of the method; they are valid if the minima are the same.
     hidden : object array (N,), optional
-        What lies behind the Earth, in words; "" where nothing does.
+        Sentence on a minimum behind the Earth; "" without one.
     missing : NoStart, optional
-        Why there is no candidate, where there is none; it counts only there.
+        Why there is no candidate; used only for problems without a candidate.
     asked : bool
-        Whether contradictions were looked into.
+        Whether a search for suspects ran.
     conclusion : object array (N,), optional
-        What explains the data where they contradict each other, an `optloc.solvers.verdict.conclusion.Conclusion`; or
-        a `Fix` from outside that stands as it is.
+        Explanation of contradictory data, an `optloc.solvers.verdict.conclusion.Conclusion`, or a `Fix` from outside
+        that the verdict does not change.
     """
 
     x: Annotated[Array, Axes(2, slots=True)]
@@ -204,32 +207,32 @@ class Pool:
 
     @property
     def unfinished(self) -> bool:
-        """Return whether the refinement of a best candidate ended before it had converged."""
+        """Return whether the refinement of a best candidate ended before it converged."""
         return bool(np.isin(self.code[:, 0], (Status.MAX_ITERATIONS, Status.STALLED)).any())
 
     @property
     def empty(self) -> Array:
-        """Return which problems have no candidate, (N,): neither a start nor a point with a cost."""
+        """Return flags (N,) of problems without a candidate: neither a start nor a point with a finite cost."""
         found = np.isfinite(self.x).all(-1) & (np.isnan(self.cost) | np.isfinite(self.cost))
         return np.asarray(~found.any(1))
 
     def without(self, items: Array, reason: str, status: Status) -> Pool:
-        """Return the pool with a reason why some of its problems have no candidate; reasons known before stay."""
+        """Return the pool with a reason why some problems have no candidate; earlier reasons are kept."""
         blank = np.full(len(self), "", dtype=object)
         known = self.missing or NoStart(blank, np.full(len(self), int(Status.UNAVAILABLE), dtype=np.int8))
-        told, code = known.reason.copy(), known.code.copy()
-        new = items[told[items] == ""]
-        told[new], code[new] = reason, int(status)
-        return replace(self, missing=NoStart(told, code))
+        reasons, code = known.reason.copy(), known.code.copy()
+        new = items[reasons[items] == ""]
+        reasons[new], code[new] = reason, int(status)
+        return replace(self, missing=NoStart(reasons, code))
 
     def merge(self, items: Array, other: Pool, stage: Stage | None = None) -> Pool:
-        """Return the pool with those of other problems in the place of some, and one more stage."""
+        """Return the pool with some problems replaced by the problems of another pool, and one more stage."""
         stages = self.stages if stage is None else (*self.stages, stage)
         return replace(overwrite(self, items, other), stages=stages)
 
 
 def offer(problem: Problem, x: Array, before: Pool | None, name: str, began: float) -> Pool:
-    """Return starts (N, q, size) as a pool, behind the stages of the one before.
+    """Return starts (N, q, size) as a pool, after the stages of the pool before.
 
     Parameters
     ----------
@@ -238,11 +241,11 @@ def offer(problem: Problem, x: Array, before: Pool | None, name: str, began: flo
     x : array (N, q, size)
         Starts; NaN in empty slots.
     before : Pool, optional
-        What was known; its candidates are not kept.
+        Earlier pool; its candidates are dropped.
     name : str
         Stage that makes the starts.
     began : float
-        When it began, by `time.perf_counter`.
+        Start time of the stage, by `time.perf_counter`.
     """
     shape, x = x.shape[:2], _within_layers(problem, x)
     stage = Stage(name, f"{x.shape[1]} candidates at most", perf_counter() - began)
@@ -260,7 +263,7 @@ def offer(problem: Problem, x: Array, before: Pool | None, name: str, began: flo
 
 
 def _within_layers(problem: Problem, x: Array) -> Array:
-    """Return starts (N, q, size) whose positions have a speed: those beyond the layers are mirrored into them."""
+    """Return starts (N, q, size) with positions inside the layers; positions beyond are mirrored into them."""
     if not isinstance(problem.medium, Layers):
         return x
     x, layout, (low, high) = x.copy(), problem.layout, problem.medium.reach
@@ -281,18 +284,18 @@ def begin(problem: Problem, start: Array) -> Pool:
 
 
 def pack(points: Array) -> Array:
-    """Return points (N, q, n) with the finite ones of each problem first, and no more slots than needed."""
+    """Return points (N, q, n) with the finite points of each problem first, and without unused slots."""
     if points.shape[1] <= 1:
         return points
     finite = np.isfinite(points).all(-1)
-    # stable: finite ones keep their order, which says what is tried first
+    # a stable sort keeps the order of finite points, in which they are tried
     order = np.argsort(~finite, axis=1, kind="stable")
     keep = max(1, int(finite.sum(1).max(initial=0)))
     return np.take_along_axis(points, order[..., None], axis=1)[:, :keep]
 
 
 def chunk_size(problem: Problem) -> int:
-    """Return the number of problems that are worked on at a time, where each has dozens of candidates."""
+    """Return the number of problems per part if each problem has dozens of candidates."""
     return max(1, _ROWS // max(problem.count, 1))
 
 
@@ -302,22 +305,22 @@ def in_parts(
     most: int = PART,
     failed: Callable[[Problem, str], Answer] | None = None,
 ) -> Answer:
-    """Return the answers for a flat batch of problems, at most so many at a time.
+    """Return the answers for a flat batch of problems, which is processed in parts of at most `most` problems.
 
-    A part that fails numerically is halved until the problems are alone that cannot be worked on: of these the cause
-    is told, and the answers of all others are theirs.
+    A part that fails numerically is halved until each failing problem is alone. Its answer reports the cause, and all
+    other problems get their answers.
 
     Parameters
     ----------
     problem : Problem
         N problems.
     work : callable
-        Maps some of the problems, and which they are, to their pool or fix.
+        Maps some of the problems, and their slice of the batch, to a pool or fix.
     most : int
         Problems in one part.
     failed : callable, optional
-        Maps problems and the cause to the answers of those that failed, and none to that of none; without it failures
-        are raised.
+        Maps failed problems and the cause to their answers; for an empty batch it gives the empty answer. Without it
+        failures are raised.
     """
     count = problem.batch_shape[0]
     if failed is not None and not count:
@@ -329,7 +332,7 @@ def in_parts(
     def answer(part: slice) -> list[Answer]:
         return list(_contained(problem.take(np.arange(part.start, part.stop)), part, work, failed))
 
-    # An even number of parts of one size: as many threads are done at a time.
+    # An even number of parts of equal size keeps an even number of threads busy to the end.
     size = -(-count // (2 * -(-count // (2 * most))))
     parts = [slice(first, min(first + size, count)) for first in range(0, count, size)]
     return _joined(chain.from_iterable(map_in_order(answer, parts)), count)
@@ -341,7 +344,7 @@ def _contained(
     work: Callable[[Problem, slice], Answer],
     failed: Callable[[Problem, str], Answer] | None,
 ) -> Iterator[Answer]:
-    """Yield the answers of a part, or of its halves one after the other where it fails numerically."""
+    """Yield the answer of a part, or the answers of its halves if it fails numerically."""
     try:
         answer = work(problem, part)
     except NUMERICAL as error:
@@ -361,7 +364,7 @@ def _contained(
 
 @contextmanager
 def noting_place(place: str) -> Iterator[None]:
-    """Note the place on a numerical failure that passes, unless an inner one has: its cause is told with it."""
+    """Add the name of the place to a numerical failure inside this context, unless an inner context has added one."""
     try:
         yield
     except NUMERICAL as error:
@@ -371,17 +374,17 @@ def noting_place(place: str) -> Iterator[None]:
 
 
 def _cause(error: Exception) -> str:
-    """Return what a numerical failure says, behind the place that `where` has noted."""
+    """Return the message of a numerical failure, after the place that `where` added."""
     return ": ".join([*getattr(error, "__notes__", ()), str(error) or type(error).__name__])
 
 
 def _joined(answers: Iterable[Answer], count: int) -> Answer:
-    """Return answers of so many problems one behind the other as one."""
+    """Return the joined answers of `count` problems."""
     stages: list[tuple[Stage, ...]] = []
 
     def told() -> Iterator[Answer]:
         for answer in answers:
-            # parts differ in them: one may need what others do not
+            # parts may have different stages: one part may need a stage that others do not
             stages.append(answer.stages)
             yield answer
 
@@ -390,7 +393,7 @@ def _joined(answers: Iterable[Answer], count: int) -> Answer:
 
 
 def _sum_stages(parts: list[tuple[Stage, ...]]) -> tuple[Stage, ...]:
-    """Return the stages of the part that took most of them, with the seconds of all."""
+    """Return the stages of the part with the most stages, with the total seconds of all parts."""
     longest = max(parts, key=len)
     seconds = dict.fromkeys(range(len(longest)), 0.0)
     for stages in parts:

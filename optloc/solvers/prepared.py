@@ -1,4 +1,4 @@
-"""Problems prepared once and fixed many times: what does not depend on the measurements is ready."""
+"""Prepared problems: everything that does not depend on the measurements is computed once, for many fixes."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from optloc.solvers.verdict.judge import verdict
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A problem that waits for measurements; see `prepare`.
+    """A problem that is prepared to fix new measurements; see `prepare`.
 
     Parameters
     ----------
     problem : Problem
-        What it was prepared from; its own measurements do not matter.
+        The problem; its measurements do not matter.
     method : str
         As of `optloc.solve`.
     plan : Plan, optional
-        What fixes its measurements; None where they take the stages of the method.
+        The plan that fixes measurements; None if the stages of the method have to run.
     shape : tuple of int
-        Batch axes that the problem has without its measurements.
+        Batch axes of the problem without its measurements.
     count : int
         Rows.
     short : Single, optional
-        What fixes few sets of measurements past all batches, where there is such a way.
+        Fixes a few sets of measurements on the short path; None if the path is not available.
     """
 
     problem: Problem
@@ -55,7 +55,7 @@ class Prepared:
         return self.solve(z)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return how another process prepares the same: what threads write into stays here."""
+        """Return the call that prepares the same problem in another process; workspaces are not copied."""
         return prepare, (self.problem, self.method)
 
     def solve(self, z: ArrayLike) -> Fix:
@@ -64,8 +64,8 @@ class Prepared:
         Parameters
         ----------
         z : array (..., m)
-            Measurements of all rows in the order of the problem, SI units and radians; NaN where one is missing makes
-            the status of that fix "rejected".
+            Measurements of all rows in the order of the problem, SI units and radians. A fix with a missing measurement
+            (NaN) has the status "rejected".
 
         Returns
         -------
@@ -75,16 +75,16 @@ class Prepared:
         Raises
         ------
         InvalidProblem
-            Where z does not fit the rows of the problem.
+            If z does not fit the rows of the problem.
         """
         values = np.asarray(z, dtype=float)
         shape = self._batch(values)
         if self.short is not None and is_few(shape):
-            with suppress(*NUMERICAL):  # the stages tell which of them fails
+            with suppress(*NUMERICAL):  # the stages report the item that fails
                 fix = self.short(np.broadcast_to(values, (*shape, values.shape[-1])) if self.shape else values)
                 if fix is not None:
                     return fix
-        # nothing is ready: the stages of the method do it as ever
+        # without machine code at hand the stages of the method run
         if self.plan is None or not self.plan.at_hand(prod(shape)):
             wide = np.broadcast_to(values, (*shape, values.shape[-1]))
             return solve_in_stages(self.problem.with_rows(z=wide), Method.parse(self.method))
@@ -93,12 +93,13 @@ class Prepared:
             pool = settle_by_plan(self.plan, self.plan.load(flat), flat.z, flat.take)
             fix = verdict(flat, pool)
         except NUMERICAL:
-            # one of them fails: which one is told where all take the stages
+            # one item fails, and the stages report which
             return solve(flat, self.method).reshape(shape)
         return fix if len(shape) == 1 else fix.reshape(shape)
 
     def _flat(self, z: Array, shape: tuple[int, ...]) -> Problem:
-        # A problem without batch axes takes those of its measurements: there is nothing to make flat.
+        """Return a flat batch of problems with the measurements z (..., m)."""
+        # A problem without batch axes takes the axes of its measurements, so only the measurements are reshaped.
         if not self.shape:
             return self.problem.with_rows(z=np.broadcast_to(z, (*shape, z.shape[-1])).reshape(-1, z.shape[-1]))
         return self.problem.with_rows(z=np.broadcast_to(z, (*shape, z.shape[-1]))).flat()
@@ -123,16 +124,16 @@ class Prepared:
 
 
 def prepare(problem: Problem, method: str = "gtrs+lsr") -> Prepared:
-    """Return a problem that fixes new measurements of the same rows, again and again.
+    """Return a prepared problem that fixes new measurements of the same rows many times.
 
-    Everything that does not depend on the measurements is done once. With "gtrs+lsr" and "auto" a fix of one target at
-    rest then takes some hundred microseconds, for rows of every kind. Every other problem and method works as well, as
-    fast as `optloc.solve`.
+    All work that does not depend on the measurements is done once. With "gtrs+lsr" and "auto" a fix of one target at
+    rest then takes some hundred microseconds, for rows of every kind. Every other problem and method works too, as fast
+    as `optloc.solve`.
 
     Parameters
     ----------
     problem : Problem
-        Batch axes (...); its own measurements do not matter.
+        Batch axes (...); its measurements do not matter.
     method : str
         As of `optloc.solve`.
 
@@ -144,15 +145,15 @@ def prepare(problem: Problem, method: str = "gtrs+lsr") -> Prepared:
     Raises
     ------
     InvalidProblem
-        For an unknown method, or where nothing is unknown.
+        For an unknown method, or if nothing is unknown.
     """
     parsed = Method.parse(method)
     if problem.layout.size == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
-    # without measurements, so that nothing prepared can depend on them
+    # the prepared problem must not depend on measurements, so they are zero
     bare = problem.with_rows(z=np.zeros(problem.count))
     plan = short = None
-    with suppress(*NUMERICAL):  # the stages tell which of its fixes fails
+    with suppress(*NUMERICAL):  # the stages report the item that fails
         plan = plan_of(bare) if shortcut(parsed) and not separable(bare) else None
         short = prepare_fix(bare, parsed)
     return Prepared(bare, method, plan, bare.batch_shape, bare.count, short)

@@ -1,4 +1,7 @@
-"""A solution that grows with its run: new epochs add to the sums, and nothing old is looked at without need."""
+"""A solution that grows with its run: new epochs are added to sums.
+
+Old epochs are linearised again only if the estimate has moved too far.
+"""
 
 from __future__ import annotations
 
@@ -23,17 +26,17 @@ from optloc.solvers.pool import begin
 from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.judge import verdict
 
-# One standard deviation: the sums then err by thousandths of it.
+# One standard deviation: the error of the sums is then thousandths of a standard deviation.
 _TOLERANCE = 1.0
-# Steps of a new linearisation: it begins a few standard deviations from its end, where two or three would do.
+# Most steps of a new linearisation: it begins a few standard deviations from its end, where two or three are enough.
 _STEPS = 20
-# Answers of a growing run, as many as a picture can show.
+# Most estimates of a growing run: a picture cannot show more.
 _POINTS = 60
 
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """The maximum-likelihood solution of a run so far, ready for more epochs.
+    """The maximum-likelihood solution of a run so far, to which more epochs can be added.
 
     Parameters
     ----------
@@ -44,13 +47,13 @@ class Running:
     cov : array (N, n, n)
         Their covariance; NaN where singular.
     at : array (N, n)
-        Where the sums were linearised.
+        Point of linearisation of the sums.
     sums : Normal
-        Information of the measurements about the shared unknowns; those of single epochs are eliminated.
+        Information of the measurements about the shared unknowns; unknowns of single epochs are eliminated.
     linearised : int
-        How often all epochs were linearised.
+        Number of linearisations of all epochs.
     tolerance : float
-        Steps longer than this many of their own standard deviations lead to a new linearisation.
+        Steps longer than this many standard deviations of the estimate lead to a new linearisation.
     """
 
     problem: Problem
@@ -70,22 +73,22 @@ class Running:
         problem : Problem
             Batch (...) of runs. Targets last the run.
         fix : Fix
-            Its fix, of `optloc.solve`; the best answer where it is ambiguous.
+            Its fix, of `optloc.solve`; if the fix is ambiguous, the best answer is used.
         tolerance : float
-            Steps longer than this many of their own standard deviations lead to a new linearisation.
+            Steps longer than this many standard deviations of the estimate lead to a new linearisation.
 
         Raises
         ------
         InvalidProblem
-            Where targets have states of their own at each epoch, a bias walks, or the fix has no answer.
+            If targets have separate states at each epoch, a bias walks, or the fix has no answer.
         """
         if any(motion.span == "epoch" and motion.known is None for motion in problem.motions):
-            raise InvalidProblem("targets that are free at each epoch share nothing", "begin", "solve their epochs")
+            raise InvalidProblem("targets that are free at each epoch share no unknown", "begin", "solve their epochs")
         if walks(problem):
-            what = f"the walk {walks(problem)[0].name!r} ties each epoch to the next, so that they do not add up"
+            what = f"the walk {walks(problem)[0].name!r} links each epoch to the next, so that epochs cannot be added"
             raise InvalidProblem(what, "begin", "solve the whole run")
         if not np.isfinite(fix.x).all():
-            raise InvalidProblem("the fix has no answer to begin from", "fix", "wait for more epochs; see fix.status")
+            raise InvalidProblem("the fix has no answer to start from", "fix", "wait for more epochs; see fix.status")
         flat = problem.flat()
         at = fix.x[..., : problem.layout.n_shared].reshape(-1, problem.layout.n_shared)
         return _linearise(flat, at, 0, tolerance)
@@ -93,8 +96,8 @@ class Running:
     def update(self, more: Problem) -> Running:
         """Return the solution with the epochs of another problem added.
 
-        The new epochs are linearised where the old ones were and added to the sums. Only where the step is longer
-        than the tolerance are all epochs linearised anew.
+        The new epochs are linearised at the point of the old ones and added to the sums. All epochs are linearised
+        again only if the step is longer than the tolerance.
 
         Parameters
         ----------
@@ -104,14 +107,14 @@ class Running:
         Raises
         ------
         InvalidProblem
-            Naming what differs, or the epoch that is not later than the last.
+            It names the difference, or the epoch that is not later than the last.
         """
         joint = joined(self.problem, more.flat())
         fresh = window(joint, self.problem.epochs, joint.epochs)
-        # sums add only where they were linearised at the same place
+        # sums add only if they have the same point of linearisation
         sums = self.sums + _information(fresh, self.at)
         x, cov, length = _step(joint, sums, self.at)
-        # the whole batch is linearised together: its sums are one array
+        # the sums of the batch are one array, so the whole batch is linearised together
         if np.any(length > self.tolerance):
             start = complete(joint, x[:, None])[:, 0]
             done = refine(joint, start, limit=_STEPS)
@@ -125,6 +128,7 @@ class Running:
 
 
 def _linearise(problem: Problem, at: Array, before: int, tolerance: float) -> Running:
+    """Return the running solution after a linearisation of all epochs at vectors (N, n)."""
     sums = _information(problem, at)
     x, cov, _ = _step(problem, sums, at)
     return Running(problem, x, cov, at, sums, before + 1, tolerance)
@@ -133,23 +137,24 @@ def _linearise(problem: Problem, at: Array, before: int, tolerance: float) -> Ru
 def _information(problem: Problem, at: Array) -> Normal:
     """Return the information of the measurements about the shared unknowns, linearised at vectors (N, n)."""
     x = complete(problem, at[:, None])[:, 0]
-    # priors of local unknowns leave with them; those of shared ones would count again with every update
+    # Priors of local unknowns are added here and eliminated. Priors of shared unknowns would count again with every
+    # update.
     return eliminated(with_priors(problem, x, summed(problem, x), shared=False))
 
 
 def _step(problem: Problem, sums: Normal, at: Array) -> tuple[Array, Array, Array]:
-    """Return estimates (N, n), their covariance and the length (N,) of the step in its own standard deviations."""
+    """Return estimates (N, n), their covariance, and the length (N,) of the step in standard deviations."""
     x = np.zeros((len(at), problem.layout.size))
     x[:, : at.shape[1]] = at
     total = with_priors(problem, x, sums, local=False)
     step, ok = linalg.solve(total.shared, total.shared_vector[..., None])
     cov, _ = linalg.inverse(total.shared)
-    # step' information step: the step in its own standard deviations
+    # step' information step: the squared step in standard deviations
     length = np.sqrt(np.maximum((step[..., 0] * total.shared_vector).sum(-1), 0.0))
     return np.where(ok[:, None], at + step[..., 0], np.nan), cov, np.where(ok, length, np.inf)
 
 
-# How the estimate of a run grows: the answer after its first epochs.
+# The estimate as a function of the number of epochs.
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,15 +164,15 @@ class GrowingRun:
     Parameters
     ----------
     counts : int array (q,)
-        How many epochs count.
+        Numbers of epochs used.
     times : array (q,)
-        Seconds of the last of them.
+        Time of the last epoch used, seconds.
     x : array (q, n)
         Estimates of the shared unknowns; NaN where the epochs do not determine them.
     cov : array (q, n, n)
         Their covariance; NaN likewise.
     layout : Layout
-        What each entry means.
+        Names and units of the entries.
     """
 
     counts: Array
@@ -184,7 +189,7 @@ class GrowingRun:
 
 
 def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = None) -> GrowingRun:
-    """Return the maximum-likelihood estimate after the first epochs of a run, refined from that of the whole run.
+    """Return the maximum-likelihood estimates after the first epochs of a run, refined from the fix of the whole run.
 
     Parameters
     ----------
@@ -193,26 +198,27 @@ def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = N
     fix : Fix
         Its fix.
     counts : sequence of int, optional
-        Numbers of epochs, 1 to k; at most sixty of them, closer together at the start, by default.
+        Numbers of epochs, 1 to k; by default at most sixty numbers, denser at the start.
 
     Raises
     ------
     InvalidProblem
-        Where the epochs share nothing or noise ties them together, a count is out of range, or the fix has no answer.
+        If the epochs share nothing, noise correlates them, a count is out of range, or the fix has no answer.
     """
     k, n = problem.epochs, problem.layout.n_shared
     if k == 1 or not n or problem.batch_shape or has_correlated_epochs(problem):
         advice = "give a single run of epochs that have biases or a motion in common"
         raise InvalidProblem("the estimate does not grow with the epochs", "problem", advice)
     if fix.shape or not np.isfinite(fix.x).all():
-        raise InvalidProblem("the run has no answer to begin from", "fix", "see its status for the reason")
+        raise InvalidProblem("the run has no answer to start from", "fix", "see its status for the reason")
     chosen = _space_counts(k) if counts is None else np.asarray(counts, dtype=np.int64)
     if not len(chosen) or chosen.min() < 1 or chosen.max() > k:
         raise InvalidProblem(f"the counts are not among 1 to {k}", "counts", "give numbers of epochs")
     x, cov = np.full((len(chosen), n), np.nan), np.full((len(chosen), n, n), np.nan)
     for i, count in enumerate(chosen):
         part = cut(problem, 0, int(count)).flat()
-        # from the answer of the whole run: the minimum that grows into it, even where the first epochs have others
+        # the start is the answer of the whole run, so that the estimate follows its minimum even if the first epochs
+        # have others
         done = refine(part, fix.x[None, : part.layout.size])
         spread, ok = covariance(done.equations)
         if ok[0] and done.status[0] == Status.OK:
@@ -221,7 +227,8 @@ def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = N
 
 
 def _space_counts(epochs: int) -> Array:
+    """Return at most sixty numbers of epochs, denser at the start."""
     if epochs <= _POINTS:
         return np.arange(1, epochs + 1)
-    # geometric: an estimate changes most while its epochs are few
+    # geometric spacing: an estimate changes most while its epochs are few
     return np.unique(np.geomspace(1, epochs, _POINTS).round().astype(np.int64))

@@ -1,4 +1,4 @@
-"""The status that a fix will have at a place: shares of many simulated measurements."""
+"""The probability of each status at given positions, from many simulated measurements."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.solution import solve
 
-# Fixes at a time: their rows take some tens of megabytes.
+# Fixes that are solved together: their rows take some tens of megabytes.
 _PART = 2**14
 _STATES = ("position", "velocity", "acceleration")
 
 
 @dataclass(frozen=True, slots=True)
 class StatusShares:
-    """Shares of the statuses of fixes at places.
+    """Shares of the statuses of fixes at given positions.
 
     Parameters
     ----------
     statuses : tuple of s Status
-        Those that occur, in the order of precedence.
+        Statuses that occur, in the order of precedence.
     share : array (..., s)
-        Of the trials at each place; they sum to one.
+        Share of each status in the trials at each position; they sum to one.
     covered : array (...)
-        Share of the `ok` fixes whose 95 % region holds the true place; NaN without such fixes, and for problems that
-        are not of one position.
+        Share of the `ok` fixes whose 95 % region contains the true position; NaN without such fixes, and for problems
+        of several positions.
     trials : int
-        Simulated measurements at each place.
+        Simulated measurements at each position.
     """
 
     statuses: tuple[Status, ...]
@@ -54,28 +54,29 @@ class StatusShares:
 
     @property
     def deviation(self) -> Array:
-        """Return the standard errors (..., s) of the shares, by their number of trials."""
+        """Return the standard errors (..., s) of the shares, from the number of trials."""
         return np.asarray(np.sqrt(self.share * (1.0 - self.share) / self.trials))
 
 
 def status_shares(
     problem: Problem, truth: Array, trials: int = 200, seed: int = 0, method: str = "auto"
 ) -> StatusShares:
-    """Return the share of each status among fixes of simulated measurements at places.
+    """Return the share of each status among fixes of simulated measurements at given positions.
 
-    Noise is drawn, biases are drawn from their priors, and prior means of states are drawn about the truth. `ok`
-    promises its figures over all measurements; this share says how many of them are `ok`.
+    The simulation draws noise, biases from their priors, and prior means of states about the truth. The figures of `ok`
+    hold over all measurements; this function returns the share of measurements that are `ok`.
 
     Parameters
     ----------
     problem : Problem
-        A single problem; of a batch, or of epochs that share nothing, the first. Its measurements do not matter.
+        A single problem. Of a batch, or of epochs that share nothing, the first is used. Its measurements do not
+        matter.
     truth : array (..., size)
-        True parameter vectors in the order of ``problem.layout``, with the places.
+        True parameter vectors in the order of ``problem.layout``, with the positions.
     trials : int
-        Simulated measurements at each place.
+        Simulated measurements at each position.
     seed : int
-        Decides all draws. The draws at a place depend on its number alone.
+        Seed of all draws. The draws at a position depend on the seed and the number of the position only.
     method : str
         As of `optloc.solve`.
 
@@ -88,7 +89,7 @@ def status_shares(
     single = apart.flat().take(np.zeros(1, dtype=int))
     truth = np.asarray(truth, dtype=float)
     if trials < 1:
-        raise InvalidProblem(f"{trials} trials give no share", "trials", "take 100 or more")
+        raise InvalidProblem(f"{trials} trials are not enough", "trials", "take 100 or more")
     if truth.shape[-1:] != (single.layout.size,):
         advice = f"give {single.layout.size} numbers in the order of problem.layout"
         raise InvalidProblem(f"a truth of shape {truth.shape} does not fit the unknowns", "truth", advice)
@@ -102,6 +103,7 @@ def status_shares(
 
 
 def _parts(count: int, trials: int) -> Iterator[Array]:
+    """Yield the numbers of positions whose trials fit in one part."""
     size = max(1, _PART // trials)
     for first in range(0, count, size):
         yield np.arange(first, min(first + size, count))
@@ -110,7 +112,7 @@ def _parts(count: int, trials: int) -> Iterator[Array]:
 def _solve_trials(
     single: Problem, places: Array, numbers: Array, trials: int, seed: int, method: str
 ) -> tuple[Fix, Array]:
-    """Return the fixes (q trials,) of measurements at q places, and the true vectors (q trials, size)."""
+    """Return the fixes (q trials,) of measurements at q positions, and the true vectors (q trials, size)."""
     drawn, true = [], []
     for number, place in zip(numbers.tolist(), places, strict=True):
         at_truth, at_noise = np.random.SeedSequence((seed, number)).spawn(2)
@@ -127,7 +129,7 @@ def _solve_trials(
 
 
 def _with_drawn_priors(problem: Problem, place: Array, trials: int, rng: np.random.Generator) -> tuple[Problem, Array]:
-    """Return a problem whose means of states are drawn about a true vector (size,), and true vectors (trials, size)."""
+    """Return a problem with prior means of states drawn about a true vector (size,), and the true vectors of trials."""
     layout, n = problem.layout, problem.layout.n_shared
     x, means = np.tile(place, (trials, 1)), dict[str, Array]()
     local = x[:, n:].reshape(trials, problem.epochs, -1)
@@ -148,7 +150,7 @@ def _with_drawn_priors(problem: Problem, place: Array, trials: int, rng: np.rand
 
 
 def _hold(fix: Fix, true: Array) -> Array:
-    """Return 1 for each `ok` fix whose 95 % region holds the truth, 0 if it does not, and NaN for other fixes."""
+    """Return 1 for each `ok` fix whose 95 % region contains the truth, 0 if it does not, and NaN for other fixes."""
     out = np.full(len(true), np.nan)
     if fix.chart is None:
         return out
@@ -159,7 +161,7 @@ def _hold(fix: Fix, true: Array) -> Array:
 
 
 def _shares(code: Array, holds: Array, shape: tuple[int, ...]) -> StatusShares:
-    """Return the shares of codes (q, trials) at places of a shape."""
+    """Return the shares of codes (q, trials) at positions of a given shape."""
     statuses = tuple(one for one in PRECEDENCE if (code == one).any())
     share = np.stack([(code == one).mean(-1) for one in statuses], axis=-1)
     known = np.isfinite(holds).sum(-1)
@@ -170,14 +172,14 @@ def _shares(code: Array, holds: Array, shape: tuple[int, ...]) -> StatusShares:
 
 @dataclass(frozen=True, slots=True)
 class StatusMap:
-    """Shares of the statuses over a grid of places.
+    """Shares of the statuses over a grid of positions.
 
     Parameters
     ----------
     grid : Grid
-        The places.
+        The positions.
     shares : StatusShares
-        At the places (ny, nx).
+        At the positions (ny, nx).
     """
 
     grid: Grid
@@ -196,7 +198,7 @@ def status_map(
     method: str = "auto",
     geodetic: bool | None = None,
 ) -> StatusMap:
-    """Return the shares of the statuses of fixes of a target at every point of a grid; arguments as of `bound_map`.
+    """Return the shares of the statuses of fixes of a target at every point of a grid.
 
     Parameters
     ----------

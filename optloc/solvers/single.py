@@ -1,8 +1,8 @@
-"""Few fixes at once: from new measurements of a kept problem to the verdict, through machine code and past all batches.
+"""The short path: a few fixes of one problem from new measurements to the verdict, in compiled code, without batches.
 
-What does not depend on the measurements is kept: the linear maps of the fix, the nodes of the proof and the map to its
-right side, the columns of the verdict. What is not plain (a rival, a doubtful cost, a proof that is not done at once)
-takes the long way, which knows what to say of it.
+Everything that does not depend on the measurements is stored: the linear maps of the fix, the terms of the proof, and
+the constant columns of the verdict. For a fix with a complication, such as a rival minimum, a doubtful cost or an
+unfinished proof, the result is None. The caller then runs the stages of the method: the long path.
 """
 
 from __future__ import annotations
@@ -68,34 +68,34 @@ from optloc.solvers.verdict.findings import (
 )
 from optloc.solvers.verdict.repeats import holds, is_repeatable, repeat
 
-# Beginnings of methods that go the short way, and whether they prove.
+# Stages of methods that can take the short path, and whether they include a proof.
 _WORDS = {("gtrs", "lsr"): False, ("gtrs", "lsr", "certify"): True}
 
 
-# What is said of a fix by its status, and of a curved one by the kind of its chart; whatever else there may be to say
-# takes numbers, and the long way.
+# Reasons of fixes by status, and of curved fixes also by the kind of their chart. Other reasons contain numbers: only
+# the long path writes them.
 _SENTENCES: dict[tuple[Status, int | None], str] = {
     (Status.OK, None): "",
     (Status.UNPROVEN, None): NOT_TRIED,
     **{(Status.CURVED, kind): claim_sentence for kind, claim_sentence in BENT_SENTENCE.items()},
 }
-# What a proof of all that an `ok` asks for claims, but for its bound.
+# The claim of a complete proof, as `ok` requires it, without its bound.
 _PROVEN = claim(Certificate("global", claim_sentence(LISTED_GAP, 0, None), METHOD, unique=True, margin=LISTED_GAP))
 _NOTHING = np.empty((), dtype=object)
 _NOTHING[()] = ()
-# By how much of what counts as equal (`equal_cost`) the bound of a proof may be off the cost: it is one below.
+# Largest difference between the bound of a proof and the cost, in units of `equal_cost`. The bound is one unit below.
 _APART = 3.0
 
 
-# Problems that go the short way together at most: from there on a batch is as quick.
+# Most problems on the short path: for more problems a batch takes no longer.
 MANY = 64
-# Numbers of problems for which a thread keeps arrays: a stream has one or two, and some kilobytes for each are enough.
-_ROOMS = 4
+# Batch shapes for which a thread stores arrays. A stream has one or two shapes, and each takes some kilobytes.
+_WORKSPACES = 4
 
 
 @dataclass(slots=True)
 class _SingleWorkspace:
-    """What a thread writes into while it works on n problems, and what all their fixes share.
+    """The arrays that one thread writes to for n problems, and the constant parts of their fixes.
 
     Parameters
     ----------
@@ -106,21 +106,21 @@ class _SingleWorkspace:
     costs : PositionCosts
         With the whitened measurements; empty without a proof.
     asked, answered : ProofRequest, ProofResult
-        Of the proofs.
+        Requests and results of the proofs.
     centre : array (..., d)
-        Of the charts.
+        Centre of the charts, metres.
     claims : Claims
-        Of the fixes, without the bounds and boxes of proofs.
+        Claims of the fixes, without the bounds and boxes of proofs.
     nothing : object array (...)
-        Constraints that hold fixes: none.
+        Empty tuples: no constraint holds a fix.
     alone : Alternatives
-        Other minima: none.
+        Empty: no other minimum.
     beside : ReachWorkspace, optional
-        Of the proofs that bounds are out of reach.
+        Workspace of the proofs that bounds are out of reach.
     kept : dict
-        Fields of a fix that are the same for all measurements; nobody can write into them.
+        Fields of a fix that are the same for all measurements, as read-only arrays.
     checked : bool
-        Whether the position cost of a fix was compared with its own.
+        Whether the position cost of a first fix was compared with the cost of the problem.
     """
 
     z: Array
@@ -139,43 +139,43 @@ class _SingleWorkspace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedFix:
-    """A problem without batch axes that waits for measurements; see `single`.
+    """One problem without batch axes, prepared to fix new measurements on the short path; see `single`.
 
     Parameters
     ----------
     problem : Problem
-        What it was made of; its own measurements do not matter.
+        The problem; its measurements do not matter.
     plan : Plan
-        What fixes it.
+        Its plan.
     load : Load
-        What the problem has to itself.
+        The numbers of the problem that the plan takes as arguments.
     map : Affine, optional
-        Of the costs of the proof; None for methods without one.
+        Map from measurements to the position costs of the proof; None for methods without a proof.
     planes, surface : array (1, e, 3), array (1, 0) or (1, SURFACE_WIDTH)
-        To which proofs are limited, see `optloc.proof.batch.ProofRequest`.
+        Planes and surface to which proofs are limited, see `optloc.proof.batch.ProofRequest`.
     upward : int, optional
-        Which of what holds fixes is the height whose gradient is the surface's upward axis.
+        Number of the height constraint whose gradient is the upward axis of the surface.
     edges : Edges, optional
         Bounds that proofs show to be out of reach; None without bounds.
     sights : list of Sight
         Lines of sight that the Earth may block.
     normal : array (d,), optional
-        Of the plane of all stations, where both sides of it are alike.
+        Normal of the plane of all stations, if both sides of the plane fit equally well.
     absent : bool array (m,), optional
-        Rows of weight zero, which may hold anything; None where all count.
+        Rows of weight zero, whose values are arbitrary; None if all rows count.
     centre : array (d,)
-        Middle of the stations.
+        Middle of the stations, metres.
     doubt, refuted, region : float
-        Costs that call for another look and that refute the model, and by how much those of the likelihood region
-        exceed the least.
+        Three limits of the cost. Above `doubt` a fix takes the long path, and `refuted` refutes the model. `region` is
+        the largest excess in the likelihood region.
     often : bool
-        Whether it is worth loading machine code for.
+        Whether the problem is fixed often enough to load machine code for it.
     repeatable : bool
-        Whether the measurement of a curved fix can be repeated.
+        Whether repeats of the measurement can be simulated for a curved fix.
     limits : array (k, 2), optional
-        Bounds that may cut its law off; None without any.
+        Bounds that may truncate the law of the position; None without bounds.
     own : threading.local
-        What each thread writes into.
+        Workspaces of each thread.
     """
 
     problem: Problem
@@ -199,24 +199,24 @@ class PreparedFix:
     own: local = field(default_factory=local)
 
     def __call__(self, z: Array) -> Fix | None:
-        """Return the fix of measurements (m,), or fixes (n,) of a few (n, m).
+        """Return the fix of measurements (m,), or the fixes (n,) of measurements (n, m).
 
-        None where only the long way knows what to say of one of them.
+        None if one of the fixes needs the long path.
         """
         began, shape, plan = perf_counter(), z.shape[:-1], self.plan
         n = prod(shape)
         kernel = plan.kernel(n, often=self.often)
         if not may_use_code(kernel, n) or (self.map is not None and lacks_code(n)):
             return None
-        room, size, shared = self._room(shape), plan.size, plan.shared
-        room.z[:] = z
+        workspace, size, shared = self._workspace(shape), plan.size, plan.shared
+        workspace.z[:] = z
         if self.absent is not None:
-            room.z[:, self.absent] = 0.0
-        answer = Answer(np.empty((n, size)), np.empty((n, shared, shared)), *room.found)
-        steps = kernel(*self.load[:2], room.z, self.load.place, TOLERANCE, LIMIT, False, answer)
+            workspace.z[:, self.absent] = 0.0
+        answer = Answer(np.empty((n, size)), np.empty((n, shared, shared)), *workspace.found)
+        steps = kernel(*self.load[:2], workspace.z, self.load.place, TOLERANCE, LIMIT, False, answer)
         found = [EngineResult(*numbers) for numbers in answer.number.tolist()]
         for one in found:
-            # on Earth the sight of satellites says which of two that cost the same is meant
+            # on Earth, satellite visibility decides between two minima of equal cost, on the long path
             tied = self.plan.frame.geodetic and one.rival_cost - one.cost <= equal_cost(one.cost)
             if not one.settled or tied or not one.cost <= self.doubt:
                 return None
@@ -227,33 +227,33 @@ class PreparedFix:
         fixed = perf_counter()
         stages = planned_stages(n, steps, fixed - began)
         if self.map is not None:
-            if not self._proves(self.map, answer, found, room):
+            if not self._proves(self.map, answer, found, workspace):
                 return None
-            told = "global" if self.edges is None else f"within {violation_names(self.problem)}"
-            stages = (*stages, certify_stage(f"{n} {told}", fixed))
-        fix = self._judge(shape, answer, found, stages, room)
-        if fix is not None and not room.checked:
-            room.checked = self._agrees(fix, room)
-            return fix if room.checked else None
+            scope = "global" if self.edges is None else f"within {violation_names(self.problem)}"
+            stages = (*stages, certify_stage(f"{n} {scope}", fixed))
+        fix = self._judge(shape, answer, found, stages, workspace)
+        if fix is not None and not workspace.checked:
+            workspace.checked = self._agrees(fix, workspace)
+            return fix if workspace.checked else None
         return fix
 
     def _is_near_bound(self, limits: Array, answer: Answer) -> bool:
-        """Return whether a bound may cut the law of a fix off."""
+        """Return whether a bound may truncate the law of a fix."""
         d = self.load.place.shape[-1]
         # equalities come first
         own = slice(answer.quantity.shape[1] - len(limits), None)
         return are_near(limits, answer.quantity[:, own], answer.normal[:, own], answer.covariance[:, :d, :d])
 
     def _is_near_plane(self, normal: Array, answer: Answer) -> bool:
-        """Return whether a fix may be so near to the plane of the stations that both sides of it are one region."""
+        """Return whether a fix may be so near to the plane of the stations that one region includes both sides."""
         d = len(normal)
         w = np.abs((answer.x[:, :d] - self.centre) @ normal)
         variance = (answer.covariance[:, :d, :d] @ normal) @ normal
         return not bool((w * w > APART * APART * variance).all())
 
-    def _proves(self, affine: Affine, answer: Answer, found: list[EngineResult], room: _SingleWorkspace) -> bool:
-        """Return whether all there is to prove is proven of all positions; bounds and boxes are in the room."""
-        asked, answered, d = room.asked, room.answered, self.load.place.shape[-1]
+    def _proves(self, affine: Affine, answer: Answer, found: list[EngineResult], workspace: _SingleWorkspace) -> bool:
+        """Return whether every fix is proven over all positions; bounds and boxes are written to the workspace."""
+        asked, answered, d = workspace.asked, workspace.answered, self.load.place.shape[-1]
         asked.known.fill(0)
         for i, one in enumerate(found):
             if one.rival_cost < inf:
@@ -262,28 +262,28 @@ class PreparedFix:
             normal = answer.normal[:, self.upward]
             asked.surface[:, UP:] = normal / np.sqrt((normal * normal).sum(-1, keepdims=True))
         for i, one in enumerate(found):
-            affine.write(room.z[i], room.costs, i)
+            affine.write(workspace.z[i], workspace.costs, i)
             asked.eps[i] = equal_cost(one.cost)
         asked.x[:] = answer.x[:, :d]
-        prove_here(room.costs, asked, answered)
+        prove_here(workspace.costs, asked, answered)
         if self.sights:
             for i in range(len(found)):
-                self._pass_hidden(room, answer.x[i], i)
-        if self.edges is not None and not self._is_inside(self.edges, answer, room):
+                self._pass_hidden(workspace, answer.x[i], i)
+        if self.edges is not None and not self._is_inside(self.edges, answer, workspace):
             return False
-        told = zip(found, *(array.tolist() for array in (answered.verdict, *answered[2:6])), strict=True)
-        for one, verdict, bound, everywhere, shown, met in told:
+        results = zip(found, *(array.tolist() for array in (answered.verdict, *answered[2:6])), strict=True)
+        for one, verdict, bound, everywhere, shown, met in results:
             if verdict != UNIQUE or not everywhere or shown != LISTED_GAP or met:
                 return False
-            # a bound that is not that of this cost is one of another: the long way finds out which is wrong
+            # If the bound does not match this cost, one of the two is wrong: the long path finds out which.
             if not abs(one.cost - bound) <= _APART * equal_cost(one.cost):
                 return False
         return True
 
-    def _pass_hidden(self, room: _SingleWorkspace, x: Array, i: int) -> None:
-        """Prove a fix x (size,), number i, again without the minima behind the Earth that its proof meets."""
-        one, d = slice(i, i + 1), room.asked.x.shape[-1]
-        costs, asked, answered = room.costs.take(one), room.asked.take(one), room.answered.take(one)
+    def _pass_hidden(self, workspace: _SingleWorkspace, x: Array, i: int) -> None:
+        """Prove fix number i at x (size,) again, without the minima behind the Earth that its proof found."""
+        one, d = slice(i, i + 1), workspace.asked.x.shape[-1]
+        costs, asked, answered = workspace.costs.take(one), workspace.asked.take(one), workspace.answered.take(one)
         asked.hidden[0] = 0
         boxes = 0
         while answered.verdict[0] == OTHER and asked.hidden[0] < HIDDEN:
@@ -298,20 +298,20 @@ class PreparedFix:
             prove_here(costs, asked, answered)
         answered.boxes[0] += boxes
 
-    def _is_inside(self, edges: Edges, answer: Answer, room: _SingleWorkspace) -> bool:
-        """Return whether nothing on a bound costs as little as what the proofs are about."""
-        assert room.beside is not None
-        if (answer.rival_cost < np.inf).any():  # what is low about a rival may reach elsewhere
+    def _is_inside(self, edges: Edges, answer: Answer, workspace: _SingleWorkspace) -> bool:
+        """Return whether no point on a bound costs as little as the levels of the proofs."""
+        assert workspace.beside is not None
+        if (answer.rival_cost < np.inf).any():  # low costs around a rival may reach a bound elsewhere
             return False
         d = self.load.place.shape[-1]
         x, cov = answer.x[:, :d], answer.covariance[:, :d, :d]
         numbers = (x, cov, answer.cost, answer.quantity, answer.normal)
-        return are_out_of_reach(edges, room.beside, room.costs, *numbers)
+        return are_out_of_reach(edges, workspace.beside, workspace.costs, *numbers)
 
-    def _agrees(self, fix: Fix, room: _SingleWorkspace) -> bool:
-        """Return whether the position costs are the problem's own, at the first fixes of a thread and beside them."""
-        many = self.problem.with_rows(z=room.z.copy())
-        return self.map is None or bool(matches_problem_cost(many, fix.flat(), room.costs).all())
+    def _agrees(self, fix: Fix, workspace: _SingleWorkspace) -> bool:
+        """Return whether the position costs equal the costs of the problem, at the fixes and near them."""
+        many = self.problem.with_rows(z=workspace.z.copy())
+        return self.map is None or bool(matches_problem_cost(many, fix.flat(), workspace.costs).all())
 
     def _judge(
         self,
@@ -319,29 +319,32 @@ class PreparedFix:
         answer: Any,
         found: list[EngineResult],
         stages: tuple[Stage, ...],
-        room: _SingleWorkspace,
+        workspace: _SingleWorkspace,
     ) -> Fix | None:
-        """Return the fixes with their verdicts, or None where more stands against one than words without numbers."""
+        """Return the fixes with their verdicts, or None if the reason of one of them needs the long path."""
         marks, kinds, gaps = [], [], []
         for one in found:
             more, gap = one.infinity - one.cost, one.rival_cost - one.cost
-            if one.kappa > STRAIGHT and isnan(more):  # nobody has looked at infinity
+            if one.kappa > STRAIGHT and isnan(more):  # the cost at infinity was not computed
                 return None
             marks.append(marks_of(one.cost > self.refuted, more, self.region, gap, one.kappa, self.map is not None))
             kinds.append(chart_kind(one.kappa, one.kappa_far))
             gaps.append(ambiguity(self.problem, gap) if gap < AMBIGUOUS_GAP else "")
-        inflation = self._inflations(answer, marks, room)
+        inflation = self._inflations(answer, marks, workspace)
         for i in inflation:
             marks[i], kinds[i] = Status.TAILS.mark, CARTESIAN if kinds[i] == CURVED else kinds[i]
-        told = _told(tuple(marks), tuple(kinds), tuple(gaps), shape)
-        if told is None:
+        notes = _notes_of(tuple(marks), tuple(kinds), tuple(gaps), shape)
+        if notes is None:
             return None
         x, covariance = (answer.x, answer.covariance) if shape else (answer.x[0], answer.covariance[0])
         inflations = np.array([inflation.get(i, 1.0) for i in range(len(found))]).reshape(shape) if inflation else None
         held, alone = active_of(self.plan, answer.multiplier), all(one.rival_cost == inf for one in found)
-        cost, claims, d = answer.cost.reshape(shape).copy(), room.claims, self.load.place.shape[-1]
+        cost, claims, d = answer.cost.reshape(shape).copy(), workspace.claims, self.load.place.shape[-1]
         if self.map is not None:
-            bound, boxes = room.answered.bound.reshape(shape).copy(), room.answered.boxes.reshape(shape).copy()
+            bound, boxes = (
+                workspace.answered.bound.reshape(shape).copy(),
+                workspace.answered.boxes.reshape(shape).copy(),
+            )
             reason = claims.reason if alone else _reasons(answer.rival_cost < np.inf, shape)
             claims = Claims(
                 claims.proof, reason, claims.method, bound, cost - bound,
@@ -350,40 +353,41 @@ class PreparedFix:
         return Fix(
             x,
             covariance,
-            code=told.code,
-            reason=told.reason,
+            code=notes.code,
+            reason=notes.reason,
             claims=claims,
             cost=cost,
             stages=stages,
-            marks=told.marks,
-            chart=Chart(told.kind, x[..., :d], covariance[..., :d, :d], room.centre, inflation=inflations),
+            marks=notes.marks,
+            chart=Chart(notes.kind, x[..., :d], covariance[..., :d, :d], workspace.centre, inflation=inflations),
             infinity=answer.infinity.reshape(shape) - cost,
-            alternatives=room.alone if alone else _rivals(answer, shape),
-            active=room.nothing if held is None else held.reshape(shape),
-            **room.kept,
+            alternatives=workspace.alone if alone else _rivals(answer, shape),
+            active=workspace.nothing if held is None else held.reshape(shape),
+            **workspace.kept,
         )
 
-    def _inflations(self, answer: Any, marks: list[int], room: _SingleWorkspace) -> dict[int, float]:
-        """Return the inflations of curved fixes, by number, whose 95 % figures hold when measurements are repeated."""
+    def _inflations(self, answer: Any, marks: list[int], workspace: _SingleWorkspace) -> dict[int, float]:
+        """Return the inflations, by item number, of curved fixes whose 95 % ellipses cover simulated repeats."""
         items = [i for i, mark in enumerate(marks) if mark == Status.CURVED.mark]
         if not items or not self.repeatable:
             return {}
-        many = self.problem.with_rows(z=room.z[items]).flat()
+        many = self.problem.with_rows(z=workspace.z[items]).flat()
         found = repeat(many, answer.x[items], answer.covariance[items])
         return {i: float(one[2]) for i, one, good in zip(items, found, holds(found), strict=True) if good}
 
-    def _room(self, shape: tuple[int, ...]) -> _SingleWorkspace:
-        """Return the arrays of this thread for so many problems."""
-        rooms: dict[tuple[int, ...], _SingleWorkspace] | None = getattr(self.own, "rooms", None)
-        if rooms is None:
-            rooms = self.own.rooms = {}
-        if shape not in rooms:
-            if len(rooms) == _ROOMS:
-                rooms.clear()
-            rooms[shape] = self._make_room(shape)
-        return rooms[shape]
+    def _workspace(self, shape: tuple[int, ...]) -> _SingleWorkspace:
+        """Return the workspace of this thread for a batch shape."""
+        workspaces: dict[tuple[int, ...], _SingleWorkspace] | None = getattr(self.own, "workspaces", None)
+        if workspaces is None:
+            workspaces = self.own.workspaces = {}
+        if shape not in workspaces:
+            if len(workspaces) == _WORKSPACES:
+                workspaces.clear()
+            workspaces[shape] = self._make_workspace(shape)
+        return workspaces[shape]
 
-    def _make_room(self, shape: tuple[int, ...]) -> _SingleWorkspace:
+    def _make_workspace(self, shape: tuple[int, ...]) -> _SingleWorkspace:
+        """Return a new workspace for a batch shape."""
         n, size, d, m = max(1, *shape, 1), self.plan.layout.size, self.load.place.shape[-1], self.problem.count
         found = tuple(blank_answer(n, *self.plan.widths))[2:]
         affine = self.map
@@ -392,13 +396,13 @@ class PreparedFix:
         nowhere = np.full((n, 2, d), np.nan)
         asked = ProofRequest(
             x=np.empty((n, d)),
-            others=np.zeros((n, 1 + HIDDEN, d)),  # another image, and what the Earth hides
+            others=np.zeros((n, 1 + HIDDEN, d)),  # the second image, and minima behind the Earth
             known=np.zeros(n, dtype=np.int64),
             hidden=np.zeros(n, dtype=np.int64),
             gaps=np.tile(gaps_below(LISTED_GAP, d), (n, 1)),
             eps=np.empty(n),
             region=nowhere,
-            # where all positions cannot be bounded the long way says what can
+            # no fallback: if the proof over all positions fails, the long path proves a smaller region
             fallback=nowhere,
             budget=budgets(n, len(costs.kinds), 1) * (1 if self.upward is None else ALL_AROUND),
             planes=np.repeat(self.planes, n, axis=0),
@@ -408,7 +412,7 @@ class PreparedFix:
         kept = {
             "layout": self.plan.layout,
             "frame": self.plan.frame,
-            # views that nobody can write into
+            # read-only views
             "dof": np.broadcast_to(np.int32(self.plan.dof), shape),
             "weights": np.broadcast_to(self.plan.weight, (*shape, m)),
             "reach": np.broadcast_to(centre_and_spread(self.problem.stations.places)[1].reshape(()), shape),
@@ -422,14 +426,14 @@ class PreparedFix:
 
 
 def _reasons(listed: Array, shape: tuple[int, ...]) -> Array:
-    """Return what is claimed of proven fixes, of which some (n,) have another minimum that is listed."""
+    """Return the claims in words of proven fixes; `listed` (n,) flags those with another listed minimum."""
     out = np.empty(len(listed), dtype=object)
     out[:] = [claim_sentence(LISTED_GAP, int(one), None) for one in listed]
     return out.reshape(shape)
 
 
 def _rivals(answer: Answer, shape: tuple[int, ...]) -> Alternatives:
-    """Return the other minima of fixes, with an empty slot where there is none."""
+    """Return the other minima of fixes, with an empty slot for a fix without one."""
     there = answer.rival_cost < np.inf
     x = np.where(there[:, None], answer.rival, np.nan)
     gap = np.where(there, answer.rival_cost - answer.cost, np.inf)
@@ -437,7 +441,7 @@ def _rivals(answer: Answer, shape: tuple[int, ...]) -> Alternatives:
 
 
 class _SingleNotes(NamedTuple):
-    """What is said of fixes (...): their statuses, reasons, marks and kinds of chart; nobody can write into them."""
+    """Statuses, reasons, marks and kinds of chart of fixes (...), as read-only arrays."""
 
     code: Array
     reason: Array
@@ -445,37 +449,38 @@ class _SingleNotes(NamedTuple):
     kind: Array
 
 
-@lru_cache(maxsize=256)  # few things are said of plain fixes
-def _told(
+@lru_cache(maxsize=256)  # fixes on the short path have few combinations of status and reason
+def _notes_of(
     marks: tuple[int, ...], kinds: tuple[int, ...], gaps: tuple[str, ...], shape: tuple[int, ...]
 ) -> _SingleNotes | None:
+    """Return statuses and reasons from marks, chart kinds and texts on rivals; None for the long path."""
     code = [Status(int(one)) for one in first_status(np.array(marks))]
     curved = [kind if status == Status.CURVED else None for status, kind in zip(code, kinds, strict=True)]
-    said = [
+    reasons = [
         gap if status == Status.AMBIGUOUS else _SENTENCES.get((status, kind))
         for status, kind, gap in zip(code, curved, gaps, strict=True)
     ]
-    if None in said:
+    if None in reasons:
         return None
-    told = zip((code, said, marks, kinds), (np.int8, object, np.int32, np.int8), strict=True)
-    out = _SingleNotes(*(np.array(values, dtype=kind).reshape(shape) for values, kind in told))
+    columns = zip((code, reasons, marks, kinds), (np.int8, object, np.int32, np.int8), strict=True)
+    out = _SingleNotes(*(np.array(values, dtype=kind).reshape(shape) for values, kind in columns))
     for array in out:
         array.setflags(write=False)
     return out
 
 
 def prepare_fix(problem: Problem, method: Method, *, often: bool = True) -> PreparedFix | None:
-    """Return what fixes measurements of one problem the short way, or None where there is none.
+    """Return a prepared problem that fixes measurements on the short path, or None if the path is not available.
 
-    There is one where problems differ in measurements alone and have a direct way, for methods that begin with it, and
-    where a proof depends on the measurements in a straight line.
+    The path has three conditions. Problems differ in their measurements only. The method begins with a direct solution.
+    The numbers of the proof are affine functions of the measurements.
 
     Parameters
     ----------
     problem : Problem
-        Its own measurements do not matter, nor do batch axes that they alone have, or that are of length one.
+        Its measurements do not matter. Only the measurements may have batch axes longer than one.
     method : Method
-        What its fixes are to be the same as.
+        The fixes equal those of this method.
     often : bool
         As of `Single`.
     """
@@ -488,7 +493,7 @@ def prepare_fix(problem: Problem, method: Method, *, often: bool = True) -> Prep
         return None
     limited = proves and any(not is_exact(constraint) for constraint in bare.constraints)
     edges = edges_of(bare) if limited else None
-    if limited and edges is None:  # proofs look along all of them
+    if limited and edges is None:  # the proofs would have to follow all bounds
         return None
     affine = affine_costs(bare) if proves else None
     if proves and affine is None:
@@ -524,27 +529,27 @@ def _alone(problem: Problem) -> Problem:
     bare = problem.with_rows(z=np.zeros(problem.count))
     if not bare.batch_shape or prod(bare.batch_shape) > 1:
         return bare
-    # what has a plan has batch axes of its stations alone
+    # in a problem with a plan only the stations have batch axes
     place, rates = bare.stations.position, bare.stations.velocity
     rates = None if rates is None else rates.reshape(rates.shape[-3:])
     return replace(bare, stations=replace(bare.stations, position=place.reshape(place.shape[-3:]), velocity=rates))
 
 
-# What fixes one problem is made in two milliseconds and takes some 50 kB.
-_KEPT = Cache["PreparedFix | None"](64)
+# A prepared problem takes two milliseconds to make and about 50 kB of memory.
+_KEPT = Cache["Single | None"](64)
 
 
 def at_once(problem: Problem, method: Method) -> Fix | None:
-    """Return the fixes of one problem, or of few that differ in measurements alone; None where the stages have to.
+    """Return the fixes of one problem, or of a few that differ in measurements only; None if the stages have to run.
 
-    What does not depend on the measurements is kept for the next problem of the same structure.
+    A cache stores the prepared problem for later problems of the same structure.
     """
     shape, place = problem.batch_shape, problem.stations.position
-    # a problem without batch axes shares all that it has, and `single` finds out the rest once
+    # a problem without batch axes shares everything, and `single` tests the other conditions once
     few = is_few(shape) and problem.count <= MOST and place.size == prod(place.shape[-3:])
     if not few or (shape and not is_planned(problem)):
         return None
-    with suppress(*NUMERICAL):  # the stages tell which of them fails
+    with suppress(*NUMERICAL):  # the stages report the item that fails
         ready = _KEPT.find((method, *_own_numbers(problem), *key_of(problem)), lambda: prepare_fix(problem, method))
         if ready is not None:
             z = problem.z
@@ -553,12 +558,15 @@ def at_once(problem: Problem, method: Method) -> Fix | None:
 
 
 def _own_numbers(problem: Problem) -> tuple[Any, ...]:
-    """Return what a plan takes as arguments and `Single` keeps, but for measurements: stations, levels, as bytes."""
+    """Return the numbers that `Single` stores and the key of a plan omits: stations and levels, without measurements.
+
+    They are bytes, as parts of a cache key.
+    """
     rates, bands = problem.stations.velocity, problem.constraints
     levels = tuple((b.lower.tobytes(), b.upper.tobytes()) for b in bands if isinstance(b, Band))
     return (problem.stations.position.tobytes(), None if rates is None else rates.tobytes(), levels)
 
 
 def is_few(shape: tuple[int, ...]) -> bool:
-    """Return whether problems with some batch axes may go the short way: one axis at most, and a short one."""
+    """Return whether problems with these batch axes may take the short path: at most one axis, of at most `MANY`."""
     return len(shape) < 2 and 0 < max(shape, default=1) <= MANY

@@ -1,4 +1,4 @@
-"""Solve: from a problem to a fix, without a guess."""
+"""`solve`: from a problem to a fix, without a first guess."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ def solve(problem: Problem, method: str = "auto", *, start: ArrayLike | None = N
     Parameters
     ----------
     problem : Problem
-        Batch axes (...). Where its epochs share no unknown they are solved as one more batch axis, (..., k).
+        Batch axes (...). If its epochs share no unknown, the epochs become one more batch axis, (..., k).
     method : str
-        "auto", or stages joined by "+": for instance "gtrs+lsr"; see ``optloc list solvers``. One that only starts,
-        such as "sdp" or "minimax", is followed by "lsr+certify".
+        "auto", or stages joined by "+", for instance "gtrs+lsr"; see ``optloc list solvers``. After a method that only
+        starts, such as "sdp" or "minimax", the stages "lsr+certify" run.
     start : array (..., size), optional
-        Starting vector: all that a method has which begins with a refinement, such as "lsr", and one more candidate
-        of every other.
+        Starting vector. A method that begins with a refinement, such as "lsr", has no other start. Every other method
+        treats it as one more candidate.
     refine : bool
-        False: a method that only starts returns its estimate as it is, with the status `unrefined`: for those who
-        compare starts.
+        False: a method that only starts returns its estimate without refinement, with the status `unrefined`. Use this
+        to compare starts.
 
     Returns
     -------
     Fix
-        With the problem's batch axes. Failure is a status, never an exception: where a stage fails numerically for one
-        problem of a batch it is `numerical` with the cause, and the others are fixed.
+        With the batch axes of the problem. A failure is a status, never an exception. If a stage fails numerically for
+        one problem of a batch, its status is `numerical` and its reason is the cause; the other problems are fixed.
 
     Raises
     ------
     InvalidProblem
-        For an unknown method, or where nothing is unknown.
+        For an unknown method, or if nothing is unknown.
     """
     run = Method.parse(method)
     fix = at_once(problem, run) if start is None else None
@@ -55,7 +55,7 @@ def solve(problem: Problem, method: str = "auto", *, start: ArrayLike | None = N
 
 
 def solve_in_stages(problem: Problem, run: Method, start: Any = None, *, refine: bool = True) -> Fix:
-    """Return what `solve` returns, by the stages of a method: a batch is what they are made for."""
+    """Return the fixes of `solve` by the stages of a method, which work on batches."""
     if problem.layout.size == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     if separable(problem):
@@ -70,14 +70,14 @@ def solve_in_stages(problem: Problem, run: Method, start: Any = None, *, refine:
         with noting_place("the verdict"):
             return hide_open_epochs(verdict(some, pool))
 
-    # the shortcut divides its work itself, and shares it among threads
+    # the shortcut divides the batch for its threads
     most = flat.batch_shape[0] if shortcut(run) and vector is None else PART
-    with np.errstate(all="ignore"):  # what overflows is judged: a status says so, once
+    with np.errstate(all="ignore"):  # an overflow gets a status, so a warning would repeat it
         fix = in_parts(flat, work, most, failed_fixes)
     return fix.reshape(shape) if shape != (len(fix),) else fix
 
 
-# What refines and judges the starts of a method that has nothing behind them.
+# Stages that refine and judge the starts of a method that only starts.
 _FINISH = Method(("lsr", "certify"))
 
 
@@ -88,16 +88,16 @@ def _broadcast_start(problem: Problem, start: Any) -> Array:
         return np.broadcast_to(vector, wanted)
     except ValueError:
         raise InvalidProblem(
-            f"start has shape {vector.shape}, not {wanted}", "start", "order it by the layout"
+            f"start has shape {vector.shape}, not {wanted}", "start", "give numbers in the order of problem.layout"
         ) from None
 
 
-# Fixes of a batch that keep their problems: a person looks at no more of them one by one.
+# Most fixes of a batch that keep their problems for later advice: a user reads no more fixes one by one.
 _KEPT = 8
 
 
 def _with_sources(problem: Problem, fix: Fix) -> Fix:
-    """Return fixes with the problems of those that are not `ok`, where they are few."""
+    """Return the fixes; those that are not `ok` keep their problems, if there are few."""
     if not fix.shape and int(fix.code) == Status.OK:
         return fix
     if not fix.shape and not problem.batch_shape:  # a copy of the problem would take as long as the fix

@@ -1,4 +1,4 @@
-"""Starts and suspected rows from a convex programme in which a few rows may be grossly wrong."""
+"""The stage "sparse": starts and suspected rows from a convex program that allows gross errors in a few rows."""
 
 from __future__ import annotations
 
@@ -28,29 +28,30 @@ from optloc.solvers.starts.several_positions import from_pieces
 from optloc.solvers.starts.squared_range import Coordinates, lift_rows
 from optloc.solvers.verdict.judge import judge
 
-# Least scaled distance, and factor, by which a row is weighed: a point on a station must not give one row all the
+# Least scaled distance, and least factor, for the weight of a row: a point on a station must not give one row all the
 # weight.
 _NEAR = 1e-3
-# A row is in error if its residual is larger than the greatest of all rows is with this probability: clean data lose a
-# row once in a hundred (docs/measured/sparse.md).
+# A row is in error if noise makes the greatest of all residuals this large with at most this probability. Clean data
+# lose a row once in a hundred cases (docs/measured/sparse.md).
 _LEVEL = 0.01
-# Tests of the rows, each with the fix of those that passed the one before: usually the second confirms the first, and
-# two sets that lead to each other must not go on for ever.
+# Most tests of the rows, each with the fix of the rows that passed the test before. Usually the second test confirms
+# the first. The limit ends cycles of two sets that lead to each other.
 _PASSES = 8
-# Variance of a residual, in that of its row, below which nothing checks the row: rounding of 1 - J C J'.
+# Variance of a residual, in units of the variance of its row, below which the row is not checked: rounding of 1 - J C
+# J'.
 _UNCHECKED = 1e-6
 
 
-# Rows of one position made linear one by one, so that one wrong measurement is one wrong row.
+# Linear rows for one position, one per measurement, so that one wrong measurement is one wrong row.
 #
-# A range row says ``r_a + c r_b + t = m`` with c of 0, 1 or -1 and t the emission time. With ``|x - s|^2 = r^2`` it is
+# A range row is ``r_a + c r_b + t = m`` with c of 0, 1 or -1 and the emission time t. With ``|x - s|^2 = r^2`` it is
 # linear in the position and in
 #
-# - ``|x|^2`` (range: c = 0, no t), which is not less than the square of x: a cone;
-# - ``t`` and ``|x|^2 - t^2`` (arrival times), of which every value is possible: no cone;
-# - ``r_b`` (pairs), which is not less than ``|x - s_b|``: a cone.
+# - ``|x|^2`` (range: c = 0, no t), which is at least the square of x: a cone;
+# - ``t`` and ``|x|^2 - t^2`` (arrival times), which may have any value: no cone;
+# - ``r_b`` (pairs), which is at least ``|x - s_b|``: a cone.
 #
-# No row passes on its error to another one, as it does where the ranges are first reduced to one reference.
+# If the ranges were first reduced to one reference, an error would spread to other rows.
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +65,13 @@ class RowWise:
     scale : array (N,)
         Metres.
     rows, right : array (N, m, n), (N, m)
-        Zero for a row that is absent or does not lift.
+        Zero for a row that is absent or has no linear form.
     error : callable
         Maps scaled points (N, d), or None, to the standard deviations (N, m) of the right sides.
     apex : array (N, q, d)
         Stations b, scaled.
     square : bool
-        Whether y holds ``|x|^2``, behind x; the ranges to the q stations b are the last entries.
+        Whether y holds ``|x|^2``, after x; the ranges to the q stations b are the last entries.
     """
 
     origin: Array
@@ -82,7 +83,7 @@ class RowWise:
     square: bool
 
     def cones(self, item: int) -> list[tuple[int, Array]]:
-        """Return the entry of y that each cone bounds, and the cone, of one problem."""
+        """Return the cones of one problem, each with the entry of y that it bounds."""
         n, d, q = self.rows.shape[-1], self.apex.shape[-1], self.apex.shape[1]
         ranged = [(n - q + j, range_cone(self.apex[item, j], n, n - q + j)) for j in range(q)]
         return [(d, square_cone(d, n, d)), *ranged] if self.square else ranged
@@ -90,7 +91,7 @@ class RowWise:
 
 @dataclass(frozen=True, slots=True)
 class _SparsePart:
-    """Rows of one kind: coefficients of x, of |x|^2 and of others by their column, right side, error at a point."""
+    """Rows of one kind: coefficients of x, of |x|^2 and of other unknowns by column, right side, error at a point."""
 
     x: Array
     square: Array
@@ -100,7 +101,7 @@ class _SparsePart:
 
 
 def row_wise(problem: Problem) -> RowWise:
-    """Return the rows of a flat batch of problems with one static target, each made linear by itself.
+    """Return linear rows for a flat batch of problems with one static target, one row for each measurement.
 
     Parameters
     ----------
@@ -152,6 +153,7 @@ def _references(problem: Problem) -> list[int]:
 
 
 def _block_sigma(problem: Problem, block: Rows, start: int) -> Array:
+    """Return the standard deviations (..., m) of the rows of one kind, with their weights."""
     weight = np.where(block.weight > 0.0, block.weight, 1.0)
     return np.sqrt(variances(problem.noise, problem.count)[..., start : start + block.count] / weight)
 
@@ -159,6 +161,7 @@ def _block_sigma(problem: Problem, block: Rows, start: int) -> Array:
 def _lift_ranges(
     problem: Problem, block: Rows, start: int, origin: Array, scale: Array, pairs: list[int], first: int
 ) -> _SparsePart | None:
+    """Return the linear rows of range measurements of one kind, or None for other kinds."""
     model, form = MODELS[block.kind], MODELS[block.kind].ranges
     if form is None:
         return None
@@ -175,14 +178,14 @@ def _lift_ranges(
         column = first + np.searchsorted(pairs, block.b)
         others = ((column, 2.0 * form[1] * m),)
     elif model.emission:
-        # r = m - t: |x|^2 - t^2 is one more unknown of the epoch, and 2 m t stands on the left
+        # r = m - t: |x|^2 - t^2 is one more unknown of the epoch, and 2 m t is on the left
         m = _centre(m, block)
         column = problem.dimension + 1 + 2 * block.epoch
         square, others = np.zeros(block.count), ((column, 2.0 * m), (column + 1, np.ones(block.count)))
     sigma = _block_sigma(problem, block, start) / scale[:, None]
 
     def error(point: Array | None) -> Array:
-        # before there is a point: as if as far away as the measurement says, or a network's size
+        # without a point, assume the measured distance, or at least the size of the network
         away = np.maximum(1.0, np.abs(m)) if point is None else np.sqrt(((point[:, None] - a) ** 2).sum(-1))
         return np.asarray(2.0 * np.maximum(np.where(np.isfinite(away), away, 1.0), _NEAR) * sigma)
 
@@ -190,17 +193,18 @@ def _lift_ranges(
 
 
 def _centre(m: Array, block: Rows) -> Array:
-    """Return arrival times (N, m) less the median of their epoch: one that is far off must not decide the origin."""
-    out, heard = np.array(m), np.broadcast_to(block.weight > 0.0, m.shape)
+    """Return arrival times (N, m) minus the median of their epoch: one gross error must not set the origin of time."""
+    out, present = np.array(m), np.broadcast_to(block.weight > 0.0, m.shape)
     for epoch in np.unique(block.epoch):
         own = block.epoch == epoch
         with np.errstate(all="ignore"):
-            middle = np.nanmedian(np.where(heard[:, own], m[:, own], np.nan), axis=1, keepdims=True)
+            middle = np.nanmedian(np.where(present[:, own], m[:, own], np.nan), axis=1, keepdims=True)
         out[:, own] -= np.where(np.isfinite(middle), middle, 0.0)
     return out
 
 
 def _lift_others(problem: Problem, block: Rows, start: int, to: Coordinates) -> _SparsePart | None:
+    """Return the linear rows of measurements without ranges of one kind, or None if it has no linear form."""
     lifted = lift_rows(problem, block, start, None, to)
     if lifted is None:
         return None
@@ -211,21 +215,21 @@ def _lift_others(problem: Problem, block: Rows, start: int, to: Coordinates) -> 
     return _SparsePart(lifted.row[..., :-1], lifted.row[..., -1], (), lifted.right, error)
 
 
-# The programmes, and the test of what they accuse.
+# The programs, and the test of the rows that they suspect.
 
 
 @dataclass(frozen=True, slots=True)
 class SparseErrors:
-    """What the convex programmes say about a flat batch of N problems of one position.
+    """Results of the convex programs for a flat batch of N problems of one position.
 
     Parameters
     ----------
     position : array (N, 2, d)
-        Point of the last programme, and the fix without the rows in error; NaN where there is none.
+        Point of the last program, and the fix without the rows in error; NaN without a solution.
     raw : bool array (N, m)
-        Support of the last programme: rows whose gross error is not zero.
+        Support of the last program: rows whose gross error is not zero.
     wrong : bool array (N, m)
-        Rows in error after the fix without them was tested.
+        Rows in error after the test of the fix without them.
     """
 
     position: Array
@@ -234,15 +238,16 @@ class SparseErrors:
 
 
 def sparse(problem: Problem, pool: Pool | None) -> Pool:
-    """Return the point of the convex programme with sparse errors and the fix without the rows in error.
+    """Return two starts: the point of the convex program with sparse errors, and the fix without the rows in error.
 
-    With fewer than about ten stations this is a start and nothing more: the sum of the errors' sizes then often hides
-    the wrong rows. Search their subsets instead.
+    With fewer than about ten stations this is only a start: the penalty on the sizes of the errors then often hides the
+    wrong rows. Use a search for suspects instead.
     """
     return explain_absence(problem, _starts(problem, pool), "sparse")
 
 
 def _starts(problem: Problem, pool: Pool | None) -> Pool:
+    """Return the starts of `sparse` without reasons for missing ones."""
     began = perf_counter()
     if not one_position(problem):
         x = from_pieces(problem, lambda piece: fix_by(piece, lambda one: _starts(one, None)))
@@ -250,7 +255,7 @@ def _starts(problem: Problem, pool: Pool | None) -> Pool:
     alone = problem_at_rest(problem)
     arrived = as_arrivals(alone)
     found = sparse_errors(alone if arrived is None else arrived.problem)
-    # a wrong arrival is in all differences that were made from it
+    # a wrong arrival is part of all differences that contain it
     wrong = found.wrong if arrived is None else spread_rows(found.wrong, arrived.origin, problem.count)
     weights = np.where(wrong, 0.0, problem.weight)
     x = vectors(problem.with_rows(weight=weights), pack(found.position))  # emission times fit the rows that are kept
@@ -260,7 +265,7 @@ def _starts(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def spread_rows(wrong: Array, origin: Sequence[Array], count: int) -> Array:
-    """Return the rows (N, count) that wrong arrival times (N, m) were made from (`optloc.problem.arrival_times`)."""
+    """Return flags (N, count) of rows that contain a wrong arrival time (N, m) (`optloc.problem.arrival_times`)."""
     out = np.zeros((len(wrong), count), dtype=bool)
     for i, rows in enumerate(origin):
         out[:, rows] |= wrong[:, i, None]
@@ -270,9 +275,10 @@ def spread_rows(wrong: Array, origin: Sequence[Array], count: int) -> Array:
 def sparse_errors(problem: Problem) -> SparseErrors:
     """Return positions and suspected rows of a flat batch of problems with one static target.
 
-    Three programmes follow each other: the rows squared one by one, the same weighed by the ranges to the first
-    answer, and the rows linearised at the second one. Then the support is tested: rows are left out, the rest is fixed,
-    and a row is in error if its residual is larger than the greatest of all rows is with a probability of 1 %.
+    Three programs run in turn: with the squared rows, with the squared rows weighted by the ranges to the first
+    solution, and with the rows linearised at the second solution. Then the support is tested: its rows are left out,
+    the other rows are fixed, and each row gets a test. A row is in error if noise makes the greatest of all residuals
+    this large with a probability of at most 1 %.
 
     Parameters
     ----------
@@ -284,17 +290,17 @@ def sparse_errors(problem: Problem) -> SparseErrors:
     x, raw, unsolved = _linearise(problem, x)
     start = problem.layout.take(x, "position")
     fixed, wrong = _test_support(problem, x, raw)
-    # without the answer of a programme nothing of it is left: not the fix of the rows that were not tested, either
+    # if a program fails, its fix and its rows are not tested, so all results are dropped
     failed |= unsolved
     found = np.where(failed[:, None, None], np.nan, np.stack([start, fixed], axis=1))
     return SparseErrors(found, raw & ~failed[:, None], wrong & ~failed[:, None])
 
 
 def _lift(problem: Problem) -> tuple[Array, Array]:
-    """Return positions (N, d) of the squared rows in two weightings, and where the solver failed (N,).
+    """Return positions (N, d) from the squared rows in two weightings, and flags (N,) of failed programs.
 
-    Where these leave a direction open (pairs without a common station have one more unknown each), it is the closed
-    form of all rows.
+    If these rows leave a direction undetermined, the position is the closed form of all rows: pairs without a common
+    station have one more unknown each.
     """
     lifts, point, failed = row_wise(problem), None, np.zeros(problem.batch_shape[0], dtype=bool)
     for _ in range(2):
@@ -310,16 +316,16 @@ def _lift(problem: Problem) -> tuple[Array, Array]:
 
 
 def _linearise(problem: Problem, x: Array) -> tuple[Array, Array, Array]:
-    """Return vectors (N, size) after one step with sparse errors, the support (N, m), and where the solver failed."""
+    """Return vectors (N, size) after one step with sparse errors, the support (N, m), and flags of failed programs."""
     residual, jacobian = _derivatives(problem, x)
     move, errors, failed = _fit(jacobian, residual, _sigma(problem))
     return x + move, errors != 0.0, failed
 
 
 def _fit(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) -> tuple[Array, Array, Array]:
-    """Return the unknowns (N, n) and errors in sigmas (N, m) of linear rows, and where the solver failed (N,).
+    """Return the unknowns (N, n) and errors in sigmas (N, m) of linear rows, and flags (N,) of failed programs.
 
-    Unknowns that no row has are zero.
+    Unknowns that no row contains are zero.
     """
     from formulations.sparse_errors import sparse_fit
 
@@ -331,7 +337,7 @@ def _fit(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) 
         used = (white[i] != 0.0).any(0)
         if not (used.any() and np.isfinite(white[i]).all() and np.isfinite(side[i]).all()):
             return
-        # cones have a last column of their own, the constant
+        # the last column of a cone is its constant
         kept = np.append(used, True)
         cones = [] if lifts is None else [cone[:, kept] for column, cone in lifts.cones(i) if used[column]]
         found = sparse_fit(white[i][:, used], side[i], cones=cones)
@@ -346,18 +352,18 @@ def _fit(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) 
 
 
 def _test_support(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Array]:
-    """Return the positions (N, d) without the rows in error, and these rows (N, m)."""
+    """Return the positions (N, d) without the rows in error, and flags (N, m) of these rows."""
     present = np.broadcast_to(problem.weight > 0.0, wrong.shape)
-    # two-sided, and the greatest of m rows: Bonferroni
+    # two-sided, for the greatest of m rows: Bonferroni
     limit = -ndtri(0.5 * _LEVEL / np.maximum(present.sum(1, keepdims=True), 1))
     wrong, active = wrong.copy(), np.arange(len(x))
     x = x.copy()
-    # the support may be too large for a fix: of equals the first rows are kept in it
+    # if the support leaves too few rows for a fix, its first rows stay in it
     wrong = _spare(problem, wrong.astype(float), wrong)
     for _ in range(_PASSES):
         part, out = problem.take(active), wrong[active]
         rest = part.with_rows(weight=np.where(out, 0.0, part.weight))
-        # the rest has a closed form of its own, which the wrong rows have not pulled
+        # the other rows have a closed form that the wrong rows have not biased
         starts = np.stack([x[active], gtrs(rest, None).x[:, 0]], axis=1)
         fixed = judge(rest, lsr(rest, begin(rest, starts))).x
         x[active] = np.where(np.isfinite(fixed), fixed, x[active])
@@ -372,7 +378,7 @@ def _test_support(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Arra
 
 
 def _spare(problem: Problem, size: Array, wrong: Array) -> Array:
-    """Return the largest of the rows in error (N, m), so many that one row more than unknowns is left."""
+    """Return the largest of the rows in error (N, m), limited so that one row more than unknowns remains."""
     present = np.broadcast_to(problem.weight > 0.0, wrong.shape)
     most = np.maximum(present.sum(1, keepdims=True) - present_unknowns(problem)[:, None] - 1, 0)
     # argsort of argsort is the rank: 0 for the largest
@@ -381,23 +387,23 @@ def _spare(problem: Problem, size: Array, wrong: Array) -> Array:
 
 
 def _standardise(problem: Problem, x: Array, kept: Array) -> Array:
-    """Return residuals (N, m) at the fix of the rows kept, in units of their own standard deviations.
+    """Return residuals (N, m) at the fix of the rows kept, divided by their standard deviations.
 
-    A row of the fix has residual variance s^2 - J C J', one left out s^2 + J C J'.
+    The residual of a row in the fix has the variance s^2 - J C J', the residual of a row left out s^2 + J C J'.
     """
     residual, jacobian = _derivatives(problem, x)
     sigma = _sigma(problem)
     residual, white = residual / sigma, jacobian / sigma[..., None]
     inside = np.where(kept[..., None], white, 0.0)
     information = np.swapaxes(inside, -1, -2) @ inside
-    # unknowns that no kept row has: a one on the diagonal keeps the matrix invertible and touches nothing else
+    # for unknowns without a kept row, a one on the diagonal keeps the matrix invertible and changes nothing else
     idle = np.einsum("nii->ni", information) == 0.0
     covariance, _ = linalg.inverse(information + idle[..., None] * np.eye(idle.shape[-1]))
     lever = np.einsum("nmi,nij,nmj->nm", white, covariance, white)
     variance = np.where(kept, 1.0 - lever, 1.0 + lever)
     with np.errstate(invalid="ignore"):
-        told = variance > _UNCHECKED  # what has no redundancy fits whatever its error
-    return np.where(told, np.abs(residual) / np.sqrt(np.where(told, variance, 1.0)), 0.0)
+        checked = variance > _UNCHECKED  # a row without redundancy fits with any error
+    return np.where(checked, np.abs(residual) / np.sqrt(np.where(checked, variance, 1.0)), 0.0)
 
 
 def _derivatives(problem: Problem, x: Array) -> tuple[Array, Array]:
@@ -406,13 +412,14 @@ def _derivatives(problem: Problem, x: Array) -> tuple[Array, Array]:
     n, width = problem.layout.n_shared, problem.layout.n_local
     full = np.zeros((*compact.shape[:-1], problem.layout.size))
     full[..., :n] = compact[..., :n]
-    # local columns are compact: those of each row belong to its own epoch
+    # local columns are compact: each row has the columns of its epoch
     for j in range(width):
         full[:, np.arange(problem.count), n + problem.epoch * width + j] = compact[..., n + j]
     return residual, np.where(problem.weight[..., None] > 0.0, full, 0.0)
 
 
 def _sigma(problem: Problem) -> Array:
+    """Return the standard deviations (N, m) of all rows, with their weights."""
     weight = np.where(problem.weight > 0.0, problem.weight, 1.0)
     sigma = np.sqrt(variances(problem.noise, problem.count) / weight)
     return np.broadcast_to(sigma, (*problem.batch_shape, problem.count))

@@ -1,4 +1,4 @@
-"""The stages that a method is made of: (problem, pool or None) -> pool."""
+"""The stages of methods. A stage maps (problem, pool or None) to a pool."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ from optloc.solvers.verdict.minima import is_measured, settle
 
 Solver = Callable[[Problem, Pool | None], Pool]
 
-# What more candidates may change; what a proof or a look around the fix says is known only once all of them are there.
+# Statuses that more candidates may change. Proofs and the cost at infinity come later, when all candidates are known.
 _UNSETTLED = (Status.AMBIGUOUS, Status.UNBOUNDED, Status.CONTRADICTORY, Status.MISFIT)
-# Share of its distance from the stations beyond which the error of a fix calls for a look along the valley: from
-# there on the cost may be far from quadratic over the ellipsoid, and have another minimum a few sigma away.
+# Error of a fix, as a share of its distance from the stations, above which more starts along the valley are tried. The
+# cost may then be far from quadratic over the ellipsoid, with another minimum a few sigma away.
 _WEAK = 1e-2
 
 
 def start_with(word: str) -> Solver:
-    """Return the stage that offers the candidates of all formulations which start fixes under a word of a method."""
+    """Return the stage of a word of a method: it offers the starts of all formulations for the word."""
 
     def start(problem: Problem, pool: Pool | None) -> Pool:
         began, turned = perf_counter(), headings(problem)
@@ -60,14 +60,15 @@ def start_with(word: str) -> Solver:
 
     def begin(problem: Problem, pool: Pool | None) -> Pool:
         began = perf_counter()
-        # rays are the refinement's: what starts a fix knows straight lines
+        # closed forms use straight lines; the refinement follows rays
         whole, problem = problem, problem.straightened()
         serving = [form for form in FORMULATIONS.values() if word in form.starts and form.serves(problem)]
-        # what serves fewer problems knows more of this one: where nothing refines the starts, its answer is the fix
+        # A formulation that serves fewer problems is more specific: without a refinement its answer is the fix, so it
+        # comes first.
         serving.sort(key=lambda form: form.serves is one_position)
         if one_position(problem):
             alone = problem_at_rest(problem)
-            # an empty slot, so that rows which no formulation starts give a pool without candidates
+            # an empty slot, so that rows without a serving formulation give a pool without candidates
             nowhere = np.full((problem.batch_shape[0], 1, problem.dimension), np.nan)
             position = np.concatenate([*(form.starts[word](alone) for form in serving), nowhere], axis=1)
             return _place(whole, position, pool, word, began)
@@ -81,7 +82,7 @@ def start_with(word: str) -> Solver:
 
 
 def explain_absence(problem: Problem, pool: Pool, word: str) -> Pool:
-    """Return a pool of starts that says why a word of a method found none for rows that have some of other words.
+    """Return a pool of starts with reasons for problems without a start, if another method can start them.
 
     Parameters
     ----------
@@ -90,37 +91,37 @@ def explain_absence(problem: Problem, pool: Pool, word: str) -> Pool:
     pool : Pool
         Their starts.
     word : str
-        What made them: a key of the starts of a formulation, or the name of a stage.
+        Source of the starts: a key of the starts of a formulation, or the name of a stage.
     """
     items = np.zeros(0, dtype=int) if word in _COMPLETE else np.flatnonzero(pool.empty)
     if not len(items):
         return pool
-    if failures():  # not the rows are the reason
+    if failures():  # a back end failed, so the rows are not the reason
         return pool
     part = problem.take(items)
-    # of what starts nowhere else, and determines nothing, the verdict knows more
+    # if no other method can start the rows either, the verdict finds a better reason
     items = items[~roots(part, None).empty | is_measured(part)]
     forms = FORMULATIONS.values()
     own = [form for form in forms if word in form.starts] or [form for form in forms if word in form.words]
     needs = [form.needs(problem) for form in own]
-    told = needs[0] if needs and all(needs) else "finds no start from these rows"
-    return pool.without(items, f"{word} {told}: use 'auto'", Status.UNAVAILABLE)
+    reason = needs[0] if needs and all(needs) else "finds no start from these rows"
+    return pool.without(items, f"{word} {reason}: use 'auto'", Status.UNAVAILABLE)
 
 
-# Words whose starts serve all rows that any closed form serves.
+# Words whose starts cover all rows that any closed form covers.
 _COMPLETE = ("gtrs", "roots")
 
 gtrs, roots = start_with("gtrs"), start_with("roots")
 
-# Squared length of the undamped step, in standard deviations, below which a refinement has arrived: a hundredth of one.
+# Squared length of the undamped step, in standard deviations, below which a refinement has converged: 0.01 squared.
 _ARRIVED = 1e-4
 
 
 def lsr_with_mirror(problem: Problem, start: Pool) -> Pool:
     """Return starts and their mirror images, refined.
 
-    The image in the plane (or line) that fits the stations best is where flat networks have their second minimum; one
-    that ends where an undamped step would lead on is no minimum.
+    Flat networks have their second minimum near the mirror image in the plane (or line) that fits the stations best. An
+    image is no minimum if an undamped step would move on from its end point.
 
     Parameters
     ----------
@@ -137,12 +138,12 @@ def lsr_with_mirror(problem: Problem, start: Pool) -> Pool:
     x = np.concatenate([start.x, vectors(problem, image)], axis=1)
     x = pack(x)
     both = replace(offer(problem, x, start, "", perf_counter()), stages=start.stages)
-    # where an image runs to infinity its cost is one of many there, and not the least: nobody has looked
+    # an image that runs to infinity gives a cost there, but not the least one, so this cost is not kept
     return replace(_without_halted(problem, lsr(problem, both)), infinity=None)
 
 
 def _without_halted(problem: Problem, pool: Pool) -> Pool:
-    """Return a settled pool without the rivals at which an undamped step would lead on."""
+    """Return a settled pool without rivals from which an undamped step would move on."""
     item, slot = pool.occupied
     item, slot = item[slot > 0], slot[slot > 0]
     # constraints and interfaces hold points that free steps would leave
@@ -166,9 +167,9 @@ def fix_by(problem: Problem, start: Callable[[Problem], Pool]) -> Fix:
 
 
 def add_candidates(problem: Problem, pool: Pool | None) -> Pool:
-    """Return a refined pool with mirror images beside it, and where the verdict is not clean starts of sub-arrays."""
+    """Return a refined pool with mirror images as starts, and starts of sub-arrays if the verdict has findings."""
     if pool is None:
-        raise InvalidProblem("widen adds candidates to a fix", "method", "put it behind a refinement")
+        raise InvalidProblem("widen needs a fix", "method", "put it after a refinement, as in 'gtrs+lsr+widen'")
     if is_registration_run(problem):
         began, fix = perf_counter(), judge(problem, pool)
         around = step_beside(problem, fix.x, fix.covariance())
@@ -179,11 +180,12 @@ def add_candidates(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def _widen(problem: Problem, pool: Pool) -> Pool:
-    """Return the candidates of a refined pool of problems of one position, and more."""
+    """Return the candidates of a refined pool of problems of one position, and additional starts."""
     began, fix, alone = perf_counter(), judge(problem, pool), problem_at_rest(problem.straightened())
     seen = problem.layout.take(surviving_candidates(pool, fix), "position")
     parts = [mirror(alone, fix.position[:, None])]
-    # the mirror image is one start and always tried; the others are many: where the verdict is not clean
+    # The mirror image is a single start, so it is always tried. The other starts are many, so they are tried only if
+    # the verdict has findings.
     unsettled = ~fix.answered | fix.has(*_UNSETTLED) | (fix.p_value < P_SUSPECT)
     valley = np.flatnonzero(unsettled | _weak(problem, fix))
     for items, more in (
@@ -200,16 +202,18 @@ def _widen(problem: Problem, pool: Pool) -> Pool:
 
 
 def _beside(problem: Problem, pool: Pool, fix: Fix, x: Array, began: float) -> Pool:
+    """Return the candidates of fixes together with more starts x (N, q, size)."""
     return offer(problem, pack(np.concatenate([surviving_candidates(pool, fix), x], axis=1)), pool, "widen", began)
 
 
 def _subarrays(problem: Problem, fix: Fix) -> Array:
+    """Return the starts (N, q, d) of all sub-arrays and their mirror images."""
     found = subarray_starts(problem)
     return np.concatenate([found, mirror(problem, found)], axis=1)
 
 
 def _weak(problem: Problem, fix: Fix) -> Array:
-    """Return which fixes have an error of more than a hundredth of their distance from the stations, (N,)."""
+    """Return flags (N,) of fixes whose error exceeds a hundredth of their distance from the stations."""
     centre, _ = spread_of(problem)
     with np.errstate(invalid="ignore"):
         spread = np.sqrt(np.trace(fix.covariance(), axis1=-2, axis2=-1))
@@ -217,7 +221,7 @@ def _weak(problem: Problem, fix: Fix) -> Array:
 
 
 def _fresh(problem: Problem, fix: Fix, seen: Array, more: Array) -> Array:
-    """Return those of more positions that are not within one standard deviation of those seen; the others are NaN."""
+    """Return additional positions, with NaN for positions within one standard deviation of those seen."""
     covariance = fix.covariance()
     usable = np.asarray(np.isfinite(covariance).all((-1, -2)))
     information, ok = linalg.inverse(np.where(usable[:, None, None], covariance, np.eye(problem.dimension)))
@@ -225,31 +229,32 @@ def _fresh(problem: Problem, fix: Fix, seen: Array, more: Array) -> Array:
     for point in np.moveaxis(seen, 1, 0):
         apart = more - point[:, None]
         with np.errstate(invalid="ignore"):
-            # within one sigma refinement of either leads to the same minimum
+            # within one sigma both refinements lead to the same minimum
             near |= ((apart @ information) * apart).sum(-1) < 1.0
     return np.where((near & (usable & ok)[:, None])[..., None], np.nan, more)
 
 
-# The last resort, a seeded search from many places, for mixtures that no closed form starts: directions are uniform and
-# distances log-uniform, so many that in space each of the 8 octants is tried at 12 scales; the dozen cheapest go on:
-# more than a handful, because the few steps before rank them only roughly and many lead to the same minimum.
+# The last resort is a seeded search from many positions, for mixtures that no closed form starts. Directions are
+# uniform and distances log-uniform. 96 positions try each of the 8 octants of space at 12 scales. The 12 cheapest are
+# refined fully, since the first steps rank them only roughly and many lead to the same minimum.
 _PLACES, _KEPT = 96, 12
-_FEW = 8  # steps that tell promising places from others
-_SEED = 20261121  # any: the same problem always gets the same places
+_FEW = 8  # steps that separate promising positions from others
+_SEED = 20261121  # arbitrary: the same problem always gets the same positions
 
-# More starts change nothing about these.
+# Statuses that more starts do not change.
 _SETTLED = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.CONTRADICTORY)
-# Of these no closed form had a start.
+# Statuses of problems for which no closed form had a start.
 _STARTLESS = (Status.DISCONNECTED, Status.UNAVAILABLE)
 
 
 def search(problem: Problem, pool: Pool | None) -> Pool:
-    """Return a pool whose unanswered problems were searched: box by box where a proof bounds their cost, or by places.
+    """Return a pool after a search for its unanswered problems.
 
-    Only of those that were searched from places does the pool say so.
+    If a proof bounds their cost, the search goes over boxes, else from many positions. Only the latter problems are
+    marked as searched.
     """
     if pool is None or pool.curvature is None:
-        raise InvalidProblem("search fills the gaps of a fix", "method", "put it behind a refinement")
+        raise InvalidProblem("search needs a fix", "method", "put it after a refinement, as in 'gtrs+lsr+search'")
     if not (why_unsupported(problem) or is_scaled(problem)):
         pool = _answer(problem, pool, lambda part: _with_offsets(part, best_first_starts(part)), lambda why: {})
     elif moves_at_once(problem):
@@ -262,11 +267,11 @@ def search(problem: Problem, pool: Pool | None) -> Pool:
 def _answer(
     problem: Problem, pool: Pool, starts: Callable[[Problem], Array], says: Callable[[Array], dict[str, Any]]
 ) -> Pool:
-    """Return a pool whose unanswered problems begin anew, and keep what they had where that answers nothing either."""
+    """Return a pool whose unanswered problems start again; problems that stay unanswered keep their old pool."""
     fix = judge(problem, pool)
-    # where all that is known is hidden by the Earth, another minimum may be in sight
+    # if the Earth hides all known minima, another minimum may be visible
     hidden = np.zeros(len(fix.code), dtype=bool) if pool.hidden is None else pool.hidden != ""
-    # closed forms start with straight lines: in layers none of their starts need have a ray to every station
+    # closed forms use straight lines, so in layers their starts need not have a ray to every station
     bent = isinstance(problem.medium, Layers) & (fix.code == Status.INFEASIBLE)
     lost = ~fix.answered & (hidden | bent | ~np.isin(fix.code, _SETTLED))
     refuted = fix.answered & (fix.code == Status.MISFIT) & problem.frame.geodetic
@@ -280,7 +285,7 @@ def _answer(
     part = problem.take(items)
     found = lsr(part, offer(part, starts(part), take(pool, items), "search", began))
     now = judge(part, found)
-    # a minimum with an objection is better news than a missing start
+    # a minimum with a finding is better than a missing start
     better = np.isin(fix.code[items], _STARTLESS) & ~np.isin(now.code, _STARTLESS)
     good = np.flatnonzero(now.answered | better)
     found = replace(found, **says(fix.reason[items]))
@@ -289,10 +294,10 @@ def _answer(
 
 
 def _with_offsets(problem: Problem, position: Array) -> Array:
-    """Return vectors (N, q, size) of positions (N, q, d), the other shared unknowns as fit them.
+    """Return vectors (N, q, size) of positions (N, q, d), with the other shared unknowns at their best values.
 
-    They are linear where a proof bounds the cost. Beside the minimum of a weak pair a refinement from other offsets
-    creeps along a valley and stops short.
+    They are linear if a proof bounds the cost. With other offsets, a refinement of a weak pair creeps along a valley
+    and stops before the minimum.
     """
     x = vectors(problem, pack(position))
     slot, _ = problem.layout.find("position")
@@ -300,23 +305,24 @@ def _with_offsets(problem: Problem, position: Array) -> Array:
     item, place = np.nonzero(np.isfinite(x).all(-1))
     if len(others) and len(item):
         at = equations_at(problem.take(item), x[item, place])
-        # a combination of offsets that no row feels stays as it is
+        # a combination of offsets that no row measures does not change
         solved = np.linalg.pinv(at.shared[:, others[:, None], others], hermitian=True)
         x[item[:, None], place[:, None], others] += (solved @ at.shared_vector[:, others, None])[..., 0]
     return x
 
 
 def _searched(why: Array) -> dict[str, Any]:
-    """Return what a pool says of problems that were searched from places, after what was wrong before."""
+    """Return the fields of a pool for problems that were searched from many positions, with their earlier reasons."""
     remark = np.array([_searched_sentence(each) for each in why], dtype=object)
     return {"searched": np.ones(len(why), dtype=bool), "remark": remark}
 
 
 def _search_starts(problem: Problem) -> Array:
-    """Return the best starting positions (N, q, d) of a flat batch among places around the stations.
+    """Return the best starting positions (N, q, d) of a flat batch among positions around the stations.
 
-    Directions are uniform, distances log-uniform from a tenth of the stations' spread to a hundred times it; every
-    place is refined for a few steps and the cheapest are kept. The same problem always gets the same places.
+    Directions are uniform, and distances are log-uniform from a tenth of the spread of the stations to a hundred times
+    it. Every position is refined for a few steps, and the cheapest are kept. The same problem always gets the same
+    positions.
 
     Parameters
     ----------
@@ -337,29 +343,31 @@ def _search_starts(problem: Problem) -> Array:
 
 
 def _directions(d: int) -> Array:
+    """Return the fixed positions (96, d) of the search, in spreads of the stations from their centre."""
     rng = np.random.default_rng(_SEED)
     direction = rng.standard_normal((_PLACES, d))
-    # normal deviates over their length are uniform on the sphere, in any dimension
+    # normal deviates divided by their length are uniform on the sphere, in any dimension
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    # a tenth of the spread is amid the stations; at a hundred of it wave fronts are all but flat
+    # a tenth of the spread is between the stations; at a hundred spreads wave fronts are almost flat
     return direction * 10.0 ** rng.uniform(-1.0, 2.0, (_PLACES, 1))
 
 
 def _searched_sentence(why: str) -> str:
-    return f"{why}; best of a search from {_PLACES} places" if why else f"best of {_PLACES} places"
+    """Return the remark on a searched problem, after the reason `why` of its missing start."""
+    return f"{why}; best of a search from {_PLACES} positions" if why else f"best of {_PLACES} positions"
 
 
 def search_widely(problem: Problem) -> Pool:
-    """Return what the method "searched" returns: every start that is known, and a search where there is none."""
+    """Return the pool of the method "searched": from every known start, and from a search for problems without one."""
     return search(problem, lsr(problem, add_candidates(problem, lsr(problem, roots(problem, None)))))
 
 
 def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int = 100) -> Pool:
     """Return the minima that damped least squares reaches from all candidates of the pool before."""
     if pool is None:
-        raise InvalidProblem("lsr refines a start", "method", "give start= or a method such as 'gtrs+lsr'")
+        raise InvalidProblem("lsr needs a start", "method", "give start= or a method such as 'gtrs+lsr'")
     if damped and pool.refined and not pool.unfinished:
-        return pool  # nothing was added since
+        return pool  # no candidate was added since
     began = perf_counter()
     strata = strata_of(problem, exact(problem)) if damped else None
     if strata is not None:
@@ -370,11 +378,12 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
     item, slot = pool.occupied
     detail = "nothing to refine"
     if len(item):
-        # one candidate each: no copy of the problems is made
+        # with one candidate each, the problems are not copied
         whole = len(item) == len(pool) and bool((item == np.arange(len(pool))).all())
         face = exact(problem) if damped else ()
         own = None if whole else item
-        # a hundred steps by default: damped ones along a flat valley are short; what is unfinished then runs away
+        # A hundred steps by default: damped steps along a flat valley are short. A refinement that needs more runs to
+        # infinity.
         if strata is None:
             done = refine(problem, x[item, slot], item=own, damped=damped, limit=limit, face=face)
         else:
@@ -385,9 +394,9 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
         turned = headings(problem)
         x = x if turned is None else unwind(turned, x)
     weights = np.broadcast_to(problem.weight, (len(pool), problem.count))
-    # on the face without inequalities, number 0; `bound_pool` adds those on others
-    inside, told = np.zeros(shape, dtype=int), pool.missing
-    refined = Pool(x, cost, code, inside, weights, pool.dof, pool.stages, missing=told, hidden=pool.hidden)
+    # face 0 has no inequalities; `bound_pool` adds candidates on other faces
+    inside, missing = np.zeros(shape, dtype=int), pool.missing
+    refined = Pool(x, cost, code, inside, weights, pool.dof, pool.stages, missing=missing, hidden=pool.hidden)
     free = least_finished(refined) if problem.constraints else None
     refined = replace(bound_pool(problem, refined) if damped else refined, free=free)
     stage = Stage("lsr" if damped else "taylor", detail, perf_counter() - began)
@@ -397,9 +406,10 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
 
 def taylor(problem: Problem, pool: Pool | None) -> Pool:
     """Return the result of plain undamped Taylor iteration: a baseline that diverges silently, kept for comparison."""
-    # plain steps converge within a few or never: fifty leave no doubt which
+    # undamped steps converge within a few steps or never; fifty steps decide
     return lsr(problem, pool, damped=False, limit=50)
 
 
 def _place(problem: Problem, position: Array, pool: Pool | None, name: str, began: float) -> Pool:
+    """Return positions (N, q, d) as a pool of starts, with the other unknowns filled in."""
     return offer(problem, vectors(problem, pack(position)), pool, name, began)

@@ -1,4 +1,4 @@
-"""What the data say beyond a covariance: regions, arcs, samples, mixtures and the radii of data sheets."""
+"""Uncertainty beyond a covariance: regions, arcs, samples, mixtures and the radii of data sheets."""
 
 from typing import TYPE_CHECKING
 

@@ -1,7 +1,7 @@
-"""The valley of a curved likelihood: a curve along which the data tell little, traced from the fix both ways.
+"""The valley of a curved likelihood: a curve of almost constant cost, traced from the fix in both directions.
 
-Ranges from stations on a line leave a circle around it, ranges from a plane an arc through the fix and its mirror
-image. Along such a curve no Gaussian covers; across it one does.
+Ranges from stations on a line leave a circle around it. Ranges from stations in a plane leave an arc through the fix
+and its mirror image. Along such a curve no Gaussian covers; across it a Gaussian does.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.uncertainty.region import RegionSurface
 
-# Corrections across the curve, in its standard deviations, below which the next step is longer and above which it is
-# tried again; a step that changes the cost by more is tried again too: a circle takes 300 nodes, an arc 40.
+# Corrections across the curve, in standard deviations: below _EASY the next step is longer, above _HARD the step is
+# tried again. A step that changes the cost by more than _JUMP is tried again too. A circle takes 300 nodes, an arc 40.
 _EASY, _HARD, _JUMP = 1.5, 4.0, 1.5
 _LONGER, _SHORTER = 1.5, 0.5
-# Cost above the fix's at which a curve ends: a share of 4e-6 of the density is left.
+# Excess of the cost over the fix at which a curve ends: a share of 4e-6 of the density remains.
 _END = 25.0
-# First step in standard deviations along the curve, nodes each way at most, and corrections of a node.
+# First step in standard deviations along the curve, most nodes in each direction, and most corrections of a node.
 _FIRST, _NODES, _CORRECTIONS = 0.2, 400, 3
-# A node is good where the last correction was so small, standard deviations.
+# Length of the last correction of a good node, standard deviations.
 _SETTLED = 0.05
-# Steps shorter than this share of the first do not go on: the curve has an end or a branch.
+# Least step, as a share of the first: at shorter steps the curve has an end or a branch.
 _TINY = 1e-6
-# How much wider than the curve samples are spread across it: chords leave the curve by a standard deviation.
+# Factor of the spread of samples across the curve: chords leave the curve by a standard deviation.
 _WIDER = 1.3
-# Nearest to infinity that a node may come in the inverse-range chart.
+# Least w of a node in the inverse-range chart; zero is infinity.
 _LEAST_W = 1e-6
 
 
@@ -52,7 +52,7 @@ class Arc:
     across : array (m, d, d - 1)
         Standard deviations across the curve, in columns, in the coordinates of the nodes.
     closed : bool
-        Whether the last node is the first one again.
+        Whether the last node equals the first.
     """
 
     surface: RegionSurface
@@ -69,13 +69,13 @@ class Arc:
 
     @property
     def mass(self) -> Array:
-        """Return the share (m - 1,) of the probability that lies between each two nodes, for an even prior."""
+        """Return the share (m - 1,) of the probability between neighbouring nodes, for a uniform prior."""
         density = self._density()
         mass = self._lengths() * 0.5 * (density[1:] + density[:-1])
         return np.asarray(mass / mass.sum())
 
     def locate(self, points: Array) -> tuple[Array, Array]:
-        """Return where points lie along the curve and how far beside it.
+        """Return the coordinates of points along the curve, and their distances from it.
 
         Parameters
         ----------
@@ -85,7 +85,7 @@ class Arc:
         Returns
         -------
         share : array (q,)
-            Share of the probability before each along the curve: 0.025 to 0.975 holds 95 %.
+            Share of the probability before each point along the curve: 0.025 to 0.975 contains 95 %.
         beside : array (q,)
             Distance across the curve, standard deviations.
         """
@@ -107,18 +107,18 @@ class Arc:
         Parameters
         ----------
         n : int
-            How many.
+            Number of samples.
         seed : int
-            Decides the draw.
+            Seed of the draw.
 
         Returns
         -------
         position : array (n, d)
             Metres.
         log_weight : array (n,)
-            Logarithms of their weights but for a constant, for an even prior in the coordinates of the nodes.
+            Logarithms of their weights up to a constant, for a uniform prior in the coordinates of the nodes.
         share : array (n,)
-            Where along the curve they were drawn, see `locate`.
+            Coordinates along the curve at which they were drawn, see `locate`.
         """
         mass, d = self.mass, self.node.shape[-1]
         spaced, wide, density = student(d - 1, n, seed)
@@ -135,9 +135,11 @@ class Arc:
         return position, np.where(good, -0.5 * (cost - self.surface.least) - density, -np.inf), spaced
 
     def _to_position(self, z: Array) -> Array:
+        """Return the positions, metres, of node coordinates."""
         return self.surface.chart.to_position(z) if self.far else z
 
     def _lengths(self) -> Array:
+        """Return the lengths (m - 1,) of the chords between nodes."""
         return np.asarray(np.sqrt((np.diff(self.node, axis=0) ** 2).sum(-1)))
 
     def _log_width(self) -> Array:
@@ -151,7 +153,7 @@ class Arc:
 
 
 def trace_arc(problem: Problem, fix: Fix) -> Arc:
-    """Return the curve along which the data allow a fix to move, traced both ways.
+    """Return the curve along which the data hardly determine a fix, traced in both directions.
 
     Parameters
     ----------
@@ -162,8 +164,8 @@ def trace_arc(problem: Problem, fix: Fix) -> Arc:
 
     Notes
     -----
-    Steps along the axis of least information, corrected by Gauss-Newton across it, until the cost is 25 above that of
-    the fix or the curve comes back.
+    Steps follow the axis of least information, and Gauss-Newton corrects them across it. The curve ends if the cost
+    exceeds the cost of the fix by 25, or if the curve returns to the fix.
     """
     return trace_from(RegionSurface.of(problem, fix))
 
@@ -180,7 +182,7 @@ def trace_from(surface: RegionSurface) -> Arc:
         other, closed = valley.walk(start, -first)
         nodes = other[:0:-1] + one
     if closed:
-        # It is cut where it is least likely, so that shares count from there.
+        # A closed curve is cut at its least likely node, and shares count from there.
         least = int(np.argmax([node.cost for node in nodes]))
         nodes = nodes[least:] + nodes[:least]
         nodes.append(nodes[0])
@@ -231,7 +233,7 @@ class _Valley:
         return node, size * vectors[:, 0]
 
     def walk(self, start: _Node, first: Array) -> tuple[list[_Node], bool]:
-        """Return the nodes one way, the fix first, and whether the curve has come back to it."""
+        """Return the nodes in one direction, the fix first, and whether the curve has returned to it."""
         size = least = float(np.sqrt((first**2).sum()))
         least *= _TINY
         nodes, along = [start], first / size
@@ -251,7 +253,7 @@ class _Valley:
         return nodes, False
 
     def _settle(self, z: Array, along: Array) -> tuple[_Node | None, float]:
-        """Return the node next to coordinates, and by how many standard deviations it lay beside them."""
+        """Return the node next to coordinates, and their distance from it in standard deviations."""
         moved = 0.0
         for number in range(_CORRECTIONS + 1):
             if self.far and not z[-1] > _LEAST_W:
@@ -271,6 +273,7 @@ class _Valley:
         return None, np.inf
 
     def _node(self, z: Array, cost: float, information: Array, along: Array) -> _Node:
+        """Return the node at coordinates z (d,), with one standard deviation across the curve."""
         sides = basis(along)
         values, vectors = np.linalg.eigh(sides.T @ information @ sides)
         root = vectors / np.sqrt(np.maximum(values, np.finfo(float).tiny))
@@ -286,19 +289,19 @@ class _Valley:
 
 # Points from which samples are drawn: a Student distribution, spread evenly.
 
-# Student's degrees of freedom: tails heavier than those of a Gaussian keep the weights of what lies there small.
+# Student's degrees of freedom: tails heavier than a Gaussian's keep the weights of far samples small.
 _DEGREES = 5.0
 
 
 def student(d: int, n: int, seed: int) -> tuple[Array, Array, Array]:
-    """Return evenly spread points of a Student distribution and one more number each.
+    """Return evenly spread points of a Student distribution, each with one more number.
 
     Parameters
     ----------
     d, n : int
         Dimensions and number of points.
     seed : int
-        Decides the draw.
+        Seed of the draw.
 
     Returns
     -------
@@ -307,12 +310,12 @@ def student(d: int, n: int, seed: int) -> tuple[Array, Array, Array]:
     points : array (n, d)
         Of scale one.
     log_density : array (n,)
-        Logarithm of the density there but for a constant.
+        Logarithm of the density there up to a constant.
     """
     from scipy.special import gammaincinv, ndtri
     from scipy.stats import qmc
 
-    # Of any number, not only powers of two: the balance that is lost then is nothing beside the weights.
+    # n need not be a power of two: the lost balance is negligible against the effect of the weights
     spaced = qmc.Sobol(d + 2, rng=np.random.default_rng(seed)).random_base2(int(np.ceil(np.log2(max(n, 2)))))[:n]
     spaced = np.clip(spaced, np.finfo(float).eps, 1.0 - np.finfo(float).eps)
     stretch = np.sqrt(_DEGREES / (2.0 * gammaincinv(0.5 * _DEGREES, spaced[:, 1])))

@@ -1,8 +1,8 @@
-"""Where a function of two coordinates is negative: its contour as closed lines, found by a grid and made exact.
+"""Contours of a function of two coordinates: the set where it is negative, as closed lines.
 
-The grid lies inside cells that are known to hold the set, and is refined until the set has enough nodes. Every point of
-a line is then moved along its edge of the grid to where the function changes its sign, so that the grid decides which
-parts there are and how many corners a line has, but not where it runs.
+The grid is inside cells that hold the set, and it is refined until enough of its nodes are in the set. Each point of a
+line is then moved along its edge of the grid to the zero of the function. So the grid decides the number of parts and
+corners, but not the course of a line.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ Value = Callable[[Array], Array]
 Polygon = list[Array]
 """Closed lines (r, 2): the outer one counter-clockwise, then those around holes, clockwise."""
 
-# Nodes across the longer side of the grid on which cells that touch are told from cells that are apart.
+# Nodes across the longer side of the grid that separates cells which touch from cells which do not.
 _COARSE = 200
-# Nodes of a first grid, and inside a part before it is traced: a disc of 600 has an outline of 90 corners, and 0.1 % of
-# its area is lost between them. And nodes that are evaluated at a time at most: 0.2 s in the plane.
+# Nodes of the first grid. Nodes inside a part before it is traced: a disc of 600 nodes has an outline of 90 corners,
+# which loses 0.1 % of its area. Most nodes that are evaluated together: 0.2 s in the plane.
 _FIRST, _INSIDE, _MOST = 4000, 600, 40_000
-# So many times more nodes inside show that parts are parts, and not a ridge that is thinner than a step.
+# Factor of the nodes inside at which several parts are accepted: fewer may be one ridge that is thinner than a step.
 _APART_AT = 10
-# Grids at most: each has half the step of the one before.
+# Most grids: each has half the step of the one before.
 _PASSES = 8
-# Values below which a node is near the set, the widest first: beside a ridge of half width w the value is 3 at 2 w.
+# Values below which a node is near the set, the widest first: at a ridge of half width w the value is 3 at distance 2
+# w.
 _LIMITS = (3.0, 1.0, 0.2)
-# Least width of a grid, of its length: a line of cells has none.
+# Least width of a grid as a share of its length: a row of cells may have no width.
 _THIN = 1e-9
-# Steps of the search for the change of sign along an edge: it begins with an interpolation, and the function is smooth.
+# Steps of the search for the zero along an edge: it begins with an interpolation, and the function is smooth.
 _STEPS = 7
-# Value to which larger ones are cut off for interpolations, in units of the value that ends the set.
+# Larger values are cut to this value for interpolation, in units of the value at the end of the set.
 _CUT = 4.0
 
 
@@ -48,7 +49,7 @@ class _Grid:
     step: Array
 
     def points(self, nodes: Array) -> Array:
-        """Return the points (n, 2) of nodes (n, 2), whole numbers or not."""
+        """Return the points (n, 2) of nodes (n, 2), which need not be whole numbers."""
         return np.asarray(self.origin + (self.step * nodes) @ self.axes)
 
 
@@ -65,20 +66,20 @@ def trace(value: Value, cells: Array) -> list[Polygon]:
     Returns
     -------
     list of list of array (r, 2)
-        Each a closed line, then its holes; the parts that are larger come first.
+        Each a closed line, then its holes; larger parts come first.
     """
     found = [polygon for part in _parts(cells) for polygon in _trace_part(value, part)]
     return sorted(found, key=lambda polygon: -area(polygon[0]))
 
 
 def area(line: Array) -> float:
-    """Return the area that a closed line (r, 2) encloses: negative where it runs clockwise."""
+    """Return the area inside a closed line (r, 2); negative for a clockwise line."""
     (x, y) = (line - line[0]).T
     return 0.5 * float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum())
 
 
 def holds(line: Array, point: Array) -> bool:
-    """Return whether a closed line (r, 2) is around a point (2,), by the crossings of a ray."""
+    """Return whether a closed line (r, 2) surrounds a point (2,), from the crossings of a ray."""
     (x0, y0), (x1, y1) = line[:-1, :2].T, line[1:, :2].T
     crosses = (y0 > point[1]) != (y1 > point[1])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -96,7 +97,7 @@ def trace_nodes(value: Value, nodes: Array, step: float) -> list[Polygon]:
     return _polygons(value, grid, values)
 
 
-# Parts of the cells that do not touch, each with a grid of its own.
+# Parts of the cells that do not touch; each part has a grid.
 
 
 def _parts(cells: Array) -> list[Array]:
@@ -112,12 +113,12 @@ def _parts(cells: Array) -> list[Array]:
     if count <= 1:
         return [cells]
     own = groups[tuple(first.T)]
-    # a group of its own size may come apart on its finer grid
+    # a group may separate further on its finer grid
     return [part for i in range(1, count + 1) for part in _parts(cells[own == i])]
 
 
 def _painted(first: Array, last: Array, shape: tuple[int, int]) -> Array:
-    """Return which nodes of a grid lie in rectangles from a first to a last node, both (m, 2)."""
+    """Return flags of the nodes of a grid in rectangles from first to last nodes, both (m, 2)."""
     count = np.zeros((shape[0] + 1, shape[1] + 1), dtype=int)
     (west, south), (east, north) = first.T, last.T + 1
     for x, y, sign in ((west, south, 1), (east, south, -1), (west, north, -1), (east, north, 1)):
@@ -130,13 +131,13 @@ def _trace_part(value: Value, cells: Array) -> list[Polygon]:
     flat = cells.reshape(-1, 2)
     middle = flat.mean(0)
     axes = np.linalg.eigh(np.cov((flat - middle).T))[1].T[::-1].copy()
-    axes[1] *= np.sign(np.linalg.det(axes))  # no mirror image: lines keep their sense
+    axes[1] *= np.sign(np.linalg.det(axes))  # a rotation without reflection: lines keep their sense
     grid, mask = _first_grid((cells - middle) @ axes.T, axes, middle)
     found: list[Polygon] = []
     for _ in range(_PASSES):
         values = _evaluate(value, grid, mask)
         found, inside = _polygons(value, grid, values), int((values < 0.0).sum())
-        # a part that is thinner than the grid comes apart on it
+        # a part that is thinner than a step falls apart on the grid
         if inside >= _INSIDE and (len(found) <= 1 or inside >= _APART_AT * _INSIDE):
             break
         finer = _promising(values, mask)
@@ -147,11 +148,11 @@ def _trace_part(value: Value, cells: Array) -> list[Polygon]:
 
 
 def _first_grid(cells: Array, axes: Array, middle: Array) -> tuple[_Grid, Array]:
-    """Return a grid over cells (m, v, 2) along its axes, and which of its nodes are in cells or beside them."""
+    """Return a grid over cells (m, v, 2) along its axes, and flags of its nodes in or next to cells."""
     low, high = cells.min((0, 1)), cells.max((0, 1))
     size = np.maximum(high - low, _THIN * float((high - low).max()))
-    step = size / np.sqrt(_FIRST)  # a set that is long and thin along the axes takes no more nodes than a round one
-    for _ in range(2):  # cells fill a part of the rectangle: so much finer the grid may be
+    step = size / np.sqrt(_FIRST)  # separate steps: a long thin set takes as many nodes as a round one
+    for _ in range(2):  # cells fill only a part of the rectangle, so the grid may be finer
         shape = np.ceil(size / step).astype(int) + 5
         first = np.floor((cells.min(1) - low) / step).astype(int) + 1
         last = np.ceil((cells.max(1) - low) / step).astype(int) + 3
@@ -161,7 +162,7 @@ def _first_grid(cells: Array, axes: Array, middle: Array) -> tuple[_Grid, Array]
 
 
 def _promising(values: Array, mask: Array) -> Array | None:
-    """Return the nodes of a grid of half the step near which the set may be, or None where they are too many."""
+    """Return flags of the nodes near the set on a grid of half the step, or None if there are too many."""
     from scipy.ndimage import binary_dilation
 
     around = np.ones((3, 3), dtype=bool)
@@ -178,19 +179,19 @@ def _promising(values: Array, mask: Array) -> Array | None:
 
 
 def _evaluate(value: Value, grid: _Grid, mask: Array) -> Array:
-    """Return the values (nx, ny) at nodes of a mask, cut off, and outside of it as if far outside the set."""
+    """Return the values (nx, ny) at the nodes of a mask, cut off; other nodes get the value far outside the set."""
     out = np.full(mask.shape, _CUT)
     nodes = np.argwhere(mask)
     if len(nodes):
         found = value(grid.points(nodes.astype(float)))
         out[tuple(nodes.T)] = np.where(np.isnan(found), _CUT, np.clip(found, -_CUT, _CUT))
-    out[[0, -1]] = out[:, [0, -1]] = _CUT  # lines close
+    out[[0, -1]] = out[:, [0, -1]] = _CUT  # so that lines close
     return out
 
 
-# Marching squares: the corners of a square that are inside decide which of its edges a line joins, the inside on its
-# left. Corners have the bits 1, 2, 4, 8 from the lower left one, counter-clockwise; edges are those below (B), right
-# (R), above (T) and left (L). Squares with two opposite corners are told by their middle.
+# Marching squares: the corners of a square that are inside decide which of its edges a line joins, with the inside on
+# the left. Corners have the bits 1, 2, 4, 8 from the lower left one, counter-clockwise. Edges are below (B), right (R),
+# above (T) and left (L). For squares with two opposite corners inside, the mean value decides.
 _JOINS: dict[int, tuple[str, ...]] = {
     1: ("BL",),
     2: ("RB",),
@@ -207,14 +208,14 @@ _JOINS: dict[int, tuple[str, ...]] = {
 }
 _APART: dict[int, tuple[str, ...]] = {5: ("BL", "TR"), 10: ("RB", "LT")}
 _TOGETHER: dict[int, tuple[str, ...]] = {5: ("BR", "TL"), 10: ("LB", "RT")}
-# An edge is its lower or left node, and whether it goes along the second axis.
+# An edge is its lower or left node, and a flag for the second axis.
 _EDGES = {"B": (0, 0, 0), "T": (0, 1, 0), "L": (0, 0, 1), "R": (1, 0, 1)}
 
 Edge = tuple[int, int, int]
 
 
 def _polygons(value: Value, grid: _Grid, values: Array) -> list[Polygon]:
-    """Return the polygons of values on a grid, their corners where the function changes its sign."""
+    """Return the polygons of values on a grid, with corners at the zeros of the function."""
     loops = _loops(values)
     if not loops:
         return []
@@ -256,7 +257,7 @@ def _loops(values: Array) -> list[list[Edge]]:
 
 
 def _crossings(value: Value, grid: _Grid, values: Array, edges: Array) -> Array:
-    """Return the points (n, 2) at which a function changes its sign along edges (n, 3) of a grid."""
+    """Return the zeros (n, 2) of a function along edges (n, 3) of a grid."""
     begin, along = edges[:, :2].astype(float), np.eye(2)[edges[:, 2]]
     one, two = values[tuple(edges[:, :2].T)], values[tuple((edges[:, :2] + np.eye(2, dtype=int)[edges[:, 2]]).T)]
     # from the end inside to the end outside
@@ -272,7 +273,7 @@ def _crossings(value: Value, grid: _Grid, values: Array, edges: Array) -> Array:
         found = np.where(np.isnan(found), _CUT, np.clip(found, -_CUT, _CUT))
         within = found < 0.0
         low, high = np.where(within, middle, low), np.where(within, high, middle)
-        # where one end stays twice its value counts half (Illinois): both ends come near
+        # if one end is used twice, half of its value is taken (Illinois rule), so that both ends approach the zero
         at_high = np.where(within, np.where(side > 0.0, 0.5 * at_high, at_high), found)
         at_low = np.where(within, found, np.where(side < 0.0, 0.5 * at_low, at_low))
         side = np.where(within, 1.0, -1.0)

@@ -1,8 +1,8 @@
-"""The likelihood region of a fix in the plane of a picture: the contour of the cost, whatever its shape.
+"""The likelihood region of a fix in the plane of a picture: a contour of the cost, of any shape.
 
-In the plane the region is ``f <= f(fix) + q`` itself. In space a picture shows two coordinates: the third one is at its
-best, and q is the quantile of chi-square with two degrees of freedom, as of an ellipse that is drawn of a covariance.
-What is drawn therefore holds the two coordinates that are seen with the stated probability.
+In the plane the region is ``f <= f(fix) + q``. In space a picture shows two coordinates. The third coordinate then
+takes its best value, and q is the quantile of chi-square with two degrees of freedom, as for an ellipse from a
+covariance. So the outline contains the two visible coordinates with the stated probability.
 """
 
 from __future__ import annotations
@@ -23,26 +23,25 @@ from optloc.problem.problem import Problem
 from optloc.uncertainty.contour import Polygon, area, trace, trace_nodes
 from optloc.uncertainty.region import RegionSurface, likelihood_region, passes
 
-# Cells that hold a region, by dimension: where the contour is looked for.
+# Most cells that hold a region, by dimension; the contour is searched in them.
 _CELLS = {2: 400, 3: 3000}
-# Where a region that goes on to infinity is cut off in a picture: so many times the distance of the fix.
+# Distance, in distances of the fix, at which a picture cuts off a region that reaches to infinity.
 FAR = 3.0
-# How much nearer than that a line is taken to end there.
+# Share of that distance from which a line counts as cut off.
 _AT_EDGE = 0.995
-# Steps across the ellipsoid of a far fix, by dimension, and how far beyond it the contour is looked for: the fix is not
-# quite Gaussian there.
+# Steps across the ellipsoid of a far fix, by dimension, and the factor by which the search extends beyond the
+# ellipsoid, since the fix is not exactly Gaussian there.
 _STEPS, _BEYOND = {2: 24, 3: 14}, 1.4
-# Places along the coordinate that is not seen, and steps from the best two of them: a cost with two minima there has
-# both.
+# Positions along the hidden coordinate, and steps from the best two of them: a cost with two minima there has both.
 _ALONG, _NEWTON = 9, 4
-# Nodes across the plane by which the reach of cells along the third coordinate is told.
+# Nodes across the plane of the table that holds the reach of cells along the third coordinate.
 _ACROSS = 160
-# Half the width of a region that is a line, of its length: it is seen, and not taken for an area.
+# Half the drawn width of a region that is a line, as a share of its length: visible, but not mistaken for an area.
 _WIDTH = 2e-3
 # Halvings that find the ends of a line within a step.
 _HALVINGS = 20
-# Steps of the grid from the fix to where a Gaussian meets the level, and nodes at most: more than a picture shows.
-# Where there are more the steps are doubled, so often that a region of a million standard deviations has an end.
+# Steps of the grid from the fix to the level of a Gaussian, most nodes (more than a picture shows), and most doublings
+# of the step for larger regions: a region of a million standard deviations still ends.
 _FINE, _NODES, _DOUBLINGS = 8.0, 4000, 20
 
 
@@ -56,7 +55,7 @@ class Outline:
         Closed lines along the axes of the plane, metres from the fix: the outer one counter-clockwise, then those
         around holes, clockwise.
     cut : bool
-        Whether it goes on beyond where it is drawn.
+        Whether the region continues beyond the drawn part.
     """
 
     polygons: tuple[Polygon, ...]
@@ -69,7 +68,7 @@ class Outline:
 
 
 def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) -> Outline | None:
-    """Return the region of a fix that no ellipse covers, in a plane through it.
+    """Return the region of a fix, in a plane through it, if no ellipse covers it.
 
     Parameters
     ----------
@@ -78,14 +77,14 @@ def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) ->
     fix : Fix
         Its fix.
     plane : array (2, d)
-        Unit vectors at right angles: the axes of the plane in the problem's frame.
+        Unit vectors at right angles: the axes of the plane in the frame of the problem.
     level : float
-        Probability that the region contains what is seen of the target.
+        Probability that the region contains the visible coordinates of the target.
 
     Returns
     -------
     Outline or None
-        None where an ellipse covers, or nothing encloses the region.
+        None if an ellipse covers, or if the region cannot be enclosed.
     """
     if fix.chart is not None and fix.chart.truncated is not None and fix.chart.cut_off:
         line = fix.chart.truncated.outline(plane, level)
@@ -125,7 +124,7 @@ def _free(surface: RegionSurface, cells: Array, plane: Array, level: float) -> O
 
 
 def _profile(surface: RegionSurface, cells: Array, plane: Array) -> Callable[[Array], Array]:
-    """Return what maps points (n, 2) of a plane to the least cost (n,) over the coordinate that is not seen."""
+    """Return a function from points (n, 2) of a plane to the least cost (n,) over the hidden coordinate."""
     if plane.shape[1] == 2:
         return lambda points: surface.cost(surface.position + points @ plane)
     normal = np.cross(plane[0], plane[1])
@@ -153,7 +152,7 @@ def _profile(surface: RegionSurface, cells: Array, plane: Array) -> Callable[[Ar
 
 
 def _least_along(surface: RegionSurface, base: Array, normal: Array, low: Array, high: Array) -> Array:
-    """Return the least costs (n,) along lines from points (n, d) about the fix, between two ends (n,) of each."""
+    """Return the least costs (n,) along lines through points (n, d) about the fix, between two ends (n,) of each."""
 
     def at(t: Array) -> tuple[Array, Array, Array]:
         points = surface.position + base[:, None] + t[..., None] * normal
@@ -163,7 +162,7 @@ def _least_along(surface: RegionSurface, base: Array, normal: Array, low: Array,
         return cost, t, np.where(np.isfinite(step), step, 0.0)
 
     cost, t, step = at(low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _ALONG))
-    # the best two of those that are better than both beside them
+    # the best two of the local minima along the line
     around = np.pad(cost, ((0, 0), (1, 1)), constant_values=np.inf)
     valley = np.where((cost <= around[:, :-2]) & (cost <= around[:, 2:]), cost, np.inf)
     pick = np.argsort(valley, axis=1)[:, :2]
@@ -187,7 +186,7 @@ def _far_cells(chart: Chart, level: float) -> Array:
     cells = edges[first[:, None] + corner]
     cells = cells[np.sqrt((cells**2).sum(-1)).min(1) <= _BEYOND]
     at = chart.mean + cells @ axes.T
-    at[..., -1] = np.maximum(at[..., -1], 0.9 / FAR)  # beyond is cut off
+    at[..., -1] = np.maximum(at[..., -1], 0.9 / FAR)  # farther points are cut off
     return chart.to_position(at)
 
 
@@ -195,9 +194,9 @@ def _far_cells(chart: Chart, level: float) -> Array:
 
 
 def _held(problem: Problem, fix: Fix, plane: Array, level: float) -> Outline | None:
-    """Return the outline of a region along a surface, or the strip around one along a line."""
+    """Return the outline of a region along a surface, or a strip around a region along a line."""
     assert fix.chart is not None
-    held = hold_along(problem, fix, level, FAR * float(fix.chart.distance))
+    held = cost_along(problem, fix, level, FAR * float(fix.chart.distance))
     nodes, step = held.flooded()
     if not len(nodes):
         return None
@@ -211,12 +210,12 @@ def _held(problem: Problem, fix: Fix, plane: Array, level: float) -> Outline | N
 
 
 def _turned(polygon: Polygon) -> Polygon:
-    """Return a polygon whose outer line runs counter-clockwise: axes of a surface may be seen from below."""
+    """Return a polygon whose outer line runs counter-clockwise: the axes of a surface may be seen from below."""
     return polygon if area(polygon[0]) >= 0.0 else [line[::-1] for line in polygon]
 
 
-def _strips(held: Held, plane: Array, position: Array) -> tuple[Polygon, ...]:
-    """Return thin strips around a region along a line: without a width it would not be seen."""
+def _strips(held: EqualityCost, plane: Array, position: Array) -> tuple[Polygon, ...]:
+    """Return thin strips around a region along a line: without a width it would be invisible."""
     nodes, step = held.flooded()
     order = np.sort(nodes[:, 0])
     parts = np.split(order, np.flatnonzero(np.diff(order) > 1) + 1)
@@ -232,8 +231,8 @@ def _strips(held: Held, plane: Array, position: Array) -> tuple[Polygon, ...]:
     return tuple(map(_turned, found))
 
 
-def _ends(held: Held, part: Array, step: float) -> Array:
-    """Return the ends (2,) of an interval of nodes, where the cost meets the level."""
+def _ends(held: EqualityCost, part: Array, step: float) -> Array:
+    """Return the ends (2,) of an interval of nodes, at which the cost meets the level."""
     inside = np.array([part[0], part[-1]], dtype=float) * step
     outside = inside + np.array([-step, step])
     for _ in range(_HALVINGS):
@@ -244,8 +243,8 @@ def _ends(held: Held, part: Array, step: float) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
-    """The cost along a surface or line that equalities leave, by coordinates from the fix along its principal axes.
+class EqualityCost:
+    """The cost along the surface or line of equalities, in coordinates from the fix along its principal axes.
 
     Parameters
     ----------
@@ -256,15 +255,15 @@ class Held:
     x : array (1, size)
         All unknowns of the fix.
     own : slice
-        Which of them are the position.
+        Slice of the position in the unknowns.
     axes : array (d, k)
         One standard deviation along each axis, metres.
     least : float
         Cost of the fix.
     quantile : float
-        By how much costs of the region exceed it at most: that of chi-square with k degrees of freedom.
+        Largest excess of the cost in the region: the quantile of chi-square with k degrees of freedom.
     reach : float
-        How far from the fix the region goes, metres: where it has no end, it has one.
+        Largest distance from the fix, metres, which also ends a region without an end.
     starts : array (q, k)
         The fix, and alternatives within the region.
     """
@@ -284,7 +283,7 @@ class Held:
         return np.asarray(self._vectors(steps)[:, self.own])
 
     def away(self, steps: Array) -> Array:
-        """Return how far coordinates (n, k) are from the fix, as shares (n,) of the reach."""
+        """Return the distances (n,) of coordinates (n, k) from the fix, as shares of the reach."""
         return np.asarray(np.sqrt(((self.place(steps) - self.x[0, self.own]) ** 2).sum(-1)) / self.reach)
 
     def value(self, steps: Array) -> Array:
@@ -295,7 +294,7 @@ class Held:
         return np.asarray(np.maximum((cost - self.least) / self.quantile - 1.0, beyond))
 
     def flooded(self) -> tuple[Array, float]:
-        """Return the nodes (n, k) of a grid that are reached within the region, and its step; none where too many."""
+        """Return the connected nodes (n, k) of a grid in the region, and the step; empty if there are too many."""
         step = float(np.sqrt(self.quantile)) / _FINE
         for _ in range(_DOUBLINGS):
             found = _flooded(lambda steps: self.value(steps) <= 0.0, self.starts, step)
@@ -305,13 +304,14 @@ class Held:
         return np.zeros((0, self.axes.shape[1]), dtype=int), step
 
     def _vectors(self, steps: Array) -> Array:
+        """Return vectors (n, size) of coordinates (n, k), moved onto the equalities."""
         points = np.repeat(self.x, len(steps), axis=0)
         points[:, self.own] += steps @ self.axes.T
         return restore(self.problem, self.face, points)
 
 
-def hold_along(problem: Problem, fix: Fix, level: float, reach: float) -> Held:
-    """Return the cost along what equalities leave of a fix.
+def cost_along(problem: Problem, fix: Fix, level: float, reach: float) -> EqualityCost:
+    """Return the cost of a fix along the surface or line of its equalities.
 
     Parameters
     ----------
@@ -322,28 +322,28 @@ def hold_along(problem: Problem, fix: Fix, level: float, reach: float) -> Held:
     level : float
         Probability that the region contains the target.
     reach : float
-        How far from the fix the region goes, metres.
+        Largest distance of the region from the fix, metres.
     """
     flat, x = problem.flat().with_rows(weight=fix.weights[None]), fix.x[None]
     face, d = exact(flat), problem.dimension
     slot, _ = problem.layout.find("position")
     own = slice(slot.start, slot.start + d)
     gradients = levels(flat, face, x)[1][0][:, own]
-    left = np.linalg.svd(gradients)[2][len(gradients) :].T  # what is orthogonal to all of them
+    left = np.linalg.svd(gradients)[2][len(gradients) :].T  # orthogonal to all gradients
     values, vectors = np.linalg.eigh(left.T @ fix.covariance() @ left)
     axes = left @ (vectors * np.sqrt(np.maximum(values, 0.0)))
     q = quantile(level, axes.shape[1])
     least = float(profile(flat, x[None], x, passes(flat))[0][0, 0])
     others = fix.alternatives.x[:, own][fix.alternatives.gap <= q]
     starts = np.concatenate([np.zeros((1, axes.shape[1])), (others - x[0, own]) @ np.linalg.pinv(axes).T])
-    return Held(flat, face, x, own, axes, least, q, reach, starts)
+    return EqualityCost(flat, face, x, own, axes, least, q, reach, starts)
 
 
 def _flooded(inside: Callable[[Array], Array], starts: Array, step: float) -> Array | None:
-    """Return the nodes (n, k) of a grid, in steps, that are reached within a region; None where there are too many."""
+    """Return the nodes (n, k) of a grid, in steps, that are connected within a region; None if there are too many."""
     k = starts.shape[1]
     ways = np.array([way for way in product((-1, 0, 1), repeat=k) if any(way)])
-    # those around a start are held too: the region may be thinner than a step
+    # neighbours of a start are included too: the region may be thinner than a step
     seen = {tuple(node) for node in np.round(starts / step).astype(int).tolist()}
     held, front = set(seen), seen
     while front:

@@ -1,4 +1,4 @@
-"""Samples of where the target may be, and a sum of few Gaussians that stands for them."""
+"""Samples of the posterior position, and a sum of a few Gaussians that approximates it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from optloc.uncertainty.region import RegionSurface
 
 Belief = Literal["jeffreys", "flat"]
 
-# By how much wider than the fix's own ellipsoid the proposal is: 0.8 of the samples are effective then (median).
+# Factor of the proposal over the ellipsoid of the fix: 0.8 of the samples are then effective (median).
 _WIDER = 1.1
-# Share of the samples below which their effective number is too small to trust a mean: at a tenth, one in ten counts.
+# Share of effective samples below which a mean is not reliable.
 _POOR = 0.1
-# Nearest to infinity that a sample may come in the inverse-range chart: a rounding of w.
+# Least w of a sample in the inverse-range chart: one rounding from infinity.
 _LEAST_W = 1e-12
 
 
@@ -35,15 +35,15 @@ class Samples:
     position : array (n, d)
         Metres.
     weight : array (n,)
-        They sum to one.
+        Weights; they sum to one.
     prior : str
-        What was believed before the data: "jeffreys", "flat", or "arc": even along an arc.
+        Prior of the position: "jeffreys", "flat", or "arc" for a uniform prior along an arc.
     within : float, optional
-        Radius of the ball around the stations' middle that holds all of them, metres.
+        Radius of the ball around the middle of the stations that contains all samples, metres.
     bounded : bool
-        Whether moments exist: not where infinity has density.
+        Whether moments exist; they do not if infinity has density.
     reason : str
-        What is wrong with the samples, in a sentence; empty where nothing is.
+        Sentence on a fault of the samples; empty without one.
     """
 
     position: Array
@@ -55,18 +55,18 @@ class Samples:
 
     @property
     def effective(self) -> float:
-        """Return how many samples of equal weight would say as much: one over the sum of squared weights."""
+        """Return the effective number of samples: one over the sum of squared weights."""
         return float(1.0 / (self.weight**2).sum())
 
     @property
     def mean(self) -> Array:
-        """Return the mean (d,), metres; it needs `within` where infinity has density."""
+        """Return the mean (d,), metres; if infinity has density, it needs `within`."""
         self._demand("mean")
         return np.asarray(self.weight @ self.position)
 
     @property
     def covariance(self) -> Array:
-        """Return the covariance (d, d), square metres; it needs `within` where infinity has density."""
+        """Return the covariance (d, d), square metres; if infinity has density, it needs `within`."""
         self._demand("covariance")
         return moments(self.position, self.weight)[1]
 
@@ -82,11 +82,12 @@ class Samples:
         return np.asarray(self.position[chosen])
 
     def _demand(self, what: str) -> None:
+        """Raise InvalidProblem if a moment does not exist."""
         if not self.bounded:
             raise InvalidProblem(
-                f"infinity has density, and the {what} in metres does not exist",
+                f"infinity has density, so the {what} in metres does not exist",
                 "samples",
-                "ask for them `within` a ball",
+                "limit the samples to a ball by `within`",
             )
 
 
@@ -108,32 +109,32 @@ def samples(
     problem : Problem
         The problem of the fix: one static position.
     fix : Fix
-        A single fix; its alternatives are left out, see `optloc.uncertainty.mixture`.
+        A single fix; its alternatives are ignored, see `optloc.uncertainty.mixture`.
     n : int
-        How many samples; powers of two are spread most evenly.
+        Number of samples; powers of two are spread most evenly.
     seed : int
-        Decides the draw.
+        Seed of the draw.
     prior : "jeffreys" or "flat"
-        What is believed before the data. Jeffreys' prior, the root of the determinant of the information, does not
-        depend on the coordinates and is proper at infinity. A flat one is not, where the cost stays finite at infinity:
-        it needs `within`. Where the fix is curved in all coordinates the prior is even along its arc.
+        Prior of the position. Jeffreys' prior is the root of the determinant of the information. It does not depend on
+        the coordinates and is proper at infinity. A flat prior is improper if the cost stays finite at infinity, so it
+        needs `within`. If the fix is curved in all coordinates, the prior is uniform along its arc.
     within : float, optional
-        Radius of a ball around the stations' middle to which the position is limited, metres.
+        Radius of a ball around the middle of the stations that limits the position, metres.
 
     Notes
     -----
-    Importance sampling from a Student distribution by Sobol points: where the fix is Gaussian in metres or in the
-    inverse-range chart, in these coordinates; the weights make it exact.
+    Importance sampling from a Student distribution by Sobol points. If the fix is Gaussian in metres or in the
+    inverse-range chart, these coordinates are used; the weights make the samples exact.
 
     References
     ----------
     H. Jeffreys, "An invariant form for the prior probability in estimation problems" (1946).
     """
     if prior not in ("jeffreys", "flat"):
-        raise InvalidProblem(f"there is no prior {prior!r}", "prior", "known are 'jeffreys', 'flat'")
+        raise InvalidProblem(f"unknown prior {prior!r}", "prior", "use 'jeffreys' or 'flat'")
     if prior == "flat" and within is None:
         raise InvalidProblem(
-            "a flat prior has no end, and the samples hang on where it is cut", "prior", "say `within` how many metres"
+            "a flat prior is infinite, and the samples depend on its limit", "prior", "give the radius `within`, metres"
         )
     surface = RegionSurface.of(problem, fix)
     if surface.kind == CURVED:
@@ -167,7 +168,7 @@ def around(surface: RegionSurface, n: int, seed: int, prior: str = "jeffreys", w
 def _within_bounds(
     surface: RegionSurface, law: Truncated, n: int, seed: int, prior: str, within: float | None
 ) -> Samples:
-    """Return samples of a fix whose law bounds cut off: drawn from the law, weighed by the cost."""
+    """Return samples of a fix with a truncated law: drawn from the law, weighted by the cost."""
     away, excess = law.draw(n, seed)
     position, centre = surface.position + away, surface.chart.centre
     cost, information, _ = surface.look(position)
@@ -179,7 +180,7 @@ def _within_bounds(
 
 
 def _scaled(information: Array, position: Array, centre: Array, inverse: bool) -> Array:
-    """Return information per squared distance from the centre: far away that of metres is nothing but rounding."""
+    """Return information times squared distance from the centre: far away, information in metres is only rounding."""
     if not inverse:
         return information
     return np.asarray(information * ((position - centre) ** 2).sum(-1)[:, None, None])
@@ -195,29 +196,31 @@ def along(arc: Arc, n: int, seed: int, within: float | None = None) -> Samples:
 
 
 def weighed(position: Array, log_weight: Array, prior: str, within: float | None, bounded: bool) -> Samples:
-    """Return samples with normalised weights, and what is wrong with them."""
+    """Return samples with normalised weights, and a reason if too few are effective."""
     kept = log_weight > -np.inf
     if not kept.any():
-        raise InvalidProblem("no sample is within the ball", "within", "the fix lies outside: take a larger one")
+        raise InvalidProblem("no sample is within the ball", "within", "the fix is outside: give a larger radius")
     weight = np.exp(log_weight[kept] - log_weight[kept].max())
     weight /= weight.sum()
     found = Samples(position[kept], weight, prior, within, bounded)
     if found.effective >= _POOR * len(position):
         return found
-    says = f"{len(position)} samples are worth {found.effective:.0f}: they are drawn where the data hardly allow it"
+    says = (
+        f"only {found.effective:.0f} of {len(position)} samples are effective: the proposal differs from the posterior"
+    )
     return Samples(found.position, weight, prior, within, bounded, says)
 
 
-# A sum of few Gaussians.
+# A sum of a few Gaussians.
 
-# Slices of a fix: with four the density at the truth is as high as that of the Gaussian in its chart; sixteen have too
-# few samples each, and are worse. Arcs are longer than any slice: of a circle each is 15 degrees.
+# Slices of a fix: with four the density at the truth is as high as with the Gaussian in its chart; sixteen have too few
+# samples each, and are worse. Arcs are longer than any slice: of a circle each slice is 15 degrees.
 _SLICES, _ARC_SLICES = 4, 24
-# Samples of a fix, and where the slices begin and end: beyond lies one in 500.
+# Samples of a fix, and quantiles at which the slices begin and end: one sample in 500 is outside.
 _SAMPLES, _EDGES = 4096, (0.001, 0.999)
-# Fewest samples a dimension of a slice that stands alone.
+# Fewest samples, per dimension, of a separate slice.
 _FEWEST = 4
-# Gap in cost beyond which another minimum weighs nothing: 0.011 of the fix.
+# Gap in cost beyond which another minimum is ignored: its weight is 0.011 of the fix.
 _NEGLIGIBLE = 9.0
 
 
@@ -228,7 +231,7 @@ class Mixture:
     Parameters
     ----------
     weight : array (q,)
-        They sum to one.
+        Weights; they sum to one.
     mean : array (q, d)
         Metres.
     covariance : array (q, d, d)
@@ -250,13 +253,13 @@ class Mixture:
         return np.asarray(logsumexp(-0.5 * (white**2).sum(-1) - size + np.log(self.weight), axis=-1))
 
     def moments(self) -> tuple[Array, Array]:
-        """Return mean (d,) and covariance (d, d) of the whole, metres."""
+        """Return mean (d,), metres, and covariance (d, d), square metres, of the sum."""
         mean, spread = moments(self.mean, self.weight)
         return mean, spread + (self.weight[:, None, None] * self.covariance).sum(0)
 
 
 def mixture(problem: Problem, fix: Fix, k: int = _SLICES, seed: int = 0) -> Mixture:
-    """Return Gaussians in metres that stand for what the data say of a position, other minima included.
+    """Return Gaussians in metres that approximate the posterior position, including other minima.
 
     Parameters
     ----------
@@ -265,18 +268,19 @@ def mixture(problem: Problem, fix: Fix, k: int = _SLICES, seed: int = 0) -> Mixt
     fix : Fix
         A single fix.
     k : int
-        Slices of a minimum that is Gaussian in its inverse range: of equal logarithm of the range. One that is Gaussian
-        in metres is one Gaussian; one that is curved in all coordinates has six times as many, along its arc.
+        Slices of a minimum that is Gaussian in its inverse range, equal in the logarithm of the range. A minimum that
+        is Gaussian in metres is one Gaussian. A minimum that is curved in all coordinates has six times as many slices,
+        along its arc.
     seed : int
-        Decides the draw of the samples whose moments these are.
+        Seed of the samples from which the moments are computed.
 
     Notes
     -----
-    A minimum weighs exp(-gap / 2): the integral of its likelihood under Jeffreys' prior, whose determinant cancels that
-    of the covariance (Laplace).
+    The weight of a minimum is exp(-gap / 2): the integral of its likelihood under Jeffreys' prior, whose determinant
+    cancels the determinant of the covariance (Laplace).
     """
     if k < 1:
-        raise InvalidProblem(f"{k} slices are none", "k", "4 are enough")
+        raise InvalidProblem(f"{k} slices are not possible", "k", "give 1 or more; 4 are enough")
     parts = [(1.0, _slices(RegionSurface.of(problem, fix), k, seed))]
     for x, gap in zip(fix.alternatives.x, fix.alternatives.gap, strict=True):
         if gap < _NEGLIGIBLE and np.isfinite(x).all():
@@ -309,12 +313,13 @@ def _slices(surface: RegionSurface, k: int, seed: int) -> Mixture:
 
 
 def _quantiles(values: Array, weight: Array) -> list[float]:
+    """Return the weighted quantiles of values at which slices begin and end."""
     order = np.argsort(values)
     return [float(v) for v in np.interp(_EDGES, np.cumsum(weight[order]), values[order])]
 
 
 def _by_slice(drawn: Samples, slice_of: Array, k: int) -> Mixture:
-    """Return moments and weights of the samples in k slices; one with too few samples is joined to its neighbour."""
+    """Return moments and weights of the samples in k slices; slices with too few samples join a neighbour."""
     fewest, groups = _FEWEST * drawn.position.shape[1], [np.zeros(len(slice_of), dtype=bool)]
     for i in range(k):
         if groups[-1].sum() >= fewest:

@@ -1,4 +1,7 @@
-"""The likelihood region of a fix: all positions whose cost is near enough to its own, as bent and open as they are."""
+"""The likelihood region of a fix: all positions whose cost exceeds the cost of the fix by at most a quantile.
+
+A region may have any shape, several parts, and no end.
+"""
 
 from __future__ import annotations
 
@@ -23,13 +26,13 @@ from optloc.proof.scope import why_too_large, why_unsupported
 from optloc.proof.search_space import Cost, cost_of, empty_box
 from optloc.proof.subpaving import cover_region
 
-# Boxes of a cover at most, by dimension: the hull of an ellipse is then 2 % wider than the ellipse, that of an
-# ellipsoid 10 %, after some 20 and 100 ms. Plain Python takes a thousand times longer for each.
+# Most boxes of a cover, by dimension: the hull of an ellipse is then 2 % wider than the ellipse, the hull of an
+# ellipsoid 10 %, after about 20 and 100 ms. Plain Python takes a thousand times longer for each box.
 _MOST, _MOST_PLAIN = {2: 1000, 3: 8000}, 300
-# Share of a cell by which it is taken larger where points are looked up, for the rounding of its inverse.
+# Share by which a cell is enlarged when points are looked up, for the rounding of its inverse.
 _ROUNDED = 1e-7
-NOWHERE = "nothing encloses the positions of a cost this low"
-TURNS = "angles may be a whole turn off with their biases at costs within the region"
+NOWHERE = "the positions with a cost this low are not bounded"
+TURNS = "biases of angles may reach a whole turn at costs within the region"
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +44,10 @@ class Cells:
     base : array (d,)
         A position, metres.
     edges : array (n, 1 + d, 1 + d)
-        Of each cell its middle, then half of each edge, in homogeneous coordinates: (P, v) is the position
-        ``base + P / v``. The cell is the middle plus the edges times numbers between -1 and 1.
+        Middle of each cell, then half of each edge, in homogeneous coordinates: (P, v) is the position ``base + P /
+        v``. The cell is the middle plus the edges times numbers between -1 and 1.
     inside : int
-        How many of them, the first ones, lie wholly inside the region.
+        Number of cells, at the beginning, that are completely inside the region.
     """
 
     base: Array
@@ -53,17 +56,17 @@ class Cells:
 
     @property
     def corners(self) -> Array:
-        """Return the corners (n, 2^d, d) of the cells, metres; coordinates are infinite where a cell has no end."""
+        """Return the corners (n, 2^d, d) of the cells, metres; coordinates are infinite if a cell has no end."""
         return self._finite(self._homogeneous())
 
     @property
     def directions(self) -> Array:
-        """Return the corners of the cells as the directions (n, 2^d, d) of points ever farther along their rays."""
+        """Return the corners of the cells as directions (n, 2^d, d), also for corners at infinity."""
         found = self._homogeneous()[..., :-1]
         return np.asarray(found / np.sqrt((found**2).sum(-1, keepdims=True)))
 
     def hold(self, points: Array) -> Array:
-        """Return whether points (q, d), metres, lie in a cell, (q,)."""
+        """Return flags (q,) of points (q, d), metres, that are in a cell."""
         from_point = np.linalg.inv(np.swapaxes(self.edges, -1, -2))
         out = np.zeros(len(points), dtype=bool)
         for i, point in enumerate(np.append(points - self.base, np.ones((len(points), 1)), axis=1)):
@@ -73,11 +76,13 @@ class Cells:
         return out
 
     def _homogeneous(self) -> Array:
+        """Return the corners (n, 2^d, 1 + d) of the cells in homogeneous coordinates."""
         d = len(self.base)
         signs = np.array([(1.0, *corner) for corner in product((-1.0, 1.0), repeat=d)])
         return np.asarray(signs @ self.edges)
 
     def _finite(self, corners: Array) -> Array:
+        """Return homogeneous corners as positions, metres; infinite where the last coordinate is zero."""
         scale = corners[..., -1:]
         with np.errstate(divide="ignore", invalid="ignore"):
             apart = np.where(corners[..., :-1] == 0.0, 0.0, corners[..., :-1] / np.maximum(scale, 0.0))
@@ -86,7 +91,7 @@ class Cells:
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """All positions whose cost exceeds that of a fix by at most a quantile of chi-square.
+    """All positions whose cost exceeds the cost of a fix by at most a quantile of chi-square.
 
     Parameters
     ----------
@@ -97,18 +102,20 @@ class Region:
     threshold : float
         Highest cost inside.
     points : array (k, d)
-        Where rays from the fix leave it first, metres: along the principal axes and between them, in the coordinates
-        in which the fix is Gaussian; in the plane one after the other around the fix. NaN where a ray never leaves it.
+        First points at which rays from the fix leave the region, metres. The rays follow the principal axes and the
+        directions between them, in the coordinates in which the fix is Gaussian. In the plane they are in order around
+        the fix. NaN for a ray that never leaves the region.
     cells : Cells, optional
-        Cells that hold it, whatever its shape and however many parts it has; certified by the bounds of the proof.
+        Cells that hold the region, of any shape and with any number of parts; bounds of the proof certify them.
     open : bool
-        Whether it has no end: infinity is as likely. What is known then is a direction (`cone`) and a least range.
+        Whether the region has no end: infinity is as likely. Then only a direction (`cone`) and a least range are
+        known.
     reason : str
-        Why there are no cells; empty where there are some.
+        Why there are no cells; empty if there are some.
 
     Notes
     -----
-    It is that of the measurements and priors alone: inequalities cut it further.
+    The region follows from measurements and priors only: inequalities reduce it further.
     """
 
     level: float
@@ -120,12 +127,12 @@ class Region:
     reason: str = ""
 
     def covers(self, points: Array) -> Array:
-        """Return whether positions (..., d), metres, are in the region, (...)."""
+        """Return flags (...) of positions (..., d), metres, that are in the region."""
         return np.asarray(self.surface.cost(np.asarray(points, dtype=float)) <= self.threshold)
 
     @property
     def box(self) -> tuple[Array, Array] | None:
-        """Return the least and greatest coordinates (d,) of a box that is certain to hold the region, or None."""
+        """Return the least and greatest coordinates (d,) of a box that holds the region, or None without cells."""
         if self.cells is None:
             return None
         corners = self.cells.corners.reshape(-1, len(self.cells.base))
@@ -133,9 +140,9 @@ class Region:
 
     @property
     def cone(self) -> tuple[Array, float] | None:
-        """Return axis (d,) and half-angle of a cone from the stations' middle that holds the region.
+        """Return axis (d,) and half-angle, radians, of a cone from the middle of the stations that holds the region.
 
-        The angle is pi where the region surrounds the middle; None without cells.
+        The angle is pi if the region surrounds the middle; None without cells.
         """
         if self.cells is None:
             return None
@@ -146,26 +153,26 @@ class Region:
         mean = away.reshape(-1, len(axis)).mean(0)
         axis = mean / np.sqrt((mean**2).sum()) if (mean**2).sum() > 0.0 else axis
         half = float(np.arccos(np.clip((away @ axis).min(), -1.0, 1.0)))
-        # Beyond a right angle the corners of a convex cell no longer say how far it reaches.
+        # Beyond a right angle the corners of a convex cell do not limit its directions.
         return axis, half if half < 0.5 * np.pi else float(np.pi)
 
     @property
     def least_range(self) -> float:
-        """Return a distance from the stations' middle, metres, nearer than which no point is; 0 without cells."""
+        """Return a lower bound of the distance from the middle of the stations, metres; 0 without cells."""
         if self.cells is None:
             return 0.0
-        # Of a convex cell no point is nearer than its corners are along the direction of its middle.
+        # Along the direction of its middle, no point of a convex cell is nearer than its corners.
         middle = self.cells.edges[:, 0]
         away = self.cells.base - self.surface.chart.centre + middle[:, :-1] / middle[:, -1:]
         size = np.sqrt((away**2).sum(-1, keepdims=True))
         toward = away / np.where(size > 0.0, size, 1.0)
         with np.errstate(invalid="ignore"):
             along = ((self.cells.corners - self.surface.chart.centre) * toward[:, None]).sum(-1)
-        # A corner at infinity lies ahead of the middle, or is left to the others.
+        # A corner at infinity is beyond the middle, or other corners limit the range.
         return max(0.0, float(np.where(np.isfinite(along), along, np.inf).min()))
 
     def _seen_from_middle(self) -> Array:
-        """Return the directions (n, 2^d, d) of the corners of all cells from the stations' middle."""
+        """Return the directions (n, 2^d, d) of the corners of all cells from the middle of the stations."""
         assert self.cells is not None
         away = self.cells.corners - self.surface.chart.centre
         away = np.where(np.isfinite(away).all(-1, keepdims=True), away, self.cells.directions)
@@ -184,13 +191,13 @@ def likelihood_region(problem: Problem, fix: Fix, level: float = 0.95, *, boxes:
     level : float
         Probability that the region contains the target.
     boxes : int, optional
-        How many cells may be used to hold it; more are finer. By default 1 000 in the plane and 8 000 in space.
+        Most cells that may hold the region; more are finer. By default 1 000 in the plane and 8 000 in space.
 
     Notes
     -----
-    ``{x: f(x) <= f(fix) + q}``, q the quantile of chi-square with as many degrees of freedom as coordinates: the
-    likelihood-ratio region (S. S. Wilks, 1938). It covers as promised where no Gaussian does, because curvature of the
-    coordinates does not change it.
+    The region is ``{x: f(x) <= f(fix) + q}``, with q the quantile of chi-square for the number of coordinates: the
+    likelihood-ratio region (S. S. Wilks, 1938). It covers at its level even if no Gaussian does, because curvature of
+    the coordinates does not change it.
     """
     surface = RegionSurface.of(problem, fix)
     threshold = surface.least + quantile(level, len(surface.position))
@@ -200,11 +207,11 @@ def likelihood_region(problem: Problem, fix: Fix, level: float = 0.95, *, boxes:
     return Region(level, surface, threshold, points, cells, endless, reason)
 
 
-# The outside: certified cells.
+# Outer bound: certified cells.
 
 
 def _cover(surface: RegionSurface, threshold: float, boxes: int | None) -> tuple[Cells | None, bool, str]:
-    """Return cells that hold the region, whether they found it open, or why there are none."""
+    """Return cells that hold the region or None, whether a cell reaches infinity, and why there are no cells."""
     why = why_unsupported(surface.problem) or why_too_large(surface.problem)
     if why:
         return None, False, why
@@ -223,27 +230,28 @@ def _cover(surface: RegionSurface, threshold: float, boxes: int | None) -> tuple
 
 
 def _present(kinds: Array, data: Array, K: Array, w: Array) -> Cost:
-    """Return the cost without nodes that no row has: the tables of a proof are for nodes that count."""
+    """Return the cost without terms that no row has: the tables of a proof need terms that count."""
     used = (K != 0.0).any(0)
     rows = (K != 0.0).any(1) | (w != 0.0)
     return cost_of(*(np.ascontiguousarray(each) for each in (kinds[used], data[used], K[rows][:, used], w[rows])))
 
 
-# The inside: where rays from the fix leave the region.
+# Inner points: rays from the fix end at the edge of the region.
 
-# Rays in the plane, of which every eighth lies on an axis or a diagonal: enough to draw the outline of an ellipse.
+# Rays in the plane, with every eighth along an axis or a diagonal: enough to draw the outline of an ellipse.
 _RAYS = 64
-# Steps along a ray before the level is met, in units of where a Gaussian meets it: the first, the last, and the factor
-# between two. Narrow enough to leave no bay of a banana unseen that is as wide as its distance.
+# Steps along a ray before the level is met, in units of the distance at which a Gaussian meets it: the first, the last,
+# and the factor between two. The factor is small enough to notice every gap of a curved region that is as wide as its
+# distance.
 _FIRST, _LAST, _FACTOR = 0.05, 1e3, 1.2
-# Halvings of the last step: to the rounding of a double.
+# Halvings of the last step: down to the rounding of a double.
 _HALVINGS = 50
-# Least w of a ray in the inverse-range chart: beyond is infinity.
+# Least w of a ray in the inverse-range chart; zero is infinity.
 _NEAR_INFINITY = 1e-6
 
 
 def boundary(surface: RegionSurface, threshold: float) -> Array:
-    """Return where rays from the fix first leave the region of lower cost, (k, d); NaN where they never do."""
+    """Return the first points (k, d) at which rays from the fix leave the region; NaN for endless rays."""
     rays = directions(len(surface.position))
     q = np.sqrt(threshold - surface.least)
     count = int(np.ceil(np.log(_LAST / _FIRST) / np.log(_FACTOR)))
@@ -275,7 +283,7 @@ def directions(d: int) -> Array:
 
 
 def _axes(chart: Chart) -> tuple[Array, Array]:
-    """Return the fix (d,) and one standard deviation along principal axes, in columns (d, d), where it is Gaussian."""
+    """Return the fix (d,), and its principal standard deviations as columns (d, d), in its Gaussian coordinates."""
     inverse = int(chart.kind) == INVERSE_RANGE
     spread = chart.spread if inverse else chart.covariance
     values, vectors = np.linalg.eigh(spread)
@@ -283,11 +291,12 @@ def _axes(chart: Chart) -> tuple[Array, Array]:
 
 
 def _points(surface: RegionSurface, at: Array) -> Array:
+    """Return the positions, metres, of coordinates in which the fix is Gaussian."""
     return surface.chart.to_position(at) if surface.kind == INVERSE_RANGE else at
 
 
 def _limit(surface: RegionSurface, steps: Array) -> Array:
-    """Return how far each ray (k, d) may go (k,)."""
+    """Return the largest multiples (k,) of ray steps (k, d); infinite in metres."""
     if surface.kind != INVERSE_RANGE:
         return np.full(len(steps), np.inf)
     with np.errstate(divide="ignore"):
@@ -296,7 +305,7 @@ def _limit(surface: RegionSurface, steps: Array) -> Array:
 
 # The cost around a fix, along rays.
 
-# Evaluations of the cost at a time: their normal equations then take some megabytes.
+# Evaluations of the cost per part: their normal equations take some megabytes.
 _PART = 2**13
 
 
@@ -311,7 +320,7 @@ class RegionSurface:
     x : array (1, size)
         All unknowns of the fix.
     chart : Chart
-        Position, covariance, and where the fix is Gaussian.
+        Position, covariance, and the coordinates in which the fix is Gaussian.
     least : float
         Cost of the fix.
     """
@@ -323,10 +332,10 @@ class RegionSurface:
 
     @classmethod
     def of(cls, problem: Problem, fix: Fix) -> RegionSurface:
-        """Return the surface of a single fix of one position that stays; raise InvalidProblem for others."""
+        """Return the surface of a single fix of one static position; raise InvalidProblem for others."""
         _check(problem, fix)
         if not np.isfinite(fix.position).all() or not np.isfinite(fix.covariance()).all():
-            raise InvalidProblem("the fix has no position with a covariance", "fix", "its status says why")
+            raise InvalidProblem("the fix has no position with a covariance", "fix", "see fix.status for the reason")
         kind = None if fix.chart is None or int(fix.chart.kind) == CURVED else int(fix.chart.kind)
         surface = cls._about(problem, fix, fix.x, fix.cov, kind)
         law = None if fix.chart is None else fix.chart.truncated
@@ -339,12 +348,14 @@ class RegionSurface:
         flat = problem.flat().with_rows(weight=fix.weights[None])
         cov, ok = covariance(equations_at(flat, x[None]))
         if not ok[0]:
-            raise InvalidProblem("another minimum has no covariance", "fix", "ask for samples of the fix alone")
+            raise InvalidProblem(
+                "another minimum has no covariance", "fix", "use `samples`, which ignores other minima"
+            )
         return cls._about(problem, fix, x, cov[0], None)
 
     @classmethod
     def _about(cls, problem: Problem, fix: Fix, x: Array, cov: Array, kind: int | None) -> RegionSurface:
-        """Return the surface of a minimum with a covariance of the shared unknowns."""
+        """Return the surface of a minimum from the covariance of its shared unknowns."""
         flat, x = problem.flat().with_rows(weight=fix.weights[None]), x[None]
         slot, _ = problem.layout.find("position")
         part = slice(slot.start, slot.start + slot.size)
@@ -374,14 +385,14 @@ class RegionSurface:
         Parameters
         ----------
         points : array (..., d)
-            Positions, metres; those that are not finite have an infinite cost.
+            Positions, metres; positions that are not finite have an infinite cost.
 
         Returns
         -------
         cost : array (...)
             Least weighted sum of squared residuals.
         information : array (..., d, d)
-            Of the position, the other unknowns eliminated.
+            Information of the position; the other unknowns are eliminated.
         vector : array (..., d)
             Half the negative gradient of the cost.
         """
@@ -406,23 +417,27 @@ class RegionSurface:
 
 
 def passes(problem: Problem) -> int:
-    """Return how often the other unknowns move to their best: far from the fix they are far off, and rounding shows."""
+    """Return the number of Gauss-Newton steps of the other unknowns.
+
+    They are linear, so one step reaches their best values. Far from the fix the step is long, and a second one removes
+    its rounding errors.
+    """
     return 1 if problem.layout.size == problem.dimension else 2
 
 
 def _check(problem: Problem, fix: Fix) -> None:
-    """Raise unless the fix is a single one of one static position, found, and held by no equality."""
+    """Raise InvalidProblem unless the fix is a single fix of one static position that no equality holds."""
     advice = "take one fix of a batch: `problem.flat().take([i])` and `fix.flat()[i]`"
     if fix.shape != () or int(np.prod(problem.batch_shape)) != 1:
-        raise InvalidProblem("a region or samples are those of one fix, and these are several", "fix", advice)
+        raise InvalidProblem("a region or samples need a single fix, and this is a batch", "fix", advice)
     motion = problem.motions[0]
     shared = problem.layout.shares("position")
     if len(problem.motions) > 1 or motion.order > 0 or motion.known is not None or not shared:
-        what = "a region or samples are those of one position that stays"
-        raise InvalidProblem(what, "problem", "use fix.ellipse() or fix.gaussian() of other problems")
+        what = "a region or samples need one target at rest"
+        raise InvalidProblem(what, "problem", "use fix.ellipse() or fix.gaussian() for other problems")
     if exact(problem):
         raise InvalidProblem(
-            "the position is held by an equality, such as a known height, along which regions are not drawn",
+            "an equality, such as a known height, holds the position, and regions do not support equalities",
             "problem",
             "give the height as a prior with its standard deviation",
         )

@@ -37,7 +37,7 @@ def test_an_unchecked_fix_says_that_no_row_checks_the_stations():
     problem = ranges(stations=RING[:2])
     found = optloc.diagnose(problem, optloc.solve(problem))
     assert {one.cause for one in found.advice} & {"redundancy", "line", "mirror"}
-    assert "no other row checks" in str(found)
+    assert "no other measurement checks" in str(found)
 
 
 def test_many_epochs_name_the_station_with_an_offset():

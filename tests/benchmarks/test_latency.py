@@ -76,7 +76,7 @@ def kernels(place):
     ready, z = prepare(problem_of(scene(place).z[0]), "auto"), scene(place).z
     ready(z[0])
     short = ready.short
-    room = short._room(())
+    room = short._workspace(())
     x, covariance = np.empty((1, 3)), np.empty((1, 3, 3))
     answer = Answer(x, covariance, *room.found)
 

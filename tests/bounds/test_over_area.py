@@ -49,7 +49,7 @@ def test_coordinates_of_a_map_are_degrees_on_earth_and_metres_elsewhere():
 
 
 def test_a_map_moves_one_target_of_a_whole_run():
-    with pytest.raises(InvalidProblem, match="0 targets are sought"):
+    with pytest.raises(InvalidProblem, match="0 targets are unknown"):
         bound_map(ranges(motions=(Motion(known=np.zeros((1, 1, 2))),)), np.zeros(0), [0.0], [0.0])
-    with pytest.raises(InvalidProblem, match="every epoch has a position of its own"):
+    with pytest.raises(InvalidProblem, match="every epoch has a separate position"):
         bound_map(ranges(motions=(Motion(span="epoch"),)), np.zeros(2), [0.0], [0.0])

@@ -59,7 +59,7 @@ def test_a_common_clock_error_of_differences_is_open():
     velocity = np.random.default_rng(5).uniform(-300.0, 300.0, (6, 3))
     problem = with_bias(steady(epochs=40, velocity=velocity), "clock", sigma=200.0)
     seen = observability(problem, at(problem))
-    assert seen.open == ("the data do not show a common change of every clock",)
+    assert seen.open == ("the data do not determine a common change of every clock",)
     assert seen.rank == 8
     assert np.isinf(seen.data[3:]).all()
     assert np.isfinite(seen.data[:3]).all()
@@ -74,7 +74,7 @@ def test_a_steady_geometry_leaves_combinations_open():
     seen = observability(problem, at(problem))
     assert seen.rank == 5
     everything = "position x, position y, position z, clock B, clock C, clock D, clock E and clock F"
-    assert seen.open == (f"the data leave 3 combinations of {everything} open",)
+    assert seen.open == (f"the data do not determine 3 combinations of {everything}",)
     assert np.isinf(seen.data).all()
 
 
@@ -83,7 +83,7 @@ def test_a_clock_error_against_a_free_emission_time():
     x = at(problem)
     problem.layout.split(x)[1][:, :3] = np.random.default_rng(2).uniform(-9e3, 9e3, (5, 3))
     seen = observability(problem, x)
-    assert seen.open == ("the data do not show a common change of every clock",)
+    assert seen.open == ("the data do not determine a common change of every clock",)
     np.testing.assert_allclose(seen.posterior, np.sqrt(np.diagonal(crlb(problem, x))), rtol=1e-6)
 
 
@@ -118,19 +118,19 @@ def test_one_bias_that_mixes_with_one_coordinate():
     problem = with_bias(assemble(line, measured("range", a=[0, 1, 2], sigma=1.0)), "delay", per="kind")
     seen = observability(problem, np.array([5e3, 0.0, 0.0]))
     assert set(seen.open) == {
-        "the data do not show position y",
-        "the data do not show a change of position x by +1 m and delay range by -1 m",
+        "the data do not determine position y",
+        "the data do not determine a change of position x by +1 m and delay range by -1 m",
     }
     scaled = with_bias(assemble(line, measured("range", a=[0], sigma=1.0)), "scale", per="kind", form="scale")
     sentences = observability(scaled, np.array([5e3, 0.0, 0.0])).open
-    assert "the data do not show a change of position x by +1 m and scale range by -0.0002" in sentences
+    assert "the data do not determine a change of position x by +1 m and scale range by -0.0002" in sentences
 
 
 def test_a_bias_that_cannot_be_told_from_a_coordinate():
     problem = scenes.problem(scenes.PRINTED, 40, prior=200.0)
     seen = observability(problem, scenes.truth(scenes.PRINTED, problem))
     (sentence,) = seen.tied
-    assert sentence.startswith("hard to tell apart: position z, delay 4-1 and delay 5-1 (correlated up to 0.999")
+    assert sentence.startswith("hard to separate: position z, delay 4-1 and delay 5-1 (correlated up to 0.999")
     longer = scenes.problem(scenes.SPATIAL, 600)
     assert observability(longer, scenes.truth(scenes.SPATIAL, longer)).open == ()
 
@@ -144,7 +144,7 @@ def test_equalities_count_as_geometry():
         flat, rows, frame=frame, constraints=[height(exactly=frame.to_geodetic(np.array([9e3, 3e3, 0.0]))[2])]
     )
     x = np.array([9e3, 3e3, 0.0])
-    assert observability(free, x).open == ("the data do not show position z",)
+    assert observability(free, x).open == ("the data do not determine position z",)
     assert observability(held, x).open == ()
     assert observability(held, x).rank == 2
 

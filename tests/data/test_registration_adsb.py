@@ -90,7 +90,7 @@ def test_what_all_clocks_share_is_the_emission_time(data):
     )
     seen = observability(whole, np.zeros(whole.layout.size))
     report(f"ADS-B, {len(BUSY)} clocks without a prior: {'; '.join(seen.sentences)}")
-    assert seen.open == ("the data do not show a common change of every clock",)
+    assert seen.open == ("the data do not determine a common change of every clock",)
     assert not solve(whole).answered
     assert fixed(solve(rest)).sigma("clock").max() < 20.0
 

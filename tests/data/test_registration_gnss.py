@@ -73,7 +73,7 @@ def test_satellite_offsets_do_not_show_at_an_unknown_receiver(session):
     assert fix.status == Status.SINGULAR_GEOMETRY
     assert "satellite" in str(fix.reason)
     start = np.concatenate([data.truth, np.zeros(blind.layout.size - 3)])
-    assert observability(blind, start).open == ("the data do not show a common change of every satellite",)
+    assert observability(blind, start).open == ("the data do not determine a common change of every satellite",)
     # With one as reference the sky would have to turn: the bound is metres to tens of metres, and the report says why.
     rest = with_bias(many, "satellite", members=blind.biases[0].members[1:])
     seen = observability(rest, start[:-1])

@@ -12,7 +12,7 @@ from optloc import Frame, InvalidProblem, Motion, Status, assemble, measured, si
 from optloc.base.types import Band, Polygon
 from optloc.kernels.least_squares import refine
 from optloc.linear.constraints import box, exact, faces, height, on_face, polygon, speed, visible
-from optloc.solvers.certificates.admitted import _is_dear
+from optloc.solvers.certificates.admitted import _is_costly
 from optloc.solvers.certificates.position_cost import eliminate_nuisance
 
 ENU = Frame.enu(lat_deg=47.0, lon_deg=8.0, height=400.0)
@@ -252,7 +252,7 @@ def test_an_edge_is_too_dear_only_where_all_of_it_is(side):
         ).cost.min()
         many = on.take(np.zeros(11, int))
         anywhere = rng.uniform(-9e3, 9e3, (11, 3, 3))
-        dear, boxes = _is_dear(
+        dear, boxes = _is_costly(
             many, np.full((2, 3), np.inf), eliminate_nuisance(flat.take(np.zeros(11, int))), anywhere, least * levels, 1
         )
         assert not dear[levels > 1.0 + 1e-6].any()

@@ -105,7 +105,7 @@ def test_a_fix_in_the_plane_is_proven_and_says_that_it_may_be_on_either_side() -
     assert fix.certificate.proof == "global"
     np.testing.assert_allclose(fix.position, (1.002, 1.001, 0.0), atol=1e-3)
     assert fix.cost == pytest.approx(0.759, abs=1e-3)
-    assert "either side" in str(fix.reason)
+    assert "both sides of the plane" in str(fix.reason)
     # the profile of the cost is 3.84 higher at 0.27 m
     assert 1.96 * fix.sigma()[2] == pytest.approx(0.28, abs=0.02)
 

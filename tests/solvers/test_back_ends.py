@@ -52,4 +52,4 @@ def test_the_trial_goes_on_behind_a_solver_that_ends_its_process(monkeypatch):
     assert try_in_process(dict.fromkeys("abc", "conic")) == {"a": "", "b": "it ends the process", "c": ""}
     assert tried == [["a", "b", "c"], ["c"]]
     monkeypatch.setattr(back_ends, "_one_process", lambda kinds: {})
-    assert try_in_process({"a": "conic"}) == {"a": "it could not be tried"}
+    assert try_in_process({"a": "conic"}) == {"a": "the trial did not run"}

@@ -29,7 +29,7 @@ def test_a_hidden_minimum_is_told_with_cost_and_place(bounds):
     reason = str(fix.reason)
     # without a bound the mirror image in the plane of the satellites is left, out in space, and fits nothing
     assert fix.status == (Status.INFEASIBLE if bounds else Status.MISFIT)
-    assert "the only minimum found, of cost 0." in reason
+    assert "the only minimum found, with chi-square 0." in reason
     assert "has stations below its horizon: 1.00" in reason  # its latitude
     assert "178.00" in reason
     assert "(S0, S1, S2 and 2 more)" in reason

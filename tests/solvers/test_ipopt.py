@@ -44,5 +44,5 @@ def test_a_program_ends_at_the_least_squares_point_and_needs_a_start():
     best = least_squares(lambda x: (np.linalg.norm(x - SQUARE, axis=1) - r - error) / 2.0, PLACE, xtol=1e-15)
     np.testing.assert_allclose(pool.x[0, 0], best.x, atol=1e-3)
     assert pool.cost[0, 0] == pytest.approx(2.0 * best.cost, rel=1e-6)
-    with pytest.raises(InvalidProblem, match="improves a start"):
+    with pytest.raises(InvalidProblem, match="needs a start"):
         nlp(problem, None)

@@ -45,5 +45,5 @@ def test_an_unknown_iteration_and_no_fix_are_refused():
     with pytest.raises(InvalidProblem, match="unknown iteration"):
         basins(problem, fix, PLACE[None], "newton")
     lost = ranges_to(PLACE, 5.0, stations=SQUARE[:1])
-    with pytest.raises(InvalidProblem, match="no fix that a start could reach"):
+    with pytest.raises(InvalidProblem, match="no fix for a start to reach"):
         basins(lost, solve(lost)[0], PLACE[None])

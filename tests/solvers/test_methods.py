@@ -98,7 +98,7 @@ def test_every_word_answers_or_says_why_not_and_what_does(name):
             assert "use 'auto'" in reason
         else:
             assert fix.status == Status.SINGULAR_GEOMETRY, (word, fix.status)
-            assert reason == "nothing measures position z"
+            assert reason == "no measurement depends on position z"
 
 
 @pytest.mark.parametrize("word", WORDS)
@@ -128,9 +128,9 @@ def test_contradictions_are_judged_too():
 def test_refusals_name_what_is_missing():
     said = {
         ("3 range", "minimax"): "starts from azimuth and elevation of two stations or more, and these rows are range",
-        ("2 tdoa", "directions"): "relaxes directions in space, and these rows are in a plane",
+        ("2 tdoa", "directions"): "relaxes directions in three dimensions, and these rows are in a plane",
         ("3 toa groa", "wiv"): "starts from azimuths, and these rows are toa and groa",
-        ("3 elevation", "roots"): "no closed form starts from these rows of elevation: use 'auto', which searches",
+        ("3 elevation", "roots"): "no closed form gives a start for measurements of elevation: use 'auto'",
         ("3 range azimuth1 elevation1", "directions"): "of two stations or more",
         ("satellites tdoa", "sparse"): "sparse finds no start from these rows: use 'auto'",
     }

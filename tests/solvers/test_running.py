@@ -53,7 +53,7 @@ def test_refusals():
     problem = drawn(run(40, prior=200.0), 9, 1)
     lost = optloc.solve(problem)
     lost.x[:] = np.nan
-    with pytest.raises(InvalidProblem, match="no answer to begin from"):
+    with pytest.raises(InvalidProblem, match="no answer to start from"):
         optloc.solvers.Running.begin(problem, lost)
     rows = optloc.measured("range", np.ones(4), a=[0, 1, 0, 1], epoch=[0, 0, 1, 1], sigma=1.0)
     free = optloc.assemble([[0.0, 0.0], [1.0, 0.0]], rows, motions=(Motion(span="epoch"),))

@@ -64,5 +64,5 @@ def test_a_fix_by_a_start_is_judged():
 
 @pytest.mark.parametrize("stage", [lsr, add_candidates, search])
 def test_a_stage_that_needs_something_before_it_says_so(stage):
-    with pytest.raises(InvalidProblem, match=r"refines a start|adds candidates|fills the gaps"):
+    with pytest.raises(InvalidProblem, match=r"(lsr needs a start|needs a fix)"):
         stage(ranges_to(PLACE, 1.0), None)

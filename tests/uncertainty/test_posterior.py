@@ -89,7 +89,7 @@ def test_moments_that_do_not_exist_are_refused():
         samples(problem, fix, 256, prior="flat")
     with pytest.raises(InvalidProblem, match="no sample"):
         samples(problem, fix, 256, within=1.0)
-    with pytest.raises(InvalidProblem, match="no prior"):
+    with pytest.raises(InvalidProblem, match="unknown prior"):
         samples(problem, fix, 256, prior="even")
 
 
@@ -99,7 +99,7 @@ def test_a_flat_prior_of_a_far_emitter_is_sampled_badly_and_says_so():
         problem, _, fix = fixed("aoa 3 50 10", item)
         if np.isfinite(fix.cov).all():
             said.append(samples(problem, fix, 1024, prior="flat", within=1e8).reason)
-    assert any("are worth" in reason for reason in said)
+    assert any("samples are effective" in reason for reason in said)
 
 
 def test_equal_weights_keep_the_distribution():

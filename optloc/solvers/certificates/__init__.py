@@ -1,1 +1,1 @@
-"""What is proven of a fix, and how."""
+"""Certificates of fixes: proofs by branch and bound, and bounds from relaxations."""

@@ -1,8 +1,8 @@
-"""Whether a fix is the best one that constraints admit: what is proven of each of their faces, put together.
+"""Proofs for problems with inequalities: whether a fix is the best position that the constraints admit.
 
-A minimum of what inequalities admit is a minimum of all positions, or one along a face: a set of inequalities that hold
-with equality. So all of them are among the minima along the faces, each of which is a problem without inequalities.
-Those that break another constraint do not count, nor those from which the cost falls inwards.
+A minimum under inequalities is a minimum over all positions, or a minimum along a face: a set of inequalities that hold
+with equality. So every candidate is among the minima along the faces, and each face is a problem without inequalities.
+Minima that violate another constraint do not count. Minima from which the cost falls inwards do not count either.
 """
 
 from __future__ import annotations
@@ -69,12 +69,12 @@ from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.judge import failed_fixes, filled_objects, judge, verdict
 from optloc.solvers.verdict.minima import settle
 
-# Begins of a proof that a face costs too much: each where it met a place at less than halfway to the level, or so many
-# steps nearer to the minimum.
+# Most restarts of a proof that a face costs too much, and refinement steps of a restart. A proof restarts at a cheaper
+# position that it found, or some steps nearer to the minimum if the cost is steep at its position.
 _BEGINS, _STEPS = 12, 8
-# Rounds of minima that are found along faces and of proofs anew: one suffices but for batches of bad fixes.
+# Rounds of new minima along faces and repeated proofs: one round is enough except for batches of bad fixes.
 _ROUNDS = 4
-UNFOLLOWED = "the proof does not follow the edge {}: {}"
+UNFOLLOWED = "the proof does not cover the edge {}: {}"
 LEFT = "no minimum was found along the edge {}"
 
 
@@ -83,7 +83,7 @@ def certified(
 ) -> Pool:
     """Return the pools of a flat batch with certificates: the stage "certify"; region (2, d) as of `certify`.
 
-    `effort` multiplies the boxes that a proof may take.
+    `effort` multiplies the number of boxes that a proof may use.
     """
     limited = any(not is_exact(constraint) for constraint in problem.constraints)
     if pool is None or region is not None or not limited or why_unsupported(problem) or problem.motions[0].order:
@@ -94,19 +94,19 @@ def certified(
     if pool.tried_before is not None:
         proven.write(same, take(pool.tried_before.proven, same))
     items, more = np.flatnonzero(asked & ~same), 0
-    pool, told, done = _prove_freely(problem, pool, items, margin, effort)
-    proven.write(items[done], take(told, done))
+    pool, claims, done = _prove_freely(problem, pool, items, margin, effort)
+    proven.write(items[done], take(claims, done))
     items, fix = items[~done], judge(problem, pool)
     for _ in range(_ROUNDS):
         if not len(items):
             break
         part, own = problem.take(items), take(pool, items)
-        told, minima = _prove_within(part, own, fix[items], margin, effort)
-        new = _beside(part, own, minima)
+        claims, minima = _prove_within(part, own, fix[items], margin, effort)
+        new = _with_minima(part, own, minima)
         better = judge(part, new)
         changed = np.flatnonzero(_is_new(fix[items], better))
-        proven.write(items, told)
-        if not has_law(problem):  # the covariance of a fix that an inequality holds is that along the edge alone
+        proven.write(items, claims)
+        if not has_law(problem):  # the covariance of a fix that an inequality holds describes the edge only
             proven.write(items[~is_free(problem, fix, items)], unknown_claim(HELD))
         more += len(changed)
         pool = pool.merge(items[changed], take(new, changed))
@@ -120,30 +120,30 @@ def certified(
 def _prove_freely(
     problem: Problem, pool: Pool, items: Array, margin: float, effort: float
 ) -> tuple[Pool, Claims, Array]:
-    """Return pools after proofs of some of them as if nothing were bounded, their claims, and which claims hold (n,).
+    """Return pools after proofs of items without inequalities, the claims of the items, and which claims hold (n,).
 
-    They hold where the bounds are out of reach: then only the fix is a minimum, with them and without them.
+    A claim holds if the bounds are out of reach: then the fix is the only minimum, with and without bounds.
     """
     edges, part = edges_of(problem), problem.take(items)
     if edges is None or is_run(problem) or not len(items):
         return pool, empty_claims(len(items)), np.zeros(len(items), dtype=bool)
     new = certified_freely(part, take(pool, items), None, margin, effort)
-    fix, told = judge(part, new), new.proven
-    assert told is not None
+    fix, claims = judge(part, new), new.proven
+    assert claims is not None
     alone = ~np.isfinite(fix.alternatives.gap).any(-1) & fix.answered & is_free(part, fix, np.arange(len(items)))
-    sure = np.flatnonzero(alone & (told.proof == GLOBAL) & told.unique & (told.margin >= margin))
+    sure = np.flatnonzero(alone & (claims.proof == GLOBAL) & claims.unique & (claims.margin >= margin))
     holds = np.zeros(len(items), dtype=bool)
     if len(sure):
         costs = eliminate_nuisance(part.take(sure))
         assert isinstance(costs, PositionCosts)
         holds[sure] = out_of_reach(part.take(sure), edges, costs, fix[sure], margin)
-    # a better minimum that was found on the way stays
+    # a better minimum that the proof found is kept
     kept = replace(new, proven=pool.proven if pool.proven is None else take(pool.proven, items))
-    return pool.merge(items, kept), told, holds
+    return pool.merge(items, kept), claims, holds
 
 
 def _is_new(fix: Fix, other: Fix) -> Array:
-    """Return where other fixes (n,) cost less, have more alternatives, or are none."""
+    """Return flags (n,) where the other fixes cost less, have more alternatives, or have no answer."""
     with np.errstate(invalid="ignore"):
         lower = other.cost < fix.cost - equal_cost(fix.cost)
     more = np.isfinite(other.alternatives.gap).sum(1) > np.isfinite(fix.alternatives.gap).sum(1)
@@ -151,20 +151,20 @@ def _is_new(fix: Fix, other: Fix) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Along:
-    """What is known of n problems along one face.
+class FaceMinima:
+    """Minima and bounds of n problems along one face.
 
     Parameters
     ----------
     x : array (n, q, size)
         Minima along the face; NaN in empty slots.
     cost : array (n, q)
-        Of these; infinite in empty slots.
+        Their costs; infinite in empty slots.
     least, rest : array (n,)
-        What every point of the face costs more than the fix at least, and every minimum that is not among these; -inf
-        where that is not proven.
+        Lower bounds of the cost minus the cost of the fix: for every point of the face, and for every minimum that is
+        not listed in `x`; -inf if not proven.
     boxes : int array (n,)
-        Boxes looked at.
+        Boxes used.
     why : object array (n,)
         Why nothing is proven, or "".
     """
@@ -181,8 +181,8 @@ Minima = tuple[Array, Array, Array]
 """Vectors (n, q, size), costs (n, q) and numbers of faces (n, q); infinite costs in empty slots."""
 
 
-def _beside(problem: Problem, pool: Pool, minima: Minima) -> Pool:
-    """Return pools with more minima, which are refined already, settled anew."""
+def _with_minima(problem: Problem, pool: Pool, minima: Minima) -> Pool:
+    """Return settled pools with additional minima, which are already refined."""
     x, cost, face = minima
     here = np.isfinite(cost)
     code = np.where(here, np.int8(Status.OK), np.int8(Status.INFEASIBLE))
@@ -202,20 +202,20 @@ def _beside(problem: Problem, pool: Pool, minima: Minima) -> Pool:
 
 
 def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort: float) -> tuple[Claims, Minima]:
-    """Return claims (n,) about fixes, and all minima that are admitted."""
-    sides, known, found, costs = faces(problem), dict[Face, Along](), list[Minima](), eliminate_nuisance(problem)
+    """Return claims (n,) about fixes, and all admitted minima."""
+    sides, known, found, costs = faces(problem), dict[Face, FaceMinima](), list[Minima](), eliminate_nuisance(problem)
     sure, boxes = np.full(len(pool), margin), np.zeros(len(pool), dtype=np.int64)
     why, seeds, tight = filled_objects(len(pool), ""), pool.x, np.zeros(len(pool), dtype=bool)
     for number, face in enumerate(sides):
-        # on an edge of an edge nothing costs less than on that
+        # the cost along a part of an edge is at least the cost along the whole edge
         above = _least_around(known, face, len(pool))
         if not (above < margin).any():
             continue
-        along = known[face] = _know_along(problem, costs, fix, face, seeds, margin, effort)
+        along = known[face] = _explore_face(problem, costs, fix, face, seeds, margin, effort)
         own, admitted = np.maximum(above, along.rest), _is_admitted(problem, face, along)
         if number:
-            # of an edge that the proof does not follow nothing is known; where the free minima are all admitted, the
-            # cost falls from there to one of them
+            # The proof does not cover every edge. If all free minima are admitted, the cost falls from an uncovered
+            # edge to one of them, so this edge needs no proof.
             own = np.where(np.isfinite(along.rest) | ~tight, own, margin)
         else:
             seeds = pack(np.concatenate([fix.x[:, None], along.x], axis=1))
@@ -232,58 +232,60 @@ def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort:
     return claims, (x, cost, face_of)
 
 
-def _least_around(known: dict[Face, Along], face: Face, size: int) -> Array:
-    """Return by how much a face costs more than the fixes at least (n,), because it is part of others that do."""
+def _least_around(known: dict[Face, FaceMinima], face: Face, size: int) -> Array:
+    """Return lower bounds (n,) of the cost of a face minus the cost of the fixes, from faces that contain it."""
     own = set(face)
     around = [along.least for other, along in known.items() if own > {*other}]
     return np.asarray(np.max([np.full(size, -np.inf), *around], axis=0))
 
 
-def _know_along(
+def _explore_face(
     problem: Problem, costs: Costs, fix: Fix, face: Face, seeds: Array, margin: float, effort: float
-) -> Along:
-    """Return what is known of n problems along a face: its minima, unless all of it costs too much for any.
+) -> FaceMinima:
+    """Return minima and bounds of n problems along a face; without minima if the whole face costs too much.
 
-    Most faces lie far from what the data say: that needs few boxes, and their minima, which may be flat and hard to
-    find, are not asked for. `costs` are those of the problems, `seeds` (n, q, size) where minima are looked for.
+    Most faces are far from the region that the data support. Their proof needs few boxes, and a search for their
+    minima, which may be flat and hard to find, is skipped. `costs` are the position costs of the problems, and `seeds`
+    (n, q, size) are the starts of the search for minima.
     """
     n, size = len(seeds), seeds.shape[-1]
     dear, boxes = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
     if len(face) > len(exact(problem)) and not why_unsupported(on_face(problem, face)):
         limits = admitted_states(problem, problem.dimension)
-        dear, boxes = _is_dear(on_face(problem, face), limits, costs, seeds, fix.cost + margin, effort)
+        dear, boxes = _is_costly(on_face(problem, face), limits, costs, seeds, fix.cost + margin, effort)
     least = np.full(n, margin)
-    out = Along(np.full((n, 1, size), np.nan), np.full((n, 1), np.inf), least, least, boxes, filled_objects(n, ""))
+    out = FaceMinima(np.full((n, 1, size), np.nan), np.full((n, 1), np.inf), least, least, boxes, filled_objects(n, ""))
     rest = np.flatnonzero(~dear)
     if not len(rest):
         return out
-    some = _prove_along(problem.take(rest), fix[rest], face, seeds[rest], margin, effort)
+    some = _prove_face(problem.take(rest), fix[rest], face, seeds[rest], margin, effort)
     return overwrite(out, rest, replace(some, boxes=some.boxes + boxes[rest]))
 
 
-def _is_dear(
+def _is_costly(
     on: Problem, limits: Array, costs: Costs, seeds: Array, level: Array, effort: float
 ) -> tuple[Array, Array]:
-    """Return whether all of a face, of equalities alone, costs at least a level (n,), and the boxes looked at (n,).
+    """Return flags (n,) of faces of equalities that cost at least a level (n,) everywhere, and the boxes used (n,).
 
-    Beyond the limits (2, d) of the coordinates nothing is admitted.
+    The proof covers positions within the limits (2, d) of the coordinates: no position beyond is admitted.
 
-    A proof says that nothing costs less than a place by more than so much: here by what the place costs above the
-    level. So any place will do that costs more; it need be no minimum. The proof begins anew nearer to the minimum
-    where the cost is steep at the place, and where it met one of less than half as much above the level.
+    A proof has the form: no position costs less than a given position by more than a difference. Here the difference is
+    the cost of that position minus the level. So every position above the level will do; it need not be a minimum. The
+    proof restarts nearer to the minimum in two cases: the cost is steep at the position, or the proof found a position
+    with less than half of the difference.
     """
     dear, boxes = np.zeros(len(seeds), dtype=bool), np.zeros(len(seeds), dtype=np.int64)
     x, cost = _cheapest(on, costs, seeds)
-    # of angles that may be a turn off, costs above a level are not those of the rows
+    # angles may be off by a whole turn, and then costs above `costs.level` are not the costs of the rows
     items = np.flatnonzero(np.isfinite(cost) & (costs.level > level))
     for _ in range(_BEGINS):
         items = items[cost[items] - level[items] > equal_cost(level[items])]
         if not len(items):
             break
         part, own = on.take(items), costs.take(items)
-        answer = prove(own, _question(part, limits, own, x[items], cost[items] - level[items], effort))
+        answer = prove(own, _request(part, limits, own, x[items], cost[items] - level[items], effort))
         boxes[items] += answer.boxes
-        # where rounding is coarse a bound may be lower than what was asked for
+        # coarse rounding may make the proven bound lower than requested
         dear[items] = (answer.verdict == VALUE) & (answer.bound > level[items] - equal_cost(level[items]))
         near, met, steep = x[items], *(np.flatnonzero(answer.verdict == code) for code in (BETTER, STATIONARY))
         if len(met):
@@ -297,7 +299,7 @@ def _is_dear(
 
 
 def _cheapest(on: Problem, costs: Costs, seeds: Array) -> tuple[Array, Array]:
-    """Return the cheapest of some vectors (n, q, size) when moved onto a face, (n, size), and what it costs (n,)."""
+    """Return the cheapest of some vectors (n, q, size) after a move onto a face, (n, size), and its cost (n,)."""
     n, q, size = seeds.shape
     with np.errstate(all="ignore"):
         x = restore(on.take(np.repeat(np.arange(n), q)), exact(on), seeds.reshape(-1, size)).reshape(seeds.shape)
@@ -307,14 +309,14 @@ def _cheapest(on: Problem, costs: Costs, seeds: Array) -> tuple[Array, Array]:
 
 
 def _costs(problem: Problem, costs: Costs, x: Array) -> Array:
-    """Return position costs (n, q) of vectors (n, q, size); infinite where there is none."""
+    """Return position costs (n, q) of vectors (n, q, size); infinite where the cost is not finite."""
     with np.errstate(all="ignore"):
         cost = costs_of(costs, x[..., state_columns(problem)])[0]
     return np.where(np.isfinite(cost), cost, np.inf)
 
 
-def _question(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, effort: float) -> ProofRequest:
-    """Return the question whether nothing along a face costs less than vectors x (n, size) by more than `less` (n,)."""
+def _request(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, effort: float) -> ProofRequest:
+    """Return the proof request: no position of a face costs less than x (n, size) by more than `less` (n,)."""
     place = x[:, state_columns(on)]
     (n, d), value = place.shape, np.zeros(len(x))
     planes, surface = surfaces_of(on, place)
@@ -334,8 +336,8 @@ def _question(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, e
     )
 
 
-def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: float, effort: float) -> Along:
-    """Return what is known of n problems along a face, looked for from seeds (n, q, size)."""
+def _prove_face(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: float, effort: float) -> FaceMinima:
+    """Return minima and bounds of n problems along a face; the search for minima starts at seeds (n, q, size)."""
     began, on, limits = perf_counter(), on_face(problem, face), admitted_states(problem, problem.dimension)
     names = " and ".join(face_names(problem, face)) or "inside"
     pool = lsr(on, offer(on, seeds, None, "certify", began))
@@ -343,13 +345,16 @@ def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: f
     corner, reason = is_corner(problem, face), why_unsupported(on)
     if corner or reason:
         lost = np.full(len(seeds), -np.inf)
-        none, least = np.zeros(len(seeds), dtype=np.int64), _gain(alone.cost, fix.cost) if corner else lost
-        # a corner is the only minimum of itself
+        none, least = np.zeros(len(seeds), dtype=np.int64), _excess(alone.cost, fix.cost) if corner else lost
+        # a corner is a single point, so it is its only minimum
         rest = np.where(np.isfinite(least), np.inf, -np.inf)
-        return Along(*_minima(alone), least, rest, none, filled_objects(len(seeds), UNFOLLOWED.format(names, reason)))
-    gain = _gain(alone.cost, fix.cost)
-    # nothing on a face that costs so much more need be told apart; where a minimum that is not admitted costs less than
-    # the fix, all up to the margin above the fix must be found: in whole numbers, so that fixes of a batch ask alike
+        return FaceMinima(
+            *_minima(alone), least, rest, none, filled_objects(len(seeds), UNFOLLOWED.format(names, reason))
+        )
+    gain = _excess(alone.cost, fix.cost)
+    # If a face costs more than the fix by the margin, its minima need no distinction. If a minimum that is not admitted
+    # costs less than the fix, the proof must find all minima up to the margin above the fix. Gaps are rounded up to
+    # whole numbers, so that fixes of a batch share a request.
     above = np.where(gain > -LISTED_GAP, max(margin, AMBIGUOUS_GAP) - gain, max(margin, AMBIGUOUS_GAP))
     wanted = np.where(gain >= margin, 0.0, np.where(gain < 0.0, np.ceil(above), margin))
     proven = empty_claims(len(seeds))
@@ -369,23 +374,23 @@ def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: f
 
     prove(alone.answered)
     alone = judge(on, replace(pool, proven=None))
-    gain = _gain(alone.cost, fix.cost)
-    # An unfinished proof falls back to the gap of `ambiguous`. It counts from the least minimum, which may cost less
-    # than the fix if it is not admitted.
+    gain = _excess(alone.cost, fix.cost)
+    # An unfinished proof falls back to the gap of `ambiguous`. This gap counts from the least minimum, which may cost
+    # less than the fix if it is not admitted.
     enough = np.ceil(AMBIGUOUS_GAP - gain)
     short = alone.answered & (gain < 0.0) & (wanted > enough) & (proven.margin + gain < AMBIGUOUS_GAP)
     if short.any():
         wanted = np.where(short, enough, wanted)
         prove(short)
         alone = judge(on, replace(pool, proven=None))
-        gain = _gain(alone.cost, fix.cost)
+        gain = _excess(alone.cost, fix.cost)
     sure, gap = _is_sure(proven, limits), proven.margin
     least, rest = np.where(sure, gain, -np.inf), np.where(sure, gain + gap, -np.inf)
-    return Along(*_minima(alone), least, rest, proven.boxes, proven.reason)
+    return FaceMinima(*_minima(alone), least, rest, proven.boxes, proven.reason)
 
 
-def _gain(cost: Array, best: Array) -> Array:
-    """Return by how much costs (n,) exceed those of fixes; zero where they are equal but for rounding."""
+def _excess(cost: Array, best: Array) -> Array:
+    """Return the costs (n,) minus the costs of fixes; zero for differences within rounding."""
     gain = np.where(np.isfinite(cost), cost - best, -np.inf)
     return np.where(np.abs(gain) <= equal_cost(best), 0.0, gain)
 
@@ -398,7 +403,7 @@ def _minima(fix: Fix) -> tuple[Array, Array]:
 
 
 def _is_sure(claims: Claims, limits: Array) -> Array:
-    """Return which claims (n,) are about all that a box admits, or about all positions."""
+    """Return flags (n,) of claims that cover all positions, or all positions within the limits (2, d)."""
     out = np.asarray(claims.proof == GLOBAL)
     for i in np.flatnonzero(claims.proof == REGION):
         lower, upper = np.array(claims.region[i])
@@ -407,7 +412,7 @@ def _is_sure(claims: Claims, limits: Array) -> Array:
 
 
 def _within_limits(problem: Problem, pool: Pool, limits: Array, margin: float, effort: float) -> Pool:
-    """Return pools of which claims that cannot be made of all positions are about those that a box admits."""
+    """Return pools in which claims cover the limits (2, d) if they cannot cover all positions."""
     assert pool.proven is not None
     open_ones = np.flatnonzero(~_is_sure(pool.proven, limits))
     if not len(open_ones) or not np.isfinite(limits).all():
@@ -417,26 +422,26 @@ def _within_limits(problem: Problem, pool: Pool, limits: Array, margin: float, e
     return pool.merge(open_ones, again)
 
 
-def _is_admitted(problem: Problem, face: Face, along: Along) -> Array:
-    """Return which minima along a face (n, q) are minima of all that is admitted."""
+def _is_admitted(problem: Problem, face: Face, along: FaceMinima) -> Array:
+    """Return flags (n, q) of minima along a face that are minima under all constraints."""
     out = np.isfinite(along.cost)
     item, slot = np.nonzero(out)
     out[item, slot] = is_minimum(problem.take(item), face, along.x[item, slot])
     return out
 
 
-# Who asks for a proof gives it more time than a method that goes on without one.
+# An explicit call of `certify` gets more boxes than a proof within a method, which can continue without it.
 _EFFORT = 4
 
 
 def certify(
     problem: Problem, fix: Fix, region: tuple[Array, Array] | None = None, *, margin: float = LISTED_GAP
 ) -> Fix:
-    """Return a fix with a certificate of what is proven about it, and with every better or other minimum met.
+    """Return a fix with a certificate, and with every better or other minimum that the proof found.
 
-    The proof encloses all positions that could cost less, shows that the cost is convex around the fix, and splits
-    the rest into boxes until a lower bound excludes each. A better position replaces the fix, which is then proven
-    again; other minima with a cost within 25 are listed as alternatives.
+    The proof encloses all positions that could cost less, and shows that the cost is convex around the fix. It splits
+    the remaining space into boxes until a lower bound excludes each box. A better position replaces the fix, which is
+    then proven again. Other minima with a cost within 25 are listed as alternatives.
 
     Parameters
     ----------
@@ -445,19 +450,20 @@ def certify(
     fix : Fix
         Their fixes, refined.
     region : (lower, upper), optional
-        Corners (d,) of the box to which the claim may be limited, in the problem's frame, metres; None: all positions,
-        or where that cannot be bounded a box around the stations that the certificate names. Of a target that moves
-        (2 d,), velocities in metres per second after the coordinates; None: what its constraints admit, see
-        `optloc.solvers.certificates.position_cost.regions_of`.
+        Corners (d,) of the box to which the claim may be limited, in the frame of the problem, metres. None: all
+        positions, or a box around the stations if the search cannot be bounded; the certificate names this box. For a
+        moving target the corners are (2 d,): velocities in metres per second follow the coordinates. None then means
+        the region that the constraints admit, see `optloc.solvers.certificates.position_cost.regions_of`.
     margin : float
-        Gap between the cost of the fix and that of any other minimum that is tried to prove first; where the proof is
-        not finished, 9, the gap of `ambiguous`, and the value alone follow. 0 asks for the value alone: quicker.
+        Gap between the cost of the fix and the cost of any other minimum that the proof tries first. If this proof is
+        not finished, the gap 9 of `ambiguous` and then the value alone follow. 0 proves the value only, which is
+        faster.
 
     Returns
     -------
     Fix
-        Like `fix`. Fixes without an answer stay as they are; what cannot be proven has the certificate "unknown" with
-        the reason, and one whose proof fails numerically the status `numerical`.
+        Like `fix`. Fixes without an answer do not change. A fix without a proof has the certificate "unknown" with the
+        reason. A fix whose proof fails numerically has the status `numerical`.
 
     Raises
     ------
@@ -469,7 +475,7 @@ def certify(
     shape, flat = problem.batch_shape, problem.flat()
     if fix.shape != shape:
         raise InvalidProblem(
-            f"a fix of shape {fix.shape} for problems of shape {shape}", "fix", "give the fix of this problem"
+            f"the fix has shape {fix.shape}, and the problem has shape {shape}", "fix", "give the fix of this problem"
         )
     if not 0.0 <= margin < np.inf:
         raise InvalidProblem(f"the margin is {margin}", "margin", "give 0 or a positive number")
@@ -484,18 +490,18 @@ def certify(
 
 
 def value_certified(problem: Problem, pool: Pool | None) -> Pool:
-    """Return the pools of a flat batch of problems with a proof that nothing costs less: the stage "value"."""
+    """Return the pools of a flat batch of problems with a proof that no position costs less: the stage "value"."""
     return certified(problem, pool, margin=0.0)
 
 
 def _corners(problem: Problem, region: tuple[Array, Array]) -> Array:
-    """Return the corners (2, d) of a region that is a box, (2, 2 d) where it says velocities as well."""
+    """Return the corners (2, d) of a box, or (2, 2 d) if the region includes velocities."""
     corners = np.array([np.asarray(corner, dtype=float) for corner in region])
     sizes = sorted({problem.dimension, problem.dimension * (problem.motions[0].order + 1)})
     shaped = corners.ndim == 2 and len(corners) == 2 and corners.shape[1] in sizes
     if not shaped or not np.isfinite(corners).all() or (corners[0] >= corners[1]).any():
         count = " or ".join(map(str, sizes))
         raise InvalidProblem(
-            "the region is no box", "region", f"give (lower, upper) with {count} finite coordinates each"
+            "the region is not a box", "region", f"give (lower, upper) with {count} finite coordinates each"
         )
     return corners

@@ -1,4 +1,7 @@
-"""Whether a fix is the best one: branch and bound over all positions, and what it finds on the way."""
+"""Proofs by branch and bound, over all positions, that a fix is the best minimum.
+
+A proof may find a better or another minimum. The minimum is then refined and added to the candidates.
+"""
 
 from __future__ import annotations
 
@@ -44,115 +47,118 @@ from optloc.solvers.pool import Pool, TriedBefore, offer, pack
 from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.judge import judge, surviving_candidates
 
-# What a proof lets a certificate say, in sentences.
+# Sentences of certificates.
 
 Corner = tuple[float, ...]
 
 METHOD = "branch and bound"
-# Reasons for which nothing is proven.
+# Reasons for a missing proof.
 UNFINISHED = "the proof was not finished within its budget of boxes"
-LACKS_CODE = "; machine code, which takes minutes to make once, would go on: run `optloc compile`"
+LACKS_CODE = "; compiled code allows more boxes: run `optloc compile` once, which takes minutes"
 FINE = (
-    "the stated noise is finer than the rounding of ranges and coordinates, so that no proof can tell positions apart; "
-    "state a larger noise, or an origin nearby"
+    "the stated noise is smaller than the rounding of ranges and coordinates, so that no proof is possible; "
+    "state a larger noise, or a nearer origin"
 )
-AROUND = "the region reaches around the Earth, and the proof is for one side of it"
-SCALED = "nothing bounds the position at all scales that the rows and priors allow"
-FAST = "nothing bounds the position at all velocities that the rows and the prior allow"
-UNSETTLED = "the rows do not make the fix a strict minimum that stands out from its neighbourhood"
-BARRED = "a position that costs less is not admitted: {}"
-LOST = "a position that costs less was met, and no minimum next to it was kept"
-HELD = "an inequality holds the fix, and the proof covers equalities only"
-REMOTE = "positions ever farther away explain the data about as well"
-TURNS = "angles may be a whole turn off with their biases at costs that matter"
-RESTLESS = "minima kept turning up"
-MISMATCHED = "the cost of the proof is not that of the fix"
+AROUND = "the region reaches around the Earth, but a proof covers one side only; give a smaller region"
+SCALED = "the position is not bounded at all scales that the rows and priors allow"
+FAST = "the position is not bounded at all velocities that the rows and the prior allow"
+UNSETTLED = "the fix is not a strict minimum: the data do not distinguish it from its neighbourhood"
+BARRED = "a position with a lower cost exists, but {}"
+LOST = "a position with a lower cost was found, but refinement from it gave no minimum"
+HELD = "an inequality constraint is active at the fix, and the proof supports equalities only"
+REMOTE = "positions at ever larger distances explain the data about equally well"
+TURNS = "biases of angles may reach a whole turn at a cost that is not excluded"
+RESTLESS = "the proof kept finding new minima"
+MISMATCHED = "the cost in the proof differs from the cost of the fix"
 
 
 def unknown_claim(reason: str) -> Claims:
-    """Return the claim () about fixes of which nothing is proven, with the reason."""
+    """Return the claim () about fixes without a proof, with the reason."""
     return claim(Certificate("unknown", reason, METHOD))
 
 
 def state_claims(
     cost: Array, bound: Array, margin: Array, boxes: Array, listed: Array, everywhere: Array | bool = True
 ) -> Claims:
-    """Return the claims (n,) about proven fixes, but for the regions of those that are not about all positions.
+    """Return the claims (n,) about proven fixes. The caller adds the region to claims that do not cover all positions.
 
     Parameters
     ----------
     cost, bound : array (n,)
-        Of the fixes, and the certified lower bounds.
+        Costs of the fixes, and certified lower bounds.
     margin : array (n,)
         Proven gaps to other minima; 0 for the value alone.
     boxes : int array (n,)
-        Boxes looked at.
+        Boxes used.
     listed : int array (n,)
-        How many alternatives a claim leaves out, because they are listed.
+        Number of listed alternatives, which a claim excepts.
     everywhere : bool array (n,)
-        Whether a claim is about all positions.
+        Whether a claim covers all positions.
     """
     out = replace(
         empty_claims(len(cost)), bound=bound, gap=cost - bound, unique=margin > 0.0, margin=margin, boxes=boxes
     )
     out.proof[:], out.method[:] = np.where(everywhere, GLOBAL, REGION), METHOD
-    # a batch has few different claims but many fixes
+    # a batch has many fixes but few different claims
     for gap in np.unique(margin):
         for count in np.unique(listed[margin == gap]):
             out.reason[(margin == gap) & (listed == count)] = claim_sentence(float(gap), int(count), None)
     return out
 
 
-# Coordinates of space.
+# coordinates of space
 _SPACE = 3
 
 
-@lru_cache(maxsize=256)  # the fixes of a call have few different margins, and formatting numbers is slow
+@lru_cache(maxsize=256)  # fixes solved together share few sentences, and Python formats numbers slowly
 def claim_sentence(margin: float, listed: int, region: tuple[Corner, Corner] | None) -> str:
-    """Return the claim about a proven fix, over all positions or over a region, in words.
-
-    Another position means another local minimum: chi-square rises continuously around the fix. See `state_claims`.
-    """
-    where = "" if region is None else f" {_where(*region)}"
-    if margin <= 0.0:
-        return f"no position{where} has a lower chi-square; other minima were searched for, not excluded"
-    except_listed = "" if not listed else f" except the {'one' if listed == 1 else listed} listed"
-    there = " there" if where else ""
-    return f"proven best{where}; any other position{there}{except_listed} raises chi-square by at least {margin:g}"
+    """Return the claim about a proven fix as a sentence: over all positions, or over a region; see `state_claims`."""
+    where = "no position" if region is None else _where(*region)
+    beside = "" if not listed else f", except the {'one' if listed == 1 else listed} listed,"
+    if margin > 0.0:
+        rest = f"every other local minimum{beside} costs at least {margin:g} more"
+    else:
+        rest = "other minima were searched for, not excluded"
+    return f"{where} costs less; {rest}"
 
 
 def _where(lower: Corner, upper: Corner) -> str:
-    """Return a region in words: positions in m, and velocities in m/s where the corners have them."""
+    """Return the sentence part for a region of positions, or of positions and velocities."""
     d = len(lower) // 2 if len(lower) > _SPACE else len(lower)
-    words = f"from {_text(lower[:d])} to {_text(upper[:d])} m"
+    words = f"no position from {_text(lower[:d])} to {_text(upper[:d])} m"
     return words if d == len(lower) else f"{words} at a velocity from {_text(lower[d:])} to {_text(upper[d:])} m/s"
 
 
 def _text(corner: Corner) -> str:
+    """Return the coordinates of a corner as text."""
     return "(" + ", ".join(f"{v:.6g}" for v in corner) + ")"
 
 
-# Gaps to other minima that are tried to prove, one after the other; the last is the value alone. Where positions ever
-# farther away cost too little for a gap, one more comes before the last: the cost of the 95 % region.
+# Gaps to other minima that a proof tries in turn; the last gap is the value alone. If infinity costs too little for a
+# gap, the cost of the 95 % region is tried before the last one.
 _MARGINS, _LEVEL = (LISTED_GAP, AMBIGUOUS_GAP, 0.0), 0.95
 # Rounds of proof and repair: every margin may be lowered and the region tried, with a few minima found in between.
 _ROUNDS = 6
-# Boxes for a proof, with up to `_NODES` nodes. Four arrivals and a measured height take 9 000 of the whole Earth. Of
-# 2 200 fixes of 55 mixtures 39 were open after 3 000 boxes. After 8 000 it was 20, in 1.3 times the time of all. After
-# 30 000 it was 11, in 1.5 times. Plain Python takes a thousand times longer for each box: a budget of all fixes.
+# Boxes for a proof, with up to `_NODES` residual terms. Four arrivals and a measured height take 9 000 over the whole
+# Earth. Of 2 200 fixes of 55 mixtures, 39 were unproven after 3 000 boxes. After 8 000 boxes 20 were unproven, in 1.3
+# times the total time; after 30 000 boxes 11, in 1.5 times. Plain Python takes a thousand times longer for each box, so
+# all fixes together share its budget.
 _BUDGET, _NODES, _SLOW_BUDGET, _AT_LEAST = 30_000, 12, 2000, 5
 ALL_AROUND = 2
-"""Times as many on the surface of a height: three range differences took 20 000 to 40 000 boxes all around the Earth,
-of two coordinates and 2 us each."""
-# Within what share of its distance from the fix a minimum that was met is one that is listed: a descent's accuracy.
+"""Factor of the budget on the surface of a height.
+
+Three range differences took 20 000 to 40 000 boxes around the whole Earth, of two coordinates and 2 us each.
+"""
+# A minimum that a proof found is a listed one within this share of its distance from the fix: the accuracy of a
+# descent.
 _SAME = 1e-3
 HIDDEN = 4
-"""Minima behind the Earth that are set aside at most: mirror images through it; whoever has more gets no proof."""
+"""Most minima behind the Earth (mirror images) that a proof excepts. A fix with more has no proof."""
 
 
 @dataclass(slots=True)
 class BoundWorkspace:
-    """A flat batch of N pools while they are proven; entries are replaced as better candidates are found.
+    """State of the proofs of a flat batch of N pools; better candidates replace entries.
 
     Parameters
     ----------
@@ -163,30 +169,30 @@ class BoundWorkspace:
     fix : Fix
         The verdict of the pool.
     proven : Claims
-        What is claimed of each.
+        Claims of the fixes.
     costs : PositionCosts, Runs or Courses
-        Their costs over the position, equalities apart.
+        Their costs over the position, without equalities.
     ignored : array (N, h, d)
         Minima that the Earth hides; NaN in empty slots.
     region : array (N, 2, d)
         Corners of the regions of the claims; NaN for all positions.
     fallback : array (N, 2, d)
-        Corners of the regions that take their place where all positions cannot be bounded.
+        Corners of the regions that replace them if the search cannot be bounded.
     margins : array (q,)
-        Gaps to prove, one after the other where proofs are not finished; the last but one only where infinity is near.
+        Gaps to prove in turn if proofs are not finished. The last but one is used only if infinity costs little.
     level : int array (N,)
-        Which of the margins is tried.
+        Index of the current margin.
     pending : bool array (N,)
-        What is not settled.
+        Fixes without a final claim.
     effort : float
-        By how much budgets and rounds are multiplied.
+        Factor of budgets and rounds.
     limited : bool
-        Whether the claims are limited to a region that somebody asked for.
+        Whether the claims are limited to a requested region.
     spent : int array (N,)
-        Boxes of all proofs that were tried.
+        Boxes of all proofs tried.
     replaced, listed, mismatched : int
-        How many fixes were replaced, how often another minimum was added to the alternatives, and how many proofs were
-        about another cost than that of their fix.
+        Numbers of replaced fixes, of minima added to the alternatives, and of proofs for another cost than the cost of
+        their fix.
     """
 
     problem: Problem
@@ -211,7 +217,7 @@ class BoundWorkspace:
     def begin(
         cls, problem: Problem, pool: Pool, fix: Fix, answered: Array, region: Array | None, margin: float, effort: float
     ) -> BoundWorkspace:
-        """Return the work before the first round."""
+        """Return the state of the proofs before the first round."""
         size, state = len(fix.x), fix.x[:, state_columns(problem)]
         d = state.shape[-1]
         corners, limited = regions_of(problem, state, region)
@@ -233,7 +239,7 @@ class BoundWorkspace:
         )
 
     def summary(self) -> str:
-        """Return what was proven, in a few words."""
+        """Return a summary of the proofs, in a few words."""
         proof = np.where(self.proven.tried, self.proven.proof, self.fix.claims.proof)
         proofs = np.bincount(proof, minlength=len(PROOFS))
         counts = [f"{proofs[k]} {PROOFS[k]}" for k in (GLOBAL, REGION, UNKNOWN) if proofs[k]]
@@ -245,27 +251,27 @@ class BoundWorkspace:
 
 
 def gaps_below(margin: float, dimension: int) -> list[float]:
-    """Return the gaps to prove, from the one asked for down to the value alone."""
+    """Return the gaps to prove, from the requested gap down to the value alone."""
     below = [m for m in _MARGINS if m < margin]
     near = min(quantile(_LEVEL, dimension), margin)
     return [margin, *below[:-1], near, 0.0] if margin > 0.0 else [0.0]
 
 
 def settle(work: BoundWorkspace) -> BoundWorkspace:
-    """Return the work with a certificate for every fix that was to be proven."""
+    """Return the state with a final claim for every pending fix."""
     asked = np.flatnonzero(work.pending)
     for _ in range(int(_ROUNDS * max(work.effort, 1))):
         items = np.flatnonzero(work.pending)
         if not len(items):
             break
-        _round(work, items)
+        _run_round(work, items)
     _give_up(work, np.flatnonzero(work.pending), RESTLESS)
     _compare(work, asked)
     return work
 
 
 def _compare(work: BoundWorkspace, items: Array) -> None:
-    """Take back what was proven of another cost than that of a fix."""
+    """Withdraw proofs whose cost is not the cost of their fix."""
     proven = items[np.isin(work.proven.proof[items], (GLOBAL, REGION))]
     if not len(proven):
         return
@@ -274,14 +280,14 @@ def _compare(work: BoundWorkspace, items: Array) -> None:
     work.mismatched += len(off)
 
 
-def _round(work: BoundWorkspace, items: Array) -> None:
-    """Try to prove some fixes once, and settle or change what can be."""
+def _run_round(work: BoundWorkspace, items: Array) -> None:
+    """Run one proof for each item, and write its claim, add its minima, or lower its margin."""
     free = is_free(work.problem, work.fix, items)
     _give_up(work, items[~free], HELD)
-    asked, costs = _asked(work, items), work.costs.take(items)
-    # Below this level a wrapped residual may stand for another than the node's: no bound of one bounds the other.
+    asked, costs = _requests(work, items), work.costs.take(items)
+    # Above `costs.level`, wrapping may change a residual by a whole turn, and the bounds of the proof do not hold.
     turning = free & (costs.level < work.fix.cost[items] + asked.gaps[:, 0])
-    _lower(work, items[turning], TURNS)
+    _lower_margin(work, items[turning], TURNS)
     good = np.flatnonzero(free & ~turning)
     if not len(good):
         return
@@ -292,22 +298,22 @@ def _round(work: BoundWorkspace, items: Array) -> None:
     done, beside = np.isin(answer.verdict, (UNIQUE, VALUE)), answer.met > 0
     holds = done & ~beside
     if (done & beside).any():
-        holds[done & beside] = _list(work, items[done & beside], answer.take(done & beside))
+        holds[done & beside] = _list_rivals(work, items[done & beside], answer.take(done & beside))
     _claim(work, items, asked, answer, np.flatnonzero(holds))
     short, last = answer.verdict == BUDGET, len(work.margins) - 1
-    # What the budget of a gap did not show, that of the value may.
+    # the budget of the value alone may show what the budget of the gap did not
     below = short & (answer.gap < asked.gaps[:, 0])
     work.level[items[below]] = last - 1
-    _lower(work, items[short], _unfinished(work.costs, len(items)))
+    _lower_margin(work, items[short], _unfinished(work.costs, len(items)))
     remote = answer.verdict == UNBOUNDED
     work.level[items[remote & (answer.gap == 0.0)]] = last
-    _lower(work, items[remote], REMOTE, remote=True)
+    _lower_margin(work, items[remote], REMOTE, remote=True)
     found = np.isin(answer.verdict, (BETTER, OTHER))
     if found.any():
-        _add(work, items[found], answer.found[found], answer.verdict[found] == BETTER)
+        _add_candidates(work, items[found], answer.found[found], answer.verdict[found] == BETTER)
     fine, unclosed = answer.verdict == COARSE, answer.verdict == OPEN
     _give_up(work, items[fine], FINE)
-    # Boxes ran out over all of the surface of a height before a region of it was tried.
+    # on the surface of a height the boxes ran out before the proof tried a region
     scaled = isinstance(work.costs, ScaledCosts)
     unbounded = (
         (FAST if has_one_epoch_velocity(work.problem) else SCALED) if scaled else _unfinished(work.costs, len(items))
@@ -316,7 +322,8 @@ def _round(work: BoundWorkspace, items: Array) -> None:
     _give_up(work, items[~(done | short | remote | found | fine | unclosed)], UNSETTLED)
 
 
-def _asked(work: BoundWorkspace, items: Array) -> ProofRequest:
+def _requests(work: BoundWorkspace, items: Array) -> ProofRequest:
+    """Return the proof requests of some fixes, with the margins, regions and known minima of this round."""
     fix, ignored, last = work.fix, work.ignored[items], len(work.margins) - 1
     gaps = work.margins[np.minimum(work.level[items, None] + np.arange(last + 1), last)]
     kappa = gaps[:, 0]
@@ -344,20 +351,21 @@ def _asked(work: BoundWorkspace, items: Array) -> ProofRequest:
 
 
 def budgets(n: int, nodes: float, effort: float) -> Array:
-    """Return the boxes (n,) that proofs may take: one takes time with the square of the nodes of dense rows."""
+    """Return the boxes (n,) that proofs may use: the time of a box grows with the square of the terms of dense rows."""
     if not enabled():
         return np.full(n, max(_AT_LEAST, _SLOW_BUDGET // max(n, 1)))
-    # The same time whatever the number of nodes, not the same number of boxes.
+    # the budget limits the time, so the number of boxes falls with the number of terms
     share = max(1.0, (nodes / _NODES) ** 2) / effort
     return np.full(n, int(_BUDGET / share))
 
 
 def _unfinished(costs: Costs, count: int) -> str:
+    """Return the reason of an unfinished proof, with a hint if machine code is missing."""
     return UNFINISHED + (LACKS_CODE if lacks(costs, count) else "")
 
 
-def _lower(work: BoundWorkspace, items: Array, why: str, *, remote: bool = False) -> None:
-    """Let proofs that failed try for a smaller margin, then for a region; give up where that was all."""
+def _lower_margin(work: BoundWorkspace, items: Array, why: str, *, remote: bool = False) -> None:
+    """Lower the margin of failed proofs, then limit them to a region; give up if both were tried."""
     last = len(work.margins) - 1
     work.level[items] += 1
     if not remote:
@@ -371,40 +379,41 @@ def _lower(work: BoundWorkspace, items: Array, why: str, *, remote: bool = False
 
 
 def _give_up(work: BoundWorkspace, items: Array, why: str) -> None:
+    """Write the final claim "unknown" with a reason for some fixes."""
     work.proven.write(items, unknown_claim(why))
     work.proven.boxes[items] = work.spent[items]
     work.pending[items] = False
 
 
 def _claim(work: BoundWorkspace, items: Array, asked: ProofRequest, answer: ProofResult, done: Array) -> None:
-    """Write the certificates of those of some fixes that are proven."""
+    """Write the claims of finished proofs `done` among the items."""
     proven, kappa = items[done], answer.gap[done]
     listed = (work.fix.alternatives.gap[proven] < kappa[:, None]).sum(1)
-    told = state_claims(
+    claims = state_claims(
         work.fix.cost[proven], answer.bound[done], kappa, answer.boxes[done], listed, answer.everywhere[done]
     )
-    told.asked[:] = work.limited
+    claims.asked[:] = work.limited
     for k in np.flatnonzero(~answer.everywhere[done]).tolist():
         whole = np.isnan(asked.region[done[k], 0, 0])
         corners = (asked.fallback if whole else asked.region)[done[k]]
-        low, high = corners[:, np.isfinite(corners).all(0)].tolist()  # what a known height says is not limited
-        told.region[k] = region = tuple(low), tuple(high)
-        told.reason[k] = claim_sentence(float(kappa[k]), int(listed[k]), region)
-    work.proven.write(proven, told)
+        low, high = corners[:, np.isfinite(corners).all(0)].tolist()  # a known height is no limit of the claim
+        claims.region[k] = region = tuple(low), tuple(high)
+        claims.reason[k] = claim_sentence(float(kappa[k]), int(listed[k]), region)
+    work.proven.write(proven, claims)
     work.pending[proven] = False
 
 
-def _add(work: BoundWorkspace, items: Array, points: Array, better: Array) -> None:
-    """Refine points (n, d) that were found beside some fixes, and let them compete."""
-    _, changed = _compete(work, items, points[:, None])
-    _stick(work, items[~changed], points[~changed], better[~changed])
+def _add_candidates(work: BoundWorkspace, items: Array, points: Array, better: Array) -> None:
+    """Refine points (n, d) that the proofs of some fixes found, and add them to the candidates."""
+    _, changed = _judge_with_points(work, items, points[:, None])
+    _handle_unchanged(work, items[~changed], points[~changed], better[~changed])
 
 
-def _list(work: BoundWorkspace, items: Array, answer: ProofResult) -> Array:
-    """Refine minima that proofs of some fixes went on beside, let them compete; return which claims hold (n,)."""
+def _list_rivals(work: BoundWorkspace, items: Array, answer: ProofResult) -> Array:
+    """Refine the other minima of finished proofs and add them to the candidates; return which claims hold (n,)."""
     rivals = answer.rivals[:, : answer.met.max()]
     rivals = np.where((np.arange(rivals.shape[1]) < answer.met[:, None])[..., None], rivals, np.nan)
-    lower, changed = _compete(work, items, rivals)
+    lower, changed = _judge_with_points(work, items, rivals)
     fix, own = work.fix[items], state_columns(work.problem)
     known, place = fix.alternatives.x[..., own], fix.x[:, None, own]
     with np.errstate(invalid="ignore"):
@@ -412,12 +421,15 @@ def _list(work: BoundWorkspace, items: Array, answer: ProofResult) -> Array:
         near = (apart <= _SAME * np.linalg.norm(rivals - place, axis=-1, keepdims=True)).any(-1)
     holds = ~lower & fix.answered & (near | np.isnan(rivals[..., 0])).all(1)
     stuck = ~changed & ~holds
-    _stick(work, items[stuck], rivals[stuck, 0], np.zeros(stuck.sum(), dtype=bool))
+    _handle_unchanged(work, items[stuck], rivals[stuck, 0], np.zeros(stuck.sum(), dtype=bool))
     return np.asarray(holds)
 
 
-def _compete(work: BoundWorkspace, items: Array, points: Array) -> tuple[Array, Array]:
-    """Refine points (n, P, d) beside some fixes; return which fixes they replaced, and of which they say more, (n,)."""
+def _judge_with_points(work: BoundWorkspace, items: Array, points: Array) -> tuple[Array, Array]:
+    """Refine points (n, P, d) and judge them with the candidates of some fixes.
+
+    Return flags (n,) of fixes that cost less now, and flags (n,) of fixes that changed in any way.
+    """
     began = perf_counter()
     part, own, before = work.problem.take(items), work.fix[items], take(work.pool, items)
     x = pack(np.concatenate([surviving_candidates(before, own), vectors(part, points)], axis=1))
@@ -437,15 +449,15 @@ def _compete(work: BoundWorkspace, items: Array, points: Array) -> tuple[Array, 
     return lower, changed
 
 
-def _stick(work: BoundWorkspace, items: Array, points: Array, better: Array) -> None:
-    """Say what becomes of fixes beside which points (n, d) were found that are no candidates."""
+def _handle_unchanged(work: BoundWorkspace, items: Array, points: Array, better: Array) -> None:
+    """Handle points (n, d) that changed no candidate: store hidden minima, give up fixes, or lower margins."""
     stuck = np.flatnonzero(~_ignore(work, items, points))
-    _bar(work, items, points, stuck[better[stuck]])
-    _lower(work, items[stuck[~better[stuck]]], _unfinished(work.costs, len(items)))
+    _give_up_forbidden(work, items, points, stuck[better[stuck]])
+    _lower_margin(work, items[stuck[~better[stuck]]], _unfinished(work.costs, len(items)))
 
 
-def _bar(work: BoundWorkspace, items: Array, points: Array, barred: Array) -> None:
-    """Give up fixes beside which a point costs less that did not replace them, and say what forbids it."""
+def _give_up_forbidden(work: BoundWorkspace, items: Array, points: Array, barred: Array) -> None:
+    """Give up fixes with a cheaper point that did not replace them, and write what forbids this point."""
     if not len(barred):
         return
     part = work.problem.take(items[barred])
@@ -458,14 +470,14 @@ def _bar(work: BoundWorkspace, items: Array, points: Array, barred: Array) -> No
 
 
 def _ignore(work: BoundWorkspace, items: Array, points: Array) -> Array:
-    """Note the minima next to points (n, d) that the Earth hides, and return which are new (n,)."""
+    """Store the minima next to points (n, d) that the Earth hides; return flags (n,) of new ones."""
     problem = work.problem
     if not problem.frame.geodetic or problem.motions[0].order or not len(items) or work.ignored.shape[1] >= HIDDEN:
         return np.zeros(len(items), dtype=bool)
     part = problem.take(items)
     done = refine(part, vectors(part, points[:, None])[:, 0], face=exact(problem))
     place = problem.layout.take(done.x, "position")
-    # The same minimum, refined twice: metres in Earth-centred coordinates.
+    # tolerance for two refinements of the same minimum: metres in Earth-centred coordinates
     known = (np.abs(work.ignored[items] - place[:, None]) <= 1e-6 * np.abs(place[:, None])).all(-1).any(1)
     fresh = is_hidden(part, done.x, HIDDEN_REACH) & ~known
     more = np.full((len(work.ignored), 1, place.shape[-1]), np.nan)
@@ -475,7 +487,7 @@ def _ignore(work: BoundWorkspace, items: Array, points: Array) -> Array:
 
 
 def keep_evidence(pool: Pool, before: Pool) -> Pool:
-    """Return a pool with what was known of its problems before one more candidate was refined."""
+    """Return a pool with the cost at infinity and the remarks that its problems had before."""
     infinity = pool.infinity if before.infinity is None else before.infinity
     if pool.infinity is not None and before.infinity is not None:
         infinity = np.fmin(pool.infinity, before.infinity)
@@ -485,7 +497,7 @@ def keep_evidence(pool: Pool, before: Pool) -> Pool:
 def certified_freely(
     problem: Problem, pool: Pool | None, region: Array | None = None, margin: float = LISTED_GAP, effort: float = 1
 ) -> Pool:
-    """Return the pools of a flat batch with certificates of claims about all positions, admitted or not.
+    """Return the pools of a flat batch with certificates over all positions; inequalities are ignored.
 
     Parameters
     ----------
@@ -498,15 +510,15 @@ def certified_freely(
     margin : float
         Gap to prove.
     effort : float
-        Multiplies the boxes that a proof may take.
+        Factor of the boxes that a proof may use.
     """
     if pool is None:
-        raise InvalidProblem("certify examines a fix", "method", "put it behind a refinement")
+        raise InvalidProblem("certify needs a fix", "method", "put it after a refinement, as in 'gtrs+lsr+certify'")
     began = perf_counter()
     fix = judge(problem, pool)
     answered, proven_before = fixes_to_prove(pool, fix)
     why = why_unsupported(problem)
-    if not why and region is None and effort <= 1:  # who calls `certify` wants what can be had
+    if not why and region is None and effort <= 1:  # an explicit call gets any proof
         why = why_unlimited(problem)
     if why or not answered.any():
         proven = claims_before(pool)
@@ -522,34 +534,34 @@ def certified_freely(
 
 
 def tried_before(pool: Pool, fix: Fix, items: Array) -> TriedBefore | None:
-    """Return what was tried to prove of some of the fixes (N,) of a pool; None where nothing was."""
+    """Return the proofs tried for some fixes (N,) of a pool; None if no proof was tried."""
     if pool.proven is None:
         return None
     return TriedBefore(fix.cost[items], _count_listed(fix)[items], take(pool.proven, items))
 
 
 def claims_before(pool: Pool) -> Claims:
-    """Return what was proven of a pool before, to be written anew."""
+    """Return a writable copy of the claims of a pool."""
     return empty_claims(len(pool)) if pool.proven is None else change(pool.proven, lambda array, core: np.array(array))
 
 
 def _count_listed(fix: Fix) -> Array:
+    """Return the number of listed alternatives of each fix, (N,)."""
     return np.asarray(np.isfinite(fix.alternatives.gap).sum(1))
 
 
 def fixes_to_prove(pool: Pool, fix: Fix) -> tuple[Array, Array]:
-    """Return which fixes (N,) there is something to prove of, and of which of these a claim of before holds still."""
+    """Return flags (N,) of fixes that can be proven, and flags of those whose earlier claim is still valid."""
     answered = fix.answered & np.isfinite(fix.cost)
     if pool.conclusion is not None:
-        answered &= ~present(pool.conclusion)  # the rows are not all there
-    return answered, answered & _stands(pool.tried_before, fix)
+        answered &= ~present(pool.conclusion)  # a conclusion leaves rows out
+    return answered, answered & _is_still_valid(pool.tried_before, fix)
 
 
-def _stands(before: TriedBefore | None, fix: Fix) -> Array:
-    """Return which claims are about the same minima as fixes (N,): what was shown, or not, of these holds still.
+def _is_still_valid(before: TriedBefore | None, fix: Fix) -> Array:
+    """Return flags (N,) of earlier claims that are about the same minima as the fixes, so that they are still valid.
 
-    The minima that were known compete in what is found later. As many of them, and a least one that costs the same, are
-    therefore the same.
+    Known minima stay candidates. So an equal number of minima and an equal least cost mean the same minima.
     """
     if before is None:
         return np.zeros(len(fix.x), dtype=bool)
@@ -558,5 +570,5 @@ def _stands(before: TriedBefore | None, fix: Fix) -> Array:
 
 
 def certify_stage(detail: str, began: float) -> Stage:
-    """Return the stage "certify" that began at a time of `time.perf_counter`, with what it did."""
+    """Return the stage "certify" with its detail; it began at `began`, a time of `time.perf_counter`."""
     return Stage("certify", detail, perf_counter() - began)

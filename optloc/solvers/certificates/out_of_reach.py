@@ -1,9 +1,9 @@
 """Bounds that the data do not reach: every position on them costs too much to matter.
 
-After a proof for all positions, every region of low cost contains a known minimum. Let these minima be admitted, and
-let every position of a plane between them and the forbidden side cost too much. Then no region of low cost crosses the
-plane, and the bound does not matter. A bound of a coordinate is such a plane. For "above ground" it is the tangent
-plane below the fix: the Earth is convex, so it is on the other side.
+After a proof over all positions, every region of low cost contains a known minimum. Assume that these minima are
+admitted, and that every position of a plane between them and the forbidden side costs too much. Then no region of low
+cost crosses the plane, and the bound does not matter. A bound of a coordinate is such a plane. For "above ground" it is
+the tangent plane below the fix: the Earth is convex, so it is on the other side.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from optloc.solvers.certificates.branch_and_bound import budgets
 from optloc.solvers.certificates.position_cost import admitted_states, state_columns
 from optloc.solvers.policy import LISTED_GAP, equal_cost
 
-# Share of the distance between fix and plane by which rounding may move a place off the plane.
+# Share of the distance between fix and plane by which rounding may move a position off the plane.
 _ON_PLANE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """Bounds of a problem, one for each side.
+    """Bounds of a problem, one entry for each side of each constraint.
 
     Parameters
     ----------
     levels : tuple of Level
-        Which constraint, and which side.
+        Constraint and side of each bound.
     value : array (e,)
-        Bound.
+        Bounds.
     region : array (2, d)
-        Corners of the admitted box, where coordinates are bounded on all sides; else NaN.
+        Corners of the admitted box if all coordinates are bounded on both sides; else NaN.
     """
 
     levels: tuple[Level, ...]
@@ -53,7 +53,7 @@ class Edges:
 
 
 def edges_of(problem: Problem) -> Edges | None:
-    """Return the bounds of a problem; None where a plane cannot separate both sides of one of them."""
+    """Return the bounds of a problem; None if a plane cannot separate the two sides of one of them."""
     found: list[tuple[Level, float]] = []
     if exact(problem):
         return None
@@ -70,7 +70,7 @@ def edges_of(problem: Problem) -> Edges | None:
 
 
 def new_questions(edges: Edges, count: int, d: int, nodes: float) -> ProofRequest:
-    """Return arrays for the questions about the edges of a number of fixes, in d coordinates."""
+    """Return a request for the proofs about the edges of `count` fixes in d coordinates, without their positions."""
     n = count * len(edges.levels)
     none = np.zeros(n, dtype=np.int64)
     return ProofRequest(
@@ -89,16 +89,16 @@ def new_questions(edges: Edges, count: int, d: int, nodes: float) -> ProofReques
 
 
 def lay_planes(edges: Edges, x: Array, cov: Array, missing: Array, slope: Array, asked: ProofRequest) -> None:
-    """Write planes to questions, and the places on them where the quadratic model of the cost is least.
+    """Write planes to a request, and the points on them where the quadratic model of the cost is least.
 
     Parameters
     ----------
     edges : Edges
-        Of the problems.
+        Edges of the problems.
     x, cov : array (n, d), (n, d, d)
         Fixes and covariances.
     missing, slope : array (n, e), (n, e, d)
-        Bounds less the bounded quantities at the fixes, and gradients.
+        Bounds minus the bounded quantities at the fixes, and gradients.
     asked : ProofRequest
         Written.
     """
@@ -108,18 +108,18 @@ def lay_planes(edges: Edges, x: Array, cov: Array, missing: Array, slope: Array,
     unit = slope / np.sqrt((slope * slope).sum(-1, keepdims=True))
     if np.isfinite(edges.region[0, 0]):
         inside = np.clip(place, *edges.region)
-        # an oblique plane does not contain the clipped place: nothing is proven about it then
+        # an oblique plane does not contain the clipped point, so nothing is proven for it
         left = np.abs(((inside - place) * unit).sum(-1)) > _ON_PLANE * np.abs(missing)
         place = np.where(left[..., None], np.nan, inside)
     asked.x[:] = place.reshape(-1, d)
     asked.planes[:, 0, :d] = unit.reshape(-1, d)
 
 
-# Few fixes by machine code, on arrays that are kept.
+# A few fixes by machine code, on stored arrays.
 
 
 class ReachWorkspace(NamedTuple):
-    """Arrays of a thread, for n fixes and e edges: costs, questions, answers, costs at places."""
+    """Arrays of a thread, for n fixes and e edges: costs, request, results, and costs at points."""
 
     costs: PositionCosts
     asked: ProofRequest
@@ -128,7 +128,7 @@ class ReachWorkspace(NamedTuple):
 
 
 def new_workspace(affine: Affine, edges: Edges, count: int, d: int) -> ReachWorkspace:
-    """Return arrays for a number of fixes."""
+    """Return the workspace for `count` fixes in d coordinates."""
     n = count * len(edges.levels)
     costs = affine.room(n)
     return ReachWorkspace(
@@ -151,9 +151,9 @@ def are_out_of_reach(
     Parameters
     ----------
     edges, room : Edges, ReachWorkspace
-        Of the problem.
+        Edges and workspace of the problem.
     costs : PositionCosts
-        Of the fixes, written.
+        Costs of the fixes, with their measurements.
     x, cov, cost : array (n, d), (n, d, d), (n,)
         Fixes, covariances and costs.
     value, normal : array (n, k), (n, k, d)
@@ -174,13 +174,13 @@ def are_out_of_reach(
 
 
 def _are_shown(answered: ProofResult, level: Array) -> Array:
-    """Return flags (n,): a plane is proven to cost at least a level everywhere."""
-    # where rounding is coarse a bound may be lower than the level
+    """Return flags (n,) of planes that are proven to cost at least a level everywhere."""
+    # coarse rounding may make the proven bound lower than the level
     return np.asarray((answered.verdict == VALUE) & (answered.bound > level - equal_cost(level)))
 
 
 def out_of_reach(problem: Problem, edges: Edges, costs: PositionCosts, fix: Fix, gap: float) -> Array:
-    """Return flags (N,): every position on the edges costs at least a gap more than the fix.
+    """Return flags (N,) of fixes: every position on their edges costs at least `gap` more than the fix.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The inputs of a proof: costs over the position, surfaces, regions; and whether a cost belongs to its fix."""
+"""The inputs of a proof: costs over the position, surfaces and regions; and a check that a cost belongs to its fix."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from optloc.proof.scope import has_one_epoch_velocity, held_height, is_run, is_s
 from optloc.proof.surface import DATA, FIRST, LEVEL, MIDDLE, SURFACE_WIDTH, UP
 from optloc.solvers.starts.position import spread_of
 
-# Costs over the target's state: its position, with dense rows or sparse ones where there are many, or where it moves
-# its position and velocity.
+# Costs over the state of the target: its position, or its position and velocity if it moves. Problems with few rows use
+# dense costs, problems with many rows use sparse costs.
 
 Costs = PositionCosts | ScaledCosts | Runs | CourseCosts
 
 
 def eliminate_nuisance(problem: Problem) -> Costs:
-    """Return the costs of a flat batch of problems over the target's state, all other unknowns at their best values."""
+    """Return the costs of a flat batch over the state of the target, minimised over all other unknowns."""
     if has_one_epoch_velocity(problem):
         return velocity_costs(problem)
     if problem.motions[0].order > 0:
@@ -47,7 +47,7 @@ def eliminate_nuisance(problem: Problem) -> Costs:
 
 
 def prove(costs: Costs, asked: ProofRequest) -> ProofResult:
-    """Return the outcome of the proofs of n fixes of n problems by their costs."""
+    """Return the results of the proofs of n fixes from the costs of their problems."""
     if isinstance(costs, CourseCosts):
         return prove_courses(costs, asked)
     if isinstance(costs, ScaledCosts):
@@ -56,14 +56,14 @@ def prove(costs: Costs, asked: ProofRequest) -> ProofResult:
 
 
 def lacks(costs: Costs, count: int) -> bool:
-    """Return whether proofs of so many fixes ended early because there is no machine code of them yet."""
+    """Return whether proofs of `count` fixes ended early because their machine code is not compiled yet."""
     if isinstance(costs, ScaledCosts):
         return scaled_lack_code(count)
     return lacks_code(count) if isinstance(costs, PositionCosts) else runs_lack_code(costs, count)
 
 
 def costs_of(costs: Costs, states: Array) -> tuple[Array, Array]:
-    """Return position costs (N, P) of states (N, P, n) and the rounding of their residuals."""
+    """Return position costs (N, P) of states (N, P, n) and the rounding errors of their residuals."""
     if isinstance(costs, CourseCosts):
         return costs_of_courses(costs, states)
     if isinstance(costs, ScaledCosts):
@@ -72,17 +72,17 @@ def costs_of(costs: Costs, states: Array) -> tuple[Array, Array]:
 
 
 def state_columns(problem: Problem) -> slice:
-    """Return where in parameter vectors the state stands that a proof is about."""
+    """Return the slice of parameter vectors that holds the state of a proof."""
     slot, _ = problem.layout.find("position")
     return slice(slot.start, slot.start + _state_size(problem))
 
 
 def _state_size(problem: Problem) -> int:
-    """Return the size of the state, without a velocity at one epoch: it is linear, and projected out."""
+    """Return the size of the state, without the velocity at a single epoch, which is linear and projected out."""
     return problem.dimension * (1 if has_one_epoch_velocity(problem) else problem.motions[0].order + 1)
 
 
-# Equalities: planes and surfaces along which a proof looks.
+# Equalities: a proof searches along their planes and surfaces only.
 
 
 def surfaces_of(problem: Problem, position: Array) -> tuple[Array, Array]:
@@ -93,23 +93,24 @@ def surfaces_of(problem: Problem, position: Array) -> tuple[Array, Array]:
     problem : Problem
         N problems.
     position : array (N, d)
-        Places on these planes or beside the surface.
+        Positions on these planes or near the surface.
 
     Returns
     -------
     planes : array (N, e, 3)
         Unit normals of planes.
     surface : array (N, w)
-        Numbers of the surface of a height (`optloc.proof.surface`), its upward axis the normal at the place; w is 0
-        without one.
+        Numbers of the surface of a height (`optloc.proof.surface`); its upward axis is the normal at the position.
+        Without a height w is 0.
     """
-    if not exact(problem):  # nothing of the problems need be looked at
+    if not exact(problem):  # a shortcut for the common case
         return np.zeros((len(position), 0, 3)), np.zeros((len(position), 0))
     bands = [band for band in problem.constraints if isinstance(band, Band) and is_exact(band)]
     return _planes(problem, bands, len(position)), _surface(problem, bands, position)
 
 
 def _planes(problem: Problem, bands: list[Band], size: int) -> Array:
+    """Return the unit normals (N, e, 3) of plane constraints."""
     normals = [band.coefficients for band in bands if band.kind == "plane"]
     out = np.zeros((size, len(normals), 3))
     for i, normal in enumerate(normals):
@@ -118,6 +119,7 @@ def _planes(problem: Problem, bands: list[Band], size: int) -> Array:
 
 
 def _surface(problem: Problem, bands: list[Band], position: Array) -> Array:
+    """Return the numbers (N, w) of the surface of a height constraint; w is 0 without one."""
     levels = [band.lower for band in bands if band.kind == "height"]
     if not levels:
         return np.zeros((len(position), 0))
@@ -130,7 +132,7 @@ def _surface(problem: Problem, bands: list[Band], position: Array) -> Array:
 
 
 def is_free(problem: Problem, fix: Fix, items: Array) -> Array:
-    """Return which of some fixes (n,) of a flat batch no constraint holds but its equalities, (n,)."""
+    """Return flags (n,) of fixes that only equalities hold, no inequalities."""
     face = exact(problem)
     if fix.active is None or not problem.constraints:
         return np.full(len(items), not face)
@@ -139,26 +141,26 @@ def is_free(problem: Problem, fix: Fix, items: Array) -> Array:
 
 # Regions of claims.
 
-# Half-width of the region where all positions cannot be bounded: spreads of the stations, or distances of the fix, so
-# that it lies well inside either way; and of the velocities, metres per second: above what flies in the air.
+# Half-widths of the fallback region if the proof cannot bound all positions. Positions: 10 spreads of the stations or 2
+# distances of the fix, so that both are well inside. Velocities: 700 metres per second, above any aircraft.
 _SPREADS, _DISTANCES, _FAST = 10.0, 2.0, 700.0
 
 
 def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Array, bool]:
-    """Return corners (N, 2, n) of the regions of claims about states (N, n), and whether somebody asked for them.
+    """Return corners (N, 2, n) of the regions of claims about states (N, n), and whether the region was requested.
 
-    A target that stays is looked for everywhere, if no region is given: NaN. One that moves could be anywhere at any
-    speed, so a claim about it is for a region. Where box and speed are constraints nothing else is admitted, and that
-    is what is asked for; else it is what `around` says, see `unlimited`.
+    For a target at rest without a given region the search covers all positions: NaN. A moving target could be anywhere
+    at any speed, so its claim needs a region. If constraints limit the position and the speed, they are the requested
+    region. Otherwise the region is the box of `around`; see `unlimited`.
 
     Parameters
     ----------
     problem : Problem
         N problems.
     state : array (N, n)
-        Positions, and velocities where the target moves.
+        Positions, followed by velocities if the target moves.
     region : array (2, d) or (2, n), optional
-        Corners that are asked for.
+        Requested corners.
     """
     size, n = state.shape
     out = np.full((size, 2, n), np.nan) if n == problem.dimension else boxes_around(problem, state)
@@ -176,20 +178,20 @@ def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Ar
 
 
 def why_unlimited(problem: Problem) -> str:
-    """Return why a proof of a moving target is worth nothing unless somebody asks for a region, or nothing."""
+    """Return why a proof of a moving target is useless without a requested region, or ""."""
     n = _state_size(problem)
     if n == problem.dimension or np.isfinite(np.delete(admitted_states(problem, n), _across(problem), axis=1)).all():
         return ""
-    return "the target could be anywhere at any speed; state a box and a greatest speed as constraints"
+    return "the target could be anywhere at any speed; add constraints: a box and a greatest speed"
 
 
 def _across(problem: Problem) -> list[int]:
-    """Return which numbers of the state a height that is kept says by itself: what is upward in a local frame."""
+    """Return the indices of the state that a fixed height determines in a local frame: upward position and velocity."""
     return [2, 5] if held_height(problem) is not None and problem.frame.kind != "ecef" else []
 
 
 def admitted_states(problem: Problem, n: int) -> Array:
-    """Return the least and greatest state (2, n) that constraints on coordinates and speed admit; NaN for none."""
+    """Return the least and greatest state (2, n) that constraints on coordinates and speed admit, or infinity."""
     d = problem.dimension
     out = np.stack([np.full(n, -np.inf), np.full(n, np.inf)])
     for band in problem.constraints:
@@ -212,7 +214,7 @@ def admitted_states(problem: Problem, n: int) -> Array:
 def boxes_around(problem: Problem, state: Array) -> Array:
     """Return the corners (N, 2, n) of boxes that hold states (N, n) well inside.
 
-    Positions lie in cubes around the stations, velocities of targets that move in cubes around none.
+    Positions are in cubes around the middle of the stations. Velocities of moving targets are in cubes around zero.
     """
     (centre, spread), d = spread_of(problem), problem.dimension
     with np.errstate(invalid="ignore"):
@@ -225,22 +227,22 @@ def boxes_around(problem: Problem, state: Array) -> Array:
     return np.stack([middle - reach, middle + reach], axis=1)
 
 
-# Whether a position cost belongs to its fix.
+# Check whether a position cost belongs to its fix.
 
-# Places beside each fix, about a standard deviation away: two ways to write the same cost agree there to the rounding,
-# two different costs differ by a share of one. A second place would cost half as much time again.
+# Test positions per fix, about a standard deviation away. Two forms of the same cost agree there up to rounding, and
+# two different costs differ by a share of one. A second test position would take half as much time again.
 _BESIDE = 1
-# Relative difference of costs that is rounding, as for a proof, and how many lengths of a residual's own.
+# Relative difference of costs that counts as rounding, as for a proof, and the factor of the rounding of a residual.
 _EQUAL, _ROUNDINGS = 1e-6, 8.0
-# Share of the largest eigenvalue of scaled information below which a combination of unknowns is open.
+# Share of the largest eigenvalue of scaled information below which a combination of unknowns is undetermined.
 _OPEN = 1e-12
-# Steps in which unknowns that enter the rows in no straight line (station errors) find their best values: each one
-# squares what is left, and what is left of the first is some metres over some kilometres.
+# Gauss-Newton steps for unknowns that enter the rows nonlinearly (station errors). Each step squares the remaining
+# error, and the relative error after the first step is some metres over some kilometres.
 _STEPS = 6
 
 
 def matches_problem_cost(problem: Problem, fix: Fix, costs: Costs) -> Array:
-    """Return of which of a flat batch of N problems the position cost is their own (N,), at the fix and beside it.
+    """Return flags (N,): the position cost equals the cost of its problem, at the fix and near it.
 
     Parameters
     ----------
@@ -249,7 +251,7 @@ def matches_problem_cost(problem: Problem, fix: Fix, costs: Costs) -> Array:
     fix : Fix
         Their fixes.
     costs : PositionCosts, Runs or CourseCosts
-        Their costs over the position, equalities apart.
+        Their costs over the position, without equalities.
     """
     places = _places(problem, fix)
     own = _own_costs(problem, fix, places)
@@ -261,12 +263,12 @@ def matches_problem_cost(problem: Problem, fix: Fix, costs: Costs) -> Array:
 
 
 def _tolerance(cost: Array, blur: Array) -> Array:
-    """Return by how much costs may differ: a share, and what the rounding of residuals makes of their squares."""
+    """Return the allowed difference of costs: a relative share, plus the effect of rounded residuals."""
     return np.asarray(_EQUAL * (1.0 + cost) + _ROUNDINGS * blur * (np.sqrt(np.maximum(cost, 0.0)) + blur))
 
 
 def _places(problem: Problem, fix: Fix) -> Array:
-    """Return the fixes and states about a standard deviation away, (N, 1 + P, n): the same ones in every run."""
+    """Return the fixes and states about a standard deviation away, (N, 1 + P, n); the same in every run."""
     own = state_columns(problem)
     position, covariance = fix.x[..., own], fix.cov[..., own, own]
     d = position.shape[-1]
@@ -277,7 +279,7 @@ def _places(problem: Problem, fix: Fix) -> Array:
 
 
 def _own_costs(problem: Problem, fix: Fix, places: Array) -> Array:
-    """Return the costs (N, P) of the problems at states (N, P, n), all other unknowns at their best values."""
+    """Return the costs (N, P) of the problems at states (N, P, n), minimised over all other unknowns."""
     count, several = places.shape[:2]
     own = state_columns(problem)
     part = problem.take(np.repeat(np.arange(count), several)) if count > 1 else problem
@@ -294,7 +296,7 @@ def _own_costs(problem: Problem, fix: Fix, places: Array) -> Array:
         rest = eliminated(equations)
         information, vector, cost = rest.shared[:, others[:, None], others], rest.shared_vector[:, others], rest.cost
         if len(others):
-            # Scaled, and by its pseudo-inverse: a combination that no row feels changes nothing.
+            # scaled pseudo-inverse: a combination of unknowns that no row measures has no effect
             size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
             size = np.where(size > 0.0, size, 1.0)
             turned = np.linalg.pinv(information / size[..., :, None] / size[..., None, :], _OPEN, hermitian=True)

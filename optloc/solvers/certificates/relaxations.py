@@ -1,7 +1,7 @@
-"""Lower bounds of the maximum-likelihood cost by convex relaxations: an opinion independent of branch and bound.
+"""Lower bounds of the maximum-likelihood cost from convex relaxations, independent of branch and bound.
 
-Every bound is recomputed from a dual point, and holds over all positions or over a named region. A method whose bound
-belongs to another cost than the likelihood answers NaN and says so.
+Every bound is recomputed from a dual point. It holds over all positions or over a named region. For a method that
+bounds another cost than the likelihood, the bound is NaN and the reason names that cost.
 """
 
 from __future__ import annotations
@@ -23,20 +23,21 @@ from optloc.problem.problem import Problem
 from optloc.solvers.starts.angles import angle_bounds, bearings
 
 TIGHT = 1e-3
-"""A bound within this of the cost, relative to one plus the cost, leaves nothing to be found."""
+"""Relative difference, to one plus the cost, up to which a bound counts as tight: no better position remains."""
 
-# Costs up to this above that of the fix are looked at: the wider the box of moments, the looser the bound.
+# The search covers costs up to this much above the fix: a wider box of moments gives a looser bound.
 _MARGIN = 0.1
-# Largest ratio of eigenvalues at which first moments are a point: what an interior-point solver leaves of zero.
+# Largest ratio of eigenvalues at which first moments count as a point: an interior-point solver leaves this much of
+# zero.
 _RANK_ONE = 1e-4
-# Relative difference at which two ways to a cost agree, as for a tight bound.
+# Relative difference up to which two computations of a cost agree, as for a tight bound.
 _SAME = 1e-3
-_OPEN = "the rows do not enclose the positions that cost as little; give a region"
+_OPEN = "the rows do not bound the positions with a cost this low; give a region"
 _MOST_STATIONS = 10  # the time of a relaxation grows with their sixth power
 _OTHER_COSTS = {
     "sdp": "Shor's relaxation bounds the squared-range cost, not the likelihood",
     "socp": "the cone relaxation bounds the squared-range cost, not the likelihood",
-    "minimax": "the cones bound the worst angle, not the likelihood",
+    "minimax": "the cone program bounds the worst angle, not the likelihood",
     "heights": "the satellite relaxation bounds the distance from the point below, not the likelihood",
 }
 METHODS = ("moment", "directions", *_OTHER_COSTS)
@@ -49,15 +50,15 @@ class Reference:
     Parameters
     ----------
     method : str
-        Which relaxation.
+        Name of the relaxation.
     bound : array (N,)
-        No position of the scope has a lower maximum-likelihood cost; NaN where nothing is bounded.
+        No position of the scope has a lower maximum-likelihood cost; NaN without a bound.
     scope : object array (N,)
-        "global", "region", or "" where nothing is bounded.
+        "global", "region", or "" without a bound.
     reason : object array (N,)
-        Why nothing is bounded; empty where something is.
+        Why there is no bound; "" if there is one.
     point : array (N, d)
-        Where the relaxation itself puts the minimum, metres; NaN where it is not a point.
+        Minimum of the relaxation, metres; NaN if the solution of the relaxation is not a point.
     """
 
     method: str
@@ -67,32 +68,34 @@ class Reference:
     point: Array
 
     def tight(self, cost: Array) -> Array:
-        """Return where the bound leaves no room below costs (N,)."""
+        """Return flags (N,) of bounds that are tight for costs (N,)."""
         with np.errstate(invalid="ignore"):
             return np.asarray(cost - self.bound <= TIGHT * (1.0 + cost))
 
 
 def reference_bound(problem: Problem, fix: Fix, method: str, *, region: float | None = None) -> Reference:
-    """Bound the maximum-likelihood cost from below by a convex relaxation, one program for each fix, over threads.
+    """Return lower bounds of the maximum-likelihood cost from a convex relaxation.
+
+    Each fix is one convex program; threads share the programs.
 
     Parameters
     ----------
     problem : Problem
         N problems, flattened.
     fix : Fix
-        Their refined fixes. A bound is valid whatever the fix, but tight at its best only for the global minimum.
+        Their refined fixes. A bound is valid for every fix, but it can be tight only for the global minimum.
     method : {"moment", "directions"}
-        Order-2 moments: one static position from range, toa, tdoa and range_sum rows, up to 10 stations.
-        Unit directions: one static position from azimuths and elevations. The names of other relaxations are known
-        and answer why they bound no likelihood.
+        "moment": moments of order 2, for one static position from range, toa, tdoa and range_sum rows, up to 10
+        stations. "directions": unit directions, for one static position from azimuths and elevations. Names of other
+        relaxations are accepted; their reason explains why they do not bound the likelihood.
     region : float, optional
-        Radius of a ball about the middle of the stations, metres: the scope where the rows alone do not enclose the
-        positions with a cost as low as that of the fix.
+        Radius of a ball about the middle of the stations, metres. It is the scope if the rows alone do not enclose the
+        positions with a cost as low as the cost of the fix.
 
     Returns
     -------
     Reference
-        Bounds, and why there are none.
+        Bounds, or reasons for missing bounds.
 
     Raises
     ------
@@ -116,42 +119,46 @@ def reference_bound(problem: Problem, fix: Fix, method: str, *, region: float | 
 
 
 def _beyond(problem: Problem) -> str:
-    """Return what no relaxation here covers."""
+    """Return why no relaxation of this module covers the problem, or ""."""
     if not one_position(problem) or problem.motions[0].order > 0:
-        return "the relaxation is for one position that stays"
+        return "the relaxation supports one target at rest only"
     if problem.biases or problem.priors:
-        return "the relaxation knows no biases and no priors"
+        return "the relaxation does not support biases and priors"
     if problem.stations.errors:
-        return "the relaxation takes the stations for exact"
-    return "the relaxation knows no constraints" if problem.constraints else ""
+        return "the relaxation does not support station errors"
+    return "the relaxation does not support constraints" if problem.constraints else ""
 
 
 def _beyond_moments(problem: Problem) -> str:
+    """Return why the moment relaxation does not cover the problem, or ""."""
     from optloc.models import MODELS
 
     for rows in problem.rows:
         if MODELS[rows.kind].ranges is None:
-            return f"{rows.kind} rows are no sums of ranges"
+            return f"{rows.kind} rows are not sums of ranges"
     return ""
 
 
 def _beyond_directions(problem: Problem) -> str:
+    """Return why the relaxation over directions does not cover the problem, or ""."""
     for rows in problem.rows:
         if rows.kind not in ("azimuth", "elevation"):
-            return f"{rows.kind} rows are no angles"
+            return f"{rows.kind} rows are not angles"
     if problem.dimension != 3 or bearings(problem) is None:
-        return "the relaxation needs azimuths and elevations in space"
+        return "the relaxation needs azimuths and elevations in three dimensions"
     correlated = any(block.row.shape[1] > 1 for block in problem.noise.blocks)
     return "the relaxation needs angles with independent errors" if correlated else ""
 
 
 def _nothing(problem: Problem, method: str, why: str) -> Reference:
+    """Return a reference without bounds, with one reason for all fixes."""
     size = problem.batch_shape[0]
     scope, reason = np.full(size, "", dtype=object), np.full(size, why, dtype=object)
     return Reference(method, np.full(size, np.nan), scope, reason, np.full((size, problem.dimension), np.nan))
 
 
 def _by_directions(problem: Problem, fix: Fix) -> Reference:
+    """Return the bounds of the relaxation over unit directions."""
     out, seen = _nothing(problem, "directions", ""), bearings(problem)
     assert seen is not None
     bound = angle_bounds(seen, np.where(fix.answered[:, None], fix.position, np.nan))
@@ -162,6 +169,7 @@ def _by_directions(problem: Problem, fix: Fix) -> Reference:
 
 
 def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
+    """Return the bounds of the moment relaxation; `region` is the radius of a ball, metres, or None."""
     from formulations.moment_sdp import moment_bound
 
     out, found = _nothing(problem, "moment", ""), ranges(problem_at_rest(problem))
@@ -181,10 +189,10 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
         own = _scaled(found, i, nodes, (place[i, nodes] - centre) / size, size)
         point = (fix.position[i] - centre) / size
         cost = float(own.cost(point))
-        # the misfit of the rows among themselves, without the digits that its own sum of squares has lost
+        # the misfit of the rows among themselves, computed without the cancellation of large sums of squares
         loops = float(fix.cost[i]) - cost
         if not abs(loops - found.cost[i]) <= _SAME * (1.0 + fix.cost[i]):
-            out.reason[i] = "the ranges do not carry the cost of the fix"
+            out.reason[i] = "the cost of the ranges differs from the cost of the fix"
             return
         box = enclosure(own, point, cost + _MARGIN)
         out.scope[i] = "global" if box is not None else "region"
@@ -192,7 +200,7 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
         answer = None if box is None else moment_bound(own, box, cost + _MARGIN)
         if answer is None or not np.isfinite(answer.bound):
             out.scope[i] = ""
-            out.reason[i] = _OPEN if answer is None else f"no dual point was found ({answer.answer.status})"
+            out.reason[i] = _OPEN if answer is None else f"the solver found no dual point ({answer.answer.status})"
             return
         out.bound[i] = max(answer.bound, 0.0) + loops
         if answer.rank_ratio < _RANK_ONE:
@@ -203,9 +211,10 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
 
 
 def _declined(found: Ranges, i: int, answered: bool) -> str:
+    """Return why the moment relaxation is not computed for problem i, or ""."""
     count = int(found.inside[i].sum())
     if not answered:
-        return "there is no fix whose cost could be compared"
+        return "there is no fix with a cost to compare"
     if count < 2:
         return "fewer than two stations have ranges"
     return f"{count} stations make the relaxation too large" if count > _MOST_STATIONS else ""
@@ -218,10 +227,12 @@ def _nodes(found: Ranges, i: int) -> Array:
 
 
 def _scaled(found: Ranges, i: int, nodes: Array, station: Array, size: float) -> Ranged:
+    """Return the ranges of problem i in units of `size` metres."""
     covariance = found.covariance[i if len(found.covariance) > 1 else 0][np.ix_(nodes, nodes)]
     sign, offset = found.sign[i, nodes].astype(float), found.offset[i, nodes] / size
     return Ranged(station, sign, offset, covariance / size**2, bool(found.sign[i].any()))
 
 
 def _region(own: Ranged, region: float | None, size: float) -> EnclosingBox | None:
+    """Return the box around a ball of radius `region` metres, or None without a region."""
     return None if region is None else ball(own, np.zeros(own.station.shape[1]), region / size)

@@ -1,1 +1,1 @@
-"""Fits that gross errors do not pull."""
+"""Robust fits: minima of losses that limit the effect of gross errors."""

@@ -18,54 +18,54 @@ from optloc.problem.noise import Noise, variances, whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.layered import refine_in_layers, strata_of
 
-# Rows of a correlated group are never quite absent while their weights are sought: their partners still foretell them.
-# At a millionth of its weight a row no longer counts in the sums, and one over it is far from overflow.
+# Least weight of a row in a correlated group during the iteration, so that its partners still predict it. At a
+# millionth of its weight the row has no effect on the sums, and the inverse of the weight does not overflow.
 _LEAST = 1e-6
-# Gauss-Newton steps between two weighings, enough for least squares to settle from afar, and the change of a weight
-# that counts as none, well below what shows in a fix.
+# Gauss-Newton steps between two updates of the weights, enough for convergence from far away; and the largest change of
+# a weight that counts as none, too small to show in a fix.
 _STEPS, _SETTLED = 12, 1e-4
-# Steps shrink by a ratio near one where weights and place trade: after eight weighings every third point is
-# extrapolated, so that the ratio of two plain steps is known again; a ratio of 0.98 is taken to end fifty steps ahead.
+# If weights and position affect each other, steps shrink by a ratio near one. After eight updates every third point is
+# extrapolated, so that two plain steps give the ratio again. The ratio is limited to 0.98, fifty steps ahead.
 _PATIENCE, _OFTEN, _SLOWEST = 8, 3, 0.98
-# A step that raises the cost is halved; after eight, a 256th of it, the iteration has stalled.
+# A step that raises the cost is halved. After eight halvings, at 1/256 of the step, the iteration has stalled.
 _HALVINGS = 8
-# Rounding of a robust cost, relative: what a step may raise it by.
+# Relative rounding error of a robust cost, by which a step may raise it.
 _ROUNDING = 1e-12
-# Standard deviations: a shorter step ends the iteration, for a millionth of one is beyond what anybody reads.
+# Length of a step, in standard deviations, that ends the iteration: a millionth has no practical effect.
 _TOLERANCE = 1e-6
-# Share of it to which least squares settles between two weighings: its own rest then does not count.
+# Tolerance of the least squares between two updates, as a share of that length, so that its error does not count.
 _SHARE = 0.1
-# Length of a step that was not finished: longer than any tolerance, and finite, since what is not finite is a failure.
+# Length of an unfinished step: above any tolerance, but finite, because a length that is not finite means failure.
 _LONG = 1e300
 
 
-# Residuals in sigma and the weights that a loss gives them, for rows of any noise.
+# Residuals in sigma, and the weights from a loss, for rows with any noise.
 
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """What a loss needs to know of the rows of a flat batch of N problems; it does not change during an iteration.
+    """Variances and weights of the rows of a flat batch of N problems, which are constant during an iteration.
 
-    A loss gives row i an error of its own with variance ``t_i = s_i (1 / weight_i - 1)``, where s_i is the variance of
-    the row given all other rows (its own variance where rows are independent). Residuals r and weights then are a
+    A loss adds an error with variance ``t_i = s_i (1 / weight_i - 1)`` to row i. Here s_i is the variance of the row
+    given all other rows, which is the variance of the row if rows are independent. Residuals r and weights then are a
     stationary point of
 
         r' (R + diag t)^-1 r  +  sum of rho(u_i) - weight_i u_i^2,
 
-    which for independent rows is the sum of rho(r_i / sigma_i): the line process of a loss (M. J. Black, A. Rangarajan,
-    "On the unification of line processes, outlier rejection, and robust statistics", Int. J. Comput. Vis. 19 (1996),
-    section 3), with a covariance R.
+    which for independent rows is the sum of rho(r_i / sigma_i). This is the line process of a loss (M. J. Black, A.
+    Rangarajan, "On the unification of line processes, outlier rejection, and robust statistics", Int. J. Comput. Vis.
+    19 (1996), section 3), with a covariance R.
 
     Parameters
     ----------
     noise : Noise
-        Station errors of span "noise" included.
+        Noise, including station errors of span "noise".
     base : array (N, m)
-        Weights of the rows before any doubt; 0 = absent.
+        Weights of the rows before the loss; 0 = absent.
     own, given : array (N, m)
-        Variance of each row, and its variance given all others that are present.
+        Variance of each row, and its variance given all other rows present.
     sided : bool array (m,)
-        Which rows are off to the positive side only when they are late.
+        Rows whose gross errors are positive only, because signals can only be late.
     """
 
     noise: Noise
@@ -76,7 +76,7 @@ class Doubt:
 
     @classmethod
     def of(cls, problem: Problem, at: Array) -> Doubt:
-        """Return what a loss needs to know of N problems; noise that depends on the place is that at x (N, size)."""
+        """Return the variances and weights of N problems, for noise at x (N, size)."""
         noise, size = with_station_noise(problem, at).noise, len(at)
         base = np.broadcast_to(problem.weight, (size, problem.count))
         own = np.broadcast_to(variances(noise, problem.count), base.shape)
@@ -85,8 +85,8 @@ class Doubt:
             if whitener.row.shape[1] > 1:
                 rows = whitener.row
                 present = base[:, rows] > 0.0
-                # W'W is the inverse covariance: one over its diagonal is the variance given the partners, if none was
-                # left out
+                # W'W is the inverse covariance. One over its diagonal is the variance given the partners, if no partner
+                # is missing.
                 full = np.broadcast_to((whitener.matrix != 0.0).any(-1).sum(-1), present.shape[:-1]) == present.sum(-1)
                 precision = (whitener.matrix**2).sum(-2)
                 known = present & full[..., None] & (precision > 0.0)
@@ -95,7 +95,7 @@ class Doubt:
         return cls(noise, base, own, given, kinds)
 
     def take(self, index: Array) -> Doubt:
-        """Return what belongs to some of the problems."""
+        """Return the entries of some of the problems."""
         blocks = tuple(
             b if b.covariance.ndim == 3 or len(b.covariance) == 1 else replace(b, covariance=b.covariance[index])
             for b in self.noise.blocks
@@ -103,8 +103,8 @@ class Doubt:
         return Doubt(Noise(blocks), self.base[index], self.own[index], self.given[index], self.sided)
 
     def row_weight(self, weight: Array) -> Array:
-        """Return weights (N, m) as `Problem.with_rows` takes them, of the weights that a loss gives."""
-        # own + given (1 / weight - 1) is the variance with the row's own error; base is its weight before
+        """Return the weights (N, m) for `Problem.with_rows` from the weights of a loss."""
+        # own + given (1 / weight - 1) is the variance with the added error; base is the weight without it
         ratio = self.given / self.own
         with np.errstate(divide="ignore", over="ignore"):
             total = 1.0 / self.base + ratio * (1.0 / weight - 1.0)
@@ -113,11 +113,11 @@ class Doubt:
     def residual(self, problem: Problem, x: Array, weight: Array) -> Array:
         """Return residuals in sigma (N, m) at vectors x (N, size), zero for absent rows.
 
-        Those of correlated rows are what is left of a row given its partners, which count as much as their weights say.
+        For correlated rows it is the residual of a row given its partners, which count by their weights.
         """
         left = np.where(self.base > 0.0, residuals(problem, x), 0.0)
         u = left / np.sqrt(self.given)
-        # independent rows: given is own, and the weights of others say nothing
+        # for independent rows `given` equals `own`, and weights of other rows have no effect
         if all(block.row.shape[1] == 1 for block in self.noise.blocks):
             return u
         least = np.maximum(weight, _LEAST)
@@ -125,14 +125,14 @@ class Doubt:
             rows = whitener.row
             if rows.shape[1] > 1:
                 white = whitener.matrix @ left[:, rows][..., None]
-                # with weights w, (R^-1 r)_i is what is left of row i given its partners, over its variance given / w_i
+                # with weights w, (R^-1 r)_i is the residual of row i given its partners, over its variance given / w_i
                 share = (np.swapaxes(whitener.matrix, -1, -2) @ white)[..., 0]
                 u[:, rows] = share * np.sqrt(self.given[:, rows]) / least[:, rows]
         return u
 
 
 def residuals(problem: Problem, x: Array) -> Array:
-    """Return residuals (N, m) of a flat batch at vectors x (N, size); angles wrapped."""
+    """Return residuals (N, m) of a flat batch at vectors x (N, size); angles are wrapped."""
     left = problem.observed - predict(problem, x)
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         if MODELS[rows.kind].period is not None:
@@ -142,16 +142,16 @@ def residuals(problem: Problem, x: Array) -> Array:
 
 
 def fold_signs(loss: Loss, u: Array, sided: Array) -> Array:
-    """Return residuals as a loss takes them: of rows that may be off to either side the size alone counts."""
+    """Return residuals for a loss: signed for rows with positive gross errors only, absolute for the others."""
     return np.where(sided, u, np.abs(u)) if loss.one_sided else u
 
 
-# The iteration.
+# Iteration.
 
 
 @dataclass(frozen=True, slots=True)
 class LossMinima:
-    """Where reweighting ended, for M starts.
+    """Results of reweighting for M starts.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ class LossMinima:
     status : int array (M,)
         `Status` of each.
     weight : array (M, m)
-        What the loss leaves of the weight of each row.
+        Factor of the weight of each row under the loss.
     """
 
     x: Array
@@ -183,9 +183,10 @@ def reweight(
 ) -> LossMinima:
     """Return the minima of a robust cost next to starts.
 
-    Least squares with the weights that the loss gives at the point before: for independent rows its cost touches the
-    robust one there and, if the loss is even, lies above it elsewhere, so that no step raises the robust cost (P. J.
-    Huber, "Robust Statistics" (1981), section 7.8). Otherwise steps that would are halved: they still lead down.
+    Each step is least squares with the weights of the loss at the previous point. For independent rows the weighted
+    cost equals the robust cost there, and for an even loss it is larger elsewhere. So no step raises the robust cost
+    (P. J. Huber, "Robust Statistics" (1981), section 7.8). In all other cases a step that raises the cost is halved:
+    its direction is downhill.
 
     Parameters
     ----------
@@ -194,38 +195,39 @@ def reweight(
     start : array (M, size)
         Starting vectors.
     loss : Loss
-        Its sigma is that of the rows.
+        Its sigma is the sigma of the rows.
     doubt : Doubt
-        Of the same problems.
+        Variances and weights of the same problems.
     limit : int
-        Weighings at most.
+        Most updates of the weights.
     tolerance : float
-        Standard deviations: a shorter step ends the iteration, once weights settle as well. Weights may change by this
-        much if it is more than what shows in a fix.
+        A step shorter than this many standard deviations ends the iteration, once the weights have converged too. The
+        weights may change by the tolerance if it exceeds the least change that shows in a fix.
     face : Face
         Constraints that hold with equality.
     """
-    # A refinement of more than fifty weighings creeps along a flat valley, and its status shows it.
+    # more than fifty updates mean slow progress along a flat valley, and the status shows it
     x, weight = np.array(start), np.ones(doubt.base.shape)
     last = np.zeros(x.shape)
     status = np.full(len(x), int(Status.MAX_ITERATIONS), dtype=np.int8)
     active = np.arange(len(x))
-    # where the weighted cost does not lie above the robust one, steps have to be watched
+    # the weighted cost is no upper bound of the robust cost, so steps are checked
     uneven = loss.one_sided or any(block.row.shape[1] > 1 for block in doubt.noise.blocks)
     with np.errstate(all="ignore"):
         for iteration in range(limit):
-            # no copy of the batch is made before some have finished
+            # the batch is not copied before some starts have finished
             whole = len(active) == len(x)
             part, own = (problem, doubt) if whole else (problem.take(active), doubt.take(active))
             here, before = x[active], weight[active]
             now = weigh_by(loss, part, own, here, before)
             step = _step(part.with_rows(weight=own.row_weight(now)), here, last[active], face, tolerance)
             moved = _backtrack(loss, part, own, here, step.x, now) if uneven else step.x
-            # the end of the series leaves a face that constraints hold: there only plain steps are taken
+            # extrapolation leaves a face that constraints hold, so there only plain steps are taken
             if iteration >= _PATIENCE and iteration % _OFTEN == 0 and not face:
                 moved = _extrapolate(loss, part, own, step, now)
             x[active], weight[active], last[active] = moved, now, step.x - here
-            # settled: neither weights nor place move; stalled: no step lowers the cost, though one was wanted
+            # converged: weights and position are constant; stalled: no step lowers the cost, although the gradient is
+            # not zero
             same = np.abs(now - before).max(-1, initial=0.0) <= max(_SETTLED, tolerance)
             settled = same & (step.length <= tolerance)
             status[active[settled]] = step.status[settled]
@@ -242,7 +244,7 @@ def reweight(
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """Where least squares leads, the length in sigma, the status, and where a geometric series of such steps ends."""
+    """A least-squares step: end point, length in sigma, status, and the limit of a geometric series of such steps."""
 
     x: Array
     length: Array
@@ -251,6 +253,7 @@ class _Step:
 
 
 def _step(problem: Problem, x: Array, last: Array, face: Face, tolerance: float) -> _Step:
+    """Return one least-squares step with fixed weights from x (M, size); `last` is the step before."""
     strata = strata_of(problem, face)
     if strata is None:
         done = refine(problem, x, tolerance=_SHARE * tolerance, limit=_STEPS, face=face)
@@ -263,7 +266,7 @@ def _step(problem: Problem, x: Array, last: Array, face: Face, tolerance: float)
         return np.asarray((a[:, None, :n] @ information @ b[:, :n, None])[:, 0, 0])
 
     length = np.sqrt(np.maximum(product(apart, apart), 0.0))
-    # the ratio of a geometric series, in the metric of the fix; negative ones (zigzag) are not extrapolated
+    # ratio of a geometric series, in the metric of the fix; a negative ratio (zigzag) is not extrapolated
     ratio = product(apart, last) / product(last, last)
     ratio = np.where(np.isfinite(ratio), np.clip(ratio, 0.0, _SLOWEST), 0.0)
     unfinished = done.status == Status.MAX_ITERATIONS
@@ -276,7 +279,7 @@ def _step(problem: Problem, x: Array, last: Array, face: Face, tolerance: float)
 
 
 def _backtrack(loss: Loss, problem: Problem, doubt: Doubt, here: Array, there: Array, weight: Array) -> Array:
-    """Return points (M, size) on the way from here to there that cost no more than here."""
+    """Return points (M, size) between `here` and `there` that cost no more than `here`."""
     least = robust_cost(loss, problem, doubt, here, weight)
     share = np.ones(len(here))
     for _ in range(_HALVINGS):
@@ -290,7 +293,7 @@ def _backtrack(loss: Loss, problem: Problem, doubt: Doubt, here: Array, there: A
 
 
 def _extrapolate(loss: Loss, problem: Problem, doubt: Doubt, step: _Step, weight: Array) -> Array:
-    """Return where the steps would end if each were shorter by the same ratio (Aitken 1926), if that costs less."""
+    """Return the limit of the steps if each shrinks by the same ratio (Aitken 1926), where the limit costs less."""
     cost = []
     for x in (step.x, step.tried):
         now = weigh_by(loss, problem, doubt, x, weight)
@@ -299,7 +302,7 @@ def _extrapolate(loss: Loss, problem: Problem, doubt: Doubt, step: _Step, weight
 
 
 def weigh_by(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Array, scale: Array | float = 1.0) -> Array:
-    """Return what a loss leaves of the weight of each row (N, m) at vectors x, with sigma times a scale.
+    """Return the factors (N, m) that a loss applies to the weights of rows at vectors x, with sigma times a scale.
 
     Parameters
     ----------
@@ -308,9 +311,9 @@ def weigh_by(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Array
     x : array (N, size)
         Parameter vectors.
     weight : array (N, m)
-        Weights so far: of the partners of correlated rows.
+        Current weights, used for the partners of correlated rows.
     scale : array (N, 1) or float
-        Above 1: fewer rows are doubted.
+        Above 1 fewer rows are doubted.
     """
     u = fold_signs(loss, doubt.residual(problem, x, weight) / scale, doubt.sided)
     return np.where(np.isfinite(u), loss.weight(u), 0.0)
@@ -327,8 +330,8 @@ def robust_cost(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Ar
 def robust_equations(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Array) -> Normal:
     """Return normal equations (N) whose inverse is the covariance of the estimate.
 
-    The weighted normal matrix of the rows over ``loss.spread``, and the priors. The right-hand side is not scaled: it
-    is half the gradient of the robust cost, downhill, from which multipliers are read.
+    They are the weighted normal matrix of the rows over ``loss.spread``, plus the priors. The right-hand side is not
+    scaled: it is half the downhill gradient of the robust cost, from which the multipliers follow.
     """
     rows = summed(problem.with_rows(weight=doubt.row_weight(weight)), x)
     information = {name: getattr(rows, name) / loss.spread for name in ("shared", "local", "cross")}

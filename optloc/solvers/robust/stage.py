@@ -1,4 +1,4 @@
-"""Robust fixes: the minimum of a loss that gross errors cannot drag away, without a guess."""
+"""Robust fixes: the minimum of a loss that limits the effect of gross errors, without a first guess."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from optloc.solvers.policy import AMBIGUOUS_GAP, REJECTED
 from optloc.solvers.pool import Pool, chunk_size, in_parts, pack
 from optloc.solvers.robust.reweighting import Doubt, residuals, reweight, robust_equations, weigh_by
 from optloc.solvers.robust.starts import flip_rows, robust_starts
-from optloc.solvers.robust.statement import stated
+from optloc.solvers.robust.statement import check_minima
 from optloc.solvers.verdict.judge import judge, surviving_candidates
 from optloc.solvers.verdict.minima import settle
 
@@ -31,17 +31,17 @@ Minimise = Callable[[Problem, Array | None], Pool]
 
 
 def by_arrivals(problem: Problem, start: Array | None, minimise: Minimise) -> Pool:
-    """Return the minima of a loss; differences of arrival times are taken apart first, where that is the same problem.
+    """Return the minima of a loss, computed with arrival times instead of differences if both are equivalent.
 
-    An error of one arrival is in every difference that it is part of, with either sign: no loss of the differences
-    names it, whereas among the arrivals it is one bad row. A difference then has the lesser weight of its two arrivals.
+    An error of one arrival is part of several differences, with either sign, so a loss on differences cannot name it.
+    Among the arrivals it is one bad row. A difference then gets the smaller weight of its two arrivals.
 
     Parameters
     ----------
     problem : Problem
         N problems.
     start : array (N, q, size), optional
-        Where to begin.
+        Starts.
     minimise : callable
         Finds the minima.
     """
@@ -60,13 +60,13 @@ def by_arrivals(problem: Problem, start: Array | None, minimise: Minimise) -> Po
 
 
 def _add_emission_time(problem: Problem, x: Array) -> Array:
-    """Return vectors (N, q, size) with the emission time that the median arrival gives, of vectors without it."""
+    """Return vectors (N, q, size) with the emission time of the median arrival, from vectors without emission time."""
     whole = np.concatenate([x, np.zeros((*x.shape[:-1], problem.layout.size - x.shape[-1]))], axis=-1)
     item, slot = np.nonzero(np.isfinite(x).all(-1))
     if len(item):
         arrivals = problem.rows[0].count
-        # at emission time zero the residual of an arrival is the emission time and its error: gross ones do not move a
-        # median
+        # At emission time zero the residual of an arrival is the emission time plus its error. Gross errors do not move
+        # a median.
         left = residuals(problem.take(item), whole[item, slot])[:, :arrivals]
         whole[item, slot, -1] = np.median(left, axis=-1)
     known = np.asarray(np.isfinite(x).all(-1))
@@ -74,42 +74,42 @@ def _add_emission_time(problem: Problem, x: Array) -> Array:
 
 
 def _weights(problem: Problem, taken: Arrivals, found: Pool) -> Array:
-    """Return the weight (N, m) of each row: the least of those of the rows that were made from it."""
+    """Return the weight (N, m) of each row: the least weight of the arrivals that were made from it."""
     weights = np.array(np.broadcast_to(problem.weight, (len(found), problem.count)))
     for row, origin in enumerate(taken.origin):
         weights[:, origin] = np.minimum(weights[:, origin], found.weights[:, row, None])
     return weights
 
 
-# Times that the weights of correlated rows are made anew at an answer: each depends on those of its partners, changes
-# by less each time, and thirty cost as much as a few steps.
+# Updates of the weights of correlated rows at an answer. Each weight depends on the weights of its partners and changes
+# less each time; thirty updates take as long as a few steps.
 _WEIGHINGS = 30
-# Gap of a rival that leaves out no more than the cheapest candidate does: the loss alone is no evidence between them.
-# Not zero, so that the cheapest stays first.
+# Gap of a rival that leaves out no more than the cheapest candidate: a loss alone is no evidence between the two. The
+# gap is not zero, so that the cheapest candidate stays first.
 _CLOSE = 1e-2
-# Minima that cost more than twice the least doubt so many more rows that no search from them ends near it.
+# Minima that cost more than twice the least reject many more rows, so that a search from them does not end near it.
 _DEARER = 2.0
-# Content of the ellipsoid within which candidates are one answer with the same rows doubted a little differently.
+# Content of the ellipsoid within which candidates are one answer with slightly different weights.
 _ONE_ANSWER = 0.95
 
 
 @dataclass(frozen=True, slots=True)
 class Robust:
-    """The stage that minimises a loss: from all candidates of a fix, or without one from starts of its own.
+    """The stage that minimises a loss: from all candidates of a fix, or from robust starts if there is no fix.
 
     Parameters
     ----------
     loss : Loss
         For instance ``LOSSES["cauchy"]``.
     states : bool
-        Whether to test the minima that it has searched for, so that fixes may be `ok`.
+        Whether the minima of a search are tested, so that fixes may be `ok`.
     """
 
     loss: Loss
     states: bool = False
 
     def __call__(self, problem: Problem, pool: Pool | None) -> Pool:
-        """Return the settled minima for a flat batch of problems; their weights are those of the loss."""
+        """Return the settled minima for a flat batch of problems; their weights are the weights of the loss."""
         start = None if pool is None else pack(surviving_candidates(pool, judge(problem, pool)))
         stages = () if pool is None else pool.stages
 
@@ -120,15 +120,18 @@ class Robust:
         return in_parts(problem, work, chunk_size(problem))
 
     def _minima(self, problem: Problem, start: Array | None, stages: tuple[Stage, ...]) -> Pool:
+        """Return the minima of the loss, tested if the stage does so and found them by a search."""
         found = _minimise(problem, self.loss, start, stages)
-        # from given starts the minima are those next to them
-        return stated(problem, self.loss, found) if self.states and start is None else found
+        # given starts lead to the nearest minima only, so these are not tested
+        return check_minima(problem, self.loss, found) if self.states and start is None else found
 
 
 def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[Stage, ...]) -> Pool:
+    """Return the settled minima of a loss, from given starts (N, q, size) or from robust starts."""
     began = perf_counter()
     pool = _minima(problem, loss, robust_starts(problem, loss) if start is None else start)
-    # a flat loss has a minimum for almost every set of rows: come from a loss that rises, and try sets next to the best
+    # A flat loss has a minimum for almost every set of rows. So start from a rising loss, and try sets next to the best
+    # one.
     if start is None and loss.flat:
         pool = _join(pool, _minima(problem, loss, _minima(problem, LOSSES["cauchy"], pool.x).x))
         pool = _join(pool, _minima(problem, loss, flip_rows(problem, loss, pool)))
@@ -139,7 +142,7 @@ def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[S
     stage = Stage(loss.name, detail, perf_counter() - began)
     pool = replace(pool, stages=stages, free=free, loss=loss.name)
     found = settle(problem, pool, stage, lambda some, x: _equations(some, loss, x)[0])
-    # rows are doubted at a place; where the verdict leaves none they keep the weights that they had
+    # The weights belong to a position. If the verdict shows no position, rows keep their earlier weights.
     answered = np.asarray(np.isfinite(surviving_candidates(found, judge(problem, found))[:, 0]).all(-1))
     weights = _equations(problem, loss, np.where(answered[:, None], found.x[:, 0], 0.0))[1]
     return replace(found, refined=False, weights=np.where(answered[:, None], weights, found.weights))
@@ -164,7 +167,7 @@ def _join(one: Pool, two: Pool) -> Pool:
 
 
 def doubted_minima(problem: Problem, loss: Loss, most: int) -> list[tuple[Array, Array]]:
-    """Return the cheap minima of a loss, found without a guess: vector (size,) and the rows (m,) hardly counted each.
+    """Return the cheap minima of a loss from robust starts: vectors (size,) and flags (m,) of rejected rows.
 
     Parameters
     ----------
@@ -173,7 +176,7 @@ def doubted_minima(problem: Problem, loss: Loss, most: int) -> list[tuple[Array,
     loss : Loss
         For instance ``LOSSES["truncated"]``.
     most : int
-        Minima at most.
+        Most minima.
     """
     pool = Robust(loss)(problem, None)
     order = np.argsort(pool.cost[0])[:most]
@@ -185,14 +188,14 @@ def doubted_minima(problem: Problem, loss: Loss, most: int) -> list[tuple[Array,
 
 
 def rejected(problem: Problem, fix: Fix) -> Array:
-    """Return which rows (..., m) that were present a fix hardly counts: their weight fell below a quarter.
+    """Return flags (..., m) of rows that a robust fix rejects: their weight is below a quarter of the original one.
 
     Parameters
     ----------
     problem : Problem
-        As it was solved; epochs that share nothing as a batch, see `optloc.problem.by_epoch`.
+        Problem as solved; epochs that share nothing are a batch, see `optloc.problem.by_epoch`.
     fix : Fix
-        Of a robust method.
+        Fix of a robust method.
     """
     return np.asarray((problem.weight > 0.0) & (fix.weights < REJECTED * problem.weight))
 
@@ -221,7 +224,7 @@ def _equations(problem: Problem, loss: Loss, x: Array) -> tuple[Normal, Array]:
 
 
 def _drop_near(problem: Problem, loss: Loss, pool: Pool) -> Pool:
-    """Return candidates without those that lie in the 95 % ellipsoid of the cheapest: they are the same answer."""
+    """Return candidates without those in the 95 % ellipsoid of the cheapest, which are the same answer."""
     from scipy.special import gammaincinv
 
     finished = np.where(pool.code == Status.OK, pool.cost, np.inf)
@@ -235,18 +238,18 @@ def _drop_near(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     apart = pool.x[rows, :, :n] - x[:, None, :n]
     with np.errstate(invalid="ignore"):
         near = ((apart @ information) * apart).sum(-1) < 2.0 * gammaincinv(n / 2.0, _ONE_ANSWER)
-    # the cheapest is near itself, and stays
+    # the cheapest is near itself, and is kept
     near[np.arange(len(rows)), best[rows]] = False
     cost[rows] = np.where(near, np.inf, cost[rows])
     return replace(pool, cost=cost)
 
 
 def _rivals(problem: Problem, loss: Loss, pool: Pool) -> Pool:
-    """Return candidates with gaps, counted from the cheapest, that tell how well the data exclude them.
+    """Return candidates with costs whose gaps to the cheapest measure how clearly the data exclude them.
 
-    A loss that still rises for gross errors holds it for unlikely that one is larger than another; so large a gap is
-    no evidence. Of truncated least squares, where all gross errors cost the same, it is, if a row that has to be left
-    out costs as much as a rival may: one more than the cheapest leaves out is a reason of its own not to believe it.
+    A loss that rises without limit also compares sizes of gross errors, and a gap from these sizes is no evidence.
+    Under truncated least squares all gross errors cost the same. Its gap is evidence, if each row left out adds the gap
+    of a rival: a candidate that leaves out one row more than the cheapest is then less likely for that reason.
     """
     found = np.isfinite(pool.cost) & (pool.code == Status.OK)
     item, slot = np.nonzero(found & (found.sum(1) > 1)[:, None])
@@ -257,7 +260,7 @@ def _rivals(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     doubt = Doubt.of(part, start)
     done = reweight(part, start, truncated, doubt, face=exact(problem))
     out = ((done.weight == 0.0) & (doubt.base > 0.0)).sum(-1)
-    # a row left out costs what a rival may: else leaving out more rows would always be the cheaper answer
+    # without this price, leaving out more rows would always cost less
     price = AMBIGUOUS_GAP * out
     evidence[item, slot] = np.where(done.status == Status.OK, done.cost + price, np.inf)
     best = np.where(found, pool.cost, np.inf).argmin(1)[:, None]
@@ -265,7 +268,7 @@ def _rivals(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     with np.errstate(invalid="ignore"):
         rival = least + np.maximum(evidence - base, _CLOSE)
     rival = np.where(np.isnan(rival), np.inf, rival)
-    # a loss that still rises may only say that a rival is nearer than the evidence says, never farther
+    # a rising loss may only reduce the gap below the evidence, never increase it
     cost = np.where(found, rival if loss.flat else np.minimum(pool.cost, rival), pool.cost)
     np.put_along_axis(cost, best, least, 1)
     return replace(pool, cost=cost)

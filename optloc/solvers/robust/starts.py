@@ -1,4 +1,4 @@
-"""Starts for a robust cost, without a guess: what fits when some stations or rows are left out."""
+"""Starts for a robust cost, without a first guess: fixes without some stations or rows."""
 
 from __future__ import annotations
 
@@ -26,57 +26,60 @@ from optloc.solvers.starts.position import is_registration_run
 from optloc.solvers.starts.registration import mirror_courses, split_epochs
 from optloc.solvers.verdict.judge import judge, surviving_candidates
 
-# Subsets of a problem at most: each is a closed form and a few steps. Stations up to which three are left out (92 sets
-# of eight, of which 80 are taken), and rows up to which single ones are: of more, a station covers the likely errors.
+# Limits of the subsets. Most subsets of a problem: each takes a closed form and a few steps. Most stations for which
+# three are left out (92 sets of eight, of which 80 are taken). Most rows for which single rows are left out: with more
+# rows, leaving out a station covers the likely errors.
 _MOST, _THREE, _ROWS = 80, 8, 12
-# Starts of a problem that are screened, cheaply, and annealed and kept.
+# Most starts of a problem that pass the cheap comparison, and most that are annealed and kept.
 _SCREENED, _KEPT = 30, 12
-# Problems, and starts times rows, that are worked on at a time: some ten megabytes an array.
+# Problems, and starts times rows, per part: an array takes about ten megabytes.
 _EACH, _NUMBERS = 64, 2**20
-# Epochs of a run that are fixed alone, spread over it, and places of each that are kept: two sides of flat stations.
+# Epochs of a run that are fixed separately, spread over the run, and positions kept for each: both sides of flat
+# stations.
 _EPOCHS, _SIDES = 12, 2
-# Starts whose residuals differ by less than this many sigma are one: they would doubt the same rows.
+# Starts whose residuals differ by less than this many sigma are equal: the loss would reject the same rows.
 _SAME = 0.5
-# Gauss-Newton steps before starts are compared: enough to leave the closed form's own weighting.
+# Gauss-Newton steps before starts are compared: enough to remove the effect of the weights of the closed form.
 _FEW = 5
-# Steps between two weighings on the way: the weights change before least squares would settle.
+# Steps between two updates of the weights during annealing: the weights change before least squares would converge.
 _BETWEEN = 2
-# Rows that are tried on the other side of a cut: those nearest to it.
+# Rows that are tried on the other side of the cut of a loss: those nearest to it.
 _FLIPPED = 10
-# Standard deviation of normal deviates over the median of their sizes: a scale that half the rows may be wrong without
-# moving much.
+# Ratio of the standard deviation to the median of absolute values, for normal errors. This scale changes little even if
+# half of the rows are wrong.
 _MEDIAN = 1.4826
-# Halvings of that scale, never below one sigma: what begins 64 sigma wide ends at the noise.
+# Halvings of that scale, down to one sigma: a scale of 64 sigma ends at the noise.
 _HALVINGS = 6
-# Growth of the control parameter and most steps of the graduation (Yang et al.: 1.4), which ends at the value where its
-# weights are those of truncated least squares but in a sliver of a thousandth around the cut.
+# Growth factor of the control parameter (Yang et al.: 1.4), most steps of the graduation, and final value. At the final
+# value the weights equal the weights of truncated least squares, except within a thousandth around the cut.
 _GROWTH, _GRADES, _SHARP = 1.4, 40, 1e3
 
 
-# Which rows to start from: all but those of some stations, or all but one, of the rows that each problem has.
+# Subsets of rows for the starts: all rows except the rows of some stations, or all except one row.
 
 
 def subsets(problem: Problem, clean: Array) -> tuple[Array, Array]:
-    """Return the subsets of all problems of a flat batch: problem of each (S,), and its rows (S, m).
+    """Return the subsets of all problems of a flat batch: problem of each subset (S,), and its rows (S, m).
 
-    One station is left out, or one row where a problem has few, or two stations, or three of few.
+    A subset leaves out one station or two. If a problem has few stations, three are left out too; if it has few rows,
+    single rows are left out too.
 
     Parameters
     ----------
     problem : Problem
-        N problems; what is left out of each are its own stations, those that it has rows of.
+        N problems; only stations with rows of a problem are left out of it.
     clean : bool array (N,)
-        Problems of which no two stations are left out.
+        Problems for which subsets leave out one station only.
     """
     present = np.broadcast_to(problem.weight > 0.0, (problem.batch_shape[0], problem.count))
     touched, single = rows_of_stations(problem), np.eye(problem.count, dtype=bool)
-    heard = np.asarray((present[:, None] & touched).any(-1))
+    measured = np.asarray((present[:, None] & touched).any(-1))
     short = np.flatnonzero(present.sum(1) <= _ROWS)
-    stations, rows = _unite(heard, touched, 3), _unite(present[short], single, 1)
+    stations, rows = _unite(measured, touched, 3), _unite(present[short], single, 1)
     wanted = ~clean[stations[0]] | (stations[2] == 1)
     item = np.concatenate([stations[0][wanted], short[rows[0]]])
     kept = present[item] & ~np.concatenate([stations[1][wanted], rows[1]])
-    # several stations, or one row, may leave the same rest: it is started from once
+    # different sets may leave the same rows, which then give one start
     _, first = np.unique(np.column_stack([item, kept]), axis=0, return_index=True)
     item, kept = item[first], kept[first]
     enough = degrees_of_freedom(problem.take(item).with_rows(weight=1.0 * kept)) >= 0
@@ -87,7 +90,7 @@ def _unite(own: Array, touched: Array, size: int) -> tuple[Array, Array, Array]:
     """Return problems (S,), unions (S, m) of the rows (g, m) of up to `size` of their members, and sizes (S,)."""
     count = own.sum(1)
     most = int(count.max(initial=0))
-    # numbers of each problem's own members, first: sets are of places in this list, the same for all problems
+    # the members of each problem come first, so that one list of index sets serves all problems
     local = np.argsort(~own, axis=1, kind="stable")[:, :most]
     sizes = range(1, 1 + (size if most <= _THREE else min(size, 2)))
     items, unions = [np.zeros(0, dtype=int)], [np.zeros((0, touched.shape[1]), dtype=bool)]
@@ -100,7 +103,7 @@ def _unite(own: Array, touched: Array, size: int) -> tuple[Array, Array, Array]:
     return np.concatenate(items), np.concatenate(unions), np.concatenate(lengths)
 
 
-# Starts from those rows, the best of them, and two ways down to a loss that is not convex.
+# Starts from these subsets, selection of the best, and two ways to reach the minimum of a non-convex loss.
 
 
 def robust_starts(problem: Problem, loss: Loss) -> Array:
@@ -111,18 +114,19 @@ def robust_starts(problem: Problem, loss: Loss) -> Array:
     problem : Problem
         N problems.
     loss : Loss
-        Whose cost decides which starts are kept.
+        Its cost selects the starts.
     """
     plain = search_widely(problem)
     pool = surviving_candidates(plain, judge(problem, plain))[:, :_KEPT]
     parts = [pool, _graduate(problem, pool[:, :1])]
     if one_position(problem):
-        # two rows that are left out are no rival of a cost below the price of one: a rival may cost that much more
+        # If the cost is below the price of one row, a solution without two rows is no rival: it costs more than the
+        # gap.
         parts.append(_leave_out(problem, loss, plain.cost[:, 0] < AMBIGUOUS_GAP))
     else:
         parts.append(_annealed(problem, pool, loss))
         if is_registration_run(problem):
-            # what gross errors have drawn to one side of the stations belongs to the other
+            # gross errors may draw a course to the wrong side of the stations
             parts.append(_annealed(problem, mirror_courses(problem, parts[-1]), loss))
         if len(problem.motions) == 1 and problem.motions[0].known is None and problem.motions[0].span == "run":
             parts.append(_through_epochs(problem, loss))
@@ -130,10 +134,10 @@ def robust_starts(problem: Problem, loss: Loss) -> Array:
 
 
 def _through_epochs(problem: Problem, loss: Loss) -> Array:
-    """Return the best starts (N, q, size) of runs that pass through the places where two epochs were fixed alone.
+    """Return the best starts (N, q, size) of runs, each through the positions of two epochs that are fixed separately.
 
-    What is wrong in a few epochs does not touch the places of the others (as by samples that are as small as can be: M.
-    A. Fischler, R. C. Bolles, "Random sample consensus", Commun. ACM 24 (1981)); here all pairs of a few are tried.
+    Errors in a few epochs do not affect the positions of the other epochs. The method is a random sample consensus with
+    minimal samples (M. A. Fischler, R. C. Bolles, Commun. ACM 24 (1981)), here over all pairs of a few epochs.
     """
     size, d, order = problem.batch_shape[0], problem.dimension, problem.motions[0].order
     epoch = np.unique(np.linspace(0, problem.epochs - 1, _EPOCHS).round().astype(int))
@@ -154,14 +158,14 @@ def _through_epochs(problem: Problem, loss: Loss) -> Array:
 
 
 def _annealed(problem: Problem, pool: Array, loss: Loss) -> Array:
-    """Return where starts (N, q, size) lead that doubt what does not fit them, the cheapest first."""
+    """Return the end points (N, q, size) of annealing from starts (N, q, size), the cheapest first."""
     item, slot = np.nonzero(np.isfinite(pool).all(-1))
     return _cheapest(problem, pool[item, slot], item, loss, _KEPT, anneal=True)
 
 
 def _leave_out(problem: Problem, loss: Loss, clean: Array) -> Array:
     """Return the best starts (N, q, size) from closed forms of all subsets."""
-    # Correlation matters for the answer, hardly for where to look for it, and it costs time.
+    # Correlation matters for the answer, but little for its start, and it costs time.
     noise = with_station_noise(problem).noise if not depends_on_place(problem) else problem.noise
     problem = replace(problem, noise=independent(variances(noise, problem.count)))
     size = problem.batch_shape[0]
@@ -174,6 +178,7 @@ def _leave_out(problem: Problem, loss: Loss, clean: Array) -> Array:
 
 
 def _start_subsets(problem: Problem, loss: Loss, clean: Array) -> Array:
+    """Return the best starts (N, q, size) from closed forms of all subsets of one part of the batch."""
     item, kept = subsets(problem, clean)
     if not len(item):
         return np.full((problem.batch_shape[0], 0, problem.layout.size), np.nan)
@@ -187,7 +192,7 @@ def _start_subsets(problem: Problem, loss: Loss, clean: Array) -> Array:
 
 
 def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *, anneal: bool) -> Array:
-    """Return the cheapest of starts (M, size) of given problems (M,), each once, as (N, most, size)."""
+    """Return the cheapest starts (N, most, size) of starts (M, size) of given problems (M,), without repetitions."""
     size, count = problem.batch_shape[0], len(x)
     cost, u, x = np.full(count, np.inf), np.zeros((count, problem.count)), np.array(x)
     usable = np.flatnonzero(np.isfinite(x).all(-1))
@@ -196,10 +201,10 @@ def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *,
         some = usable[first : first + step]
         x[some], cost[some], u[some] = _anneal(problem.take(item[some]), x[some], loss, _HALVINGS if anneal else 0)
     chosen = np.full((size, most, x.shape[1]), np.nan)
-    # by problem, the cheapest of each first
+    # sorted by problem, then by cost
     order = np.lexsort((cost, item))
     order = order[np.isfinite(cost[order])]
-    # residuals row by row: their largest is then found many starts at a time
+    # one row of `u` per measurement: the maximum over measurements is then fast for many starts
     x, u, item = x[order], np.ascontiguousarray(u[order].T), item[order]
     for slot in range(most):
         if not len(item):
@@ -213,7 +218,7 @@ def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *,
 
 
 def _anneal(problem: Problem, x: Array, loss: Loss, halvings: int) -> tuple[Array, Array, Array]:
-    """Return vectors after a few weighings by the Cauchy loss whose scale is halved, their costs and residuals."""
+    """Return vectors after steps under the Cauchy loss with falling scale, their costs and residuals."""
     doubt, cauchy, face = Doubt.of(problem, x), LOSSES["cauchy"], exact(problem)
     weight = np.ones(doubt.base.shape)
     with np.errstate(all="ignore"):
@@ -229,9 +234,9 @@ def _anneal(problem: Problem, x: Array, loss: Loss, halvings: int) -> tuple[Arra
 
 
 def flip_rows(problem: Problem, loss: Loss, pool: Pool) -> Array:
-    """Return starts (N, q, size) beside the cheapest minimum: those with one more row in or out, of rows at the brink.
+    """Return starts (N, q, size) near the cheapest minimum: each adds or removes one row near the cut of the loss.
 
-    A loss that cuts rows off has minima of its own for almost every set of rows; the best ones differ in few rows.
+    A loss that cuts rows off has a minimum for almost every set of rows, and the best minima differ in few rows.
     """
     best = np.where(pool.code == Status.OK, pool.cost, np.inf).argmin(1)
     x = pool.x[np.arange(len(best)), best]
@@ -253,7 +258,7 @@ def flip_rows(problem: Problem, loss: Loss, pool: Pool) -> Array:
 
 
 def _graduate(problem: Problem, start: Array) -> Array:
-    """Return where truncated least squares leads (N, q, size) when it begins convex and is bent step by step.
+    """Return the minima (N, q, size) of truncated least squares by graduation from a convex cost.
 
     H. Yang, P. Antonante, V. Tzoumas, L. Carlone, "Graduated non-convexity for robust spatial perception", IEEE Robot.
     Autom. Lett. 5 (2020), eq. 14 for the weights and section III-C for the schedule.
@@ -269,13 +274,13 @@ def _graduate(problem: Problem, start: Array) -> Array:
         for grade in range(_GRADES):
             u = np.abs(doubt.residual(problem, x, weight))
             worst = np.where(doubt.base > 0.0, u, 0.0).max(1, keepdims=True)
-            # so small a mu that no residual is beyond the convex part (eq. 14); the floor keeps it finite if all rows
-            # agree
+            # the largest mu for which every residual is in the convex part (eq. 14); the floor keeps it finite if all
+            # rows agree
             convex = c**2 / np.maximum(2.0 * worst**2 - c**2, 1e-300)
             mu = np.minimum(convex, _SHARP) if grade == 0 else mu * _GROWTH
             if (mu > _SHARP).all():
                 break
-            # between the cuts where it is 1 and 0: clipped there
+            # the weight between the two cuts; clipped to 1 and 0 at the cuts
             bent = c / u * np.sqrt(mu * (mu + 1.0)) - mu
             weight = np.where(np.isfinite(u), np.clip(bent, 0.0, 1.0), 0.0)
             x = refine(problem.with_rows(weight=doubt.row_weight(weight)), x, limit=_BETWEEN, face=face).x

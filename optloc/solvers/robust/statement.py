@@ -1,4 +1,4 @@
-"""Tests of a robust fix before it is `ok`: a proof by the rows that count, single rows, and repeats."""
+"""Tests that a robust fix must pass to be `ok`: a proof from the rows with weight, single rows, and repeats."""
 
 from __future__ import annotations
 
@@ -26,34 +26,36 @@ from optloc.solvers.verdict.findings import is_improbable
 from optloc.solvers.verdict.judge import filled_objects, judge, verdict
 from optloc.solvers.verdict.repeats import TOLERANCE, Repeats, holds, is_repeatable, repeated
 
-# Squared distance in standard deviations up to which the minima of the loss and of the rows that count are one
-# answer: with clean data nine in ten are nearer than half of it.
+# Squared distance in standard deviations up to which the minimum of the loss and the minimum of the rows with weight
+# are one answer: with clean data nine in ten are within half of it.
 _NEAR = 1.0
-# Fall of the cost from which leaving a row out is another explanation, and rise up to which taking one back is: as for
-# suspects, of which all within the gap of the best score are listed.
+# A change of one row is another explanation in two cases: without a row the cost falls by more than _OUT, or with a
+# rejected row the cost rises by less than _BACK. A search for suspects has the same limits.
 _OUT, _BACK = ROW_PRICE - AMBIGUOUS_GAP, ROW_PRICE + AMBIGUOUS_GAP
-# Rows of a problem up to which each is left out by itself: of more, one hardly decides, and time grows with the square.
+# Most rows for which each row is left out in turn: with more rows a single one rarely decides, and the time grows with
+# the square.
 _ROWS = 64
-# Rows of changed problems that are refined at a time: 10 MB.
+# Rows of changed problems that are refined together: 10 MB.
 _TOGETHER = 2**12
-# Weighings of a repeated measurement, which begins at its true place: ten more change no ellipse that holds.
+# Most updates of the weights for a repeated measurement, which starts at its true position: ten more updates change no
+# ellipse that covers.
 _WEIGHINGS = 10
 
-SEARCHED = "the minima of the loss come from a search, without a proof"
-NEEDS = "only one resting position without constraints is checked against its rows"
+SEARCHED = "a search found the minima of the loss; there is no proof"
+NEEDS = "robust fixes are tested for one target at rest without constraints, with at most 64 rows"
 
 
-def stated(problem: Problem, loss: Loss, pool: Pool) -> Pool:
-    """Return settled pools of a loss with marks of the minima that pass all tests, and reasons for the others.
+def check_minima(problem: Problem, loss: Loss, pool: Pool) -> Pool:
+    """Return settled pools of a loss with flags of the minima that pass all tests, and reasons for the others.
 
     Parameters
     ----------
     problem : Problem
         N problems.
     loss : Loss
-        Whose minima they are.
+        The minimised loss.
     pool : Pool
-        Settled, by a search of all starts.
+        Settled, after a search from all starts.
     """
     curvature, count = pool.curvature, len(pool)
     assert curvature is not None
@@ -67,16 +69,18 @@ def stated(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     spent = doubted.sum(1)
     left = degrees_of_freedom(problem.with_rows(weight=np.where(doubted, 0.0, problem.weight)))
     sole = fix.answered & ~fix.has(Status.AMBIGUOUS, Status.UNBOUNDED, Status.CONTRADICTORY)
-    # the rows that count name the doubted ones, and one more would show another choice
+    # the rows with weight must name the doubted rows, and one more row must show if another choice exists
     checked = left > spent
     for i in np.flatnonzero(sole & ~checked):
-        remark[i] = f"redundancy {left[i]} without {spent[i]} doubted rows: another choice of them would not be noticed"
+        remark[i] = (
+            f"redundancy {left[i]} without {spent[i]} rejected rows is too small to exclude another choice of rows"
+        )
     items = np.flatnonzero(sole & checked)
     if not len(items):
         return pool
     part, out = problem.take(items), doubted[items]
-    good, told, repeats = _examine(part, loss, fix.x[items], out)
-    kept[items], remark[items] = good, told
+    good, reasons, repeats = _examine(part, loss, fix.x[items], out)
+    kept[items], remark[items] = good, reasons
     found = np.full((count, 3), np.nan)
     found[items] = repeats
     return replace(pool, curvature=replace(curvature, repeats=found))
@@ -89,48 +93,48 @@ def _examine(problem: Problem, loss: Loss, x: Array, doubted: Array) -> tuple[Ar
     reason, repeats = filled_objects(len(x), ""), np.full((len(x), 3), np.nan)
     good = fix.code == Status.OK
     for i in np.flatnonzero(~good):
-        reason[i] = f"the rows that count do not prove the place: {fix[int(i)].status.label}"
-    # rejected rows may be too few of the wrong ones: then the rest hardly fits
+        reason[i] = f"the rows with weight do not prove the position: {fix[int(i)].status.label}"
+    # if the loss rejects too few of the wrong rows, the other rows hardly fit
     poor = good & doubted.any(1) & is_improbable(fix.cost, fix.dof, P_OUTLIER)
-    reason[poor] = "the rows that count hardly agree: p is below 0.01"
+    reason[poor] = "the rows with weight hardly agree: p is below 0.01"
     good &= ~poor
     apart = _squared(fix, x - fix.x)
     far = good & ~(apart <= _NEAR)
-    reason[far] = "the rows that count have another minimum: doubted rows still pull at this one"
+    reason[far] = "the rows with weight have another minimum: rows with reduced weight still shift the fix"
     good &= ~far
     items = np.flatnonzero(good)
     single = items[_decides(problem.take(items), fix[items], doubted[items])]
-    reason[single] = "a single measurement decides: with it the place is another than without it"
+    reason[single] = "a single measurement decides: the position with it differs from the position without it"
     good[single] = False
     items = np.flatnonzero(good)
     if len(items):
         repeats[items] = _repeat(problem.take(items), loss, fix[items], doubted[items])
         held = holds(repeats)
-        reason[good & ~held] = "the ellipses of repeated measurements do not hold their places"
+        reason[good & ~held] = "the ellipses of simulated repeats do not cover the true positions"
         good &= held
     return good, reason, repeats
 
 
 def _squared(fix: Fix, step: Array) -> Array:
-    """Return squared lengths (N,) of steps of vectors (N, size) in the covariances of fixes, shared unknowns alone."""
+    """Return squared lengths (N,) of steps (N, size) in standard deviations of fixes, for the shared unknowns only."""
     n = fix.cov.shape[-1]
     with np.errstate(all="ignore"):
         return np.asarray((step[:, :n] * linalg.solve(fix.cov, step[:, :n, None])[0][..., 0]).sum(-1))
 
 
 def _decides(problem: Problem, fix: Fix, doubted: Array) -> Array:
-    """Return flags (N,) of problems where one row more or less is another explanation with another place.
+    """Return flags (N,) of problems in which one row more or less is another explanation with another position.
 
-    Each row is left out or taken back by itself, and each rejected row is exchanged for each of the others.
+    Each row is left out or taken back separately, and each rejected row is exchanged with each other row.
 
     Parameters
     ----------
     problem : Problem
         N problems with all rows.
     fix : Fix
-        Of the rows that count.
+        Fixes of the rows with weight.
     doubted : bool array (N, m)
-        The other rows.
+        The rejected rows.
     """
     item, change, limit = _changes(np.broadcast_to(problem.weight, doubted.shape) > 0.0, doubted)
     out = np.zeros(len(doubted), dtype=bool)
@@ -148,7 +152,7 @@ def _decides(problem: Problem, fix: Fix, doubted: Array) -> Array:
 
 
 def _changes(present: Array, doubted: Array) -> tuple[Array, Array, Array]:
-    """Return the problems (M,) of changes, the rows (M, m) that these move, and how far the cost (M,) may rise."""
+    """Return the problem (M,) of each change, its rows (M, m), and the largest rise of the cost (M,) that counts."""
     item, row = np.nonzero(present)
     change = np.zeros((len(item), present.shape[1]), dtype=bool)
     change[np.arange(len(item)), row] = True
@@ -156,13 +160,13 @@ def _changes(present: Array, doubted: Array) -> tuple[Array, Array, Array]:
     swapped, back, out = np.nonzero(doubted[:, :, None] & (present & ~doubted)[:, None, :])
     more = np.zeros((len(swapped), present.shape[1]), dtype=bool)
     more[np.arange(len(swapped)), back] = more[np.arange(len(swapped)), out] = True
-    # both leave out the same number of rows: the costs alone decide
+    # an exchange leaves out equally many rows, so the costs alone decide
     limits = np.concatenate([limit, np.full(len(swapped), AMBIGUOUS_GAP)])
     return np.concatenate([item, swapped]), np.concatenate([change, more]), limits
 
 
 def _squared_position(problem: Problem, fix: Fix, step: Array) -> Array:
-    """Return squared lengths (N,) of steps (N, size) of positions in the covariances of fixes."""
+    """Return squared lengths (N,) of position steps, from steps (N, size), in standard deviations of fixes."""
     slot, _ = problem.layout.find("position")
     where = slice(slot.start, slot.start + slot.size)
     with np.errstate(all="ignore"):
@@ -171,13 +175,13 @@ def _squared_position(problem: Problem, fix: Fix, step: Array) -> Array:
 
 
 def _repeat(problem: Problem, loss: Loss, fix: Fix, doubted: Array) -> Array:
-    """Return shares of repeats of the loss whose ellipses hold their places, and an inflation, (N, 3)."""
+    """Return shares of repeats of the loss whose ellipses contain the truth, and an inflation, (N, 3)."""
     z = np.where(doubted, problem.observed - predict(problem, fix.x), 0.0)
     return repeated(problem, fix.x, fix.cov, lambda many, truth: _refit(many, loss, truth), z)
 
 
 def _refit(problem: Problem, loss: Loss, truth: Array) -> Repeats:
-    """Return the minima of a loss next to true places, and covariances."""
+    """Return the minima of a loss next to true vectors, with covariances."""
     doubt = Doubt.of(problem, truth)
     done = reweight(problem, truth, loss, doubt, limit=_WEIGHINGS, tolerance=TOLERANCE)
     information, _, ok = marginal(robust_equations(loss, problem, doubt, done.x, done.weight))

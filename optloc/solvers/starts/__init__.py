@@ -1,1 +1,1 @@
-"""Starting points without a guess, by kind of measurement."""
+"""Starts without a first guess, by kind of measurement."""

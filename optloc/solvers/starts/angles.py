@@ -1,4 +1,4 @@
-"""Starts and proofs from angles alone: instrumental variables, unit directions, the least worst angle."""
+"""Starts and bounds from angles alone: instrumental variables, unit directions, the smallest maximal angle."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Bearings:
     station : array (N, m, d)
         Positions in units of `scale` from `centre`.
     angle : array (N, m, 2)
-        Azimuth and elevation, radians; the elevation is zero where there is none.
+        Azimuth and elevation, radians; the elevation is zero if it is absent.
     weight : array (N, m, 2)
-        One over the standard deviations, 1/radians; zero where absent.
+        One over the standard deviations, 1/radians; zero for absent angles.
     axes : array (N, m, d, d), optional
         Axes of the stations.
     centre : array (N, d)
@@ -46,15 +46,15 @@ class Bearings:
     scale: Array
 
     def metres(self, point: Array) -> Array:
-        """Return scaled points (N, ..., d) in the problem's frame."""
+        """Return scaled points (N, ..., d) in the frame of the problem, metres."""
         extra = (1,) * (point.ndim - 2)
         return point * self.scale.reshape(-1, *extra, 1) + self.centre.reshape(-1, *extra, point.shape[-1])
 
 
 def bearings(problem: Problem) -> Bearings | None:
-    """Return the angles of a flat batch with one static target, or None where no azimuth was measured."""
+    """Return the angles of a flat batch with one static target, or None if no azimuth was measured."""
     rows = {block.kind: (block, start) for block, start in zip(problem.rows, problem.starts, strict=True)}
-    # an elevation without its azimuth is no bearing: nothing linear is known of the place
+    # an elevation without its azimuth gives no linear equation for the position
     if "azimuth" not in rows:
         return None
     block, start = rows["azimuth"]
@@ -76,10 +76,12 @@ def bearings(problem: Problem) -> Bearings | None:
 
 
 def _keys(rows: Rows) -> list[tuple[int, int]]:
+    """Return station and epoch of each row."""
     return list(zip(rows.a.tolist(), rows.epoch.tolist(), strict=True))
 
 
 def _values(problem: Problem, rows: Rows, start: int) -> tuple[Array, Array]:
+    """Return the angles (N, m), radians, and one over their standard deviations; zero for absent rows."""
     sigma = np.sqrt(variances(problem.noise, problem.count)[..., start : start + rows.count])
     shape = (problem.batch_shape[0], rows.count)
     importance = np.where(rows.weight > 0.0, np.sqrt(rows.weight) / sigma, 0.0)
@@ -94,7 +96,7 @@ def _at(array: Array, core: int, rows: Rows, size: int) -> Array:
 
 
 def instrumental(seen: Bearings) -> Array:
-    """Return the instrumental-variable fixes (N, 1, d), NaN where there is none."""
+    """Return the instrumental-variable fixes (N, 1, d), metres; NaN without a solution."""
     d = seen.station.shape[-1]
     steep = (None, None) if d == 2 else (seen.angle[..., 1], seen.weight[..., 1])
     azimuth, importance = seen.angle[..., 0], seen.weight[..., 0]
@@ -103,17 +105,17 @@ def instrumental(seen: Bearings) -> Array:
 
 
 def courses(problem: Problem) -> BearingCourses | None:
-    """Return the pseudo-linear courses of a flat batch of runs, or None where its rows are not all angles.
+    """Return the pseudo-linear courses of a flat batch of runs, or None if its rows are not all angles.
 
     Parameters
     ----------
     problem : Problem
-        N runs of one target that moves as a polynomial all the while; nothing else is unknown.
+        N runs of one target on a polynomial course, without other unknowns.
 
     Returns
     -------
     BearingCourses
-        In metres and seconds since the time at which the target's state holds.
+        In metres and seconds since the reference time of the state.
     """
     if any(rows.kind not in ("azimuth", "elevation") for rows in problem.rows):
         return None
@@ -145,33 +147,33 @@ def courses(problem: Problem) -> BearingCourses | None:
 
 
 def course_states(problem: Problem) -> Array | None:
-    """Return the states (N, order + 1, d) of the instrumental courses, or None where rows are not all angles.
+    """Return the states (N, order + 1, d) of the instrumental courses, or None if rows are not all angles.
 
-    NaN where the run does not determine a course, or where it is not in front of the stations.
+    NaN if the run does not determine a course, or if the course is not in front of the stations.
     """
     found = courses(problem)
     if found is None:
         return None
-    # coefficients of 1, t, t^2 as place, velocity and acceleration: x = p + v t + a t^2 / 2
+    # coefficients of 1, t, t^2 become position, velocity and acceleration: x = p + v t + a t^2 / 2
     unit = np.array([1.0, 1.0, 2.0])[: found.plain.shape[1], None]
     states = np.where(found.ahead[:, None, None], unit * found.instrumental, np.nan)
     return states if states.shape[-1] == problem.dimension else _at_height(problem, states)
 
 
 def _in_plan(problem: Problem, seen: Bearings) -> Bearings:
-    """Return azimuths alone as those of a plan where a height is known: they say nothing of it themselves."""
+    """Return azimuths as bearings in the plane if there are no elevations and the height is known."""
     local = problem.frame.kind == "enu" and problem.dimension == _SPACE
     if not local or (seen.weight[..., 1] > 0.0).any() or known_height(problem) is None:
         return seen
     return replace(seen, station=seen.station[..., :2], axes=None, centre=seen.centre[..., :2])
 
 
-# Coordinates of space.
+# coordinates of space
 _SPACE = 3
 
 
 def _at_height(problem: Problem, plan: Array) -> Array:
-    """Return states (N, q, 3) of those of a plan: at the known height where the Earth does not bend away yet."""
+    """Return states (N, q, 3) from states in the plane, at the known height, without the curvature of the Earth."""
     level = known_height(problem)
     assert level is not None
     assert problem.frame.origin is not None
@@ -185,7 +187,7 @@ def by_directions(seen: Bearings) -> Array:
     from formulations.direction_sdp import directions
 
     out = np.full((len(seen.station), 1, seen.station.shape[-1]), np.nan)
-    if out.shape[-1] == 2:  # directions in a plane are azimuths: nothing is left to relax
+    if out.shape[-1] == 2:  # directions in a plane are azimuths, which need no relaxation
         return out
 
     def relax(item: tuple[int, Array]) -> None:
@@ -198,24 +200,24 @@ def by_directions(seen: Bearings) -> Array:
 
 
 def least_worst(seen: Bearings) -> Array:
-    """Return the fixes (N, 1, d) whose worst angle in sigma is least."""
+    """Return the fixes (N, 1, d) with the smallest maximal angle in sigma."""
     from formulations.minimax_cone import minimax
 
     d = seen.station.shape[-1]
     out = np.full((len(seen.station), 1, d), np.nan)
     ahead = rays(seen.angle[..., 0], seen.angle[..., 1] if d == 3 else None, seen.axes).ahead
 
-    for i in range(len(out)):  # each is a row of programs of a tenth of a millisecond: too short for threads
+    for i in range(len(out)):  # each is a series of programs of a tenth of a millisecond: too short for threads
         use = (seen.weight[i, :, : d - 1] > 0.0).all(-1) & np.isfinite(seen.angle[i]).all(-1)
         if use.sum() > 1:
-            # a cone is as wide in all directions: the larger of the two deviations is its half angle
+            # a cone has equal width in all directions, so its half angle is the larger deviation
             sigma = 1.0 / seen.weight[i, use, : d - 1].min(-1)
             out[i, 0] = minimax(ahead[i, use], seen.station[i, use], sigma).point
     return seen.metres(out)
 
 
 def angle_bounds(seen: Bearings, point: Array) -> Array:
-    """Return lower bounds (N,) of the maximum-likelihood cost over all positions; minus infinity where there is none.
+    """Return lower bounds (N,) of the maximum-likelihood cost over all positions; minus infinity without a bound.
 
     Parameters
     ----------
@@ -231,7 +233,7 @@ def angle_bounds(seen: Bearings, point: Array) -> Array:
 
     def bound(item: tuple[int, Array]) -> None:
         i, use = item
-        # a bound of some rows' cost would be one of the whole, but a poor one: none is given
+        # a bound from some of the rows would be valid but poor, so it is not computed
         if np.isfinite(scaled[i]).all() and not (seen.weight[i, ~use] > 0.0).any():
             axes = None if seen.axes is None else seen.axes[i, use]
             sigma = 1.0 / seen.weight[i, use]
@@ -242,28 +244,28 @@ def angle_bounds(seen: Bearings, point: Array) -> Array:
 
 
 def _complete_bearings(seen: Bearings) -> list[tuple[int, Array]]:
-    """Return the problems with at least two complete bearings, and which bearings those are."""
+    """Return the problems with at least two complete bearings, each with flags of these bearings."""
     if seen.station.shape[-1] != 3:
         return []
     use = np.asarray((seen.weight > 0.0).all(-1) & np.isfinite(seen.angle).all(-1))
     return [(int(i), use[i]) for i in np.flatnonzero(use.sum(1) > 1)]
 
 
-# One receiver, one illuminator: a polynomial course straight from delays and angles of several epochs.
+# One receiver and one illuminator: a polynomial course from delays and angles of several epochs.
 
 
 def course_starts(problem: Problem) -> Array | None:
-    """Return the state (N, order + 1, 3) of the only target, or None where the rows are not of one bistatic pair.
+    """Return the state (N, order + 1, 3) of the only target, or None if the rows do not belong to one bistatic pair.
 
     Parameters
     ----------
     problem : Problem
-        Flat batch of N problems whose rows are range sums of one pair of still stations, and angles of its receiver.
+        Flat batch of N problems whose rows are range sums of one pair of stations at rest, and angles of its receiver.
 
     Returns
     -------
     array (N, order + 1, 3)
-        Position, velocity and acceleration; NaN where the epochs do not determine them.
+        Position, velocity and acceleration; NaN if the epochs do not determine them.
     """
     found = pair(problem)
     if found is None:
@@ -285,9 +287,10 @@ def course_starts(problem: Problem) -> Array | None:
     if problem.stations.axes is not None:
         own = np.broadcast_to(problem.stations.axes, (size, *problem.stations.axes.shape[-4:]))[:, 0, receiver]
         axes = axes @ own[:, None]
-    # what the way by the target is longer than the direct one
+    # path by the target minus direct path
     excess = value[2] - np.sqrt((away**2).sum(-1))[:, None]
-    # errors across the line of sight are those of the angles in radians, times the range; azimuth by cos E
+    # The error across the line of sight is the error of the angle in radians times the range; for azimuths also times
+    # cos E.
     spread = np.stack([np.cos(value[1]) * sigma[0], sigma[1], sigma[2] / length], axis=-1)
     since, order = elapsed(problem, 0), problem.motions[0].order
     fitted = course(excess / length, axes, away / length, np.broadcast_to(since, (size, k)), spread, order=order)
@@ -298,21 +301,22 @@ def course_starts(problem: Problem) -> Array | None:
 
 
 def pair(problem: Problem) -> tuple[int, int] | None:
-    """Return receiver and illuminator of all rows, or None where they are not of one bistatic pair that stays."""
+    """Return receiver and illuminator of all rows, or None if they are not one bistatic pair at rest."""
     kinds = {rows.kind: rows for rows in problem.rows}
     if problem.dimension != 3 or set(kinds) != {"range_sum", "azimuth", "elevation"} or len(kinds) != len(problem.rows):
         return None
     if problem.stations.position.shape[-3] > 1 or not all(_once_an_epoch(rows) for rows in problem.rows):
         return None
     ends = {(int(a), int(b)) for a, b in zip(kinds["range_sum"].a, kinds["range_sum"].b, strict=True)}
-    heard = {int(a) for kind in ("azimuth", "elevation") for a in kinds[kind].a}
-    if len(heard) != 1 or len({frozenset(end) for end in ends}) != 1:
+    receivers = {int(a) for kind in ("azimuth", "elevation") for a in kinds[kind].a}
+    if len(receivers) != 1 or len({frozenset(end) for end in ends}) != 1:
         return None
-    receiver = heard.pop()
+    receiver = receivers.pop()
     others = {a if b == receiver else b for a, b in ends if receiver in (a, b)}
-    # one pair of stations, whichever of the two a row names first
+    # rows may name the two stations in either order
     return (receiver, others.pop()) if len(others) == 1 else None
 
 
 def _once_an_epoch(rows: Rows) -> bool:
+    """Return whether each epoch has at most one of the rows."""
     return len(np.unique(rows.epoch)) == rows.count

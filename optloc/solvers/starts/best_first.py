@@ -1,4 +1,4 @@
-"""Starts from nothing for every mixture that the proof can bound: minima that a best-first search of boxes meets."""
+"""Starts for every mixture of kinds that a proof can bound: minima that a best-first search of boxes finds."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from optloc.solvers.certificates.position_cost import surfaces_of
 from optloc.solvers.policy import LISTED_GAP
 from optloc.solvers.starts.position import spread_of
 
-# Boxes for each problem, with machine code and without: one takes some microseconds, or a thousand times that. Mixtures
-# of frequencies, times and angles take 100 to 1 500.
+# Boxes for each problem, with machine code and without: a box takes some microseconds, or a thousand times that.
+# Mixtures of frequencies, times and angles take 100 to 1 500.
 _BUDGET, _SLOW_BUDGET = 4000, 400
-# Boxes for the few rows of a run: its best minimum is met within a hundred, and all others are the proof's to find.
+# Boxes for the few rows of a run: its best minimum is found within a hundred boxes, and the proof finds all others.
 _RUN_BUDGET = 500
 # Minima that are kept: a pass of a satellite has two, exact solutions of three frequencies in space up to a handful.
 _MOST = 12
-# Spreads of the stations around their centre that are searched where nothing bounds the cheap positions: as a proof of
-# a region takes.
+# Spreads of the stations around their centre that are searched if nothing bounds the cheap positions, as in a proof
+# over a region.
 _SPREADS = 10.0
 
 
 def best_first_starts(problem: Problem) -> Array:
-    """Return the minima (N, q, d) that a best-first search of a flat batch meets, by their cost; NaN behind the last.
+    """Return the minima (N, q, d) that a best-first search finds, by ascending cost; NaN after the last.
 
     Parameters
     ----------
@@ -45,22 +45,23 @@ def best_first_starts(problem: Problem) -> Array:
     budget = _BUDGET if enabled() else _SLOW_BUDGET
     if not is_run(problem):
         return find_minima(position_costs(problem), places, LISTED_GAP, budget, _MOST)[0]
-    # Few rows of a run are enough to begin with: the rest decides between their minima.
+    # A few rows of a run are enough for a start: the other rows decide between the minima.
     looks = [few_costs(problem.take(np.array([i]))) for i in range(size)]
     each = [find_minima(look, _place(places, i), LISTED_GAP, _RUN_BUDGET, _MOST)[0] for i, look in enumerate(looks)]
     return np.concatenate(each)
 
 
 def _place(places: FoundPlaces, i: int) -> FoundPlaces:
-    """Return the places of one problem as a batch."""
+    """Return the positions of one problem as a batch."""
     return FoundPlaces(*(array[i : i + 1] for array in places))
 
 
 def _on_planes(problem: Problem, x: Array) -> Array:
-    """Return places (N, d) moved onto the planes that hold the target."""
+    """Return positions (N, d) moved onto the planes that hold the target."""
     for band in problem.constraints:
         if isinstance(band, Band) and is_exact(band) and band.kind == "plane":
-            # One after the other: those that are not at right angles leave what the proof's own axes do not feel.
+            # One plane after the other: oblique planes leave a remainder, which does not matter along the axes of the
+            # proof.
             normal = band.coefficients
             off = np.asarray(band.lower) - (x * normal).sum(-1)
             x = x + (off / (normal**2).sum(-1))[..., None] * normal

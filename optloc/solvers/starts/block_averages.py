@@ -1,4 +1,4 @@
-"""Block averages: a long run as a short one of the same unknowns, to start from."""
+"""Block averages: a long run as a short run with the same unknowns, as the start of a fix."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from optloc.problem.epochs import cut, epochs_of, joined
 from optloc.problem.noise import Block, Noise, group_members
 from optloc.problem.problem import Problem
 
-# A block that lasts this many times longer than usual has a gap in it, and the line through it means nothing.
+# A block that lasts this many times the median duration contains a gap, and a line through its values is meaningless.
 _GAP = 2.0
 
 
 def average_blocks(problem: Problem, count: int) -> Problem:
-    """Return the run as blocks of equally many epochs, with the values that its rows have in the middle of each block.
+    """Return the run as blocks with an equal number of epochs, with the values of its rows in the middle of each block.
 
-    Blocks are equally long so that the curvature that an average leaves out is the same in all of them, and is
-    absorbed by a bias. The last epochs that fill no block are left out, and so are blocks with a gap in time.
+    Blocks have equal length, so that an average ignores the same curvature in all of them, and a bias absorbs it. The
+    last epochs that do not fill a block are dropped. Blocks with a gap in time are dropped too.
 
     Parameters
     ----------
@@ -36,18 +36,19 @@ def average_blocks(problem: Problem, count: int) -> Problem:
     Returns
     -------
     Problem
-        Batch (...) with one epoch a block. A row is the line through its values in the block, taken in the middle; it
-        exists where it is present in all problems of the batch. The same biases; states hold at the same time.
+        Batch (...) with one epoch per block. A line through the values of a row gives its value in the middle of the
+        block. A row exists if it is present in all problems of the batch. Biases are unchanged, and states have the
+        same reference time.
     """
     length = max(1, problem.epochs // count)
-    # too short to be averaged: its epochs are the blocks
+    # the run is too short for averages: its epochs are the blocks
     if length == 1:
         return _with_station_noise(problem)
     last = length * (problem.epochs // length)
     # seconds from the first epoch of each block to its last
     lasting = problem.times[length - 1 : last : length] - problem.times[:last:length]
     longest = _GAP * float(np.median(lasting))
-    # whole blocks, as many as fit the memory of a part: averages of a long run need no copy of it
+    # parts of whole blocks that fit the memory, so that a long run is never copied as a whole
     stretch = length * max(1, epochs_of(problem, int(np.prod(problem.batch_shape))) // length)
     if stretch >= last:
         return _blocks(_with_station_noise(problem), length, longest)
@@ -56,7 +57,7 @@ def average_blocks(problem: Problem, count: int) -> Problem:
 
 
 def _blocks(problem: Problem, length: int, longest: float) -> Problem:
-    """Return the blocks of a given length of a run, but for those that last longer than they may."""
+    """Return the blocks of a given length (epochs) of a run, except those that last longer than `longest` seconds."""
     blocks = problem.epochs // length
     times = problem.times[: blocks * length].reshape(blocks, length)
     kept = np.flatnonzero(times[:, -1] - times[:, 0] <= longest)
@@ -64,7 +65,7 @@ def _blocks(problem: Problem, length: int, longest: float) -> Problem:
     place = np.full(problem.epochs, -1)
     place[(kept[:, None] * length + np.arange(length)).ravel()] = np.repeat(np.arange(len(kept)), length)
     since = np.zeros(problem.epochs)
-    # seconds since the middle of the own block
+    # seconds since the middle of the block of each epoch
     since[place >= 0] = (times[kept] - middle[:, None]).ravel()
     when = _Blocks(place, since, middle)
     present = np.asarray((problem.weight > 0.0).reshape(-1, problem.count).all(0))
@@ -99,10 +100,10 @@ class _Blocks:
 
 @dataclass(frozen=True, slots=True)
 class _Mean:
-    """Which rows of a kind meet in which rows of the blocks: sorted by block, with their coefficients.
+    """The old rows of a kind in each new row, sorted by block, with their coefficients.
 
     `order` are rows of the kind, `head` the first entry of each new row among them, `row` the new row of each entry.
-    `first` is the global number of one row that goes into each new row.
+    `first` is the global number of one old row in each new row.
     """
 
     order: Array
@@ -121,11 +122,12 @@ def _with_station_noise(problem: Problem) -> Problem:
 
 
 def _reference(problem: Problem, reference: float | None) -> float:
+    """Return the reference time of a motion, seconds; by default the first epoch."""
     return float(problem.times[0]) if reference is None else reference
 
 
 def _at(times: Array, rise: Array | None, middle: Array) -> Array | None:
-    """Return the known shape of a height (..., b, 2) at the middles, straight between the epochs."""
+    """Return the known shape of a height (..., b, 2) at the middles, interpolated linearly between epochs."""
     if rise is None:
         return None
     after = np.clip(np.searchsorted(times, middle), 1, len(times) - 1)
@@ -134,7 +136,7 @@ def _at(times: Array, rise: Array | None, middle: Array) -> Array | None:
 
 
 def _means(rows: Rows, when: _Blocks, present: Array, start: int, taken: int) -> _Mean:
-    """Return how the rows of a kind, of global numbers from `start` on, are averaged."""
+    """Return the averages of the rows of a kind, whose global numbers begin at `start`."""
     inside = np.flatnonzero((when.place[rows.epoch] >= 0) & present)
     key = np.stack([when.place[rows.epoch], rows.a, rows.b, rows.target])[:, inside]
     # lexsort takes its last key first: block, then stations, then target
@@ -150,11 +152,11 @@ def _means(rows: Rows, when: _Blocks, present: Array, start: int, taken: int) ->
 
 
 def _middle(since: Array, row: Array) -> Array:
-    """Return the coefficients of the line through the values of each row, taken at time zero."""
+    """Return the coefficients that give the line through the values of each row at time zero."""
     total = [np.bincount(row, since**j) for j in range(3)]
     spread = total[0] * total[2] - total[1] ** 2
-    # A line through values at one time has no slope: by Cauchy and Schwarz the spread is between zero and the product,
-    # and below a millionth of it the slope is rounding. Such rows take their plain mean.
+    # Values at one time have no slope. By the inequality of Cauchy and Schwarz the spread is between zero and the
+    # product. Below a millionth of the product the slope is rounding, so such rows use the plain mean.
     line = spread > 1e-6 * total[0] * total[2]
     slope = np.where(line, total[1], 0.0)[row] * since
     level = np.where(line, total[2], 1.0)[row]
@@ -162,11 +164,13 @@ def _middle(since: Array, row: Array) -> Array:
 
 
 def _average_rows(rows: Rows, mean: _Mean) -> Rows:
+    """Return the averaged rows of one kind."""
+
     def middle(values: Array, wrapped: bool) -> Array:
         sorted_, base = values[..., mean.order], np.zeros(())
         if wrapped:
             base = sorted_[..., mean.head]
-            # angles are averaged about the first of their row: within half a turn of it there is no cut
+            # angles are averaged relative to the first angle of their row: within half a turn of it there is no jump
             sorted_ = wrap(sorted_ - base[..., mean.row])
         if not len(mean.head):
             return sorted_
@@ -174,12 +178,13 @@ def _average_rows(rows: Rows, mean: _Mean) -> Rows:
 
     one = mean.order[mean.head]
     z = middle(rows.z, MODELS[rows.kind].period is not None)
-    # weights are in the noise of the new rows: a row of the blocks is there or it is not
+    # the weights of old rows are in the noise of the new rows, so new rows have weight one
     weight, correction = np.ones(len(one)), middle(rows.correction, wrapped=False)
     return Rows(rows.kind, z, rows.a[one], rows.b[one], mean.block, rows.target[one], weight, correction)
 
 
 def _stations(stations: Stations, when: _Blocks) -> Stations:
+    """Return the stations with positions, velocities and axes averaged over blocks."""
     inside = np.flatnonzero(when.place >= 0)
     coefficient = _middle(when.since[inside], when.place[inside])
     head = np.flatnonzero(np.diff(when.place[inside], prepend=-1))
@@ -187,7 +192,7 @@ def _stations(stations: Stations, when: _Blocks) -> Stations:
     def middle(values: Array | None, core: int) -> Array | None:
         if values is None or values.shape[-core] == 1:
             return values
-        # epochs last: reduceat adds along it
+        # epochs last: reduceat adds along the last axis
         moved = np.moveaxis(values, -core, -1)[..., inside]
         return np.moveaxis(np.add.reduceat(moved * coefficient, head, axis=-1), -1, -core)
 
@@ -195,15 +200,15 @@ def _stations(stations: Stations, when: _Blocks) -> Stations:
     assert position is not None
     axes = middle(stations.axes, 4)
     if axes is not None and axes is not stations.axes:
-        left, _, right = np.linalg.svd(axes)  # the rotation next to the mean of rotations
+        left, _, right = np.linalg.svd(axes)  # the rotation nearest to the mean of rotations
         axes = left @ right
     return replace(stations, position=position, velocity=middle(stations.velocity, 3), axes=axes)
 
 
 def _noise(problem: Problem, means: list[_Mean], block: Array) -> Noise:
-    """Return the covariance of the new rows: C R C', of which rows of one block are kept together."""
+    """Return the covariance of the new rows, C R C', with one block per time block."""
     count, size = problem.count, sum(len(mean.head) for mean in means)
-    # C (new rows, old rows) is as sparse as the averages are
+    # C (new rows, old rows) is sparse
     entries = [(mean.taken + mean.row, mean.start + mean.order, mean.coefficient) for mean in means]
     place, old, coefficient = (np.concatenate([entry[i] for entry in entries]) for i in range(3))
     C = sparse.csr_array((coefficient, (place, old)), shape=(size, count))
@@ -217,7 +222,7 @@ def _noise(problem: Problem, means: list[_Mean], block: Array) -> Noise:
 
 
 def _sparse(problem: Problem) -> sparse.csr_array:
-    """Return the covariance of all rows; of a batch, the mean."""
+    """Return the covariance of all rows; for a batch, the mean."""
     parts = []
     for block in problem.noise.blocks:
         covariance = block.covariance.reshape(-1, *block.covariance.shape[-3:]).mean(0)
@@ -228,8 +233,8 @@ def _sparse(problem: Problem) -> sparse.csr_array:
 
 
 def _bias(bias: Bias, first: Array) -> Bias:
-    """Return the touches of the new rows: those of one row that went into each."""
-    # rows that meet in one have the same stations and target: a bias touches all of them alike
+    """Return the bias with the effect on the new rows, taken from one old row of each."""
+    # old rows of one new row have the same stations and target, so a bias affects all of them equally
     new = np.full(int(max(first.max(initial=0), bias.row.max(initial=0))) + 1, -1)
     new[first] = np.arange(len(first))
     kept = new[bias.row] >= 0

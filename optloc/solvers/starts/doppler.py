@@ -1,4 +1,4 @@
-"""Starts from Doppler shifts: rows made few enough for the relaxation, with range rows and a known height beside."""
+"""Starts from Doppler shifts: a relaxation with a limited number of rows, range rows, and a known height."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ _AXES = WGS84_A * np.array([1.0, 1.0, 1.0 - WGS84_F])
 
 
 def has_doppler_of_rest(problem: Problem) -> bool:
-    """Return whether a single source at rest is sought, and rows tell its range rates."""
+    """Return whether the only target is a source at rest, and rows measure its range rates."""
     if len(problem.motions) != 1 or problem.stations.velocity is None:
         return False
-    motion, told = problem.motions[0], any(_rates(rows) != (0, 0) for rows in problem.rows)
-    return told and motion.known is None and motion.order == 0 and motion.span == "run"
+    motion, measured = problem.motions[0], any(_rates(rows) != (0, 0) for rows in problem.rows)
+    return measured and motion.known is None and motion.order == 0 and motion.span == "run"
 
 
 def doppler_starts(problem: Problem) -> Array:
     """Return candidates of a flat batch of sources at rest from their Doppler shifts, one by one.
 
-    Rows of range rates and of sums of ranges are used, those of other kinds are the refinement's. Where they are too
-    many, those of the same stations are joined to normal points, or taken at even steps.
+    The relaxation uses rows of range rates and of sums of ranges; the refinement uses all rows. If there are too many
+    rows, rows of the same stations are averaged to normal points, or every other block is taken.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def doppler_starts(problem: Problem) -> Array:
     Returns
     -------
     array (N, q, d) or (N, q, size)
-        Metres; positions where a single one is sought, else full vectors. NaN where there is none.
+        Positions, metres, for problems of one position, else full vectors. NaN in empty slots.
     """
     size, d = problem.batch_shape[0], problem.dimension
     position = np.full((size, 1 + 2 * d, d), np.nan)
@@ -63,21 +63,21 @@ def doppler_starts(problem: Problem) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class _DopplerNotes:
-    """The rows that the relaxation takes, of all problems of a batch: numbers (m,) or (N, m) of each.
+class _DopplerRows:
+    """The rows in the relaxation, for all problems of a batch: numbers (m,) or (N, m) of each.
 
     Parameters
     ----------
     row : int array (m,)
         Number in the problem.
     epoch, a, b : int array (m,)
-        When, and at which stations; b is -1 where there is none.
+        Epoch and stations; b is -1 for a single station.
     group : int array (m,)
         Equal for rows of one kind at the same stations.
     rates, ranges : array (m, 2)
-        What it adds up of both stations' range rates and ranges.
+        Coefficients of the range rates and ranges of both stations.
     design : array (m, n)
-        What the shared unknowns add.
+        Coefficients of the shared unknowns.
     """
 
     row: Array
@@ -89,12 +89,13 @@ class _DopplerNotes:
     ranges: Array
     design: Array
 
-    def take(self, index: Array) -> _DopplerNotes:
+    def take(self, index: Array) -> _DopplerRows:
         """Return some of the rows."""
-        return _DopplerNotes(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+        return _DopplerRows(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
-def _gather(problem: Problem) -> _DopplerNotes:
+def _gather(problem: Problem) -> _DopplerRows:
+    """Return the rows in the relaxation, with groups and coefficients."""
     shared, parts = problem.layout.n_shared, list(_parts(problem))
     row, epoch, a, b, kind, rates, ranges = (np.concatenate(values) for values in zip(*parts, strict=True))
     design = np.zeros((problem.count, shared))
@@ -102,11 +103,11 @@ def _gather(problem: Problem) -> _DopplerNotes:
         mine = links.adds.column < shared
         np.add.at(design, (start + links.adds.row[mine], links.adds.column[mine]), links.adds.coefficient[mine])
     _, group = np.unique(np.stack([kind, a, b]), axis=1, return_inverse=True)
-    return _DopplerNotes(row, epoch, a, b, group.reshape(-1), rates, ranges, design[row])
+    return _DopplerRows(row, epoch, a, b, group.reshape(-1), rates, ranges, design[row])
 
 
 def _parts(problem: Problem) -> Iterator[tuple[Array, ...]]:
-    """Yield number, epoch, stations, kind and coefficients of the rows that the relaxation takes."""
+    """Yield number, epoch, stations, kind and coefficients of the rows in the relaxation."""
     for i, (rows, start) in enumerate(zip(problem.rows, problem.starts, strict=True)):
         rates, ranges = _rates(rows), _ranges(rows)
         count = rows.count if rates != (0, 0) or ranges != (0, 0) else 0
@@ -118,28 +119,29 @@ def _parts(problem: Problem) -> Iterator[tuple[Array, ...]]:
 
 
 def _rates(rows: Rows) -> tuple[int, int]:
-    """Return what rows add up of the range rates of their first and second station."""
+    """Return the coefficients of the range rates at the first and second station of rows; (0, 0) without rates."""
     model = MODELS[rows.kind]
     return model.signs if model.signs is not None and model.nodes == ((1.0, "range_rate"),) else (0, 0)
 
 
 def _ranges(rows: Rows) -> tuple[int, int]:
-    # an unknown emission time is one of an epoch each: those rows are left to the refinement
+    """Return the coefficients of the ranges at the first and second station of rows; (0, 0) without ranges."""
+    # rows with an unknown emission time in each epoch are used by the refinement only
     model = MODELS[rows.kind]
     return (0, 0) if model.ranges is None or model.emission else model.ranges
 
 
-def _start(problem: Problem, i: int, every: _DopplerNotes, surface: Ellipsoid | None) -> Array:
+def _start(problem: Problem, i: int, every: _DopplerRows, surface: Ellipsoid | None) -> Array:
     """Return the points (1 + 2 d, d) of one problem."""
     one = problem.take(np.array([i]))
     z, weight = one.observed[0, every.row], np.broadcast_to(one.weight, (1, one.count))[0, every.row]
     present = (weight > 0.0) & np.isfinite(z)
-    told, z, weight = every.take(present), z[present], weight[present]
+    rows, z, weight = every.take(present), z[present], weight[present]
     nowhere = np.full((1 + 2 * problem.dimension, problem.dimension), np.nan)
-    if not told.rates.any():
+    if not rows.rates.any():
         return nowhere
-    pick, values, sigma = _few(one, told, z, weight)
-    chosen = told.take(pick)
+    pick, values, sigma = _few(one, rows, z, weight)
+    chosen = rows.take(pick)
     nodes, ranges, rates = _nodes(one, chosen)
     if sigma is None:
         scale = np.sqrt(weight)
@@ -154,47 +156,48 @@ def _start(problem: Problem, i: int, every: _DopplerNotes, surface: Ellipsoid | 
     return found if surface is None else problem.frame.from_ecef(found)
 
 
-def _few(problem: Problem, told: _DopplerNotes, z: Array, weight: Array) -> tuple[Array, Array, Array | None]:
-    """Return the rows that are used, their values, and standard deviations where they stand for several."""
-    if _size(problem, told) <= SIZE:
+def _few(problem: Problem, rows: _DopplerRows, z: Array, weight: Array) -> tuple[Array, Array, Array | None]:
+    """Return the numbers of the rows used, their values, and standard deviations if they are normal points."""
+    if _size(problem, rows) <= SIZE:
         return np.arange(len(z)), z, None
-    time = problem.times[told.epoch]
-    parts = [np.flatnonzero(told.group == group) for group in np.unique(told.group)]
-    # the shortest blocks that are few enough; a row adds an entry of its own at least
+    time = problem.times[rows.epoch]
+    parts = [np.flatnonzero(rows.group == group) for group in np.unique(rows.group)]
+    # the shortest blocks that are few enough; each row adds at least one entry
     for length in range(max(2, len(z) // SIZE), 1 + max(2, *map(len, parts))):
         cut = [part[block] for part in parts for block in blocks(time[part], length)]
         pick = np.array([block[len(block) // 2] for block in cut])
-        if _size(problem, told.take(pick)) <= SIZE:
+        if _size(problem, rows.take(pick)) <= SIZE:
             break
-    # stations that are too many as they are: every other block, every third, ...
-    steps = (step for step in range(1, len(cut)) if _size(problem, told.take(pick[::step])) <= SIZE)
-    sigma = np.sqrt(variances(problem.noise, problem.count)[..., told.row].reshape(-1, len(z))[0] / weight)
+    # for too many stations: every other block, every third block, and so on
+    steps = (step for step in range(1, len(cut)) if _size(problem, rows.take(pick[::step])) <= SIZE)
+    sigma = np.sqrt(variances(problem.noise, problem.count)[..., rows.row].reshape(-1, len(z))[0] / weight)
     return normal_points(time, z, sigma, cut[:: next(steps, len(cut))])
 
 
-def _size(problem: Problem, told: _DopplerNotes) -> int:
-    _, ranges, rates = _nodes(problem, told)
-    return lifted_size(problem.dimension, ranges, rates, told.design[:, told.design.any(axis=0)])
+def _size(problem: Problem, rows: _DopplerRows) -> int:
+    """Return the size of the lifted matrix of the relaxation with these rows."""
+    _, ranges, rates = _nodes(problem, rows)
+    return lifted_size(problem.dimension, ranges, rates, rows.design[:, rows.design.any(axis=0)])
 
 
-def _nodes(problem: Problem, told: _DopplerNotes) -> tuple[Array, Array, Array]:
-    """Return the nodes (M, 2) of rows, epoch and station each, and what rows add up of their ranges and rates."""
+def _nodes(problem: Problem, rows: _DopplerRows) -> tuple[Array, Array, Array]:
+    """Return the nodes (M, 2) of rows, epoch and station, and the coefficients of their ranges and rates."""
     stations = problem.stations
     assert stations.velocity is not None
     stays = stations.position.shape[-3] == 1 and stations.velocity.shape[-3] == 1
-    epoch = np.zeros_like(told.epoch) if stays else told.epoch
-    ends = np.stack([np.stack([epoch, station], axis=1) for station in (told.a, told.b)], axis=1)
+    epoch = np.zeros_like(rows.epoch) if stays else rows.epoch
+    ends = np.stack([np.stack([epoch, station], axis=1) for station in (rows.a, rows.b)], axis=1)
     known = ends[..., 1] >= 0
     nodes, at = np.unique(ends[known], axis=0, return_inverse=True)
     row, side = np.nonzero(known)
-    out = np.zeros((2, len(told.row), len(nodes)))
-    np.add.at(out[0], (row, at.reshape(-1)), told.ranges[row, side])
-    np.add.at(out[1], (row, at.reshape(-1)), told.rates[row, side])
+    out = np.zeros((2, len(rows.row), len(nodes)))
+    np.add.at(out[0], (row, at.reshape(-1)), rows.ranges[row, side])
+    np.add.at(out[1], (row, at.reshape(-1)), rows.rates[row, side])
     return nodes, out[0], out[1]
 
 
 def _moving(problem: Problem, nodes: Array, geocentric: bool) -> tuple[Array, Array]:
-    """Return places and velocities (M, d) of nodes."""
+    """Return positions and velocities (M, d) of nodes."""
     stations = problem.stations
     assert stations.velocity is not None
     place, speed = (

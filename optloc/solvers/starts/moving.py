@@ -1,8 +1,8 @@
-"""Starts of a target whose velocity is unknown, from range rates of one epoch: boxes of all space in best-first order.
+"""Starts of a target with unknown velocity from range rates of one epoch: a best-first search over boxes of all space.
 
-Given the position, rates are linear in the velocity, which is taken off at the centre of each box. Over the box the
-lines of sight turn, by so much that a velocity of known size changes no residual by more than a bound says; boxes are
-looked at in the order of the bounds that are left.
+Given the position, rates are linear in the velocity, which is eliminated at the centre of each box. Over the box the
+lines of sight turn. For a velocity of limited size, the search bounds the change of the residuals by this turn.
+It takes boxes in the order of these bounds.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI, RATE, SLOPE0
 from optloc.proof.position_costs import PositionCosts, position_costs
 from optloc.proof.scope import is_run, is_scaled, why_unsupported
 
-# Boxes for each problem, by its dimension; centres that are kept, the cheapest of them. In space 600 boxes missed the
-# best place of 10 emitters of 100, and 2 400 none.
+# Boxes for each problem, by its dimension, and the number of cheapest centres kept. In space 600 boxes missed the best
+# position of 10 emitters of 100, and 2 400 boxes missed none.
 _BUDGET, _MOST = {2: 900, 3: 2400}, 24
-# Metres per second that a target is taken to move at most: above what flies in the air. It orders boxes, and no more: a
-# faster one is found by those that are cheap all the same.
+# Greatest assumed speed of a target, metres per second: above any aircraft. It only sets the order of boxes, so a
+# faster target is usually found too.
 _SPEED = 700.0
-# Remainder of a direction that is turned: see `optloc.proof.nodes.rate`, and Legendre's polynomials, n = 2.
+# Constant in the remainder of a turned direction: see `optloc.proof.nodes.rate`, and Legendre's polynomials, n = 2.
 _TURN = 2.0 / sqrt(3.0)
 # Centres nearer to each other than this share of their distance from the stations are one start.
 _APART = 0.1
 
 
 def moves_at_once(problem: Problem) -> bool:
-    """Return whether all that needs a start is the position of one target of unknown velocity, at one epoch."""
+    """Return whether only the position of one target needs a start, whose velocity is unknown, at one epoch."""
     if len(problem.motions) != 1 or problem.motions[0].order != 1 or problem.motions[0].known is not None:
         return False
     if problem.epochs > 1 or exact(problem) or not any(slot.name == "velocity" for slot in problem.layout.shared):
@@ -47,19 +47,19 @@ def moves_at_once(problem: Problem) -> bool:
 
 
 def problem_at_rest(problem: Problem) -> Problem:
-    """Return the problem of a target that stays: priors on its velocity have nothing to say then."""
+    """Return the problem with its target at rest, without priors on the velocity."""
     motions = tuple(replace(motion, order=0) for motion in problem.motions)
     priors = tuple(prior for prior in problem.priors if prior.name != "velocity")
     return replace(problem, motions=motions, priors=priors)
 
 
 def moving_starts(problem: Problem) -> Array:
-    """Return the cheapest positions (N, q, d) that a best-first search of a flat batch meets; NaN behind the last.
+    """Return the cheapest positions (N, q, d) that a best-first search of a flat batch finds; NaN after the last.
 
     Parameters
     ----------
     problem : Problem
-        N problems of which `moves_at_once` holds.
+        N problems for which `moves_at_once` is true.
     """
     costs, d = position_costs(problem_at_rest(problem)), problem.dimension
     out = np.full((problem.batch_shape[0], _MOST, d), np.nan)
@@ -104,7 +104,7 @@ def _whole(piece: int, d: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def _apart(met: list[tuple[float, tuple[float, ...]]], middle: Array) -> Array:
-    """Return the cheapest of the places that were met, each apart from those before."""
+    """Return the cheapest of the positions found, each far from the cheaper ones."""
     out: list[Array] = []
     for _, place in sorted(met):
         x = np.array(place)
@@ -117,9 +117,10 @@ def _apart(met: list[tuple[float, tuple[float, ...]]], middle: Array) -> Array:
 
 
 class _MovingRows:
-    """Whitened rows, and what they say over a box of an atlas when the velocity is the best one for its centre."""
+    """Whitened rows, and bounds of their residuals over a box of an atlas, for the best velocity at its centre."""
 
     def __init__(self, K: Array, w: Array, data: Array, rates: Array) -> None:
+        """Store whitened rows K, right sides w, and the stations of the rates."""
         self.K, self.w, self.rates, self.stations = K, w, rates, data[rates, :3]
 
     def bound(self, atlas: Atlas, nodes: Array, half: Array, d: int) -> tuple[float, float, int]:
@@ -147,10 +148,10 @@ class _MovingRows:
         return atlas.point[:d] - atlas.scale[0] * a, slants
 
     def _turned(self, pull: Array, sight: Array, slants: Array, length: Array, half: Array) -> float:
-        """Return how much of a residual one metre per second can change over the box, as lines of sight turn."""
+        """Return the largest change of a residual over the box per metre per second, as lines of sight turn."""
         reach = np.sqrt(((np.abs(slants) @ half) ** 2).sum(-1))
         share = np.where(length > 0.0, reach / np.where(length > 0.0, length, 1.0), np.inf)
-        near = share < 1.0  # elsewhere a station may be in the box, and its line point anywhere
+        near = share < 1.0  # elsewhere the station may be in the box, so that the line may have any direction
         k = np.where(near, share, 0.0)
         slope = slants - sight[:, :, None] * np.einsum("ni,nik->nk", sight, slants)[:, None]
         first = np.einsum("n,nik->ik", np.where(near, pull / np.where(near, length, 1.0), 0.0), slope)

@@ -1,12 +1,12 @@
-"""Starts where azimuths count from an unknown direction: offsets from known targets, from located ones, or from turns.
+"""Starts for azimuths with unknown offsets: from known targets, from located targets, or from a grid of turns.
 
-An offset of azimuths without a prior, or with a wide one, may be any part of a turn. Closed forms take offsets for
-their prior means, and least squares does not turn back what is off by a right angle. Three rules find each offset:
+An offset of azimuths without a prior, or with a wide one, may be any part of a turn. Closed forms set offsets to their
+prior means, and least squares does not correct an offset that is wrong by a right angle. Three rules find each offset:
 
-1. If the station measures targets of known place, the offset is the circular mean of ``z - h(x)`` over these rows.
+1. If the station measures targets of known position, the offset is the circular mean of ``z - h(x)`` over these rows.
    These rows also overrule a narrow prior.
 2. Else the rows of oriented stations locate the targets, and rule 1 applies to the located targets.
-3. Else nothing locates a target. Then a grid of turns is tried for the offset with the most rows.
+3. Else no target can be located. Then a grid of turns is tried for the offset with the most rows.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import pack
 
-# Radians of a prior standard deviation beyond which the prior mean is no start: refinement comes back from errors of 80
+# Standard deviation of a prior, radians, above which its mean is no start. Refinement recovers from errors of 80
 # degrees, which is three such deviations.
 _WIDE = 0.5
 # Turns that are tried: one of them is within 15 degrees of the offset.
 _TURNS = 12
-# Offsets that are tried by turns: with two oriented stations targets are located, and orient all others.
+# Offsets for which a grid of turns is tried: two oriented stations locate targets, which orient all other stations.
 _GRIDS = 2
 
 
@@ -51,9 +51,9 @@ class Headings:
     mean : array (n,)
         Prior mean, or zero.
     known : bool array (n,)
-        Whether the prior is narrow and no target of known place is measured: then the prior mean is the start.
+        Whether the prior is narrow and no target of known position is measured: then the prior mean is the start.
     free : bool array (n,)
-        Whether there is no prior: whole turns more or less are the same.
+        Whether there is no prior, so that the offset is determined up to whole turns.
     """
 
     names: tuple[str, ...]
@@ -115,7 +115,7 @@ def oriented_starts(problem: Problem, found: Headings, start: Callable[[Problem]
         else:
             break
     out = _locate(problem, found, x, start)
-    # a station that nothing orients keeps its prior mean: the verdict names what is open
+    # a station that cannot be oriented keeps its prior mean: the verdict names the undetermined offset
     started = np.isfinite(np.delete(out, found.column, axis=-1)).all(-1, keepdims=True)
     open_still = started & np.isnan(out[..., found.column])
     out[..., found.column] = np.where(open_still, found.mean, out[..., found.column])
@@ -143,7 +143,7 @@ def _states(problem: Problem) -> Array:
 
 
 def _located(problem: Problem, x: Array) -> Array:
-    """Return a flag for each row (N, q, m) whose target has a place in vectors (N, q, size)."""
+    """Return a flag for each row (N, q, m) whose target has a position in vectors (N, q, size)."""
     count, out = len(problem.motions), np.ones((*x.shape[:2], problem.count), dtype=bool)
     target, epoch = np.concatenate([rows.target for rows in problem.rows]), problem.epoch
     for i, motion in enumerate(problem.motions):
@@ -154,7 +154,7 @@ def _located(problem: Problem, x: Array) -> Array:
 
 
 def _orient(problem: Problem, found: Headings, x: Array) -> Array:
-    """Return vectors (N, q, size) whose offsets are circular means over the rows of targets that have a place."""
+    """Return vectors (N, q, size) whose offsets are circular means over the rows of targets that have a position."""
     size, q = x.shape[:2]
     part, value = problem.take(np.repeat(np.arange(size), q)), x[..., found.column]
     bare = x.copy()
@@ -164,7 +164,7 @@ def _orient(problem: Problem, found: Headings, x: Array) -> Array:
     weight = np.broadcast_to(part.weight / variances(part.noise, part.count), (size * q, part.count))
     usable = _located(problem, x) & (weight.reshape(size, q, -1) > 0.0) & np.isfinite(left)
     left = np.where(usable, left, 0.0) - np.nan_to_num(value) @ found.touch
-    # a row with two offsets gives one of them where the other is known
+    # a row with two offsets determines one of them if the other is known
     single = np.isnan(value).astype(float) @ np.abs(found.touch) == 1.0
     share = np.where(usable & single, weight.reshape(size, q, -1), 0.0)
     sine, cosine = (
@@ -183,7 +183,7 @@ def _lacking(found: Headings, x: Array) -> Array:
 
 
 def _locate(problem: Problem, found: Headings, x: Array, start: Callable[[Problem], Array]) -> Array:
-    """Return starting vectors (N, q c, size) from the rows whose offsets (N, q, size) have a value, with these."""
+    """Return starting vectors (N, q c, size) from the rows whose offsets have a value in x (N, q, size)."""
     size, q = x.shape[:2]
     value = x[..., found.column].reshape(size * q, -1)
     part = problem.take(np.repeat(np.arange(size), q))

@@ -1,4 +1,4 @@
-"""Starts of one position without a guess, and which problems have one: closed forms give every candidate."""
+"""Starts of one position without a first guess, from closed forms; and tests of the problems that they serve."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.squared_range import Pick, candidates, stationary_points
 
-# Where other minima are looked for beside a badly determined fix. With these places the Monte Carlo of cases in
-# docs/measured/global.md misses no minimum silently.
+# Search for other minima near a weak fix. With these positions the Monte Carlo cases in docs/measured/global.md miss no
+# minimum without a warning.
 #
-# Shares of its distance: geometric, because the range of a far emitter shows only in the curvature of wave fronts,
-# which goes as one over the range.
+# Shares of the distance of the fix. They are geometric, because the range of a far emitter shows only in the curvature
+# of wave fronts, which is one over the range.
 _RADIAL = np.array([0.25, 0.45, 0.7, 1.5, 2.5, 4.0, 8.0])
-# Spreads of the stations, in its direction: outside the network, and where wave fronts are nearly flat. They serve
-# fixes among the stations, of whose distance no share leads out.
+# Spreads of the stations, in the direction of the fix: outside the network, and at nearly flat wave fronts. They serve
+# fixes between the stations, for which no share of the distance leads out.
 _FAR = np.array([3.0, 30.0])
-# Standard deviations along its longest axis: nearer than one and a half refinement leads back to it, and each doubling
-# reaches across a valley twice as long.
+# Standard deviations along the longest axis: nearer than one and a half, refinement leads back to the fix. Each
+# doubling reaches across a valley twice as long.
 _STEPS = np.array([-12.0, -6.0, -3.0, -1.5, 1.5, 3.0, 6.0, 12.0])
 
 
 def squared_range_starts(problem: Problem, pick: Pick) -> Array:
-    """Return squared-range candidates (N, q, d) of a flat batch with one static target; NaN where there is none.
+    """Return squared-range candidates (N, q, d) of a flat batch with one static target; NaN in empty slots.
 
     Parameters
     ----------
     problem : Problem
-        N problems; those whose ranges are determined are solved apart from those whose ranges share an unknown.
+        N problems. Problems with determined ranges and problems whose ranges share an unknown are solved separately.
     pick : callable
-        Which points to take, see `optloc.solvers.starts.squared_range`.
+        Selects the points, see `optloc.solvers.starts.squared_range`.
     """
     found = ranges(problem)
     if found is None or found.free.all() or not found.free.any():
         return candidates(problem, found, pick)
-    # ranges with a common unknown lie on a cone, known ones on a paraboloid: no one batch has both shapes
+    # ranges with a common unknown lead to a cone, known ranges to a paraboloid; one batch cannot have both
     parts = []
     for mask in (found.free, ~found.free):
         some = problem.take(np.flatnonzero(mask))
@@ -55,10 +55,10 @@ def squared_range_starts(problem: Problem, pick: Pick) -> Array:
 
 
 def along_the_valley(problem: Problem, position: Array, covariance: Array) -> Array:
-    """Return points (N, q, d) where other minima hide beside a badly determined fix.
+    """Return points (N, q, d) from which other minima near a weak fix can be reached.
 
-    Far emitters have a long valley towards the stations, flat networks one across their plane: other minima lie along
-    the line to the stations' centre, or along the longest axis of the error ellipsoid.
+    Far emitters have a long valley towards the stations, and flat networks have one across their plane. So other minima
+    are on the line to the centre of the stations, or along the longest axis of the error ellipsoid.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def along_the_valley(problem: Problem, position: Array, covariance: Array) -> Ar
     position : array (N, d)
         Fixes, metres.
     covariance : array (N, d, d)
-        Of the fixes; where it is not finite there are no steps along its axis.
+        Covariances of the fixes; if one is not finite, its steps along the axis are NaN.
     """
     centre, size = centre_and_spread(problem.stations.places)
     away = position - centre
@@ -76,7 +76,7 @@ def along_the_valley(problem: Problem, position: Array, covariance: Array) -> Ar
     scaled = centre[..., None, :] + _RADIAL[:, None] * away[:, None]
     far = centre[..., None, :] + _FAR[:, None] * (np.broadcast_to(size, (len(away),))[:, None] * ahead)[:, None]
     known = np.asarray(np.isfinite(covariance).all((-1, -2)))
-    # eigenvalues ascend: the last vector is the longest axis; rounding may make its square a little negative
+    # eigenvalues ascend: the last vector is the longest axis; rounding may make its square slightly negative
     values, vectors = np.linalg.eigh(np.where(known[:, None, None], covariance, 0.0))
     longest = np.sqrt(np.maximum(values[:, -1:], 0.0)) * vectors[..., -1]
     stepped = position[:, None] + _STEPS[:, None] * np.where(known[:, None], longest, np.nan)[:, None]
@@ -84,11 +84,11 @@ def along_the_valley(problem: Problem, position: Array, covariance: Array) -> Ar
 
 
 def subarray_starts(problem: Problem) -> Array:
-    """Return the candidates (N, q, d) of all arrays that lack one station; NaN where there is none."""
+    """Return the candidates (N, q, d) of all arrays that lack one station; NaN in empty slots."""
     parts = []
     for touched in rows_of_stations(problem):
         weight = np.where(touched, 0.0, np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count)))
-        # without an unheard station the problem is the same, and without the only one there is none
+        # a station without rows changes nothing, and without the only station there is no problem
         touching = np.flatnonzero((weight != problem.weight).any(1) & (weight > 0.0).any(1))
         if len(touching):
             rest = problem.with_rows(weight=weight).take(touching)
@@ -101,35 +101,35 @@ def subarray_starts(problem: Problem) -> Array:
     return np.concatenate(parts, axis=1)
 
 
-# The size of a problem: numbers of order one are what solvers need.
+# The size of a problem: solvers need numbers of order one.
 
 
 def spread_of(problem: Problem) -> tuple[Array, Array]:
     """Return the centre of the stations (N or 1, d) and their greatest distance from it (N or 1,), metres."""
     places = problem.stations.places
     centre, spread = centre_and_spread(places if places.ndim == 3 else places[None])
-    # stations at one point have no size: then a metre is as good a unit as any
+    # stations at one point have no size, so the unit is one metre
     return centre, np.where(spread > 0.0, spread, 1.0)
 
 
 def distance_of(problem: Problem, position: Array) -> Array:
-    """Return how far positions (N, ..., d) are from the stations, in units of their spread."""
+    """Return the distances of positions (N, ..., d) from the stations, in units of the spread of the stations."""
     centre, spread = spread_of(problem)
     extra = (1,) * (position.ndim - 2)
-    # a run to infinity may overflow: infinitely far is the right answer to it
+    # a run to infinity may overflow, and infinity is then the right distance
     with np.errstate(over="ignore", invalid="ignore"):
         away = position - centre.reshape(-1, *extra, centre.shape[-1])
         return np.asarray(np.sqrt((away**2).sum(-1)) / spread.reshape(-1, *extra))
 
 
 def over_ground(problem: Problem) -> bool:
-    """Return whether one position on Earth is sought, and a row or a constraint may tell its height."""
-    told = bool(problem.constraints) or any(rows.kind == "height" for rows in problem.rows)
-    return told and problem.frame.geodetic and problem.dimension == 3 and one_position(problem)
+    """Return whether the problem has one position on Earth, and a row or a constraint may give its height."""
+    has_height = bool(problem.constraints) or any(rows.kind == "height" for rows in problem.rows)
+    return has_height and problem.frame.geodetic and problem.dimension == 3 and one_position(problem)
 
 
 def is_registration_run(problem: Problem) -> bool:
-    """Return whether a problem is a run of sums or ratios of ranges whose only target lasts it, and is not one fix."""
+    """Return whether a problem is a run of range rows with one target and a geometry that moves."""
     if len(problem.motions) != 1 or problem.epochs < 2:
         return False
     motion, moving = problem.motions[0], problem.stations.position.shape[-3] > 1
@@ -137,17 +137,18 @@ def is_registration_run(problem: Problem) -> bool:
     return differences and motion.known is None and motion.span == "run" and (moving or motion.order > 0)
 
 
-# Starts from a known height: three ranges with one common unknown, or two known ranges, meet the ellipsoid.
+# Starts from a known height: intersections of the ellipsoid with three ranges with one common unknown, or with two
+# known ranges.
 
-# Choices of stations, the widest first: the first is good for most places, and the next ones guard against a target for
-# which it is ill placed. Each costs a quartic, or a relaxation of a millisecond.
+# Sets of stations, the widest first. The first set is good for most positions, and the others serve targets for which
+# it is badly placed. Each set takes a quartic, or a relaxation of a millisecond.
 _SUBSETS = 6
 # Axes of the ellipsoid in units of its equatorial radius: numbers of order one for the quartic.
 _AXES = np.array([1.0, 1.0, 1.0 - WGS84_F])
 
 
 def known_height(problem: Problem) -> Array | None:
-    """Return the height (N,) that rows or an exact constraint give, metres, or None where nothing does."""
+    """Return the height (N,) from rows or an exact constraint, metres, or None without either."""
     size = problem.batch_shape[0]
     for constraint in problem.constraints:
         if not isinstance(constraint, Band) or constraint.kind != "height":
@@ -171,12 +172,12 @@ def height_starts(problem: Problem, *, relax: bool = False) -> Array:
     problem : Problem
         N problems with one static target.
     relax : bool
-        True: the answer of the reduced semidefinite relaxation in the place of the quartic's roots, one by one.
+        True: the point of the reduced semidefinite relaxation instead of the roots of the quartic, one by one.
 
     Returns
     -------
     array (N, q, 3)
-        Metres; NaN where there is none, q = 0 where no height is known.
+        Metres; NaN in empty slots, q = 0 if no height is known.
     """
     size = problem.batch_shape[0]
     height = known_height(problem) if problem.frame.geodetic and problem.dimension == 3 else None
@@ -187,7 +188,8 @@ def height_starts(problem: Problem, *, relax: bool = False) -> Array:
     place = problem.frame.to_ecef(position[:, found.epoch, found.station]) / WGS84_A
     surface = ellipsoid(_AXES, height / WGS84_A)
     parts = []
-    # place and common unknown take three ranges and the height; the place alone takes two known ranges and the height
+    # position and common unknown need three ranges and the height; the position alone needs two known ranges and the
+    # height
     for count, mask in ((3, found.free), (2, ~found.free)):
         subsets = _subsets(place, found, mask, count)
         met = _relax if relax and count == 3 else _intersect
@@ -198,7 +200,7 @@ def height_starts(problem: Problem, *, relax: bool = False) -> Array:
 
 
 def _subsets(place: Array, found: Ranges, mask: Array, count: int) -> list[Array]:
-    """Return up to six choices of nodes (N, count) for each problem, the widest first; -1 where there is none."""
+    """Return up to six sets of nodes (N, count) for each problem, the widest first; -1 in empty slots."""
     nodes = place.shape[1]
     if not mask.any() or nodes < count:
         return []
@@ -206,11 +208,11 @@ def _subsets(place: Array, found: Ranges, mask: Array, count: int) -> list[Array
     usable = found.inside[:, choices].all(-1) & mask[:, None]
     if count == 3:
         a, b, c = (place[:, choices[:, i]] for i in range(3))
-        # twice the area of the triangle: stations in a line say the same thing
+        # twice the area of the triangle: stations in a line give no independent information
         width = np.linalg.norm(np.cross(b - a, c - a), axis=-1)
     else:
         width = np.linalg.norm(place[:, choices[:, 1]] - place[:, choices[:, 0]], axis=-1)
-    # unusable choices come last and are told by their sign
+    # unusable sets are marked by their sign and come last
     width = np.where(usable, width, -1.0)
     order = np.argsort(-width, axis=1)[:, :_SUBSETS]
     best = np.take_along_axis(width, order, axis=1)
@@ -222,7 +224,7 @@ def _subsets(place: Array, found: Ranges, mask: Array, count: int) -> list[Array
 
 
 def _relax(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:
-    """Return the answers (N, 1, 3) of the reduced relaxation, nearest to the point below the stations."""
+    """Return the points (N, 1, 3) of the reduced relaxation, nearest to the point below the stations (Earth radii)."""
     from formulations.range_height_conic import lift
 
     out = np.full((len(place), 1, 3), np.nan)
@@ -234,7 +236,7 @@ def _relax(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: 
         own = Ellipsoid(whole.shape[i], whole.centre[i])
         stations, offset = place[i, nodes[i]], found.offset[i, nodes[i]] / WGS84_A
         above = stations.mean(0)
-        # stations above the Earth see what is below them: of both places the one on their side is meant
+        # stations above the Earth measure targets below them, so of two solutions the one on their side is taken
         below = own.centre + (above - own.centre) / np.sqrt(own.polar(above, above))
         out[i, 0] = lift(stations, found.sign[i, nodes[i]].astype(float), offset, own, below).x
 
@@ -243,7 +245,7 @@ def _relax(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: 
 
 
 def _intersect(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:
-    """Return where the ellipsoid meets the ranges of some nodes, (N, 4, 3) in Earth radii."""
+    """Return the intersections of the ellipsoid with the ranges of some nodes, (N, 4, 3) in Earth radii."""
     items = np.flatnonzero(mask)
     out = np.full((len(place), 4, 3), np.nan)
     pick = items[:, None]

@@ -1,4 +1,7 @@
-"""Starts for a whole run: the minima of its block averages, from a closed form, a relaxation, mirrors and a ring."""
+"""Starts for a whole run: minima of its block averages.
+
+The minima are reached from a closed form or a relaxation, from mirror images, and from circles around the stations.
+"""
 
 from __future__ import annotations
 
@@ -29,33 +32,35 @@ from optloc.solvers.starts.block_averages import average_blocks
 from optloc.solvers.starts.position import distance_of, spread_of
 
 BLOCKS = 30
-"""Blocks that a run is averaged over: far more rows than unknowns, at a cost that does not grow with the run. Fewer and
-longer ones bend more between stations and target: what an average leaves out of a curved course."""
+"""Blocks of a run: many more rows than unknowns, at a cost that does not grow with the run.
 
-# Which minima on block averages are refined on all epochs, the expensive part: four at most, the best two in any case
-# (averaging may turn the order of a minimum and its mirror image). A difference in cost of a thousand is beyond what
-# averaging blurs.
+Fewer and longer blocks curve more between stations and target, and an average ignores this curvature.
+"""
+
+# Selection of the minima on block averages that are refined on all epochs, which is expensive. At most four are
+# refined, and always the best two, since averaging may exchange a minimum and its mirror image. Averaging never changes
+# a cost by a thousand.
 _RIVAL = 1e3
 _KEPT = 4
 # Spreads of the stations within which two minima are one: far above the tolerance of refinement, far below a rival.
 _SAME = 1e-4
-# An error of more than this share of the distance is a weak fix: then minima are sought on circles around the stations
-# and along its valley, and so they are where its chi-square is improbable.
+# Share of the distance above which an error makes a fix weak. For weak fixes, and for improbable chi-squares, minima
+# are also searched on circles around the stations and along the valley of the fix.
 _WEAK = 1e-2
-# Places on each circle: no azimuth is more than 30 degrees from one, which is near enough for blocks of little noise.
+# Positions on each circle: every azimuth is within 30 degrees of one, which is enough for blocks with low noise.
 _AZIMUTHS = 6
-# Radii in spreads of the stations: just outside and far out; without a closed form, also among the stations.
+# Radii in spreads of the stations: just outside and far out; without a closed form, also between the stations.
 _RADII = (1.5, 5.0)
 _ANYWHERE = (0.3, 0.8, 1.5, 5.0)
-# Standard deviations along the valley, doubling from one: nearer places lead back to the fix.
+# Standard deviations along the valley, doubling from one: nearer positions lead back to the fix.
 _STEPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)
-# Fixes of whole runs with an error beyond this share of their distance may have another minimum within a few sigma,
-# which block averages blur into one. Few steps: each is refined on all epochs.
+# Share of the distance above which the error of a fix of a whole run allows another minimum within a few sigma, which
+# block averages merge with it. There are few steps, since each is refined on all epochs.
 _BLURRED = 2e-3
 _BESIDE = (-6.0, -2.0, 2.0, 6.0)
-# Images of the best minimum: turns by eighths of a circle about the axis of the stations, and images of what images led
-# to, while that costs less by more than refinements of one minimum differ. Of 1 800 targets of any speed, with stations
-# in space, 3 were lost with the mirror image alone. Rounds end by themselves.
+# Images of the best minimum: turns by eighths of a circle about the axis of the stations. Images of new minima follow
+# as long as they lower the cost by more than two refinements of one minimum differ. Of 1 800 targets of any speed, with
+# stations in space, 3 were lost with the mirror image only. Rounds normally end earlier than the limit.
 _TURNS = 8
 _ROUNDS = 10
 _BETTER = 1e-3
@@ -67,10 +72,10 @@ def run_starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Ar
     Parameters
     ----------
     problem : Problem
-        N runs of one target that lasts them.
+        N runs of one target whose state lasts the run.
     begin : callable
-        Maps the block averages to starting vectors (N, C, size of theirs), or None where it cannot: the starts are
-        then places around the stations.
+        Maps the block averages to starting vectors (N, C, size of theirs), or to None if it does not apply. Positions
+        around the stations are then the starts.
     """
     groups = group_alike(problem)
     if len(groups) == 1:
@@ -83,7 +88,7 @@ def run_starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Ar
 
 
 def group_alike(problem: Problem) -> list[Array]:
-    """Return the problems of a flat batch in groups that have the same rows: these have block averages in common."""
+    """Return the item numbers of a flat batch in groups with the same rows, which share their block averages."""
     present = np.broadcast_to(problem.weight > 0.0, (problem.batch_shape[0], problem.count))
     if problem.weight.ndim == 1 or (present == present[:1]).all():
         return [np.arange(len(present))]
@@ -93,13 +98,13 @@ def group_alike(problem: Problem) -> list[Array]:
 
 def _start_group(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
     """Return starting vectors (N, C, size) of runs that have the same rows."""
-    # every candidate is refined on the averages, where a step costs next to nothing; few are on all epochs
+    # on the averages a step is cheap, so every candidate is refined there; few are refined on all epochs
     straight = _straighten(problem, local=False)
     blocks = average_blocks(straight, BLOCKS)
     x = _begin(blocks, begin)
     x = _around(blocks, _ANYWHERE) if x is None else x
     pool = _with_images(blocks, _minima(blocks, x))
-    # ring and valley only where something calls for them: they are most of the candidates
+    # circles and valley give most of the candidates, so they are used only for doubtful minima
     doubtful = np.flatnonzero(~_is_settled(blocks, pool))
     if len(doubtful):
         part = blocks.take(doubtful)
@@ -110,16 +115,16 @@ def _start_group(problem: Problem, begin: Callable[[Problem], Array | None]) -> 
 
 
 def _begin(blocks: Problem, begin: Callable[[Problem], Array | None]) -> Array | None:
-    """Return starting vectors of blocks; those whose biases walk begin as if these were offsets that drift."""
+    """Return starting vectors of blocks; for the start, biases that walk become offsets that drift."""
     steady = _straighten(blocks, local=True)
     x = begin(steady)
     return x if x is None or steady is blocks else _bend(blocks, steady, x)
 
 
 def _straighten(problem: Problem, local: bool) -> Problem:
-    """Return the problem with offsets and drifts for its walks, if `local`, or for its splines.
+    """Return the problem with offsets and drifts instead of its walks, if `local`, or instead of its splines.
 
-    A few dozen blocks determine no more of them. A problem without any is returned as it is.
+    A few dozen blocks determine only offsets and drifts. A problem without such biases is returned unchanged.
     """
     biases: list[Bias] = []
     for bias in problem.biases:
@@ -131,13 +136,13 @@ def _straighten(problem: Problem, local: bool) -> Problem:
 
 
 def _bend(problem: Problem, straight: Problem, x: Array) -> Array:
-    """Return vectors (N, C, size) of a problem from those of the same with straight biases; NaN stay NaN."""
+    """Return vectors (N, C, size) of a problem from vectors of its form with straight biases; NaN stay NaN."""
     layout, out = problem.layout, np.zeros((*x.shape[:2], problem.layout.size))
     moments = {bias.name: at(bias) for bias in problem.biases if (at := form_of(bias).values_at) is not None}
     for slot in layout.shared:
         part, own = slice(slot.start, slot.start + slot.size), straight.layout.take(x, slot.name)
         if slot.name in moments and own.shape[-1] != slot.size:
-            # a coefficient is the value of a straight line at its time
+            # a coefficient of a spline is the value of the straight line at its time
             slope = straight.layout.take(x, rate_name(slot.name))[..., None]
             own = own[..., None] + slope * (moments[slot.name] - problem.origin)
         out[..., part] = own.reshape(*x.shape[:2], -1)
@@ -159,22 +164,22 @@ def _bend(problem: Problem, straight: Problem, x: Array) -> Array:
 
 
 def _minima(blocks: Problem, x: Array) -> tuple[Array, Array]:
-    """Return the refined starts (N, C, size), the cheapest first, and their costs (N, C), infinite where lost."""
+    """Return the refined starts (N, C, size), the cheapest first, and their costs (N, C), infinite for failures."""
     cost, out = np.full(x.shape[:2], np.inf), x.copy()
     item, slot = np.nonzero(np.isfinite(x).all(-1))
     if len(item):
         done = refine(blocks, x[item, slot], item=item)
         out[item, slot] = done.x
-        # unfinished ones compete: they are refined again on all epochs
+        # unfinished ones compete too, since they are refined again on all epochs
         cost[item, slot] = np.where(np.isin(done.status, (Status.OK, Status.MAX_ITERATIONS)), done.cost, np.inf)
     return _sort(out, cost)
 
 
 def _with_images(blocks: Problem, pool: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return minima and those that images of the best lead to: of each better one, too, that is found so.
+    """Return minima, and the minima that images of the best one lead to, repeated for each better minimum.
 
-    Stations in a plane see the mirror image as well; a target that may have any speed in space is turned about the axis
-    of the stations besides.
+    Images are mirror images in the plane of the stations. In space, if the target may have any speed, turns about the
+    axis of the stations are images too.
     """
     turns, items = blocks.dimension == 3 and blocks.motions[0].order > 0, np.arange(len(pool[0]))
     for _ in range(_ROUNDS):
@@ -190,7 +195,7 @@ def _with_images(blocks: Problem, pool: tuple[Array, Array]) -> tuple[Array, Arr
 
 
 def _merge(one: tuple[Array, Array], two: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return two sets of minima as one, the cheapest first."""
+    """Return the union of two sets of minima, the cheapest first."""
     x, cost = (np.concatenate(parts, axis=1) for parts in zip(one, two, strict=True))
     return _sort(x, cost)
 
@@ -202,6 +207,7 @@ def _sort(x: Array, cost: Array) -> tuple[Array, Array]:
 
 
 def _scatter(found: tuple[Array, Array], items: Array, count: int) -> tuple[Array, Array]:
+    """Return minima of some items as arrays for all `count` items, with empty slots for the others."""
     x = np.full((count, *found[0].shape[1:]), np.nan)
     cost = np.full((count, found[1].shape[1]), np.inf)
     x[items], cost[items] = found
@@ -209,12 +215,12 @@ def _scatter(found: tuple[Array, Array], items: Array, count: int) -> tuple[Arra
 
 
 def _is_settled(blocks: Problem, pool: tuple[Array, Array]) -> Array:
-    """Return where the best minimum (N,) fits the data and has a small error: where else to look is no question."""
+    """Return flags (N,) of problems whose best minimum fits and has a small error, so that no search is needed."""
     from scipy.special import gammaincc
 
     x, cost = pool[0][:, 0], pool[1][:, 0]
     found, dof = np.isfinite(cost), np.maximum(degrees_of_freedom(blocks), 1)
-    # the chi-square of the averages, at the threshold at which a verdict calls residuals too large
+    # chi-square test of the averages, with the threshold of the verdict for large residuals
     fits = found & (gammaincc(dof / 2.0, np.where(found, cost, np.inf) / 2.0) > P_SUSPECT)
     deviation = np.sqrt(np.trace(_covariance(blocks, x), axis1=-2, axis2=-1))
     with np.errstate(invalid="ignore"):
@@ -222,7 +228,7 @@ def _is_settled(blocks: Problem, pool: tuple[Array, Array]) -> Array:
 
 
 def _covariance(blocks: Problem, x: Array) -> Array:
-    """Return the covariance of the position (N, d, d) in units of the spread of the stations."""
+    """Return the covariance of the position (N, d, d) in units of the squared spread of the stations."""
     usable = np.asarray(np.isfinite(x).all(-1))
     slot, _ = blocks.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
@@ -234,6 +240,7 @@ def _covariance(blocks: Problem, x: Array) -> Array:
 
 
 def _length(blocks: Problem) -> Array:
+    """Return the spread of the stations (N or 1,), metres."""
     return np.asarray(spread_of(blocks)[1])
 
 
@@ -258,9 +265,9 @@ def _valley(blocks: Problem, x: Array) -> Array:
 
 
 def step_beside(problem: Problem, x: Array, covariance: Array) -> Array:
-    """Return vectors (N, C, size) along the longest axis of badly determined fixes of runs; NaN for the others.
+    """Return vectors (N, C, size) along the longest axis of weak fixes of runs; NaN for the others.
 
-    Block averages blur minima that lie within a few standard deviations of each other.
+    Block averages merge minima that are within a few standard deviations of each other.
 
     Parameters
     ----------
@@ -269,7 +276,7 @@ def step_beside(problem: Problem, x: Array, covariance: Array) -> Array:
     x : array (N, size)
         Their fixes.
     covariance : array (N, d, d)
-        Of the positions, square metres.
+        Covariances of the positions, square metres.
     """
     far = distance_of(problem, problem.layout.take(x, "position")) * _length(problem)
     with np.errstate(invalid="ignore"):
@@ -289,9 +296,9 @@ def _along(problem: Problem, x: Array, covariance: Array, steps: tuple[float, ..
 
 
 def _best(blocks: Problem, x: Array, cost: Array) -> Array:
-    """Return the different minima (N, C, size) worth refining on all epochs; NaN in empty slots."""
+    """Return the distinct minima (N, C, size) to refine on all epochs; NaN in empty slots."""
     x, cost = _sort(x, cost)
-    # cheapest first: of two at one place the dearer goes
+    # sorted by cost: of two minima at one position the costlier one is dropped
     for i in np.flatnonzero(np.isfinite(cost).any(0))[1:]:
         for j in range(i):
             cost[:, i] = np.where(_at_one_place(blocks, x[:, i], x[:, j]) & np.isfinite(cost[:, j]), np.inf, cost[:, i])
@@ -303,7 +310,7 @@ def _best(blocks: Problem, x: Array, cost: Array) -> Array:
 
 
 def _at_one_place(blocks: Problem, x: Array, y: Array) -> Array:
-    """Return where the positions of two vectors (N, size) are one, as measured by the spread of the stations."""
+    """Return flags (N,) of vector pairs with equal positions, relative to the spread of the stations."""
     apart = blocks.layout.take(x, "position") - blocks.layout.take(y, "position")
     return np.asarray(np.sqrt((apart**2).sum(-1)) < _SAME * _length(blocks))
 
@@ -311,17 +318,17 @@ def _at_one_place(blocks: Problem, x: Array, y: Array) -> Array:
 def mirror_courses(blocks: Problem, x: Array) -> Array:
     """Return courses (N, C, size) mirrored at every epoch in the plane (or line) that fits the stations best."""
     apart = _apart(blocks)
-    # a plane for each epoch, as stations move; eigenvalues ascend, so the first vector is its normal
+    # stations move, so each epoch has a plane; eigenvalues ascend, so the first vector is its normal
     _, vectors = np.linalg.eigh(np.swapaxes(apart, -1, -2) @ apart)
     normal = vectors[..., 0]
     return _map_courses(blocks, x, (np.eye(blocks.dimension) - 2.0 * normal[..., None] * normal[..., None, :])[:, None])
 
 
 def turn_courses(blocks: Problem, x: Array) -> Array:
-    """Return courses (N, C (_TURNS - 1), size) turned about the longest axis of the stations, which go along with it.
+    """Return courses (N, C (_TURNS - 1), size) turned about the longest axis of the stations, relative to their centre.
 
-    A long array tells next to nothing of the angle about its axis: where a target may have any speed, there is a valley
-    all around it, with several minima.
+    A long array hardly determines the angle about its axis. If the target may have any speed, the cost has a valley
+    around the axis, with several minima.
     """
     apart = _apart(blocks)
     _, vectors = np.linalg.eigh((np.swapaxes(apart, -1, -2) @ apart).sum(1))
@@ -335,13 +342,13 @@ def turn_courses(blocks: Problem, x: Array) -> Array:
 
 
 def _apart(blocks: Problem) -> Array:
-    """Return the places of the stations about their middle (N or 1, epochs, s, d)."""
+    """Return the positions of the stations relative to their centre (N or 1, epochs, s, d), metres."""
     place = _places(blocks)
     return np.asarray(place - place.mean(-2, keepdims=True))
 
 
 def _map_courses(blocks: Problem, x: Array, maps: Array) -> Array:
-    """Return courses (N, C m, size) of which each place about the middle of the stations is mapped, at every epoch.
+    """Return courses (N, C m, size) with each position, relative to the centre of the stations, mapped at every epoch.
 
     Parameters
     ----------
@@ -349,7 +356,7 @@ def _map_courses(blocks: Problem, x: Array, maps: Array) -> Array:
         N runs.
     x : array (N, C, size)
     maps : array (N or 1, m, epochs or 1, d, d)
-        The mapped places are those of a course again where the maps are parallel; else the polynomial next to them.
+        Linear maps. If the maps of all epochs are equal, the result is a course; else it is the nearest polynomial.
     """
     order = blocks.motions[0].order
     # (k, order + 1): the course at epoch k is the sum of state_j t^j / j!
@@ -359,7 +366,7 @@ def _map_courses(blocks: Problem, x: Array, maps: Array) -> Array:
     centre = _places(blocks).mean(-2)[:, None, None]
     course = (powers @ state)[:, :, None]
     course = centre + ((course - centre)[..., None, :] @ np.swapaxes(maps, -1, -2)[:, None])[..., 0, :]
-    # images in turning planes are no polynomial: the one with least squares next to them
+    # images in turning planes are not polynomials, so a polynomial is fitted by least squares
     state = np.linalg.pinv(powers) @ course
     out = np.repeat(x[:, :, None], maps.shape[1], axis=2)
     for j, slot in enumerate(slots):
@@ -367,25 +374,25 @@ def _map_courses(blocks: Problem, x: Array, maps: Array) -> Array:
     return out.reshape(len(x), -1, x.shape[-1])
 
 
-# Starts on the block averages: a run of range differences, one target that lasts it, and unknown biases.
+# Starts on the block averages: runs of range differences, one target whose state lasts the run, and unknown biases.
 
-# Blocks that the relaxation sees: the time of a semidefinite programme grows steeply with them.
+# Blocks in the relaxation: the time of a semidefinite program grows steeply with their number.
 _WINDOWS = 6
-# It needs a prior: biases without one are taken for about this share of the largest range difference. Too loose a prior
-# leaves the lifted biases free, too tight a one pulls the start; only a start hangs on it.
+# The relaxation needs a prior. Biases without a prior get a deviation of this share of the largest range difference. A
+# wide prior leaves the lifted biases free, and a narrow one shifts the start; only a start depends on it.
 _LOOSE = 1e-2
 
 
 @dataclass(frozen=True, slots=True)
 class RegistrationRun:
-    """The range offsets of a run in units of its own size.
+    """The range offsets of a run in scaled units.
 
     Parameters
     ----------
     course : RegistrationCourse
         N problems.
     column : int array (q,)
-        Shared unknown of each bias.
+        Column of each bias in the shared unknowns.
     origin : array (d,)
         Metres.
     length, duration : float
@@ -400,7 +407,7 @@ class RegistrationRun:
 
 
 def closed_form(problem: Problem) -> Array | None:
-    """Return starting vectors (N, C, size) of runs in closed form, or None where no rows make range differences.
+    """Return starting vectors (N, C, size) of runs in closed form, or None if no rows make range differences.
 
     Parameters
     ----------
@@ -415,7 +422,7 @@ def closed_form(problem: Problem) -> Array | None:
 
 
 def place_states(problem: Problem, run: RegistrationRun, state: Array, bias: Array) -> Array:
-    """Return vectors (N, C, size) of states (N, C, order + 1, d) and biases (N, C, q) in the units of a run."""
+    """Return vectors (N, C, size) from states (N, C, order + 1, d) and biases (N, C, q) in the units of a run."""
     state = state * (run.length / run.duration ** np.arange(state.shape[2])[:, None])
     state[:, :, 0] += run.origin
     x = np.repeat(vectors(problem, None)[:, None], state.shape[1], axis=1)
@@ -427,29 +434,29 @@ def place_states(problem: Problem, run: RegistrationRun, state: Array, bias: Arr
 
 
 def run_of(problem: Problem) -> RegistrationRun | None:
-    """Return the range offsets of a flat batch of runs; None where no epoch has any."""
+    """Return the range offsets of a flat batch of runs; None if no epoch has any."""
     found = ranges(split_epochs(problem).flat())
     if found is None or not (found.free & (found.inside.sum(-1) > 1)).any():
         return None
     size, epochs = problem.batch_shape[0], problem.epochs
-    # epochs may differ in who is heard: offsets to one reference, that of most, are compared over the run
+    # Epochs may have different stations. The offsets to the most common reference are compared over the run.
     reference = _most_common(found.reference[found.free & (found.inside.sum(-1) > 1)])
     others = np.flatnonzero(np.arange(len(found.station)) != reference)
     sign = np.array([_most_common(found.sign[found.sign[:, i] != 0, i]) for i in others])
-    heard = (found.reference == reference)[:, None] & found.inside[:, others] & (found.sign[:, others] == sign)
+    present = (found.reference == reference)[:, None] & found.inside[:, others] & (found.sign[:, others] == sign)
     centre, spread = spread_of(problem)
     origin, length, since = centre.mean(0), float(spread.max()), elapsed(problem, 0)
-    # a run whose epochs are simultaneous has no duration: any unit does
+    # simultaneous epochs have no duration, so the unit is arbitrary
     duration = float(np.abs(since).max()) or 1.0
     column, effect = _effects(problem, found)
     mean, sigma = _prior(problem, column)
     course = RegistrationCourse(
         since / duration,
         (_places(problem, found.station[[reference, *others]]) - origin) / length,
-        np.where(heard, found.offset[:, others], 0.0).reshape(size, epochs, -1) / length,
+        np.where(present, found.offset[:, others], 0.0).reshape(size, epochs, -1) / length,
         sign.astype(float),
         np.moveaxis(effect[..., others], 0, -1)[None],
-        _whiten(found, others, heard).reshape(size, epochs, len(others), len(others)) * length,
+        _whiten(found, others, present).reshape(size, epochs, len(others), len(others)) * length,
         mean / length,
         sigma / length,
     )
@@ -462,7 +469,7 @@ def split_epochs(problem: Problem) -> Problem:
 
 
 def _most_common(values: Array) -> int:
-    """Return the most common of some integers; 0 of none."""
+    """Return the most common of some integers; 0 for an empty array."""
     found, count = np.unique(values, return_counts=True)
     return int(found[count.argmax()]) if len(found) else 0
 
@@ -474,21 +481,21 @@ def _places(problem: Problem, station: Array | slice = slice(None)) -> Array:
     return np.broadcast_to(place, (len(place), problem.epochs, *place.shape[2:]))
 
 
-def _whiten(found: Ranges, others: Array, heard: Array) -> Array:
-    """Return whitening matrices (N k, s - 1, s - 1) of the offsets, without those not heard."""
+def _whiten(found: Ranges, others: Array, present: Array) -> Array:
+    """Return whitening matrices (N k, s - 1, s - 1) of the offsets; zero for stations without one."""
     covariance = found.covariance[:, others][:, :, others]
-    return linalg.whitening(np.where(heard[:, :, None] & heard[:, None, :], covariance, 0.0))
+    return linalg.whitening(np.where(present[:, :, None] & present[:, None, :], covariance, 0.0))
 
 
 def _effects(problem: Problem, found: Ranges) -> tuple[Array, Array]:
-    """Return the columns (q,) of the biases that add to the offsets, and what each adds, (q, k, s).
+    """Return the columns (q,) of the biases that add to the offsets, and the effect of one unit of each, (q, k, s).
 
-    The offsets are linear in the rows: they are those of rows that hold nothing but one bias.
+    The offsets are linear in the rows. So the effect of a bias is the offsets of rows that contain only this bias.
     """
     column, unit = _units(problem)
     effect = np.zeros((len(column), problem.epochs, len(found.station)))
     if len(column):
-        # a batch whose items are the biases: each item's rows hold one unit of its bias and nothing else
+        # a batch with one item per bias: its rows contain one unit of the bias
         zero = tuple(replace(rows, correction=np.zeros(rows.count)) for rows in problem.rows)
         single = replace(problem.take(np.zeros(1, dtype=int)), rows=zero)
         same = ranges(split_epochs(single.with_rows(z=unit)).flat())
@@ -498,7 +505,7 @@ def _effects(problem: Problem, found: Ranges) -> tuple[Array, Array]:
 
 
 def _units(problem: Problem) -> tuple[Array, Array]:
-    """Return the columns (q,) of offsets and drifts of range rows, and the rows (q, m) that one unit of each makes."""
+    """Return the columns (q,) of offsets and drifts of range rows, and the rows (q, m) for one unit of each."""
     size = problem.layout.n_shared
     unit = np.zeros((size, problem.count))
     for links, start in zip(block_links(problem), problem.starts, strict=True):
@@ -510,7 +517,7 @@ def _units(problem: Problem) -> tuple[Array, Array]:
 
 
 def _prior(problem: Problem, column: Array) -> tuple[Array, Array]:
-    """Return prior means and standard deviations (q,) of some shared unknowns; infinite where there is none."""
+    """Return prior means and standard deviations (q,) of some shared unknowns; infinite without a prior."""
     mean, information = np.zeros(problem.layout.n_shared), np.zeros(problem.layout.n_shared)
     for name, value, precision in prior_parts(problem):
         slot, shared = problem.layout.find(name)
@@ -518,15 +525,15 @@ def _prior(problem: Problem, column: Array) -> tuple[Array, Array]:
             part = slice(slot.start, slot.start + slot.size)
             mean[part] = value.reshape(-1, slot.size)[0]
             information[part] = np.diagonal(precision.reshape(-1, slot.size, slot.size)[0])
-    # no information is an infinite standard deviation
+    # zero information is an infinite standard deviation
     with np.errstate(divide="ignore"):
         return mean[column], 1.0 / np.sqrt(information[column])
 
 
 def relax_run(problem: Problem) -> Array | None:
-    """Return starting vectors (N, C, size) of runs from the semidefinite relaxation, or None where it does not apply.
+    """Return starting vectors (N, C, size) of runs from the semidefinite relaxation, or None if it does not apply.
 
-    A few blocks over the whole run are used, of those in which every station is heard.
+    It uses a few blocks over the whole run in which every station has a row.
 
     Parameters
     ----------
@@ -542,12 +549,12 @@ def relax_run(problem: Problem) -> Array | None:
     size, d = len(course.offset), problem.dimension
     station, bias = (np.broadcast_to(a, (size, *a.shape[1:])) for a in (course.station, course.bias))
     whiten = np.broadcast_to(course.whiten, (size, *course.offset.shape[1:], course.offset.shape[2]))
-    # offsets are scaled: so is what they are compared with
+    # the offsets are scaled, and so is the loose prior
     loose = _LOOSE * np.abs(course.offset).max() if course.offset.size else 1.0
     sigma = np.where(np.isfinite(course.sigma), course.sigma, loose)
     found: list[list[tuple[Array, Array]]] = []
     for i in range(size):
-        # blocks in which every station is heard, spread evenly over the run
+        # blocks in which every station has a row, spread evenly over the run
         whole = np.flatnonzero((whiten[i] != 0.0).any(-1).all(-1))
         k = whole[np.unique(np.linspace(0, len(whole) - 1, _WINDOWS).round().astype(int))] if len(whole) else whole
         time = course.time[k] if order else None

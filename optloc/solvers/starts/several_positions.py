@@ -1,4 +1,4 @@
-"""Starts for more than one position: target by target, then all epochs at once, or one by one and a polynomial."""
+"""Starts for more than one position: each target separately, by a closed form for all epochs, or epoch by epoch."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from optloc.solvers.starts.angles import course_starts, course_states
 def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
     """Return one starting vector (N, 1, size) for a flat batch of problems with several targets or epochs.
 
-    A state that its rows do not tell starts from its prior, where it has one.
+    A state that its rows do not determine starts from its prior, if it has one.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         if motion.known is not None:
             continue
         names = state_names(i, len(problem.motions), motion.order)
-        # a target that no row measures keeps its prior
+        # a target without rows keeps its prior mean
         state = np.full((len(x), problem.epochs, len(names), problem.dimension), np.nan)
         if any((rows.target == i).any() for rows in problem.rows):
             state = _state(_isolate(problem, i), fixed)
@@ -50,7 +50,7 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
             slot, shared = problem.layout.find(name)
             if shared:
                 own, found = slice(slot.start, slot.start + slot.size), state[:, 0, j]
-                usable = np.isfinite(found) | (name not in known)  # else its prior mean, which stands there
+                usable = np.isfinite(found) | (name not in known)  # otherwise the prior mean, which is in x, is kept
                 x[:, 0, own] = np.where(usable, found, x[:, 0, own])
                 continue
             for k in range(problem.epochs):
@@ -60,11 +60,11 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
 
 
 def _isolate(problem: Problem, target: int) -> Problem:
-    """Return the problem of one target: its rows and nothing else unknown."""
+    """Return the problem of one target: its rows, without other unknowns."""
     problem = without_biases(problem)
     problem = _take_rows(problem, target) if len(problem.motions) > 1 else problem
     motion = problem.motions[target]
-    # What bounds a target at its reference time alone may not hold at others, but a known height is a good start.
+    # A constraint at the reference time may not hold at other times, but a known height is a good start.
     constraints = tuple(
         replace(c, target=0)
         for c in problem.constraints
@@ -74,6 +74,7 @@ def _isolate(problem: Problem, target: int) -> Problem:
 
 
 def _along(constraint: Band | Polygon) -> bool:
+    """Return whether a constraint holds along the whole course."""
     return isinstance(constraint, Band) and constraint.along
 
 
@@ -99,14 +100,14 @@ def _take_rows(problem: Problem, target: int) -> Problem:
 
 
 def _take_noise(noise: Noise, kept: Array, count: int) -> Noise:
-    """Return the noise of some of the rows, which are numbered anew in their order."""
-    # new number of each row; -1 for those that go
+    """Return the noise of some of the rows, which get new numbers in their order."""
+    # new number of each row; -1 for dropped rows
     number = np.full(count, -1)
     number[kept] = np.arange(len(kept))
     blocks = []
     for block in noise.blocks:
         present = number[block.row] >= 0
-        # groups of a block may lose different rows: those that lose the same ones stay a block
+        # groups of a block may lose different rows; groups that lose the same rows stay one block
         for pattern in np.unique(present, axis=0):
             inside = np.flatnonzero(pattern)
             if not len(inside):
@@ -118,24 +119,24 @@ def _take_noise(noise: Noise, kept: Array, count: int) -> Noise:
 
 
 def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
-    """Return the state (N, k or 1, order + 1, d) of the only target; NaN where it has no fix."""
+    """Return the state (N, k or 1, order + 1, d) of the only target; NaN without a fix."""
     motion, size = problem.motions[0], problem.batch_shape[0]
     if one_position(problem):
         position = fixed(problem_at_rest(problem)).position
         state = np.zeros((size, 1, motion.order + 1, problem.dimension))
         state[:, 0, 0] = position
         return state
-    # rows of single stations make one fix whenever they were measured, as long as the target stays
+    # rows of single stations give one fix, measured at any time, if the target is at rest
     if _meets(problem):
         return fixed(_merge_epochs(problem)).position[:, None, None]
-    # closed forms of whole courses first: epochs by themselves need not determine a position at all
+    # closed forms of whole courses come first: a single epoch need not determine a position
     ahead = course_starts(problem) if motion.span == "run" else None
     if ahead is not None and np.isfinite(ahead).all():
         return ahead[:, None]
     seen = course_states(problem) if motion.span == "run" else None
     if seen is not None and np.isfinite(seen).all():
         return seen[:, None]
-    # else epoch by epoch, and a polynomial through the fixes: rough where epochs are weak, but a start
+    # else epoch by epoch, and a polynomial through the fixes: inaccurate for weak epochs, but good enough as a start
     free = by_epoch(without_epoch_correlation(replace(problem, motions=(Motion(span="epoch", rise=motion.rise),))))
     fix = fixed(free.flat()).reshape((size, problem.epochs))
     if motion.span == "epoch":
@@ -143,21 +144,21 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         state[:, :, 0] = _fill_gaps(fix.position)
         return state
     state = _polynomial(fix, elapsed(problem, 0), motion.order)
-    # where the course from angles alone exists it is the better one: it has seen all epochs at once
+    # the course from angles is better, since it uses all epochs
     if seen is not None:
         state = np.where(np.isfinite(seen).all((-2, -1), keepdims=True), seen, state)
     return state[:, None]
 
 
 def _meets(problem: Problem) -> bool:
-    """Return whether the rows of one target that stays meet in one epoch: it takes no two of them to make a range."""
+    """Return whether the rows of one target at rest may be merged into one epoch: each row has one station only."""
     motion = problem.motions[0]
     alone = all(MODELS[rows.kind].stations < 2 for rows in problem.rows)
     return motion.order == 0 and motion.span == "run" and alone and not problem.emitting
 
 
 def _merge_epochs(problem: Problem) -> Problem:
-    """Return the problem of a target that stays as one epoch: every place it was measured from is a station."""
+    """Return the problem of a target at rest as one epoch: every position of a station becomes a station."""
     s = problem.stations
     nodes = [np.where(rows.a < 0, -1, rows.epoch * s.count + rows.a) for rows in problem.rows]
     used = np.unique(np.concatenate(nodes))
@@ -183,9 +184,9 @@ def _merge_epochs(problem: Problem) -> Problem:
 
 
 def _fill_gaps(position: Array) -> Array:
-    """Return positions (N, k, d) in which an epoch without a fix takes that of the last one before, or of the first."""
+    """Return positions (N, k, d) in which an epoch without a fix takes the last fix before it, or the first fix."""
     found = np.asarray(np.isfinite(position).all(-1))
-    # index of the last fix so far; -1 before the first, which takes the first
+    # index of the last fix so far; -1 before the first fix
     last = np.maximum.accumulate(np.where(found, np.arange(position.shape[1]), -1), axis=1)
     taken = np.where(last < 0, found.argmax(1)[:, None], last)
     return np.take_along_axis(position, taken[..., None], axis=1)
@@ -195,7 +196,7 @@ def _polynomial(fix: Fix, since: Array, order: int) -> Array:
     """Return the state (N, order + 1, d) of the polynomial nearest to the fixes (N, k), weighted by their variances."""
     variance = np.trace(fix.covariance(), axis1=-2, axis2=-1)
     good = fix.answered & np.isfinite(variance) & np.isfinite(fix.position).all(-1)
-    # a fix counts by its own variance; epochs without one not at all
+    # a fix has the weight of its variance; epochs without a fix have weight zero
     weight = np.where(good, 1.0 / np.where(good, variance, 1.0), 0.0)
     design = np.stack([since**j / factorial(j) for j in range(order + 1)], axis=-1)
     weighted = np.swapaxes(design, -1, -2) * weight[:, None, :]

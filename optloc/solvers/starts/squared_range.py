@@ -22,16 +22,15 @@ from optloc.problem.problem import Problem
 Factor = Callable[[Array | None], Array]
 """Maps points (N, d), or None, to the error of a row per unit of error of its measurement, (N, m)."""
 
-# Scaled distance, and factor, below which a row is weighed as if it were there: an answer on a station, or on the line
-# of a bearing's singularity, must not give one row all the weight. A thousandth of the network is nearer than any start
-# has to be right.
+# Least scaled distance, and least factor, for the weight of a row. Otherwise a point on a station, or on the singular
+# line of a bearing, would give one row all the weight. No start needs an accuracy of a thousandth of the network.
 _NEAR = 1e-3
 
-# Share of the right sides' squares by which equal costs differ: rounding.
+# Rounding error of equal costs, as a share of the squares of the right sides.
 _ALIKE = 1e-12
 
 Pick = Callable[[Array, Array, Quadric], tuple[Array, Array]]
-"""Maps rows (N, m, n), right sides (N, m) and the quadric to points (N, q, n), and which of them exist (N, q)."""
+"""Maps rows (N, m, n), right sides (N, m) and the quadric to points (N, q, n), and flags (N, q) of valid ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +46,7 @@ class Squared:
     scale : array (N,)
         Metres.
     ranged, ranged_right : array (N, s, n), (N, s)
-        One row for each station; zero where it has none.
+        One row for each station; zero for a station without one.
     whiten : array (N or 1, s, s)
         Whitening matrix of the least-squares ranges, 1/metres.
     place : array (N, s, d)
@@ -67,10 +66,10 @@ class Squared:
 
 
 def candidates(problem: Problem, found: Ranges | None, pick: Pick) -> Array:
-    """Return starting positions (N, q, d) of a flat batch of problems with one static target; NaN where there is none.
+    """Return starting positions (N, q, d) of a flat batch of problems with one static target; NaN in empty slots.
 
-    Two weightings: the first takes all ranges as equal, the second divides by twice the ranges to the first
-    answer, which turns the error of a squared range into that of a range.
+    There are two weightings. The first gives all ranges equal weight. The second divides by twice the ranges to the
+    first point, which turns the error of a squared range into the error of a range.
 
     Parameters
     ----------
@@ -79,7 +78,7 @@ def candidates(problem: Problem, found: Ranges | None, pick: Pick) -> Array:
     found : Ranges, optional
         Its least-squares ranges.
     pick : callable
-        Which points of a squared-range problem to take: `minimum`, `every`, `shor` or `hull`.
+        Selects points of a squared-range problem: `minimum`, `every`, `shor` or `hull`.
 
     References
     ----------
@@ -91,24 +90,25 @@ def candidates(problem: Problem, found: Ranges | None, pick: Pick) -> Array:
     point = np.where(np.isfinite(first[:, 0]), first[:, 0], 0.0)
     distance = np.maximum(np.sqrt(((point[:, None, :] - squared.place) ** 2).sum(-1)), _NEAR)
     second = _pick(squared, distance, point, pick)
-    # both weightings have stationary points of their own; of a single answer the better weighted one is enough
+    # the two weightings have different stationary points; for a single point the second weighting is enough
     points = np.concatenate([second, first], axis=1) if pick is stationary_points else second
     return points * squared.scale[:, None, None] + squared.origin[:, None, :]
 
 
 def _pick(squared: Squared, distance: Array, point: Array | None, pick: Pick) -> Array:
+    """Return the picked points (N, q, d), scaled, of the rows weighted by distances (N, s)."""
     rows, right = _weigh(squared, distance, point)
-    # bearings alone: no row holds the last coordinate, and the quadric would only invent one
+    # with bearings only, no row contains the last coordinate, and the quadric would add false information
     linear = squared.quadric.shape == "paraboloid" and not rows[..., -1].any()
     y, valid = _linear(rows[..., :-1], right) if linear else pick(rows, right, squared.quadric)
     return np.where(valid[..., None], y[..., :-1], np.nan)
 
 
 def minimum(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
-    """Return the exact minimisers (N, 1 or 2, n) of squared-range problems, and which exist: a minimal set has two."""
+    """Return the exact minimisers (N, 1 or 2, n) of squared-range problems, and flags; a minimal set has two."""
     positive = quadric.shape == "cone"
     y, ok = minimiser(rows, right, quadric, positive=positive)
-    # a row less than unknowns: the quadric meets the line of points that fit, twice
+    # with one row less than unknowns, the line of points that fit meets the quadric twice
     few = np.flatnonzero((rows != 0.0).any(-1).sum(-1) < quadric.size)
     if not len(few):
         return y[:, None], ok[:, None]
@@ -120,28 +120,28 @@ def minimum(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
 
 
 def stationary_points(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
-    """Return all real stationary points (N, K, n) of squared-range problems, best first, and which are valid."""
+    """Return all real stationary points (N, K, n) of squared-range problems, best first, and flags of valid ones."""
     y, _, valid = stationary(rows, right, quadric, positive=quadric.shape == "cone")
     return y, valid
 
 
 def shor(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
-    """Return the answers (N, 3, n) of Shor's semidefinite relaxation, over threads: see `_one_by_one`."""
+    """Return the points (N, 3, n) of Shor's semidefinite relaxation, over threads: see `_one_by_one`."""
     from formulations.squared_range_conic import shor as relax
 
     return _one_by_one(relax, rows, right, quadric)
 
 
 def hull(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
-    """Return the answers (N, 3, n) of the second-order cone relaxation, over threads: see `_one_by_one`."""
+    """Return the points (N, 3, n) of the second-order cone relaxation, over threads: see `_one_by_one`."""
     from formulations.squared_range_conic import hull as relax
 
     return _one_by_one(relax, rows, right, quadric)
 
 
 def _one_by_one(relax: Callable[..., Any], rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
-    """Return relaxed points, and the points of the quadric that they are between where there are two answers."""
-    # missing data: the solver is not asked
+    """Return the relaxed point, and the two points of the quadric on both sides of it if the solution is not unique."""
+    # problems with missing data are skipped
     usable = np.isfinite(rows).all((-1, -2)) & np.isfinite(right).all(-1)
     y = np.full((len(rows), 3, quadric.size), np.nan)
 
@@ -154,7 +154,7 @@ def _one_by_one(relax: Callable[..., Any], rows: Array, right: Array, quadric: Q
 
 
 def _linear(rows: Array, right: Array) -> tuple[Array, Array]:
-    """Return the plain least-squares point: no row has ranges."""
+    """Return the plain least-squares point of rows without ranges."""
     transposed = np.swapaxes(rows, -1, -2)
     x, ok = linalg.solve(transposed @ rows, transposed @ right[..., None])
     y = np.concatenate([np.swapaxes(x, -1, -2), np.zeros((*x.shape[:-2], 1, 1))], axis=-1)
@@ -178,10 +178,10 @@ def squared_rows(problem: Problem, found: Ranges | None) -> Squared:
     origin = centre
     if on_cone:
         assert found is not None
-        # the cone stands on the reference station: t is the distance from the origin
+        # the apex of the cone is the reference station: t is the distance from the origin
         origin = place[np.arange(size), found.reference]
     if found is not None and not on_cone:
-        # ranges much longer than the network: the unknowns are of their size, and numbers of order one are wanted
+        # If ranges are much longer than the network, they set the scale, so that the unknowns are of order one.
         spread = np.maximum(spread, np.where(found.inside, np.abs(found.offset), 0.0).max(1))
     scale = np.where(spread > 0.0, spread, 1.0)
     place = (place - origin[:, None]) / scale[:, None, None]
@@ -202,24 +202,25 @@ def squared_rows(problem: Problem, found: Ranges | None) -> Squared:
 
 
 def _station_nodes(problem: Problem, found: Ranges | None) -> tuple[Array, Array]:
+    """Return the positions (N, s, d) of the stations of ranges, or of all used stations, and flags of used ones."""
     position = np.broadcast_to(
         problem.stations.position, (problem.batch_shape[0], *problem.stations.position.shape[-3:])
     )
     if found is None:
         used = sorted({int(s) for rows in problem.rows for s in (*rows.a, *rows.b) if s >= 0})
-        used = used or list(range(problem.stations.count))  # heights alone name none, and are no start
+        used = used or list(range(problem.stations.count))  # heights alone have no stations, and are no start
         nodes = position[:, 0, used]
         return nodes, np.ones(nodes.shape[:2], dtype=bool)
     return position[:, found.epoch, found.station], found.inside
 
 
 def _range_rows(found: Ranges, place: Array, scale: Array, on_cone: bool) -> tuple[Array, Array]:
-    """Square r_i = c_i + sign_i t: subtract t^2 = |y|^2 on the cone, keep |y|^2 as unknown on the paraboloid."""
+    """Return squared rows of r_i = c_i + sign_i t: t^2 = |y|^2 cancels on the cone, and is unknown otherwise."""
     c = found.offset / scale[:, None]
     squares = (place**2).sum(-1)
     usable = found.inside
     if on_cone:
-        # the reference's own row says t = t
+        # the row of the reference is t = t
         usable = usable & (found.sign != 0) & (np.arange(place.shape[1]) != found.reference[:, None])
         rows = np.concatenate([2.0 * place, (2.0 * found.sign * c)[..., None]], axis=-1)
         right = squares - c**2
@@ -230,8 +231,8 @@ def _range_rows(found: Ranges, place: Array, scale: Array, on_cone: bool) -> tup
 
 
 def _weigh(squared: Squared, distance: Array, point: Array | None) -> tuple[Array, Array]:
-    """Divide each row by the error it inherits from the measurements at an approximate point."""
-    # d(r^2) = 2 r dr: over twice the range a squared range has the error of the range, here in metres
+    """Return rows and right sides, each divided by its error from the measurements at an approximate point."""
+    # d(r^2) = 2 r dr: divided by twice the range, a squared range has the error of the range, here in metres
     factor = 0.5 * squared.scale[:, None] / distance
     stacked = np.concatenate([squared.ranged, squared.ranged_right[..., None]], axis=-1)
     parts = [squared.whiten @ (factor[..., None] * stacked)]
@@ -242,7 +243,7 @@ def _weigh(squared: Squared, distance: Array, point: Array | None) -> tuple[Arra
     return joined[..., :-1], joined[..., -1]
 
 
-# Rows of other kinds than ranges beside them: bearings and gain ratios are linear in the same coordinates.
+# Rows of other kinds than ranges: bearings and gain ratios are linear in the same coordinates.
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,7 +278,7 @@ class LiftedRows:
     sigma : array (..., m)
         Standard deviations of the measurements.
     factor : callable
-        Maps points (N, d), or None for "one scale away", to the row's error per unit of measurement error (N, m).
+        Maps points (N, d), or None for "one scale away", to the error of the row per unit of measurement error (N, m).
     """
 
     row: Array
@@ -287,14 +288,14 @@ class LiftedRows:
 
 
 def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to: Coordinates) -> LiftedRows | None:
-    """Return the linear rows of one kind, or None where it has none.
+    """Return the linear rows of one kind, or None if it has no linear form.
 
     Parameters
     ----------
     problem : Problem
         Flat batch of N problems.
     rows : Rows
-        One of its kinds.
+        Rows of one kind.
     start : int
         Global number of its first row.
     found : Ranges, optional
@@ -309,9 +310,10 @@ def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to
     m, paired = rows.z - rows.correction, None
     beside = azimuths_beside(problem, rows) if rows.kind == "elevation" else None
     if beside is not None:
-        # an absent elevation is taken for present: it needs no azimuth
+        # an absent elevation counts as present, since it needs no azimuth
         paired = (problem.weight[..., beside] > 0.0) | (rows.weight == 0.0)
-        # without ranges the paired form is the only linear one; with some, only where every elevation has its azimuth
+        # Without ranges the paired form is the only linear one. With ranges it is used only if every elevation has its
+        # azimuth.
         paired = paired if found is None or bool(np.all(paired)) else None
     if paired is not None:
         entry: LiftEntry | None = pair_elevation(m, problem.observed[..., beside], a)
@@ -327,7 +329,7 @@ def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to
     weight = np.broadcast_to(rows.weight, right.shape)
     present = (weight > 0.0) & (True if paired is None else paired)
     sigma = np.sqrt(variances(problem.noise, problem.count)[..., start : start + rows.count])
-    # a row of weight w counts as one of variance sigma^2 / w; absent ones have zero coefficients
+    # a row of weight w counts like one of variance sigma^2 / w; absent rows have zero coefficients
     sigma = sigma / np.sqrt(np.where(present, weight, 1.0))
 
     def factor(point: Array | None) -> Array:
@@ -339,11 +341,12 @@ def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to
 
 
 def _wide(parts: list[Any], size: int, count: int) -> Array:
-    """Return numbers side by side, (N, m, parts)."""
+    """Return numbers as columns, (N, m, parts)."""
     return np.stack([np.broadcast_to(part, (size, count)) for part in parts], axis=-1)
 
 
 def _point(problem: Problem, rows: Rows, index: Array, to: Coordinates) -> Point:
+    """Return the scaled positions and axes of the stations `index` of rows, as components."""
     stations, still = problem.stations, np.zeros_like(rows.epoch)
     epoch = rows.epoch if stations.position.shape[-3] > 1 else still
     place = (stations.position[..., epoch, index, :] - to.origin[:, None]) / to.scale[:, None, None]
@@ -357,22 +360,23 @@ def _point(problem: Problem, rows: Rows, index: Array, to: Coordinates) -> Point
 
 
 def _stays_unknown(entry: LiftEntry, known: tuple[KnownLift, KnownLift]) -> bool:
-    """Return whether a row has a range that is not known, nor up to the common unknown."""
+    """Return whether a row contains a range that is unknown even up to the common unknown."""
     lost = np.isnan(known[0].sign) | np.isnan(known[1].sign)
     return bool((np.isnan(entry.last) & lost).any())
 
 
 def _known(found: Ranges, rows: Rows, to: Coordinates) -> tuple[KnownLift, KnownLift]:
-    """Return the ranges of both ends of rows, scaled; NaN where one stays unknown."""
+    """Return the scaled ranges at both ends of rows; NaN for an unknown range."""
     both = []
     for index in (rows.a, rows.b):
         node = np.array([_node(found, int(s), int(e)) for s, e in zip(index, rows.epoch, strict=True)])
         offset = np.where(node >= 0, found.offset[:, node], np.nan) / to.scale[:, None]
-        # on the paraboloid ranges are known (sign 0), and the last coordinate is no range
+        # on the paraboloid ranges are known (sign 0), and the last coordinate is not a range
         both.append(KnownLift(offset, np.where(node >= 0, found.sign[:, node] * to.on_cone, np.nan)))
     return both[0], both[1]
 
 
 def _node(found: Ranges, station: int, epoch: int) -> int:
+    """Return the number of a station among the ranges; -1 if some problem lacks its range."""
     at = np.flatnonzero((found.station == station) & ((found.epoch == epoch) | (found.epoch.max(initial=0) == 0)))
     return int(at[0]) if len(at) and found.inside[:, at[0]].all() else -1

@@ -1,1 +1,1 @@
-"""Which stations, rows and priors contradict the rest."""
+"""Search for suspects: the stations, rows and priors that contradict the other data."""

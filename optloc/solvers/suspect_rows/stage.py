@@ -1,4 +1,4 @@
-"""Which measurement is lying: where the data contradict each other, who has to be left out for the rest to agree."""
+"""The stage "suspects": it names the measurements, stations and priors that contradict the other data."""
 
 from __future__ import annotations
 
@@ -48,68 +48,71 @@ from optloc.solvers.suspect_rows.subsets import (
 from optloc.solvers.verdict.conclusion import Conclusion, list_names
 from optloc.solvers.verdict.judge import failed_fixes, filled_objects, judge, surviving_candidates, verdict
 
-# A row that a loss gives less than half its weight is suspected first. More than `REJECTED` names: here it is a hint
-# that is tested, and who fits is taken back.
+# A row that a robust loss gives less than half its weight is suspected first. The limit is above `REJECTED`, because
+# this is a hint only: the row is tested, and taken back if it fits.
 _HALF = 0.5
-# Minima of a loss from which who is wrong is sought: an image in the plane of the stations has another beside it.
+# Minima of a robust loss from which a search starts. A mirror image in the plane of the stations doubles their number.
 _MINIMA = 4
-# Median costs per degree of freedom beyond which a fix is left out where the noise level is sought: noise of any size
-# exceeds it in 3 % of fixes with redundancy one, and hardly ever with more.
+# Fixes with more than this many median costs per degree of freedom do not count for the noise level. For noise of any
+# size 3 % of fixes with redundancy one exceed it, and almost no fix with more redundancy.
 _GROSS = 10.0
-# No other choice of rows helps these.
+# statuses that no other choice of rows changes
 _BEYOND = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.UNAVAILABLE, Status.DISCONNECTED)
 
 
-_Told = dict[int, Error]
+_GroupErrors = dict[int, Error]
 _Explained = list[tuple[Array, tuple[Group, ...], list[Outcome]]]
 
 
 @dataclass(frozen=True, slots=True)
-class _Doubted:
-    """Rows (N, m) that a robust fix before rejected, and the vectors (N, size) at which it did."""
+class _RejectedRows:
+    """Rows (N, m) that an earlier robust fix rejected, and the vectors (N, size) of that fix."""
 
     rows: Array
     x: Array
 
-    def take(self, items: Array) -> _Doubted:
-        """Return those of some problems."""
-        return _Doubted(self.rows[items], self.x[items])
+    def take(self, items: Array) -> _RejectedRows:
+        """Return the entries of some problems."""
+        return _RejectedRows(self.rows[items], self.x[items])
 
 
 def suspects(
     problem: Problem, fix: Fix | None = None, *, by: str | Sequence[str] = KINDS, together: bool = True
 ) -> Fix:
-    """Return fixes without the measurements that contradict the rest, and who they are.
+    """Return fixes without the measurements that contradict the other data, and name these suspects.
 
-    Every group, every two of them and so on are left out and the rest fixed anew without a guess. A set explains the
-    data where its rest passes the chi-square test at 1e-4; its score is the cost of the rest and a price for each group
-    (16 for one row). All sets within 9 of the best score are listed, the empty one too. Where they place the target
-    elsewhere the fix is ambiguous; where none explains the data it is contradictory; an explanation that leaves out q
-    rows is `ok` only with redundancy q + 1 without them. A range or range sum may also have an offset that all rows of
-    its kind share. Where the sets are too many, and in runs, groups are left out one at a time.
+    Every group, every pair of groups and so on is left out, and the remaining data are fixed again without a first
+    guess. A set explains the data if its rest passes the chi-square test at 1e-4. Its score is the cost of the rest
+    plus a price for each group (16 for one row). All sets within 9 of the best score are listed, including the empty
+    set.
+
+    If the listed sets give different positions, the fix is ambiguous. If no set explains the data, it is contradictory.
+    An explanation that leaves out q rows is `ok` only if the rest has redundancy q + 1. A range or range sum may also
+    have an offset that all rows of its kind share. For too many sets, and in runs, groups are left out one at a time.
 
     Parameters
     ----------
     problem : Problem
-        Batch axes (...). Where its epochs share no unknown they are one more batch axis, as in `solve`.
+        Batch axes (...). If its epochs share no unknown, the epochs become one more batch axis, as in `solve`.
     fix : Fix, optional
-        Of the same problem, by `solve`; None: it is solved first. Rows that a robust method rejected are suspected
+        Fix of the same problem, by `solve`; None: it is solved first. Rows that a robust method rejected are suspected
         first.
     by : "station", "row", "prior", "offset" or several of them
-        What may be wrong: all rows of a station, one measurement, a prior, all lengths of a kind by one offset.
+        Kinds of groups that may be wrong: all rows of a station, one measurement, a prior, or all lengths of a kind by
+        one offset.
     together : bool
-        Whether the noise of a batch, and of epochs, is stated for all of them, so that it is a suspect too where many
-        contradict themselves; False for problems that have nothing to do with each other.
+        Whether one statement of the noise holds for the whole batch and all epochs. If so, the noise is a suspect too
+        when many fixes contradict themselves. False for unrelated problems.
 
     Returns
     -------
     Fix
-        With `explanations`; its weights are zero on rows that were left out.
+        With `explanations`; the weights of rows left out are zero.
 
     Raises
     ------
     InvalidProblem
-        For an unknown group, or a fix of other batch axes.
+        For an unknown group, or a fix with other batch axes.
     """
     kinds = check_kinds(by)
     problem = by_epoch(problem) if separable(problem) else problem
@@ -126,34 +129,32 @@ def suspects(
 
 
 def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS, *, together: bool = True) -> Pool:
-    """Return the pool of a flat batch with what contradicts the rest left out: the stage behind `suspects`."""
+    """Return the pool of a flat batch with the conclusions of a search for suspects: the stage behind `suspects`."""
     if pool is None:
-        raise InvalidProblem(
-            "suspects questions a fix", "method", "put it behind a refinement, as in 'gtrs+lsr+suspects'"
-        )
+        raise InvalidProblem("suspects needs a fix", "method", "put it after a refinement, as in 'gtrs+lsr+suspects'")
     began = perf_counter()
     present = np.broadcast_to(problem.weight, (len(pool), problem.count))
     rejected = np.asarray((pool.weights < _HALF) & (present > _HALF))
-    doubted = _Doubted(rejected, judge(problem, pool).x if rejected.any() else pool.x[:, 0])
+    doubted = _RejectedRows(rejected, judge(problem, pool).x if rejected.any() else pool.x[:, 0])
     if not np.array_equal(pool.weights, present):
-        # a robust fix has its minima elsewhere: the test is that of least squares with every row
+        # a robust fix has other minima, and the test needs least squares with every row
         pool = lsr(
             problem, offer(problem, surviving_candidates(pool, judge(problem, pool)), pool, "start", perf_counter())
         )
     before = pool.stages
     asked = partial(_explain, present=present, doubted=doubted, by=by)
-    louder, found = _weigh(problem, pool, asked, together)
+    larger, found = _choose_noise(problem, pool, asked, together)
     count = sum(len(items) for items, _, _ in found)
-    if louder is None:
+    if larger is None:
         pool = _with_conclusions(problem, pool, found)
     else:
-        pool = replace(pool, asked=True, conclusion=_fix_by_louder_noise(louder, found))
-    stage = Stage("suspects", f"{count} of {len(pool)} contradict themselves", perf_counter() - began)
+        pool = replace(pool, asked=True, conclusion=_fix_with_larger_noise(larger, found))
+    stage = Stage("suspects", f"{count} of {len(pool)} have contradictions", perf_counter() - began)
     return replace(pool, stages=(*before, stage))
 
 
 def _with_conclusions(problem: Problem, pool: Pool, found: _Explained) -> Pool:
-    """Return pools with the conclusions that explanations lead to."""
+    """Return pools with the conclusions from explanations."""
     pool = replace(pool, asked=True)
     fix, conclusion = judge(problem, pool), filled_objects(len(pool), None)
     step = chunk_size(problem)
@@ -166,7 +167,7 @@ def _with_conclusions(problem: Problem, pool: Pool, found: _Explained) -> Pool:
 
 
 @dataclass(frozen=True, slots=True)
-class _Louder:
+class _LargerNoise:
     """Problems with larger noise than stated, and their refined candidates.
 
     Parameters
@@ -174,11 +175,11 @@ class _Louder:
     problem : Problem
         N problems with the larger noise.
     pool : Pool
-        Refined with it.
+        Candidates, refined with the larger noise.
     sizes : array (m,)
         Factors of the stated standard deviations of the rows, 1 or more.
     reason : str
-        Which noise is larger, and by how much.
+        Sentence on which noise is larger, and by how much.
     """
 
     problem: Problem
@@ -187,31 +188,31 @@ class _Louder:
     reason: str
 
 
-def _weigh(
+def _choose_noise(
     problem: Problem, pool: Pool, asked: Callable[[Problem, Fix], _Explained], together: bool
-) -> tuple[_Louder | None, _Explained]:
-    """Return the larger noise that is likelier for all problems together, if any, and the explanations with it."""
+) -> tuple[_LargerNoise | None, _Explained]:
+    """Return a larger noise if it is likelier for all problems together, else None; and the explanations with it."""
     fix = judge(problem, pool)
-    louder = _louder(problem, pool, fix) if together else None
-    if louder is None:
+    larger = _larger_noise(problem, pool, fix) if together else None
+    if larger is None:
         return None, asked(problem, fix)
     # with the larger noise fewer rows are suspects
-    other = judge(louder.problem, louder.pool)
-    again, present = asked(louder.problem, other), np.broadcast_to(problem.weight, fix.weights.shape)
-    more = 2.0 * (present @ np.log(louder.sizes)) / np.maximum(present.sum(1), 1.0)
+    other = judge(larger.problem, larger.pool)
+    again, present = asked(larger.problem, other), np.broadcast_to(problem.weight, fix.weights.shape)
+    more = 2.0 * (present @ np.log(larger.sizes)) / np.maximum(present.sum(1), 1.0)
     score = _score(again, other, more) + ROW_PRICE
-    # with the noise as stated each fix costs what it does, or the price of a row at least
+    # a lower bound of the score with the stated noise: each fix costs at least its cost or the price of a row
     if score < np.fmin(fix.cost, ROW_PRICE)[np.isfinite(fix.cost) & (fix.dof > 0)].sum():
-        return louder, again
+        return larger, again
     found = asked(problem, fix)
-    return (louder, again) if score < _score(found, fix, np.zeros(len(more))) else (None, found)
+    return (larger, again) if score < _score(found, fix, np.zeros(len(more))) else (None, found)
 
 
-def _louder(problem: Problem, pool: Pool, fix: Fix) -> _Louder | None:
-    """Return a batch with the noise that its fixes show, where that is larger than stated.
+def _larger_noise(problem: Problem, pool: Pool, fix: Fix) -> _LargerNoise | None:
+    """Return the problems with the noise level that their fixes show; None if it is not larger than stated.
 
-    A kind whose noise is stated too large keeps it: its ellipses then cover more than they promise. The upper ends of
-    the intervals count, so that ellipses cover also where few fixes determine the factors.
+    A kind whose noise is smaller than stated keeps the stated noise: its ellipses then cover more than they promise.
+    The upper ends of the intervals are used, so that ellipses cover even if few fixes determine the factors.
     """
     if problem.epochs > 1 or len(fix.x) < SEVERAL:
         return None
@@ -219,7 +220,7 @@ def _louder(problem: Problem, pool: Pool, fix: Fix) -> _Louder | None:
         each = np.where(fix.dof > 0, fix.cost / fix.dof, np.inf)
     if np.isfinite(each).sum() < SEVERAL:
         return None
-    # a liar has a large cost relative to the other fixes, for noise of any size
+    # a fix with a gross error has a large cost relative to the other fixes, for noise of any size
     kept = np.flatnonzero(each <= _GROSS * np.median(each[np.isfinite(each)]))
     if len(kept) < SEVERAL:
         return None
@@ -229,40 +230,42 @@ def _louder(problem: Problem, pool: Pool, fix: Fix) -> _Louder | None:
     if not level.refutes or not np.isfinite(level.high[grown]).all():
         return None
     used = replace(level, factor=np.where(grown, level.high, 1.0))
-    said = [
+    sentences = [
         f"the noise of {kind} rows is {factor:.2g} ({low:.2g} to {high:.2g}) times as large as stated"
         for kind, factor, low, high, larger in zip(level.kinds, level.factor, level.low, level.high, grown, strict=True)
         if larger
     ]
     loud = used.scale(problem)
     refined = lsr(loud, offer(loud, surviving_candidates(pool, fix), pool, "start", perf_counter()))
-    return _Louder(loud, refined, used.sizes(problem), f"{' and '.join(said)}: the upper end of the interval is used")
+    return _LargerNoise(
+        loud, refined, used.sizes(problem), f"{' and '.join(sentences)}: the upper end of the interval is used"
+    )
 
 
-def _fix_by_louder_noise(louder: _Louder, found: _Explained) -> Array:
-    """Return the finished fixes (N,), objects, of problems with larger noise than stated."""
-    problem = louder.problem
-    fix = verdict(problem, certified(problem, _with_conclusions(problem, louder.pool, found)))
+def _fix_with_larger_noise(larger: _LargerNoise, found: _Explained) -> Array:
+    """Return the finished fixes (N,), an object array, of problems with larger noise than stated."""
+    problem = larger.problem
+    fix = verdict(problem, certified(problem, _with_conclusions(problem, larger.pool, found)))
     marks, reason = np.array(fix.marks), np.array(fix.reason)
     items = np.flatnonzero(fix.answered)
     marks[items] |= Status.RESCALED.mark
-    reason[items] = [f"{louder.reason}; {own}" if own else louder.reason for own in reason[items]]
+    reason[items] = [f"{larger.reason}; {own}" if own else larger.reason for own in reason[items]]
     out, fix = filled_objects(len(reason), None), replace(fix, marks=marks, reason=reason)
     for i in range(len(out)):
         out[i] = fix[i]
     return out
 
 
-def _explain(problem: Problem, fix: Fix, present: Array, doubted: _Doubted, by: Sequence[GroupKind]) -> _Explained:
-    """Return what explains those problems that show something: their numbers, what may be wrong, and what is."""
+def _explain(problem: Problem, fix: Fix, present: Array, doubted: _RejectedRows, by: Sequence[GroupKind]) -> _Explained:
+    """Return the explanations of problems with a contradiction: item numbers, groups, and outcomes."""
     with np.errstate(invalid="ignore"):
-        # of a lower cost the cheapest set has a score beyond the gap whatever it leaves
+        # at a lower cost every set has a score beyond the gap
         noticed = ~fix.answered | (fix.cost > ROW_PRICE - AMBIGUOUS_GAP)
-    noticed |= problem.epochs > 1  # a few of many rows go unnoticed by the chi-square of all
+    noticed |= problem.epochs > 1  # the chi-square test of a whole run does not notice a few wrong rows
     items = np.flatnonzero(noticed & (fix.dof > 0) & ~np.isin(fix.code, _BEYOND))
     patterns = [items[own] for own in _group_alike(present[items] > 0.0)]
     alike = [_alike(problem, fix, own, by) for own in patterns]
-    # few sets: all are tried, and nothing masks anything; runs and many groups: one at a time
+    # if the sets are few, all are tried; in runs and for many groups, one group at a time
     many = [problem.epochs > 1 or not enumerable(one.groups, one.batch.count, 1) for one in alike]
     found = iter(explain([one for one, grown in zip(alike, many, strict=True) if not grown]))
     out: _Explained = []
@@ -277,9 +280,9 @@ def _explain(problem: Problem, fix: Fix, present: Array, doubted: _Doubted, by: 
 
 
 def _score(found: _Explained, fix: Fix, more: Array) -> float:
-    """Return the least score of all problems together, with more (N,) for each redundancy: what larger noise costs.
+    """Return the least score of all problems together; `more` (N,) is the price of larger noise per degree of freedom.
 
-    It is twice the negative logarithm of the restricted likelihood, in which sigma times f counts r ln f^2.
+    It is twice the negative logarithm of the restricted likelihood, in which a factor f of sigma costs r ln f^2.
     """
     good = np.isfinite(fix.cost) & (fix.dof > 0)
     score, dof = np.where(good, fix.cost, 0.0), np.where(good, fix.dof, 0)
@@ -299,7 +302,10 @@ def _group_alike(present: Array) -> list[Array]:
 
 
 def _alike(problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind]) -> SameRows:
-    """Return problems in which the same rows are present, by arrivals where that is the same, and their groups."""
+    """Return problems in which the same rows are present, and their groups.
+
+    Range differences become arrival times if the two forms are equivalent.
+    """
     part = problem.take(items)
     arrivals = as_arrivals(part)
     work = part if arrivals is None else arrivals.problem
@@ -310,8 +316,8 @@ def _alike(problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind]) ->
     return SameRows(work, np.arange(len(items)), groups, fix[items])
 
 
-def _with_grown(alike: SameRows, doubted: _Doubted, outcomes: list[Outcome]) -> list[Outcome]:
-    """Return outcomes where sets that were too many to be tried are sought group by group from the best found."""
+def _with_grown(alike: SameRows, doubted: _RejectedRows, outcomes: list[Outcome]) -> list[Outcome]:
+    """Return outcomes after a search group by group, from the closest rest, for problems with too many sets."""
     dof = alike.whole.dof
     untried = [not own.rests and own.tried < most - 1 for own, most in zip(outcomes, dof, strict=True)]
     for i in np.flatnonzero(untried).tolist():
@@ -321,7 +327,7 @@ def _with_grown(alike: SameRows, doubted: _Doubted, outcomes: list[Outcome]) -> 
 
 
 def _conclude(problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: Sequence[Outcome]) -> Array:
-    """Return what is concluded of problems (N,) in which the same rows are present, None where nothing is."""
+    """Return the conclusions (N,) for problems with the same rows; None if the fix of all data is kept."""
     arrivals, out = as_arrivals(problem), filled_objects(len(outcomes), None)
     cases: list[SuspectCase] = []
     chosen: dict[int, RemainingFix] = {}
@@ -333,7 +339,7 @@ def _conclude(problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: S
             out[i] = _unexplained(cases[i], outcome)
         elif (best := _best_rest(cases[i], outcome)) is not None:
             chosen[i] = best
-    # fixes of the problem as given have other unknowns than fixes of its arrivals
+    # fixes of the given problem and fixes of its arrivals have different unknowns
     for given in (True, False):
         items = [i for i, best in chosen.items() if (best.fix.layout == problem.layout) == given]
         if items:
@@ -341,19 +347,20 @@ def _conclude(problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: S
             proven = prove_remaining(work.take(np.array(items)), groups, [chosen[i] for i in items])
             chosen |= dict(zip(items, proven, strict=True))
     rests = {i: (best, *outcomes[i].rests[1:]) for i, best in chosen.items()}
-    told = _errors(problem if arrivals is None else arrivals.problem, groups, rests)
+    group_errors = _errors(problem if arrivals is None else arrivals.problem, groups, rests)
     for i, own in rests.items():
-        out[i] = _explained(cases[i], outcomes[i], own, told[i])
+        out[i] = _explained(cases[i], outcomes[i], own, group_errors[i])
     return out
 
 
-def _grow(alike: SameRows, i: int, doubted: _Doubted, start: RemainingFix | None) -> Outcome:
-    """Return what explains the i-th of some problems, found group by group.
+def _grow(alike: SameRows, i: int, doubted: _RejectedRows, start: RemainingFix | None) -> Outcome:
+    """Return the explanations of problem i from a search group by group.
 
-    The fix of all rows is where wrong ones have drawn it, perhaps to another minimum, from which the right ones look
-    wrong. Where it shows something, the minima of a loss that no error draws far are begun from as well.
+    Wrong rows draw the fix of all data away, perhaps to another minimum, so that right rows look wrong there. If the
+    first search finds a contradiction, more searches start from the minima of a robust loss, which wrong rows cannot
+    draw far.
     """
-    # the fix is of the problem as given; with arrivals for differences the layout has emission times besides
+    # the fix has the layout of the given problem; with arrivals the layout also has emission times
     one, own, groups = alike.batch.take(alike.items[[i]]), alike.whole[i], alike.groups
     if own.layout != one.layout or not np.isfinite(own.x).all():
         n = one.layout.n_shared
@@ -371,23 +378,23 @@ def _grow(alike: SameRows, i: int, doubted: _Doubted, start: RemainingFix | None
     return explain_from_beginnings([first, *(grow_explanation(one, groups, own, each) for each in begun)], groups)
 
 
-# From what explains the data of one problem to explanations: who is left out, how large an error, what evidence.
+# From outcomes to explanations: suspects, their errors, and the evidence.
 
 
 @dataclass(frozen=True, slots=True)
 class SuspectCase:
-    """A problem whose data contradict each other, and in which form it was looked at.
+    """A problem whose data contradict each other, and the form in which it was searched.
 
     Parameters
     ----------
     problem : Problem
         Flat batch of one problem, as given.
     arrivals : Arrivals, optional
-        The same problem with arrival times for range differences.
+        The same problem with arrival times instead of range differences.
     groups : tuple of Group
-        What may be wrong.
+        Groups that may be wrong.
     whole : Fix
-        The fix with nothing left out, without batch axes.
+        The fix of all data, without batch axes.
     """
 
     problem: Problem
@@ -397,50 +404,52 @@ class SuspectCase:
 
     @property
     def work(self) -> Problem:
-        """Return the form in which it was looked at."""
+        """Return the form of the problem that was searched."""
         return self.problem if self.arrivals is None else self.arrivals.problem
 
     def vector(self, fix: Fix, x: Array | None = None) -> Array:
-        """Return a fix, or vectors (..., size) in its order, in the order of the given problem."""
+        """Return the vector of a fix, or vectors (..., size) in its layout, in the layout of the given problem."""
         x, layout = fix.x if x is None else x, self.problem.layout
         return x if fix.layout == layout else restore_order(layout, fix.layout, x)
 
     def rows(self, group: Group) -> tuple[int, ...]:
-        """Return the rows of a group as numbers of the given problem's rows."""
+        """Return the rows of a group as row numbers of the given problem."""
         if self.arrivals is None:
             return group.rows
         return tuple(sorted({int(i) for row in group.rows for i in self.arrivals.origin[row]}))
 
 
 def _unexplained(case: SuspectCase, outcome: Outcome) -> Conclusion | None:
-    """Return the conclusion of a problem that nothing explains; None where the fix of all data is kept."""
-    # no set was tried and nothing stood out: a run whose noise is larger than stated keeps its fix
+    """Return the conclusion of a problem without an explanation; None if the fix of all data is kept."""
+    # A run without a tried set and without an outlier keeps its fix: its noise is larger than stated.
     if case.whole.answered and set(outcome.p_value) == {()} and not outcome.note:
         return None
     return Conclusion((), case.whole, case.whole.alternatives, tried=_name_closest(case, outcome))
 
 
 def _best_rest(case: SuspectCase, outcome: Outcome) -> RemainingFix | None:
-    """Return the rest that explains a problem best, to be proven; None where the fix of all data is kept."""
+    """Return the best rest of a problem, which is not proven yet; None if the fix of all data is kept."""
     best, *others = outcome.rests
     if not best.left and all(_same_place(best.fix, rest.fix) for rest in others):
         return None
     return best
 
 
-def _explained(case: SuspectCase, outcome: Outcome, rests: Sequence[RemainingFix], told: Sequence[_Told]) -> Conclusion:
-    """Return the conclusion of a problem of which the first rest is proven, with the errors of each rest."""
+def _explained(
+    case: SuspectCase, outcome: Outcome, rests: Sequence[RemainingFix], group_errors: Sequence[_GroupErrors]
+) -> Conclusion:
+    """Return the conclusion of a problem from its rests, of which the first is proven, and the errors of each rest."""
     (best, *_), (first, *others) = rests, outcome.rests
     elsewhere = [rest for rest in others if not _same_place(first.fix, rest.fix)]
-    pairs = zip(rests, told, strict=True)
+    pairs = zip(rests, group_errors, strict=True)
     explanations = tuple(_explanation(case, rest, outcome, found) for rest, found in pairs)
     spent, fix = int(case.whole.dof) - int(best.fix.dof), _in_layout(case, best.fix)
     return Conclusion(explanations, fix, _alternatives(case, best, elsewhere), spent, bool(elsewhere))
 
 
 def _same_place(best: Fix, other: Fix) -> bool:
-    """Return whether two fixes give the same answer: the other one's place is inside the ellipsoid of the best."""
-    # of unknowns besides, such as an offset that only one of them has, nobody asked
+    """Return whether two fixes give the same answer: the position of `other` is inside the ellipsoid of `best`."""
+    # unknowns that only one of the fixes has, such as an offset, do not count
     theirs = {slot.name for slot in other.layout.shared}
     common = [slot for slot in best.layout.shared if slot.name in theirs]
     common = [slot for slot in common if slot.name.partition("[")[0] == "position"] or common
@@ -456,37 +465,38 @@ def _same_place(best: Fix, other: Fix) -> bool:
 
 
 def _in_layout(case: SuspectCase, fix: Fix) -> Fix:
-    """Return a fix with the shared unknowns of the given problem alone."""
+    """Return a fix with only the shared unknowns of the given problem."""
     layout = case.problem.layout
     if fix.layout == layout:
         return fix
     places = shared_places(layout, fix.layout)
     others = Alternatives(case.vector(fix, fix.alternatives.x), fix.alternatives.gap)
-    # the states of epochs may stand in another order
+    # the states of epochs may have another order, so their covariances are dropped
     return replace(
         fix, x=case.vector(fix), cov=fix.cov[np.ix_(places, places)], layout=layout, local=None, alternatives=others
     )
 
 
 def _name_closest(case: SuspectCase, outcome: Outcome) -> str:
-    """Return what came closest to an explanation, in words."""
+    """Return a sentence on the set that came closest to an explanation."""
     tested = {left: p for left, p in outcome.p_value.items() if left and np.isfinite(p)}
     if not tested:
         return outcome.note
     best = max(tested, key=tested.__getitem__)
     names = list_names([case.groups[i].name for i in best])
-    reason = f"nothing explains it; best is to leave out {names} (p = {tested[best]:.1g})"
+    reason = f"no explanation passes; the closest leaves out {names} (p = {tested[best]:.1g})"
     return reason + (f"; {outcome.note}" if outcome.note else "")
 
 
-def _explanation(case: SuspectCase, rest: RemainingFix, outcome: Outcome, told: _Told) -> Explanation:
+def _explanation(case: SuspectCase, rest: RemainingFix, outcome: Outcome, error_of: _GroupErrors) -> Explanation:
+    """Return the explanation of a rest: its suspects with errors and p-values, and its fix."""
     fix = rest.fix
     p_without = float(fix.p_value)
-    # Errors of compass bearings are reported in the sense of the readings.
+    # errors of compass bearings are reported in the sense of the readings
     senses = np.concatenate([np.full(rows.count, rows.sense) for rows in case.work.rows])
     suspects = []
     for i in rest.left:
-        group, error = case.groups[i], told.get(i)
+        group, error = case.groups[i], error_of.get(i)
         known = outcome.p_value.get(tuple(j for j in rest.left if j != i))
         p_with = _p_with(fix, error) if known is None else known
         none = np.full(1, np.nan)
@@ -499,49 +509,49 @@ def _explanation(case: SuspectCase, rest: RemainingFix, outcome: Outcome, told: 
 
 def _errors(
     work: Problem, groups: Sequence[Group], rests: dict[int, tuple[RemainingFix, ...]]
-) -> dict[int, list[_Told]]:
-    """Return the estimated errors of what each rest of some problems leaves out, by number of the group.
+) -> dict[int, list[_GroupErrors]]:
+    """Return the estimated errors of the groups that each rest leaves out, by number of the group.
 
-    Rests with the same offsets have the same unknowns: they are linearised together.
+    Rests with the same offsets have the same unknowns, so they are linearised together.
     """
-    out: dict[int, list[_Told]] = {i: [{} for _ in own] for i, own in rests.items()}
-    alike: dict[tuple[int, ...], list[tuple[int, RemainingFix, _Told]]] = {}
+    out: dict[int, list[_GroupErrors]] = {i: [{} for _ in own] for i, own in rests.items()}
+    alike: dict[tuple[int, ...], list[tuple[int, RemainingFix, _GroupErrors]]] = {}
     for i, own in rests.items():
-        for rest, told in zip(own, out[i], strict=True):
+        for rest, estimates in zip(own, out[i], strict=True):
             if not np.isfinite(rest.fix.x).all() or not rest.left:
                 continue
             offsets = tuple(j for j in rest.left if groups[j].offset is not None)
-            told |= {j: _offset_error(groups[j], rest.fix) for j in offsets}
+            estimates |= {j: _offset_error(groups[j], rest.fix) for j in offsets}
             if len(offsets) < len(rest.left):
-                alike.setdefault(offsets, []).append((i, rest, told))
+                alike.setdefault(offsets, []).append((i, rest, estimates))
     for offsets, members in alike.items():
         part = leave_out_of(work.take(np.array([i for i, _, _ in members])), groups, offsets)
         found = influences(part, np.stack([rest.fix.x for _, rest, _ in members]))
-        for at, (_, rest, told) in zip(found, members, strict=True):
+        for at, (_, rest, estimates) in zip(found, members, strict=True):
             others = [j for j in rest.left if j not in offsets]
-            told |= dict(zip(others, errors(at, [groups[j] for j in others]), strict=True))
+            estimates |= dict(zip(others, errors(at, [groups[j] for j in others]), strict=True))
     return out
 
 
 def _offset_error(group: Group, fix: Fix) -> Error:
-    """Return the error of a group that is one offset, from a fix that estimates it."""
+    """Return the error of an offset group from a fix that estimates the offset."""
     value, sigma = fix.take(group.name), fix.sigma(group.name)
     statistic = float((value / sigma) @ (value / sigma)) if np.isfinite(sigma).all() else np.nan
     return Error(value, sigma, statistic, len(value))
 
 
 def _p_with(fix: Fix, error: Error | None) -> float:
-    """Return the chi-square probability of a rest with one of its suspects back, to first order."""
+    """Return the chi-square probability of a rest with one of its suspects taken back, to first order."""
     from scipy.special import gammaincc
 
     if error is None:
         return float("nan")
-    # the rest with the suspect back: to first order its cost rises by the statistic
+    # to first order the suspect raises the cost of the rest by its statistic
     return float(gammaincc((int(fix.dof) + error.dof) / 2, (float(fix.cost) + error.statistic) / 2))
 
 
 def _alternatives(case: SuspectCase, best: RemainingFix, elsewhere: Sequence[RemainingFix]) -> Alternatives:
-    """Return the other positions of the best explanation and those of the others, by score, cheapest first."""
+    """Return the other positions of the best and of the other explanations, in ascending order of their gaps."""
     first = best.fix
     x = [case.vector(first, first.alternatives.x), *(case.vector(rest.fix)[None] for rest in elsewhere)]
     gap = [first.alternatives.gap, *(np.array([max(rest.score - best.score, 0.0)]) for rest in elsewhere)]

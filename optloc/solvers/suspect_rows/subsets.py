@@ -1,4 +1,8 @@
-"""Every set of a few groups is left out and the rest is fixed anew, without a guess: nothing masks anything."""
+"""Search for suspects over sets of groups: leave each set out and fix the remaining rows again, without a first guess.
+
+If the sets are few, all of them are tried, so that one error cannot mask another. If they are many, `grow` leaves out
+one group at a time.
+"""
 
 from __future__ import annotations
 
@@ -27,36 +31,38 @@ from optloc.solvers.pool import Pool, begin, offer, pack
 from optloc.solvers.stages import add_candidates, fix_by, gtrs, lsr, roots, search
 from optloc.solvers.verdict.judge import judge, surviving_candidates, verdict
 
-# Rows times subsets of one problem up to which all subsets of a size are tried: seconds of fixes; and rows of all
-# subsets that are fixed together, at 2.5 kB a row: 40 MB, and larger parts are not faster.
+# Rows times sets of one problem up to which all sets of a size are tried: this takes seconds. Rows of all sets that are
+# fixed together, at 2.5 kB per row: 40 MB, and larger parts are not faster.
 _MOST, _CHUNK = 100_000, 2**14
-# The same from which sets are looked at to first order before they are tried: fewer take less time than is saved.
+# Rows times sets above which a first-order test selects the sets to try: below, the test takes longer than it saves.
 _FEW = 2_000
-# Rests whose cost is at most so many times that of the test are solved in more ways, and in all of them. The cheapest
-# start may end at another minimum, and a wrong rest that costs a hundred times too much hardly has one that passes.
+# Factors of the limit of the chi-square test. Rests with a cost up to the first are solved from more starts, rests with
+# a cost up to the second from all starts. The cheapest start may end at another minimum, and a rest that costs a
+# hundred times too much almost never has a minimum that passes.
 _NEAR, _CLOSE = 100.0, 4.0
-# Share of the boxes of a proof that a rest may take: good rests need tens of these hundreds, and more boxes take longer
+# Share of the boxes of a proof that a rest may use: good rests need tens of these hundreds, and more boxes take longer
 # than other starts.
 _SHORT = 0.01
-_BLIND = "an error is there, but redundancy 1 does not tell where"
+_BLIND = "a measurement is wrong, but redundancy 1 cannot identify it"
 
 
-# A set of groups, the rows that it leaves out, and those of the groups that have no rows.
+# A set of groups, the rows that it leaves out, and its groups without rows.
 _Set = tuple[tuple[int, ...], Array, frozenset[int]]
 
 
 @dataclass(frozen=True, slots=True)
 class RemainingFix:
-    """The fix to what is left without some groups.
+    """The fix of one problem without some groups.
 
     Parameters
     ----------
     left : tuple of int
-        Numbers of the groups that were left out, ascending; () where all data count.
+        Numbers of the groups left out, ascending; () for the fix of all data.
     fix : Fix
         Of one problem, without batch axes.
     score : float
-        Its cost and the prices of what was left out: twice a negative logarithm of probability, up to a constant.
+        Cost of the fix plus the prices of the groups left out: twice a negative logarithm of probability, up to a
+        constant.
     """
 
     left: tuple[int, ...]
@@ -66,24 +72,24 @@ class RemainingFix:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What explains the data of one problem.
+    """The result of the search for one problem.
 
     Parameters
     ----------
     rests : tuple of Rest
-        All whose score comes within the gap of the least, that one first; empty where nothing passes.
+        Rests whose score is within the gap of the least, the best first; empty if no rest passes.
     p_value : dict of tuple of int to float
-        Chi-square probability of the rest without each set of groups that was tried; NaN without redundancy.
+        Chi-square probability of the rest without each set that was tried; NaN without redundancy.
     note : str
-        What limited the search, in words.
+        Sentence on the limit of the search.
     closest : Rest, optional
         The cheapest of the rests that were tried last.
     tried : int
-        Size of the largest sets of which all were tried, or can be left untried because of their prices.
+        Size of the largest sets that are covered: all were tried, or their prices exclude them.
     least : float
-        Least score of all that was tried, whether it passes or not.
+        Least score of all sets tried, whether they pass or not.
     dof : int
-        Redundancy of what has it.
+        Redundancy of the rest with the least score.
     """
 
     rests: tuple[RemainingFix, ...]
@@ -96,21 +102,21 @@ class Outcome:
 
 
 def remaining_fix_of(groups: Sequence[Group], left: tuple[int, ...], fix: Fix) -> RemainingFix:
-    """Return what one problem is without some groups, with its score."""
+    """Return the rest of one problem without some groups, with its score."""
     return RemainingFix(left, fix, float(fix.cost) + sum(groups[i].price for i in left))
 
 
 def passes_noise_test(fix: Fix) -> Array:
-    """Return which rests (N,) the noise allows; one without redundancy shows nothing.
+    """Return flags (N,) of rests with redundancy that pass the chi-square test.
 
-    Rests that fit at infinity only count too.
+    Rests without redundancy are not tested, so they do not pass. Rests with their minimum at infinity count too.
     """
     with np.errstate(invalid="ignore"):
         return np.asarray(np.isfinite(fix.cost) & (fix.dof > 0) & (fix.p_value >= P_MISFIT))
 
 
 def enumerable(groups: Sequence[Group], rows: int, size: int) -> bool:
-    """Return whether all sets of so many groups are few enough to be tried."""
+    """Return whether all sets of `size` groups are few enough to be tried."""
     return comb(len(groups), size) * rows <= _MOST
 
 
@@ -123,11 +129,11 @@ class SameRows:
     batch : Problem
         The batch.
     items : int array (N,)
-        Their numbers in it.
+        Numbers of the problems in the batch.
     groups : tuple of Group
-        What may be wrong.
+        Groups that may be wrong.
     whole : Fix
-        Their fixes (N,) with nothing left out.
+        Their fixes (N,) of all data.
     """
 
     batch: Problem
@@ -138,7 +144,7 @@ class SameRows:
 
 @dataclass(frozen=True, slots=True)
 class _Request:
-    """Sets of groups (C,) that are left out of some of the problems of an `Alike`, and the least scores so far."""
+    """Sets of groups (C,) to leave out of some problems of an `Alike`, and the least scores so far."""
 
     alike: SameRows
     items: Array
@@ -149,8 +155,9 @@ class _Request:
 def explain(alike: Sequence[SameRows]) -> list[list[Outcome]]:
     """Return the explanations of each problem: all sets of groups within the gap of the best.
 
-    Sets of one, of two and so on are tried, as long as their prices alone do not exceed what has been found, the rest
-    has redundancy, and they are few enough. Rests of all problems of a batch are fixed together.
+    Sets of one group, of two groups and so on are tried under three conditions: their prices alone do not exceed the
+    best score, the rest has redundancy, and the sets are few enough. Rests of all problems of a batch are fixed
+    together.
     """
     searches = dict(enumerate(_search(one) for one in alike))
     out: list[list[Outcome]] = [[] for _ in alike]
@@ -168,7 +175,7 @@ def explain(alike: Sequence[SameRows]) -> list[list[Outcome]]:
 
 
 def _search(alike: SameRows) -> Generator[list[_Request], list[list[_Tried]], list[Outcome]]:
-    """Yield the sets to be tried, size by size, and return the outcomes (N,)."""
+    """Yield requests for the sets to try, size by size, and return the outcomes (N,)."""
     groups, whole, count = alike.groups, alike.whole, alike.batch.count
     prices = np.cumsum(np.sort([group.price for group in groups]))
     rests = [[remaining_fix_of(groups, (), whole[i])] if ok else [] for i, ok in enumerate(passes_noise_test(whole))]
@@ -178,7 +185,7 @@ def _search(alike: SameRows) -> Generator[list[_Request], list[list[_Tried]], li
     tried = np.zeros(len(rests), dtype=np.int64)
     for size in range(1, len(groups) + 1):
         best = np.array([min((rest.score for rest in own), default=np.inf) for own in rests])
-        # no set of this size, and so no larger one, can come near
+        # no set of this size or larger can come within the gap
         done = (prices[size - 1] > best + AMBIGUOUS_GAP) | (whole.dof <= size)
         tried[done] = len(groups)
         if done.all() or not enumerable(groups, count, size):
@@ -187,7 +194,7 @@ def _search(alike: SameRows) -> Generator[list[_Request], list[list[_Tried]], li
         items, sets = np.flatnonzero(~done), list(_subsets(groups, count, size))
         requests = []
         if len(sets) * count > _FEW:
-            # of many sets few matter where all data agree about as well: what their rest costs is known to first order
+            # If all data agree, few of many sets matter, and the cost of their rests is known to first order.
             agree = [i for i in items if rests[i] and not rests[i][0].left]
             for i in agree:
                 own = _promising(alike.batch.take(alike.items[[i]]), groups, sets, whole[i], best[i])
@@ -206,10 +213,10 @@ def _search(alike: SameRows) -> Generator[list[_Request], list[list[_Tried]], li
 
 
 def within_gap(rests: Sequence[RemainingFix], groups: Sequence[Group]) -> tuple[RemainingFix, ...]:
-    """Return the rests whose score comes within the gap of the least, the best first.
+    """Return the rests whose score is within the gap of the least, the best first.
 
-    One that leaves out more than another is listed where the cost falls by more than the data may fall by chance: for
-    each row by the price of a row less the gap, as between leaving out one row and none.
+    A rest that leaves out more rows than another is listed only if its cost is lower by more than chance explains. The
+    limit for each further row is the price of a row minus the gap, as between one row and none.
     """
     if not rests:
         return ()
@@ -225,20 +232,21 @@ def within_gap(rests: Sequence[RemainingFix], groups: Sequence[Group]) -> tuple[
 
 
 def _adds_nothing(rest: RemainingFix, size: int, other: RemainingFix, fewer: int) -> bool:
-    if size == fewer:  # the same under other names: their costs differ by rounding
+    """Return whether the further rows of a rest lower the cost by no more than chance."""
+    if size == fewer:  # the same rows under other names: their costs differ by rounding
         return True
     return float(other.fix.cost - rest.fix.cost) <= (ROW_PRICE - AMBIGUOUS_GAP) * (size - fewer)
 
 
 def _parts(groups: Sequence[Group], left: Sequence[int]) -> frozenset[tuple[int, int]]:
-    """Return what a set of groups leaves out, number by number: rows, and the components of groups without rows."""
+    """Return the numbers that a set of groups leaves out: rows, and the components of groups without rows."""
     rows = {(-1, row) for i in left for row in groups[i].rows}
     return frozenset(rows | {(i, j) for i in left if not groups[i].rows for j in range(groups[i].size)})
 
 
 @dataclass(slots=True)
 class _Tried:
-    """What the sets of one size say about one problem, collected."""
+    """Collected results of the sets of one size for one problem."""
 
     rests: list[RemainingFix]
     p_value: dict[tuple[int, ...], float]
@@ -249,19 +257,19 @@ class _Tried:
 
 
 def _promising(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set], whole: Fix, best: float) -> list[_Set]:
-    """Return the sets without which one problem may come within the gap: the cost falls by half of that to first order.
+    """Return the sets whose rest may come within the gap: to first order the cost falls by half of the need.
 
-    Sets with an offset, a prior or a fix at infinity are all kept.
+    Sets with an offset or a prior are all kept. If the fix is at infinity, all sets are kept.
     """
     if not np.isfinite(whole.x).all():
         return list(sets)
-    # the fix is of the problem as given, which may have no emission time; rows are linear in it
+    # the fix may lack the emission times of arrivals; the rows are linear in them
     at = influence(problem, embed(whole.layout, problem.layout, whole.x))
     plain = [one for one in sets if not one[2]]
     drop, _ = drops(at, [np.flatnonzero(rows) for _, rows, _ in plain])
     prices = np.array([sum(groups[i].price for i in left) for left, _, _ in plain])
     wanted = float(whole.cost) + prices - best - AMBIGUOUS_GAP
-    # two offsets leave out no row at all
+    # two offsets leave out no row
     return [one for one in sets if one[2]] + [plain[i] for i in np.flatnonzero(2.0 * drop >= wanted)]
 
 
@@ -269,7 +277,7 @@ def _try_requests(asked: dict[int, list[_Request]]) -> dict[int, list[list[_Trie
     """Return the results of the sets of each request for each of its problems."""
     out = {number: [[_Tried([], {}) for _ in one.items] for one in requests] for number, requests in asked.items()}
     pairs: dict[Any, list[_Pair]] = {}
-    # problems of a batch have the same priors and unknowns: sets that change the same ones are fixed together
+    # Problems of a batch have the same priors and unknowns, so sets that change the same ones are fixed together.
     for number, requests in asked.items():
         for request, found in zip(requests, out[number], strict=True):
             groups = request.alike.groups
@@ -280,7 +288,7 @@ def _try_requests(asked: dict[int, list[_Request]]) -> dict[int, list[list[_Trie
                     key = (id(request.alike.batch), name)
                     pairs.setdefault(key, []).append(_Pair(request.alike, item, one, tried))
     for own in pairs.values():
-        # as many rests at a time as fit the memory
+        # parts that fit the memory
         step = max(1, _CHUNK // (own[0].alike.batch.count + 1))
         for first in range(0, len(own), step):
             _try_pairs(own[first : first + step])
@@ -288,7 +296,7 @@ def _try_requests(asked: dict[int, list[_Request]]) -> dict[int, list[list[_Trie
 
 
 class _Pair(NamedTuple):
-    """One problem of an `Alike`, a set that is left out of it, and where the result goes."""
+    """One problem of an `Alike`, a set to leave out of it, and the record that receives the result."""
 
     alike: SameRows
     item: int
@@ -297,14 +305,14 @@ class _Pair(NamedTuple):
 
 
 def _try_pairs(pairs: Sequence[_Pair]) -> None:
-    """Store the rests that pass near the best, the probabilities, the cheapest rests and the least scores."""
+    """Write the results of pairs: rests near the best, probabilities, cheapest rests and least scores."""
     alike, others = pairs[0].alike, sorted(pairs[0].left[2])
     items = np.array([pair.alike.items[pair.item] for pair in pairs])
     rows, changed = np.stack([pair.left[1] for pair in pairs]), [alike.groups[i] for i in others]
     fix = fix_remaining(leave_out(alike.batch.take(items), rows, changed))
     cost = np.where(np.isfinite(fix.cost), fix.cost, np.inf)
     price = np.array([sum(pair.alike.groups[i].price for i in pair.left[0]) for pair in pairs])
-    begins = all(group.offset is None for group in changed)  # what begins at the closest has no offset
+    begins = all(group.offset is None for group in changed)  # a search that starts from the closest rest has no offset
     good, kept, near = passes_noise_test(fix), list[int](), dict[int, int]()
     for j, (pair, p, c, score) in enumerate(
         zip(pairs, fix.p_value.tolist(), cost.tolist(), (cost + price).tolist(), strict=True)
@@ -312,13 +320,13 @@ def _try_pairs(pairs: Sequence[_Pair]) -> None:
         tried = pair.tried
         tried.p_value[pair.left[0]] = p
         tried.least = min(tried.least, (score, int(fix.dof[j])))
-        if good[j] and score <= tried.best + AMBIGUOUS_GAP:  # others are never listed
+        if good[j] and score <= tried.best + AMBIGUOUS_GAP:  # other rests are never listed
             tried.best = min(tried.best, score)
             kept.append(j)
         if begins and c < tried.cheapest:
             tried.cheapest, near[id(tried)] = c, j
     chosen = sorted({*kept, *near.values()})
-    # copies: a view of one fix would keep all of them in memory
+    # copies: a view of one fix would keep all fixes in memory
     own = fix[np.array(chosen, dtype=int)]
     rests = {j: remaining_fix_of(pairs[j].alike.groups, pairs[j].left[0], own[k]) for k, j in enumerate(chosen)}
     for j in kept:
@@ -328,7 +336,7 @@ def _try_pairs(pairs: Sequence[_Pair]) -> None:
 
 
 def _subsets(groups: Sequence[Group], count: int, size: int) -> Iterator[_Set]:
-    """Yield sets of groups, their rows and those that have none; each of a set must add something to the others."""
+    """Yield sets of groups, their rows, and the groups without rows. Each group adds a row to its set."""
     masks = [mark_rows([group], count) for group in groups]
     for left in combinations(range(len(groups)), size):
         rows = np.any([masks[i] for i in left], axis=0)
@@ -342,10 +350,11 @@ def _subsets(groups: Sequence[Group], count: int, size: int) -> Iterator[_Set]:
 
 
 def fix_remaining(problem: Problem) -> Fix:
-    """Return the fixes of a flat batch by the cheapest start, and in more ways where that one may have missed.
+    """Return the fixes of a flat batch from the cheapest start, and from more starts if it may miss a minimum.
 
-    A rest that fails by less than `_NEAR` gets every stationary point of the squared-range problem as a start, and one
-    that passes, or fails by little, all candidates: its other positions explain the data as well.
+    A rest whose cost is less than `_NEAR` times the limit of the test also starts from every stationary point of the
+    squared-range problem. A rest that passes, or has less than `_CLOSE` times the limit, starts from all candidates,
+    because its other minima explain the data too.
     """
     pool = lsr(problem, gtrs(problem, None))
     # a proof of a good rest takes a fraction of the time of other starts
@@ -358,76 +367,80 @@ def fix_remaining(problem: Problem) -> Fix:
 
 
 def _is_proven(problem: Problem, pool: Pool) -> Array:
-    """Return flags (N,) of rests of which a short proof shows that all minima within the listed gap are known."""
+    """Return flags (N,) of rests for which a short proof shows that all minima within the listed gap are known."""
     if not enabled() or problem.constraints or is_run(problem) or is_scaled(problem):
         return np.zeros(len(pool), dtype=bool)
-    told = certified(problem, pool, effort=_SHORT).proven
-    assert told is not None
-    return np.asarray(told.unique & (told.proof == GLOBAL) & (told.margin >= LISTED_GAP))
+    claims = certified(problem, pool, effort=_SHORT).proven
+    assert claims is not None
+    return np.asarray(claims.unique & (claims.proof == GLOBAL) & (claims.margin >= LISTED_GAP))
 
 
 def _redo(problem: Problem, pool: Pool, unproven: Array, near: float, better: Callable[[Problem, Pool], Pool]) -> Pool:
-    """Return pools of which those whose cost is not that many times too large were made anew."""
+    """Return pools in which unproven items with a cost up to `near` times the limit are solved again by `better`."""
     cost = np.where(np.isfinite(pool.cost[:, 0]), pool.cost[:, 0], np.nan)
     with np.errstate(invalid="ignore"):
-        # not: NaN, where there is no fix yet, is tried again as well
+        # written with "not", so that NaN (no fix yet) is tried again too
         items = np.flatnonzero(unproven & ~(cost > near * _limit(pool.dof)) & (pool.dof >= 0))
     if not len(items):
         return pool
     other = better(problem.take(items), take(pool, items))
-    return pool.merge(items, other, Stage("again", f"{len(items)} anew", 0.0))
+    return pool.merge(items, other, Stage("again", f"{len(items)} from more starts", 0.0))
 
 
 def _beside(problem: Problem, start: Pool, pool: Pool) -> Pool:
+    """Return a pool of starts together with the candidates of an earlier pool."""
     x = np.concatenate([start.x, surviving_candidates(pool, judge(problem, pool))], axis=1)
     return offer(problem, pack(x), None, "roots", perf_counter())
 
 
 def _limit(dof: Array) -> Array:
-    """Return the cost (N,) at which the test fails."""
+    """Return the cost (N,) at which the chi-square test fails."""
     from scipy.special import gammainccinv
 
     return np.asarray(2.0 * gammainccinv(np.maximum(dof, 1) / 2, P_MISFIT))
 
 
-# Many groups: the worst is left out and the rest fixed anew, until none stands out; then who fits again is taken back.
+# Search for many groups: leave out the worst group and fix the rest, until no group stands out. Then take back each
+# group that fits again.
 #
-# Each step tests all groups at once to first order (data snooping: Baarda 1968; iterated: Kok 1984), each at 1 % over
-# the number of groups: the chi-square of thousands of rows does not notice a few that are wrong. It may be masked
-# where many agree on a wrong answer; a robust fix before it lets it start from what that one rejected.
+# Each step tests all groups to first order (data snooping: Baarda 1968; iterated: Kok 1984), each at 1 % over the
+# number of groups: the chi-square test of thousands of rows does not notice a few wrong rows. Many rows that agree on a
+# wrong answer can mask the errors. After a robust fix, the search starts from the rows that the robust fix rejected.
 
-# Groups of more rows than this are tested again only where no smaller one stands out: their test is an eigenvalue
-# problem of their size, and a station that is wrong stood out in the first round, in which all are tested.
+# Groups of more rows are tested again only if no smaller group stands out. Their test is an eigenvalue problem of their
+# size, and a wrong station stands out in the first round, which tests all groups.
 _LARGE = 16
-# Rivals are looked for in the place of each suspect where there are not more, the three that stand out most for each:
-# every one is a fix, and a list of many more explains nothing.
+# Rivals are tried for each suspect if there are at most this many suspects: the three groups that stand out most. Each
+# rival takes a fix, and a longer list of rivals explains nothing.
 _MOST_LEFT_OUT, _RIVALS = 8, 3
 
 
 def grow_explanation(problem: Problem, groups: Sequence[Group], fix: Fix, start: RemainingFix) -> Outcome:
-    """Return what explains one problem, found group by group.
+    """Return the explanations of one problem from a search group by group.
 
     Parameters
     ----------
     problem : Problem
         Flat batch of one problem.
     groups : sequence of Group
-        What may be wrong.
+        Groups that may be wrong.
     fix : Fix
-        Of the problem, without batch axes.
+        Fix of all data, without batch axes.
     start : Rest
-        Where to begin.
+        Start of the search.
     """
-    # Bonferroni: clean data are accused once in a hundred, whatever the number of groups
+    # Bonferroni: a false alarm in one of a hundred clean problems, for any number of groups
     level = float(np.log(P_OUTLIER / len(groups)))
     left, rest = list(start.left), start.fix
     while (worst := _worst(problem, groups, left, rest, level)) is not None:
-        # nothing would be left to agree
+        # no redundancy would remain for a test
         if int(rest.dof) <= len(groups[worst].rows):
             return Outcome(
-                (), {(): float(fix.p_value)}, f"{len(left)} of {len(groups)} left out, and still no rest agrees"
+                (),
+                {(): float(fix.p_value)},
+                f"with {len(left)} of {len(groups)} left out, the remaining data still disagree",
             )
-        # a station takes the place of its rows that were left out before
+        # a station replaces its single rows that were left out before
         left = [*(i for i in left if not _inside(groups[i], groups[worst])), worst]
         rest = fix_without(problem, groups, left, rest.x)
     left, rest = _take_back(problem, groups, left, rest, level)
@@ -440,13 +453,13 @@ def grow_explanation(problem: Problem, groups: Sequence[Group], fix: Fix, start:
 
 
 def explain_from_beginnings(outcomes: Sequence[Outcome], groups: Sequence[Group]) -> Outcome:
-    """Return what explains one problem, found from several beginnings: the first one's where none explains it."""
+    """Return the joined outcome of several searches of one problem; without an explanation the first outcome."""
     rests = {rest.left: rest for outcome in outcomes for rest in outcome.rests}
     return replace(outcomes[0], rests=within_gap([*rests.values()], groups)) if rests else outcomes[0]
 
 
 def begin_without(problem: Problem, groups: Sequence[Group], rows: Array, x: Array) -> RemainingFix:
-    """Return one problem without some rows (m,), refined from a vector (size,): where `grow` may begin."""
+    """Return the rest of one problem without some rows (m,), refined from a vector (size,): a start for `grow`."""
     left = tuple(i for i, group in enumerate(groups) if len(group.rows) == 1 and rows[group.rows[0]])
     return remaining_fix_of(groups, left, fix_without(problem, groups, left, x))
 
@@ -458,12 +471,12 @@ def fix_without(problem: Problem, groups: Sequence[Group], left: Sequence[int], 
 
 
 def prove_remaining(problem: Problem, groups: Sequence[Group], rests: Sequence[RemainingFix]) -> list[RemainingFix]:
-    """Return the rests of problems (N,), one each, after all tests that `ok` needs; unanswered ones stay."""
+    """Return the rests of N problems, one each, after the proofs and tests of `ok`, where they have an answer."""
     out, alike = list(rests), dict[tuple[int, ...], list[int]]()
     for i, rest in enumerate(rests):
         if bool(rest.fix.answered):
             alike.setdefault(tuple(j for j in rest.left if not groups[j].rows), []).append(i)
-    # problems with the same offsets have the same unknowns: they are proven together
+    # problems with the same offsets have the same unknowns, so they are proven together
     for others, items in alike.items():
         rows = np.stack([mark_rows([groups[j] for j in rests[i].left], problem.count) for i in items])
         part = leave_out(problem.take(np.array(items)), rows, [groups[j] for j in others])
@@ -482,44 +495,48 @@ def leave_out_of(problem: Problem, groups: Sequence[Group], left: Sequence[int])
 
 
 def _worst(problem: Problem, groups: Sequence[Group], left: Sequence[int], rest: Fix, level: float) -> int | None:
-    """Return the group, not yet left out, that contradicts the rest most; None where none does clearly."""
+    """Return the number of the group that contradicts the rest most; None if no group does so significantly."""
     if not np.isfinite(rest.x).all():
         return None
-    gone = mark_rows([groups[i] for i in left], problem.count)
-    open_ = [i for i, g in enumerate(groups) if i not in set(left) and (g.prior >= 0 or not gone[list(g.rows)].all())]
+    left_out = mark_rows([groups[i] for i in left], problem.count)
+    open_ = [
+        i for i, g in enumerate(groups) if i not in set(left) and (g.prior >= 0 or not left_out[list(g.rows)].all())
+    ]
     at = _influence(problem, groups, left, rest.x)
     small = [i for i in open_ if len(groups[i].rows) <= _LARGE]
     first = not left
     for members in [open_] if first else [small, [i for i in open_ if len(groups[i].rows) > _LARGE]]:
         if members:
-            tail = significance(at, [_present(groups[i], gone) for i in members])
+            tail = significance(at, [_present(groups[i], left_out) for i in members])
             if tail.min() < level:
                 return members[int(tail.argmin())]
     return None
 
 
 def _influence(problem: Problem, groups: Sequence[Group], left: Sequence[int], x: Array) -> Influence:
+    """Return the influence of rows on the fix of one problem without some groups."""
     dropped = frozenset(groups[i].prior for i in left if groups[i].prior >= 0)
-    gone = mark_rows([groups[i] for i in left], problem.count)
-    return influence(leave_out(problem, gone[None]), x, dropped)
+    left_out = mark_rows([groups[i] for i in left], problem.count)
+    return influence(leave_out(problem, left_out[None]), x, dropped)
 
 
-def _present(group: Group, gone: Array) -> Group:
-    """Return a group without rows that are left out already."""
-    return group if group.prior >= 0 else replace(group, rows=tuple(i for i in group.rows if not gone[i]))
+def _present(group: Group, left_out: Array) -> Group:
+    """Return a group without the rows that are left out already."""
+    return group if group.prior >= 0 else replace(group, rows=tuple(i for i in group.rows if not left_out[i]))
 
 
 def _inside(one: Group, other: Group) -> bool:
+    """Return whether the rows of one group are all in another group."""
     return one.prior < 0 and other.prior < 0 and set(one.rows) <= set(other.rows)
 
 
 def _take_back(
     problem: Problem, groups: Sequence[Group], left: list[int], rest: Fix, level: float
 ) -> tuple[list[int], Fix]:
-    """Return what is still left out, and the rest, once every group that fits the rest is taken back."""
+    """Return the groups left out and the fix of the rest, after every group that fits the rest is taken back."""
     while left and np.isfinite(rest.x).all():
         chosen = [groups[i] for i in left]
-        # all errors jointly, to first order: the one that is most likely none is taken back if it does not stand out
+        # all errors are estimated jointly, to first order; the least significant one is taken back
         tail = [-error.log_tail for error in errors(influence(problem, rest.x), chosen)]
         best = int(np.argmin(tail))
         if tail[best] > -level:
@@ -530,13 +547,13 @@ def _take_back(
 
 
 def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fix, level: float) -> list[RemainingFix]:
-    """Return other sets of as many groups: one of them in the place of another, if then none stands out either."""
+    """Return other sets of equal size: one group replaces another, if no further group then stands out."""
     found: dict[tuple[int, ...], RemainingFix] = {}
     for i in left if len(left) <= _MOST_LEFT_OUT else ():
         others = [j for j in left if j != i]
         fix = fix_without(problem, groups, others, rest.x)
-        gone = mark_rows([groups[j] for j in others], problem.count)
-        open_ = [j for j, g in enumerate(groups) if j not in left and g.offset is None and not _overlap(g, gone)]
+        left_out = mark_rows([groups[j] for j in others], problem.count)
+        open_ = [j for j, g in enumerate(groups) if j not in left and g.offset is None and not _overlap(g, left_out)]
         if not np.isfinite(fix.x).all() or not open_:
             continue
         tail = significance(_influence(problem, groups, others, fix.x), [groups[j] for j in open_])
@@ -550,5 +567,6 @@ def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fi
     return list(found.values())
 
 
-def _overlap(group: Group, gone: Array) -> bool:
-    return group.prior < 0 and bool(gone[list(group.rows)].any())
+def _overlap(group: Group, left_out: Array) -> bool:
+    """Return whether a group has a row that is left out already."""
+    return group.prior < 0 and bool(left_out[list(group.rows)].any())

@@ -1,1 +1,1 @@
-"""From refined candidates to a fix with a status."""
+"""The verdict: from refined candidates to a fix with a status."""

@@ -1,4 +1,8 @@
-"""Findings against finished answers: the definition of `ok`, for every method."""
+"""Findings against finished answers. They define the status `ok` for every method.
+
+A finding is a test and a sentence. `mark` applies all tests to a batch of settled pools. `examine` computes the numbers
+that the tests read, and `explain` writes the sentences.
+"""
 
 from __future__ import annotations
 
@@ -31,50 +35,51 @@ NO_PROOF = claim(
         "refinement",
     )
 )
-"""The claim of a refined answer of which nobody has tried to prove more."""
+"""The claim of a refined answer without a proof."""
 NO_ANSWER = claim(Certificate("unknown", "there is no refined answer to prove anything about", "none"))
-"""The claim where there is none."""
+"""The claim of a problem without a refined answer."""
 NOT_TRIED = "no proof was tried"
 BENT_SENTENCE = {
     INVERSE_RANGE: "Gaussian in inverse range, not in metres",
     CURVED: "Gaussian neither in metres nor in inverse range",
 }
-"""Sentences on a fix that is `curved`, by the kind of its chart."""
+"""Sentences on a fix with the status `curved`, by the kind of its chart."""
 BOTH_SIDES = (
-    "the stations lie in a plane, and the target is on either side or in it: "
-    "`optloc.model_checks.distance_from_plane` says how far"
+    "the stations are in one plane, and the data allow both sides of the plane: "
+    "`optloc.model_checks.distance_from_plane` returns the distance"
 )
-"""Sentence on a fix whose two mirror images are one region."""
-_ALIKE = 1e-3  # gaps below this are told as "fits as well": a reader gains nothing from more zeros
-# Share of the distance of two mirror images by which a minimum may be off one of them and be the same.
+"""Sentence on a fix whose two mirror images share one likelihood region."""
+_ALIKE = 1e-3  # for smaller gaps the sentence is "fits equally well": more zeros would not help a reader
+# A minimum this near to a mirror image, as a share of the distance between the two images, is that image.
 _SAME_END = 1e-3
-# Gaps to infinity below this come from rounding: the fix itself is as far away as counts.
+# Smaller gaps to infinity come from rounding: the fix is already as far away as infinity for the rows.
 _NONE = 1e-6
 
 
 class Evidence(NamedTuple):
-    """The numbers that decide about one finished answer, or about many (N,); NaN decides nothing.
+    """The numbers that the tests of all findings read, for one finished answer or for N. NaN passes every test.
 
     Parameters
     ----------
     improbable : bool
-        Whether noise so rarely makes such a cost that the model is refuted.
+        Whether the chi-square test refutes the model: noise makes a cost this large too rarely.
     infinity, region : float
-        Least cost at infinity less that of the answer, and by how much costs in the likelihood region exceed it.
+        Least cost at infinity minus the cost of the answer, and the largest excess of the cost in the likelihood
+        region.
     gap : float
-        Cost of the cheapest other minimum less that of the answer.
+        Cost of the cheapest other minimum minus the cost of the answer.
     kappa : float
         Departure from a Gaussian in metres, see `optloc.solvers.pool.Curvature`.
     unique : bool
-        As of `is_proof_of_one`.
+        Whether a proof excludes unlisted minima, see `is_proof_of_one`.
     searched : bool
         Whether the start was not safe.
     blind : bool
-        Whether a search for suspects was asked for, and could not see one or tell which.
+        Whether a search for suspects was requested, and the redundancy is too low to notice or to name one.
     held : bool
-        Whether the 95 % ellipses of repeated measurements hold.
+        Whether the 95 % ellipses of repeated measurements cover.
     robust : bool
-        Whether the minima of a loss were searched, and the rows that count prove the place.
+        Whether the minima of a robust loss were searched, and the rows with weight prove the position.
     """
 
     improbable: Any
@@ -91,14 +96,14 @@ class Evidence(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """N finished answers, and what is known of them.
+    """N finished answers with their gaps and proofs.
 
     Parameters
     ----------
     problem, pool : Problem, Pool
         N problems and their settled pools.
     gap : array (N, r)
-        Costs of the other minima less the cost of the best; infinite in empty slots.
+        Costs of the other minima minus the cost of the best; infinite in empty slots.
     proven : Claims
         Claims of the proofs.
     """
@@ -111,17 +116,17 @@ class Finished:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """An objection to answers: fixes, networks, or starts of tracks.
+    """An objection to an answer: to a fix, to a network, or to the start of a track.
 
     Parameters
     ----------
     status : Status
-        The status of an answer without other findings that precede it; its sentence is the advice.
+        The status of an answer, unless a finding with a higher precedence applies. Its sentence is the advice.
     test : callable
-        Maps evidence to where it applies. Of fixes by operators alone, so that numbers and arrays take the same rules.
+        Maps the evidence to a flag. For fixes it uses operators only, so that numbers and arrays follow the same rules.
     sentence : callable
-        Maps the evidence of a network or start to sentences. Of fixes it maps `Finished` and the indices of some to one
-        sentence for all of these, or to one for each.
+        For a network or a start: maps the evidence to sentences. For fixes: maps `Finished` and item numbers to one
+        sentence for all items, or to one sentence for each item.
     """
 
     status: Status
@@ -136,25 +141,25 @@ def objections(table: Sequence[Finding], evidence: Any) -> list[tuple[Status, st
 
 
 def finding_marks(problem: Problem, pool: Pool, gap: Array) -> Array:
-    """Return the marks (N,) of all findings against settled answers that are finished; zero without one.
+    """Return the marks (N,) of all findings against settled, finished answers; zero for an answer without a finding.
 
-    An answer is `ok` where the data do not reject the model, no other minimum within `AMBIGUOUS_GAP` is left (which is
-    proven), infinity lies outside the likelihood region, and the covariance covers.
+    An answer is `ok` under four conditions. The data do not reject the model. A proof excludes other minima within
+    `AMBIGUOUS_GAP`. Infinity is outside the likelihood region. The covariance covers.
 
     Parameters
     ----------
     problem : Problem
         N problems.
     pool : Pool
-        Settled. Numbers that were not computed decide nothing; a missing proof of uniqueness is a finding.
+        Settled. Numbers that were not computed raise no finding; a missing proof of uniqueness is a finding.
     gap : array (N, r)
-        Costs of the other minima less that of the best; infinite where there is none.
+        Costs of the other minima minus the cost of the best; infinite in empty slots.
     """
     cost, kappa = pool.cost[:, 0], None if pool.curvature is None else pool.curvature.kappa
-    # a loss bears gross errors: their cost refutes nothing
+    # a robust loss allows gross errors, so their cost does not refute the model
     improbable = np.zeros(len(pool), dtype=bool) if pool.loss else is_improbable(cost, pool.dof, P_MISFIT)
     blind: Any = False
-    if pool.asked:  # without redundancy a search for suspects sees nothing, and with one it cannot tell who it is
+    if pool.asked:  # redundancy 0 cannot show an error, and redundancy 1 cannot name the wrong row
         blind = (pool.dof <= 0) | ((pool.dof == 1) & is_improbable(cost, pool.dof, P_OUTLIER))
     with np.errstate(invalid="ignore"):
         marks: Array = marks_of(
@@ -173,7 +178,7 @@ def finding_marks(problem: Problem, pool: Pool, gap: Array) -> Array:
 
 
 def marks_of(*numbers: Any) -> Any:
-    """Return the marks of all findings against one answer, or against many (N,); the numbers are an `Evidence`."""
+    """Return the marks of all findings against one answer, or against N; `numbers` are the fields of `Evidence`."""
     evidence, marks = Evidence(*numbers), 0
     for status_mark, test in _TESTS:
         marks = marks | test(evidence) * status_mark
@@ -181,7 +186,7 @@ def marks_of(*numbers: Any) -> Any:
 
 
 def _apart(pool: Pool, gap: Array) -> Array:
-    """Return the gaps (N, r) of the minima outside the region of the best; infinite for the others."""
+    """Return the gaps (N, r); infinite for the mirror image of the best within the same likelihood region."""
     if pool.pair is None or not gap.shape[1]:
         return gap
     first, second = pool.pair[:, :1], pool.pair[:, 1:]
@@ -194,8 +199,8 @@ def _apart(pool: Pool, gap: Array) -> Array:
 
 
 def is_improbable(cost: Array, dof: Array, probability: float) -> Array:
-    """Return where costs (N,) are so large that noise makes them with less than a probability, (N,)."""
-    # often one number for all, as a view without strides
+    """Return flags (N,) of costs (N,) that noise exceeds with less than the given probability."""
+    # often all N share one number of degrees of freedom: a view without strides
     if dof.strides == (0,):
         return np.asarray(cost > largest(int(dof[0]) if len(dof) else 0, probability))
     out = np.zeros(len(cost), dtype=bool)
@@ -205,8 +210,8 @@ def is_improbable(cost: Array, dof: Array, probability: float) -> Array:
 
 
 def _is_unique(pool: Pool) -> Array:
-    """Return where it is proven that no other minimum than those listed costs less than the gap more, (N,)."""
-    if pool.loss:  # what is proven of squares is not of a loss
+    """Return flags (N,) of answers with a proof that every unlisted minimum costs more than the gap."""
+    if pool.loss:  # a proof for squares does not hold for a robust loss
         return np.zeros(len(pool), dtype=bool) if pool.robust is None else pool.robust
     if pool.proven is None:
         return np.zeros(len(pool), dtype=bool)
@@ -214,24 +219,25 @@ def _is_unique(pool: Pool) -> Array:
     return is_proof_of_one(pool.proven, between)
 
 
-def is_proof_of_one(told: Claims, infinity: Array) -> Array:
-    """Return whether claims (...) say that no other minimum than those listed costs less than the gap more.
+def is_proof_of_one(claims: Claims, infinity: Array) -> Array:
+    """Return flags (...) of claims that every unlisted minimum costs more than `AMBIGUOUS_GAP` above the best.
 
-    Where infinity, which costs so much more, comes before the gap, up to there: what lies beyond is infinity's.
+    If infinity costs less than the gap (`infinity` is this difference), a proof up to infinity is enough: the finding
+    `unbounded` covers the rest.
     """
-    wide = (told.margin >= AMBIGUOUS_GAP) | ((infinity > 0.0) & (infinity < AMBIGUOUS_GAP))
-    return np.asarray(told.unique & ((told.proof == GLOBAL) | told.asked) & wide)
+    wide = (claims.margin >= AMBIGUOUS_GAP) | ((infinity > 0.0) & (infinity < AMBIGUOUS_GAP))
+    return np.asarray(claims.unique & ((claims.proof == GLOBAL) | claims.asked) & wide)
 
 
 def examine(problem: Problem, pool: Pool) -> Pool:
-    """Return a settled pool with the shape of the likelihood about its best candidates, and what infinity costs.
+    """Return a settled pool with the departure from a Gaussian, the cost at infinity, and shares of repeats.
 
     Parameters
     ----------
     problem : Problem
-        N problems; those that share a position are looked at, and infinity for those of nothing but one.
+        N problems. The departure needs a shared position; infinity and repeats need a problem of one position at rest.
     pool : Pool
-        What was measured before is kept.
+        Numbers that it already has are kept.
     """
     curvature = pool.curvature
     if curvature is None or not problem.layout.shares("position"):
@@ -239,14 +245,14 @@ def examine(problem: Problem, pool: Pool) -> Pool:
     good = (pool.code[:, 0] == Status.OK) & np.isfinite(pool.x[:, 0]).all(-1)
     good &= np.isfinite(curvature.covariance).all((-1, -2))
     if pool.conclusion is not None:
-        good &= ~present(pool.conclusion)  # not all rows count there, and its fix was examined where it was made
+        good &= ~present(pool.conclusion)  # a conclusion leaves rows out, and its fix was examined when it was computed
     kappa = np.full((len(pool), 2), np.nan) if curvature.kappa is None else np.array(curvature.kappa)
     unseen = np.isnan(kappa[:, 0])
     new = np.flatnonzero(good & unseen)
     if len(new):
         kappa[new] = _departure(problem.take(new), take(pool, new))
     pool = replace(pool, curvature=replace(curvature, kappa=kappa))
-    # far away a velocity may grow with the range: no least cost is left to compute
+    # a velocity may grow with the range, so the least cost at infinity is not computed for moving targets
     if pool.loss or not one_position(problem) or problem.motions[0].order:
         return pool
     pool = replace(pool, infinity=_infinity(problem, pool, good & _is_bent(pool), unseen))
@@ -254,13 +260,13 @@ def examine(problem: Problem, pool: Pool) -> Pool:
 
 
 def _with_repeats(problem: Problem, pool: Pool, good: Array) -> Pool:
-    """Return a pool with the repeats of fixes against which only their shape speaks."""
+    """Return a pool with repeats of the fixes whose only finding is `curved`."""
     assert pool.curvature is not None
     cost = pool.cost[:, 0]
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
     items = np.flatnonzero(good & (pool.face[:, 0] == 0) & (finding_marks(problem, pool, gap) == Status.CURVED.mark))
-    if pool.pair is not None:  # no Gaussian describes both sides of a plane
+    if pool.pair is not None:  # one Gaussian cannot describe the positions on both sides of a plane
         items = items[np.isnan(pool.pair[items, 0]).any(-1)]
     if not len(items):
         return pool
@@ -270,14 +276,14 @@ def _with_repeats(problem: Problem, pool: Pool, good: Array) -> Pool:
 
 
 def repeats_hold(curvature: Curvature | None) -> Any:
-    """Return whether repeats were tried and their ellipses hold, (N,) or False."""
+    """Return flags (N,) of fixes whose repeats were computed and cover; False if no repeats were computed."""
     if curvature is None or curvature.repeats is None:
         return False
     return holds(curvature.repeats)
 
 
 def _departure(problem: Problem, pool: Pool) -> Array:
-    """Return by how much the cost departs from a Gaussian's, (N, 2)."""
+    """Return the departures of the cost from a Gaussian's, (N, 2): in metres and in inverse range."""
     assert pool.curvature is not None
     if pool.loss:
         problem = problem.with_rows(weight=pool.weights)
@@ -294,7 +300,7 @@ def _departure(problem: Problem, pool: Pool) -> Array:
 
 
 def _departure_inwards(problem: Problem, pool: Pool) -> Array:
-    """Return by how much the cost inwards of the bounds that hold fixes departs from a Gaussian's, (N,)."""
+    """Return the departure (N,) of the cost from a Gaussian's, on the inner side of the bounds that hold fixes."""
     law = law_at(problem, pool)
     if law is None:
         return np.full(len(pool), np.inf)
@@ -309,9 +315,9 @@ def _departure_inwards(problem: Problem, pool: Pool) -> Array:
 
 
 def law_at(problem: Problem, pool: Pool) -> Law | None:
-    """Return the normal laws of the best candidates that bounds cut off; None where no bound is near any."""
+    """Return the truncated normal laws of the best candidates, or None if no bound is near a candidate."""
     curvature = pool.curvature
-    # the covariance of a loss is no quadratic model beyond a bound
+    # the covariance under a robust loss is no quadratic model beyond a bound
     if curvature is None or pool.loss or not has_law(problem):
         return None
     covariance, shift = curvature.covariance, np.zeros((len(pool), problem.layout.n_shared))
@@ -323,10 +329,10 @@ def law_at(problem: Problem, pool: Pool) -> Law | None:
 
 
 def _is_bent(pool: Pool) -> Array:
-    """Return where infinity has to be looked at, (N,): where the fix is not Gaussian in metres.
+    """Return flags (N,) of fixes that are not Gaussian in metres: only for these the cost at infinity is computed.
 
-    Of 8 233 fixes that are Gaussian in metres none had infinity in its region; and where another direction has it, no
-    proof of uniqueness comes to an end, so that the fix is not ok either way.
+    Of 8 233 fixes that are Gaussian in metres none had infinity in its region. If infinity is in the region in another
+    direction, no proof of uniqueness ends, so the fix is not `ok` in either case.
     """
     assert pool.curvature is not None
     assert pool.curvature.kappa is not None
@@ -334,9 +340,10 @@ def _is_bent(pool: Pool) -> Array:
 
 
 def _infinity(problem: Problem, pool: Pool, wanted: Array, unseen: Array) -> Array:
-    """Return the least costs (N,) of infinity: those known from runs there, and where wanted all directions tried."""
+    """Return the least costs (N,) at infinity: from runs to infinity, and from all directions for wanted fixes."""
     known = np.full(len(pool), np.nan) if pool.infinity is None else np.array(pool.infinity)
-    # one run there is none of the least; who has seen the shape before has looked in all directions
+    # A run to infinity tries one direction, so its cost need not be the least. If the shape is already known, all
+    # directions were tried before.
     new = np.flatnonzero(wanted & (unseen | np.isnan(known)))
     if len(new):
         known[new] = np.fmin(known[new], cost_at_infinity(problem.take(new), pool.x[new, 0]))
@@ -344,15 +351,17 @@ def _infinity(problem: Problem, pool: Pool, wanted: Array, unseen: Array) -> Arr
 
 
 def centre_of(problem: Problem) -> Array:
-    """Return the mean (N or 1, d) of the stations that rows are present of, metres."""
+    """Return the mean (N or 1, d) of the stations that have rows with weight, metres."""
     places = problem.stations.places
-    heard = (problem.weight > 0.0).astype(float) @ rows_of_stations(problem).T.astype(float) > 0.0
-    # a station that moves counts wherever it is in the course of the run
-    return centre_of_points(places, np.tile(heard, places.shape[-2] // problem.stations.count))
+    measured = (problem.weight > 0.0).astype(float) @ rows_of_stations(problem).T.astype(float) > 0.0
+    # a moving station counts with its positions at all epochs
+    return centre_of_points(places, np.tile(measured, places.shape[-2] // problem.stations.count))
 
 
 def reach_of(problem: Problem, x: Array) -> Array:
-    """Return the greatest distance (N,) of a station, and of a target without a chart, from the stations' middle.
+    """Return the greatest distance (N,) of a station from the middle of the stations, metres.
+
+    If the problem has no chart, the distances of the targets count too.
 
     Parameters
     ----------
@@ -363,7 +372,7 @@ def reach_of(problem: Problem, x: Array) -> Array:
     """
     centre, spread = centre_and_spread(problem.stations.places)
     reach = np.broadcast_to(spread, (len(x),))
-    if problem.layout.shares("position"):  # its chart knows how far away it is
+    if problem.layout.shares("position"):  # a shared position has a chart, and the chart holds its distance
         return reach
     slots = (*problem.layout.shared, *problem.layout.local)
     for name in (slot.name for slot in slots if slot.name.partition("[")[0] == "position"):
@@ -376,7 +385,7 @@ def reach_of(problem: Problem, x: Array) -> Array:
 def chart_of(
     problem: Problem, x: Array, covariance: Array, curvature: Curvature, truncated: Truncated | None = None
 ) -> Chart | None:
-    """Return in which coordinates positions are Gaussian, or None for problems that do not share one.
+    """Return the coordinates in which positions are Gaussian, or None for problems without a shared position.
 
     Parameters
     ----------
@@ -385,11 +394,11 @@ def chart_of(
     x : array (N, size)
         Fixes.
     covariance : array (N, n, n)
-        Of their shared unknowns.
+        Covariance of their shared unknowns.
     curvature : Curvature
-        Examined; what was not is taken for curved.
+        Examined curvature; an unexamined fix counts as curved.
     truncated : Truncated, optional
-        Their laws where bounds cut these off.
+        Laws of the fixes that bounds cut off.
     """
     if not problem.layout.shares("position"):
         return None
@@ -399,7 +408,7 @@ def chart_of(
     if curvature.kappa is not None:
         with np.errstate(invalid="ignore"):
             kind = chart_kind(curvature.kappa[:, 0], curvature.kappa[:, 1]).astype(np.int8)
-        # in metres the 95 % figures cover
+        # the 95 % ellipses in metres cover
         kind[repeats_hold(curvature) & (kind == CURVED)] = CARTESIAN
     inflation = None if curvature.repeats is None else np.where(holds(curvature.repeats), curvature.repeats[:, 2], 1.0)
     centre = centre_of(problem)
@@ -408,29 +417,29 @@ def chart_of(
 
 
 def chart_kind(metres: Any, inverse: Any) -> Any:
-    """Return the kind of chart of one fix, or of many (N,), from the two numbers of `Curvature.kappa`.
+    """Return the kind of chart of one fix, or of N fixes, from the two numbers of `Curvature.kappa`.
 
-    The first of the kinds whose number is small: NaN is not.
+    It is the first kind whose number is at most `BENT`. NaN counts as larger.
     """
-    assert (CARTESIAN, INVERSE_RANGE, CURVED) == (0, 1, 2)  # so each number that is not small counts as one kind more
+    assert (CARTESIAN, INVERSE_RANGE, CURVED) == (0, 1, 2)  # each number above the limit moves to the next kind
     bent = (metres <= BENT) ^ True
     return bent * 1 + (bent & ((inverse <= BENT) ^ True)) * 1
 
 
-# Findings in sentences.
+# Sentences of the findings.
 
 
 def explain(finished: Finished, code: Array, reason: Array) -> None:
-    """Write the reasons (N,) that belong to the statuses of finished answers, where there is none yet.
+    """Write the reasons (N,) of finished answers by their statuses, where the reason is still empty.
 
     Parameters
     ----------
     finished : Finished
-        Finished, and others, whose costs are NaN.
+        Finished answers; others have the cost NaN and get no reason.
     code : int array (N,)
         `Status` numbers.
     reason : object array (N,)
-        Written where it is empty.
+        Written in place.
     """
     pool = finished.pool
     empty = (reason == "") & np.isfinite(pool.cost[:, 0])
@@ -444,50 +453,55 @@ def explain(finished: Finished, code: Array, reason: Array) -> None:
 
 
 def _name_residuals(finished: Finished, items: Array) -> Any:
-    """Return the sentences on residuals: one for all fixes of a problem, or one for each."""
+    """Return a sentence on the residuals for each item, with the p-value; empty where the residuals fit the noise."""
     pool = finished.pool
     improbable = is_improbable(pool.cost[items, 0], pool.dof[items], P_SUSPECT)
-    told = tail_probability(pool.cost[items, 0], pool.dof[items])
-    said = [f"the residuals are larger than the noise allows (p = {p:.1g})" for p in told]
-    return np.where(improbable, np.array(said, dtype=object), "")
+    p_values = tail_probability(pool.cost[items, 0], pool.dof[items])
+    sentences = [f"the residuals are larger than the noise allows (p = {p:.1g})" for p in p_values]
+    return np.where(improbable, np.array(sentences, dtype=object), "")
 
 
 def _name_infinity(finished: Finished, items: Array) -> Any:
+    """Return the sentences of `unbounded`: the rise of chi-square at infinity."""
     assert finished.pool.infinity is not None
     more = finished.pool.infinity[items] - finished.pool.cost[items, 0]
-    told = [f"infinity costs {f'only {one:.2g}' if one > _NONE else 'no'} more" for one in more.tolist()]
-    return np.array(told, dtype=object)
+    rises = [f"only {rise:.2g}" if rise > _NONE else "nothing" for rise in more.tolist()]
+    return np.array([f"a target at infinity raises chi-square by {rise}" for rise in rises], dtype=object)
 
 
 def _name_rivals(finished: Finished, items: Array) -> Any:
+    """Return the sentences of `ambiguous`: the gap of the nearest rival."""
     gaps = _apart(finished.pool, finished.gap)[items].min(1).tolist()
     return np.array([ambiguity(finished.problem, gap) for gap in gaps], dtype=object)
 
 
 def _name_search(finished: Finished, items: Array) -> Any:
+    """Return the sentences of `searched`: the remark of the search."""
     return "" if finished.pool.remark is None else finished.pool.remark[items]
 
 
 def _name_proof(finished: Finished, items: Array) -> Any:
+    """Return the sentences of `unproven`: why there is no proof of uniqueness."""
     pool = finished.pool
     if pool.loss and pool.robust is not None and pool.remark is not None:
         return np.where(pool.remark[items] == "", NOT_TRIED, pool.remark[items])
-    told = finished.proven.reason[items]
-    return NOT_TRIED if finished.pool.proven is None else np.where(told == NO_PROOF.reason, NOT_TRIED, told)
+    reason = finished.proven.reason[items]
+    return NOT_TRIED if finished.pool.proven is None else np.where(reason == NO_PROOF.reason, NOT_TRIED, reason)
 
 
 def _name_shape(finished: Finished, items: Array) -> Any:
+    """Return the sentences of `curved`: the coordinates in which the fix is Gaussian, if any."""
     curvature = finished.pool.curvature
     assert curvature is not None
     assert curvature.kappa is not None
     inverse = chart_kind(*curvature.kappa[items].T) == INVERSE_RANGE
-    told = np.where(inverse, np.array(BENT_SENTENCE[INVERSE_RANGE], dtype=object), BENT_SENTENCE[CURVED])
+    sentences = np.where(inverse, np.array(BENT_SENTENCE[INVERSE_RANGE], dtype=object), BENT_SENTENCE[CURVED])
     pair = finished.pool.pair
-    return told if pair is None else np.where(np.isfinite(pair[items, 0]).all(-1), BOTH_SIDES, told)
+    return sentences if pair is None else np.where(np.isfinite(pair[items, 0]).all(-1), BOTH_SIDES, sentences)
 
 
 def _is_unsafe(evidence: Evidence) -> Any:
-    """Return the answers whose start was not safe, without a proof that makes up for it."""
+    """Return flags of answers whose start was not safe and that have no proof of uniqueness."""
     return evidence.searched & (evidence.unique ^ True)
 
 
@@ -506,7 +520,7 @@ _TESTS = tuple((finding.status.mark, finding.test) for finding in FINDINGS)
 
 
 def ambiguity(problem: Problem, gap: float) -> str:
-    """Return the sentence about a second minimum with a gap."""
-    text = "another position " + ("fits as well" if gap < _ALIKE else f"costs only {gap:.2g} more")
+    """Return the sentence about a second minimum whose cost is larger by `gap`."""
+    text = "another position " + ("fits equally well" if gap < _ALIKE else f"raises chi-square by only {gap:.2g}")
     moving = problem.epochs > 1 and any(motion.order > 0 for motion in problem.motions)
-    return text + (": a bound on height, speed or place would decide" if moving else "")
+    return text + (": a bound on height, speed or position can decide" if moving else "")

@@ -1,4 +1,7 @@
-"""The verdict: the only place where a pool becomes a fix, by one set of rules, so that a status means one thing."""
+"""The verdict: from a pool of candidates to a fix with a status.
+
+Only this module sets the status of a fix, by one set of rules. So a status has the same meaning for every method.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,7 @@ from optloc.solvers.verdict.minima import is_measured, station_direction, unmeas
 
 _UNFINISHED = (Status.UNBOUNDED, Status.MAX_ITERATIONS, Status.STALLED)
 
-_SHOWN = 8  # names or numbers in a sentence; more are not read
+_SHOWN = 8  # names or numbers in a sentence: a longer list does not help
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,23 +54,23 @@ class Ruling:
     Parameters
     ----------
     marks : int array (N,)
-        All that applies, a bit for each `Status`.
+        One bit for each `Status` that applies.
     reason : object array (N,)
         Sentences.
     proven : Claims
-        What is proven of each.
-    gone : bool array (N,)
-        Where there is no position to be shown.
+        Claims of the proofs.
+    no_position : bool array (N,)
+        True where the position is not shown.
     """
 
     marks: Array
     reason: Array
     proven: Claims
-    gone: Array
+    no_position: Array
 
 
 def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
-    """Return the statuses that settled pools deserve.
+    """Return the statuses, reasons and claims of settled pools.
 
     Parameters
     ----------
@@ -76,7 +79,7 @@ def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     pool : Pool
         Settled.
     gap : array (N, r)
-        Costs of the other minima less that of the best; infinite where there is none.
+        Costs of the other minima minus the cost of the best; infinite in empty slots.
     """
     curvature = pool.curvature
     assert curvature is not None
@@ -86,16 +89,17 @@ def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     few = (pool.dof < 0) & ~broken
     missing = ~np.isfinite(cost) & ~broken & ~few
     answered = ~(broken | few | missing)
-    # what is missing, in this order: data, rows, a candidate; what is left is an answer, perhaps a bad one
+    # Missing data, missing rows and missing candidates are tested in this order. Other problems have an answer, perhaps
+    # a bad one.
     weak = answered & ~_is_determined(curvature)
     distance = distance_of(problem, _position(problem, pool))
     with np.errstate(invalid="ignore"):
         improbable = is_improbable(cost, pool.dof, P_SUSPECT)
     far = answered & _runs_away(problem, curvature, distance, (code != Status.OK) | weak | improbable)
-    # No minimum in sight fits, and one that fits is hidden: that says more than where a refinement in sight broke off.
+    # If no visible minimum fits but a hidden one does, the hidden one explains more than an unfinished refinement.
     barred = answered & _has_hidden(pool) & ((code != Status.OK) | ((weak | far) & improbable))
     far &= ~barred
-    # far away every direction is weak: how far says more
+    # far away every direction is weak, so the distance is the better reason
     weak &= ~(far | barred)
     code[broken], code[few], code[far] = Status.REJECTED, Status.TOO_FEW_ROWS, Status.UNBOUNDED
     code[weak], code[barred] = Status.SINGULAR_GEOMETRY, Status.INFEASIBLE
@@ -104,7 +108,7 @@ def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     for i in np.flatnonzero(few):
         reason[i] = _lacking(-int(pool.dof[i]))
     for i in np.flatnonzero(answered & np.isin(code, _UNFINISHED)):
-        reason[i] = f"the last step ended at {distance[i]:.3g} times the size of the station array from its middle"
+        reason[i] = f"the target is too far away: {distance[i]:.3g} times the size of the station array from its middle"
     for i in np.flatnonzero(weak):
         reason[i] = _open(problem, _information(curvature)[i])
     _explain_missing(problem, pool, np.flatnonzero(missing), code, reason)
@@ -125,8 +129,8 @@ def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
 
 
 def _is_broken(problem: Problem, count: int) -> Array:
-    """Return which of so many problems have a measurement that is no number, (N,)."""
-    # a row that is absent may hold anything
+    """Return flags (N,) of problems that have a measurement which is not a finite number."""
+    # an absent row may hold any value
     return ~np.broadcast_to((np.isfinite(problem.z) | (problem.weight == 0.0)).all(-1), (count,))
 
 
@@ -138,7 +142,7 @@ def filled_objects(count: int, value: object) -> Array:
 
 
 def _is_determined(curvature: Curvature) -> Array:
-    """Return where the data leave no direction open, (N,)."""
+    """Return flags (N,) of fixes whose data determine every direction."""
     count = len(curvature.covariance)
     regular = np.ones(count, dtype=bool) if curvature.regular is None else curvature.regular
     weakest = np.full(count, np.inf) if curvature.weakest is None else curvature.weakest
@@ -146,47 +150,49 @@ def _is_determined(curvature: Curvature) -> Array:
 
 
 def _information(curvature: Curvature) -> Array:
+    """Return the information (N, n, n) of a curvature; NaN if it was not computed."""
     return np.full(curvature.covariance.shape, np.nan) if curvature.information is None else curvature.information
 
 
 def _runs_away(problem: Problem, curvature: Curvature, distance: Array, lost: Array) -> Array:
-    """Return where a position is so far away, and so badly known, that the data say a direction only, (N,)."""
+    """Return flags (N,) of positions so far away or so uncertain that the data determine a direction only."""
     covariance = np.where(_is_determined(curvature)[:, None, None], curvature.covariance, np.nan)
     with np.errstate(invalid="ignore"):
-        # an error larger than the distance from the stations: a direction, not a place
+        # if the error exceeds the distance from the stations, only the direction is known
         loose = np.trace(covariance, axis1=-2, axis2=-1) > (distance * spread_of(problem)[1]) ** 2
-        # far: only a fix that is otherwise good stands; flat: none does, since wave fronts are
+        # Beyond FAR a fix must be good in all other respects. Beyond FLAT wave fronts are flat, so no fix is accepted.
         return np.asarray(((lost | loose) & (distance > FAR)) | (distance > FLAT))
 
 
 def _lacking(count: int) -> str:
+    """Return the sentence for `count` missing measurements."""
     return f"there {'is 1 measurement' if count == 1 else f'are {count} measurements'} fewer than unknowns"
 
 
 def _open(problem: Problem, information: Array) -> str:
-    """Return what the data leave open: combinations of biases by name, else the direction of the position."""
-    # biases trade with each other: that combination says more than a direction
+    """Return a sentence on what the data do not determine: combinations of biases by name, or a direction."""
+    # biases compensate each other, and the names of this combination help more than a direction
     named = open_sentences(problem.layout, information) if problem.biases and np.isfinite(information).all() else ()
     return "; ".join(named) or weak_direction(problem, information)
 
 
 def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, reason: Array) -> None:
-    """Write the status of problems without any candidate: what keeps every closed form from a start."""
+    """Write status and reason of problems without a candidate: the cause that prevents every closed-form start."""
     if pool.missing is not None:
-        told = items[pool.missing.reason[items] != ""]
-        code[told], reason[told] = pool.missing.code[told], pool.missing.reason[told]
-        items = np.setdiff1d(items, told)
+        known = items[pool.missing.reason[items] != ""]
+        code[known], reason[known] = pool.missing.code[known], pool.missing.reason[known]
+        items = np.setdiff1d(items, known)
     if not len(items):
         return
     barred = items[(code[items] == Status.INFEASIBLE) | _has_hidden(pool)[items]]
     code[barred] = Status.INFEASIBLE
     for i in barred:
         bounds = violation_names(problem)
-        missed = f"no minimum meets all of: {bounds}" if bounds else "the Earth hides all that was found"
+        missed = f"no minimum satisfies all constraints: {bounds}" if bounds else "the Earth hides every minimum found"
         reason[i] = _hidden_or(pool, int(i), missed)
     items = np.setdiff1d(items, barred)
     single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
-    # the graph of ranges is that of one position: stations of a moving run link themselves
+    # the graph of ranges belongs to one position: in a moving run stations are linked over time
     found = ranges(problem.take(items)) if single and len(items) else None
     straight = bool(len(items)) and not isinstance(problem.medium, Layers)
     measured = is_measured(problem.take(items)) if straight else np.zeros(len(items), dtype=bool)
@@ -195,18 +201,18 @@ def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, re
         if len(groups) > 1:
             names = problem.stations.names
             code[i] = Status.DISCONNECTED
-            reason[i] = "no row links " + " with ".join(
+            reason[i] = "no measurement links " + " with ".join(
                 "{" + ", ".join(names[s] for s in sorted(set(group))) + "}" for group in groups
             )
         elif isinstance(problem.medium, Layers):
             code[i] = Status.INFEASIBLE
-            reason[i] = "no place was found within the layers that direct rays lead from to all stations of the rows"
+            reason[i] = "no position was found from which direct rays through the layers reach all stations"
         elif not any(MODELS[rows.kind].ranges or MODELS[rows.kind].lifted for rows in problem.rows) or measured[place]:
             code[i] = Status.UNAVAILABLE
             tried = any(stage.name == "search" for stage in pool.stages)
             kinds = " and ".join(dict.fromkeys(rows.kind for rows in problem.rows))
-            reason[i] = f"no closed form starts from these rows of {kinds}"
-            reason[i] += ", and a search found nothing" if tried else ": use 'auto', which searches"
+            reason[i] = f"no closed form gives a start for measurements of {kinds}"
+            reason[i] += ", and a search found no minimum" if tried else ": use 'auto', which searches"
         else:
             code[i] = Status.SINGULAR_GEOMETRY
             one = problem.take(np.array([i]))
@@ -226,44 +232,44 @@ def _short(problem: Problem) -> str:
 
 
 def _has_hidden(pool: Pool) -> Array:
-    """Return where a minimum lies behind the Earth, (N,)."""
+    """Return flags (N,) of problems with a minimum behind the Earth."""
     return np.zeros(len(pool), dtype=bool) if pool.hidden is None else np.asarray(pool.hidden != "", dtype=bool)
 
 
 def _hidden_or(pool: Pool, item: int, otherwise: str) -> str:
-    """Return the sentence on what lies behind the Earth of one problem; another one where there is none."""
+    """Return the sentence on a minimum behind the Earth of one problem, or another sentence if it has none."""
     return otherwise if pool.hidden is None else pool.hidden[item] or otherwise
 
 
 def _name_hidden(hidden: Array, items: Array, reason: Array) -> None:
-    """Write what lies behind the Earth where nothing before it fits."""
+    """Append the sentence on a minimum behind the Earth to the reasons of given items."""
     for i in np.flatnonzero(items & (hidden != "")):
         reason[i] = f"{reason[i]}; {hidden[i]}" if reason[i] else hidden[i]
 
 
 def _position(problem: Problem, pool: Pool) -> Array:
-    """Return the position (N, d) of the only target, or the centre of the stations where there is no such thing."""
+    """Return the position (N, d) of the only target, or the centre of the stations if there is no shared position."""
     if problem.layout.shares("position"):
         return problem.layout.take(np.where(np.isfinite(pool.cost[:, :1]), pool.x[:, 0], np.nan), "position")
     return np.broadcast_to(spread_of(problem)[0], (len(pool), problem.dimension))
 
 
 def _name_rejected(problem: Problem, pool: Pool, items: Array, reason: Array) -> None:
-    """Write which rows a loss rejected, where the residuals are larger than the noise allows."""
+    """Write the rows that a robust loss rejected, for items whose residuals are larger than the noise allows."""
     base = np.broadcast_to(problem.weight, pool.weights.shape)
     lost = (base > 0.0) & (pool.weights < REJECTED * base)
     for i in np.flatnonzero(items & lost.any(1)):
         rows = np.flatnonzero(lost[i])
         shown = ", ".join(map(str, rows[:_SHOWN])) + (" ..." if len(rows) > _SHOWN else "")
-        reason[i] = f"{len(rows)} of {int((base[i] > 0.0).sum())} rows are rejected: {shown}; {reason[i]}"
+        reason[i] = f"{len(rows)} of {int((base[i] > 0.0).sum())} rows were rejected: {shown}; {reason[i]}"
 
 
 def _hold_against_constraints(pool: Pool, cost: Array, finished: Array, marks: Array, reason: Array) -> None:
-    """Mark where the data contradict the constraints that hold an answer.
+    """Mark fixes whose data contradict the constraints that hold them.
 
-    They do so where the data agree among themselves without the constraints, and each constraint that holds a fix
-    costs so much that noise does it once in a thousand times: with the true place inside, what k of them cost is not
-    more than chi-square of k degrees of freedom. A loss bears gross errors: under it the data need not agree.
+    Two conditions must be true. The data agree without the constraints. The k active constraints raise the cost by more
+    than the chi-square of k degrees of freedom, which noise exceeds once in a thousand cases. Under a robust loss the
+    first condition is dropped, since a robust loss allows gross errors.
     """
     assert pool.curvature is not None
     if pool.curvature.active is None:
@@ -272,34 +278,34 @@ def _hold_against_constraints(pool: Pool, cost: Array, finished: Array, marks: A
     assert free is not None
     held = np.array([len(active) for active in pool.curvature.active])
     with np.errstate(invalid="ignore"):
-        # whether the data agree without constraints; without redundancy they always do
+        # whether the data agree without constraints; always true without redundancy
         noise = bool(pool.loss) | (pool.dof <= 0) | (chdtrc(np.maximum(pool.dof, 1), free) >= P_SUSPECT)
         dear = chdtrc(np.maximum(held, 1), np.maximum(cost - free, 0.0)) < P_SUSPECT
     for i in np.flatnonzero((held > 0) & finished & np.isfinite(free) & noise & dear):
         names = " and ".join(active.name for active in pool.curvature.active[i])
         marks[i] |= Status.CONTRADICTORY.mark
         reason[i] = (
-            f"the data and the constraint {names} disagree: cost {cost[i]:.3g} with it, {free[i]:.3g} without it"
+            f"the data and the constraint {names} disagree: chi-square {cost[i]:.3g} with it, {free[i]:.3g} without it"
         )
 
 
 def _weigh_redundancy(pool: Pool, finished: Array, reason: Array) -> None:
-    """Write what the redundancy of the rows lets a search for suspects see."""
+    """Write the limits that a redundancy of 0 or 1 sets to a search for suspects."""
     for dof, limit in (
-        (0, "an error in a measurement would not be noticed"),
-        (1, "an error would be noticed, not named"),
+        (0, "a wrong measurement would not be noticed"),
+        (1, "a wrong measurement would be noticed, but not identified"),
     ):
         for i in np.flatnonzero(finished & (pool.dof == dof)):
-            told = f"redundancy {dof}: {limit}"
-            reason[i] = f"{reason[i]}; {told}" if reason[i] else told
+            sentence = f"redundancy {dof}: {limit}"
+            reason[i] = f"{reason[i]}; {sentence}" if reason[i] else sentence
 
 
 _EPOCHS_SHOWN = 8  # epochs that a sentence names
-_EXPLAINED = 4  # misfits of a batch whose causes are looked for: each takes as long as many fixes
+_EXPLAINED = 4  # misfits of a batch that are explained: one explanation takes the time of many fixes
 
 
 def verdict(problem: Problem, pool: Pool) -> Fix:
-    """Return the fixes of a flat batch of problems after all that an `ok` promises has been looked at.
+    """Return the fixes of a flat batch of problems, after all checks that the status `ok` requires.
 
     Parameters
     ----------
@@ -312,31 +318,31 @@ def verdict(problem: Problem, pool: Pool) -> Fix:
 
 
 def _name_misfits(problem: Problem, fix: Fix) -> Fix:
-    """Return the fixes of runs with what would explain their misfits among the reasons, where they are few."""
+    """Return fixes of runs with causes of their misfits in the reasons, if there are few misfits."""
     items = np.flatnonzero(fix.code == Status.MISFIT)
     if problem.epochs == 1 or not 0 < len(items) <= _EXPLAINED:
         return fix
     reason = fix.reason.copy()
     for i in items:
-        told = misfit_of(problem.take(np.array([i])), fix.x[i])
-        reason[i] = f"{reason[i]}; {told}" if reason[i] else told
+        causes = misfit_of(problem.take(np.array([i])), fix.x[i])
+        reason[i] = f"{reason[i]}; {causes}" if reason[i] else causes
     return replace(fix, reason=reason)
 
 
 def judge(problem: Problem, pool: Pool) -> Fix:
-    """Return the fixes of a flat batch of problems by what is known so far: what stages between others need.
+    """Return the fixes of a flat batch of problems from the numbers computed so far, for use between stages.
 
     Parameters
     ----------
     problem : Problem
         N problems.
     pool : Pool
-        Their candidates; starts that nobody has refined get the status `unrefined`.
+        Their candidates; starts that are not refined get the status `unrefined`.
     """
     if pool.curvature is None:
         return _show_starts(problem, pool)
     fix = _plain(problem, pool, pool.curvature)
-    # rules cost more than a compiled fix: they are asked only where something stands against one
+    # the rules take longer than a compiled fix, so they run only for fixes with a finding
     if pool.plain is None:
         fix = _apply_rules(problem, pool, fix)
     elif not pool.plain.all():
@@ -345,18 +351,22 @@ def judge(problem: Problem, pool: Pool) -> Fix:
     if pool.conclusion is not None:
         items = np.flatnonzero(present(pool.conclusion))
         own = [_concluded(problem, int(i), pool.conclusion[i]) for i in items]
-        # one copy of all fixes for each would take a time that grows with the square of the batch
+        # one overwrite for all items: a copy of the whole batch per item would take quadratic time
         fix = overwrite(fix, items, join(own, len(own))) if own else fix
     return fix
 
 
-def _concluded(problem: Problem, item: int, told: Conclusion | Fix) -> Fix:
+def _concluded(problem: Problem, item: int, conclusion: Conclusion | Fix) -> Fix:
     """Return the fix of an item with a conclusion, a flat batch of one."""
-    return told.reshape((1,)) if isinstance(told, Fix) else conclude(problem.take(np.array([item])), told)
+    return (
+        conclusion.reshape((1,))
+        if isinstance(conclusion, Fix)
+        else conclude(problem.take(np.array([item])), conclusion)
+    )
 
 
 def surviving_candidates(pool: Pool, fix: Fix) -> Array:
-    """Return the candidates (N, q, size) of a pool that its verdict lets stand: those without a position are NaN."""
+    """Return the candidates (N, q, size) of a pool; NaN for a best candidate whose verdict shows no position."""
     if pool.curvature is None:
         return pool.x
     best = np.where(np.isnan(fix.x).all(-1, keepdims=True), np.nan, pool.x[:, 0])
@@ -364,7 +374,7 @@ def surviving_candidates(pool: Pool, fix: Fix) -> Array:
 
 
 def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
-    """Return the fixes of settled pools as if all of them were finished and near; without a status where none is."""
+    """Return the fixes of settled pools as if all were finished and near; without a status if `pool.plain` is None."""
     count, cost, proven = len(pool), pool.cost[:, 0], _claims(pool)
     law = law_at(problem, pool)
     covariance = curvature.covariance if law is None else _cut_off(problem, pool, law.truncated)
@@ -403,7 +413,7 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
 
 
 def _cut_off(problem: Problem, pool: Pool, law: Truncated) -> Array:
-    """Return the covariances (N, n, n) of the shared unknowns, cut off at bounds."""
+    """Return the covariances (N, n, n) of the shared unknowns after truncation at bounds."""
     curvature = pool.curvature
     assert curvature is not None
     out = np.array(curvature.covariance)
@@ -418,7 +428,7 @@ def _cut_off(problem: Problem, pool: Pool, law: Truncated) -> Array:
 
 
 def _claims(pool: Pool) -> Claims:
-    """Return the claims (N,) of refined answers: what was proven of them, or that they are minima."""
+    """Return the claims (N,) of refined answers: the result of their proof, or `NO_PROOF` if no proof was tried."""
     if pool.proven is None:
         return _without_proof(len(pool))
     return merged_claims(pool.proven.tried, pool.proven, NO_PROOF)
@@ -426,6 +436,7 @@ def _claims(pool: Pool) -> Claims:
 
 @lru_cache(maxsize=64)  # read-only views
 def _without_proof(count: int) -> Claims:
+    """Return `NO_PROOF` for `count` fixes."""
     return repeated_claims(NO_PROOF, count)
 
 
@@ -434,8 +445,8 @@ def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
     ruling = decide_statuses(problem, pool, fix.alternatives.gap)
     assert pool.curvature is not None
     regular = pool.curvature.regular
-    unknown = ruling.gone if regular is None else ruling.gone | ~regular
-    x = np.where(ruling.gone[:, None], np.nan, fix.x)
+    unknown = ruling.no_position if regular is None else ruling.no_position | ~regular
+    x = np.where(ruling.no_position[:, None], np.nan, fix.x)
     covariance = np.where(unknown[:, None, None], np.nan, fix.cov)
     return replace(
         fix,
@@ -451,7 +462,7 @@ def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
 
 
 def _show_starts(problem: Problem, pool: Pool) -> Fix:
-    """Return starts as fixes whose status says that they are not refined, or why there is none."""
+    """Return starts as fixes with the status `unrefined`, or with the reason why a problem has no start."""
     count, n = len(pool), problem.layout.n_shared
     name = pool.stages[-1].name if pool.stages else "start"
     code, reason = np.full(count, int(Status.UNREFINED), dtype=np.int8), filled_objects(count, "not refined")
@@ -478,7 +489,7 @@ def _show_starts(problem: Problem, pool: Pool) -> Fix:
 
 
 def failed_fixes(problem: Problem, cause: str) -> Fix:
-    """Return fixes (N,) without an answer, whose status is `numerical` and whose reason is the cause."""
+    """Return fixes (N,) without an answer, whose status is `numerical` and whose reason is the given cause."""
     count, size, n = problem.batch_shape[0], problem.layout.size, problem.layout.n_shared
     code = np.full(count, int(Status.NUMERICAL), dtype=np.int8)
     return Fix(
@@ -491,7 +502,7 @@ def failed_fixes(problem: Problem, cause: str) -> Fix:
         repeated_claims(NO_ANSWER, count),
         Alternatives(np.full((count, 0, size), np.nan), np.full((count, 0), np.inf)),
         np.full(count, np.nan),
-        # nothing is computed here, since whatever is may fail again: without a cost no redundancy is of use
+        # nothing is computed here because it might fail again; a fix without a cost does not need its redundancy
         np.zeros(count, dtype=np.int32),
         np.broadcast_to(problem.weight, (count, problem.count)),
         marks=np.full(count, Status.NUMERICAL.mark, dtype=np.int32),
@@ -499,7 +510,7 @@ def failed_fixes(problem: Problem, cause: str) -> Fix:
 
 
 def hide_open_epochs(fix: Fix) -> Fix:
-    """Return the fixes of runs without the states of epochs that leave them open: NaN, and named in the reason."""
+    """Return fixes of runs with NaN for the states of undetermined epochs; the reason names these epochs."""
     if fix.local is None or not fix.answered.any():
         return fix
     size = fix.local.shape[-1]
@@ -514,7 +525,7 @@ def hide_open_epochs(fix: Fix) -> Fix:
         where = np.flatnonzero(undone[i])
         if len(where):
             shown = ", ".join(map(str, where[:_EPOCHS_SHOWN])) + (" ..." if len(where) > _EPOCHS_SHOWN else "")
-            left = f"{len(where)} of {undone.shape[-1]} epochs do not place their targets: {shown}"
+            left = f"{len(where)} of {undone.shape[-1]} epochs do not determine their positions: {shown}"
             reason[i] = f"{reason[i]}; {left}" if reason[i] else left
     x[..., n:] = states.reshape(*x.shape[:-1], -1)
     return replace(fix, x=x, reason=reason)

@@ -1,4 +1,4 @@
-"""From refined candidates to the minima that the data allow: the best one, its curvature, and its rivals."""
+"""From refined candidates to the distinct minima of each problem: the best minimum, its curvature, and its rivals."""
 
 from __future__ import annotations
 
@@ -26,20 +26,22 @@ from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.position import distance_of, spread_of
 from optloc.solvers.verdict.findings import centre_of
 
-# Information that is none: no square of a Jacobian is as small, and its root still has an inverse.
+# Information up to this value counts as zero: the square of a Jacobian entry is never so small. Its root can be
+# inverted.
 _DEAD = 1e-300
-# Share of the largest term of an open direction below which a term is not worth its words.
+# Terms below this share of the largest term of an open direction are not named in the sentence.
 _TELLING = 0.05
-# Spread of stations, relative to their coordinates, that rounding may have left of a point; and across a line or plane,
-# relative to that along it: a micrometre a metre fixes nothing that noise would not hide.
+# Spreads of stations that count as zero, since rounding may cause them. _POINT is relative to the coordinates. _FLAT is
+# the spread across a line or plane relative to the spread along it: noise hides the effect of a micrometre per metre.
 _POINT, _FLAT = 1e-9, 1e-6
-# Where rows are asked what they measure: around the stations, off their planes of symmetry; and the share of these
-# places at which they must determine a position, for some place may lie where they do not.
+# Positions at which the information of the rows is tested: corners of a box around the stations, at 1.3 times the
+# spread to avoid planes of symmetry. Rows must determine a position at more than this share of the corners: a corner
+# may be singular by chance.
 _AWAY, _MOST = 1.3, 0.5
 
 
 def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array) -> Curvature:
-    """Return the curvature at vectors x (N, size) that lie on given faces (N,) of the constraints."""
+    """Return the curvature of the cost at vectors x (N, size) that lie on given faces (N,) of the constraints."""
     information, vector, ok = marginal(equations)
     covariance, regular = linalg.inverse(information)
     weakest = smallest_pivot(information)
@@ -57,7 +59,7 @@ def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array
             free[items], shift[items] = _without_bounds(part, sides[0], x[items], information[items], vector[items])
         along = tangent_at(part, sides[number], x[items])
         covariance[items], regular[items] = linalg.inverse_within(information[items], along)
-        # what constraints hold is not open: the pivots are those along the face
+        # constraints determine the directions across the face, so only pivots along the face count
         inner = np.swapaxes(along, -1, -2) @ information[items] @ along
         weakest[items] = smallest_pivot(inner) if inner.shape[-1] else 1.0
         active[items] = _multipliers(part, sides[number], x[items], vector[items])
@@ -69,7 +71,7 @@ def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array
 def _without_bounds(
     problem: Problem, equalities: Face, x: Array, information: Array, vector: Array
 ) -> tuple[Array, Array]:
-    """Return covariance (N, n, n), and mean less x (N, n), of the quadratic model that only equalities hold.
+    """Return covariance (N, n, n), and mean minus x (N, n), of the quadratic model with equalities but without bounds.
 
     NaN where the data and the equalities leave a direction open.
     """
@@ -83,10 +85,10 @@ def _without_bounds(
 
 
 def _local_covariance(problem: Problem, equations: Normal, shared: Array) -> Array | None:
-    """Return the covariance of the states that targets and walks have at each epoch, or None where there are none."""
+    """Return the covariance of the states of targets and walks at each epoch, or None without such states."""
     names = {name for i, m in enumerate(problem.motions) for name in state_names(i, len(problem.motions), m.order)}
     names |= set(walk_names(problem))
-    # they stand first
+    # these states come first in the layout
     size = sum(slot.size for slot in problem.layout.local if slot.name in names)
     with np.errstate(all="ignore"):
         return local_covariance(equations, shared, size) if size else None
@@ -100,18 +102,18 @@ def _multipliers(problem: Problem, face: Face, x: Array, vector: Array) -> Array
     for i in range(len(x)):
         out[i] = ()
         if np.isfinite(gradients[i]).all() and np.isfinite(vector[i]).all():
-            # half the gradient stands in the normal equations: twice it is balanced by the constraints, as well as they
-            # can
+            # The vector of the normal equations is half the gradient of the cost, hence the factor 2. Least squares,
+            # since constraints need not balance the gradient exactly.
             values = np.linalg.lstsq(gradients[i].T, 2.0 * vector[i], rcond=None)[0]
             out[i] = tuple(Active(name, float(value)) for name, value in zip(names, values, strict=True))
     return out
 
 
 def smallest_pivot(information: Array) -> Array:
-    """Return the smallest squared pivot of the information scaled to a unit diagonal, (N,)."""
+    """Return the smallest squared pivot (N,) of the information, scaled to a unit diagonal."""
     diagonal = np.diagonal(information, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        # a unit diagonal: metres, seconds and radians weigh the same
+        # a unit diagonal makes metres, seconds and radians comparable
         scale = 1.0 / np.sqrt(diagonal)
         lower, ok = linalg.factor(information * scale[..., :, None] * scale[..., None, :])
         pivots = np.diagonal(lower, axis1=-2, axis2=-1).min(-1, initial=1.0) ** 2
@@ -119,24 +121,24 @@ def smallest_pivot(information: Array) -> Array:
 
 
 def weak_direction(problem: Problem, information: Array) -> str:
-    """Return a sentence that names the combination of unknowns that the data leave open."""
+    """Return a sentence that names the combination of unknowns that the data do not determine."""
     diagonal = np.diagonal(information)
     if not np.isfinite(information).all():
         return "the information is not finite"
     labels = problem.layout.labels()
     dead = np.flatnonzero(diagonal <= _DEAD)
     if len(dead):
-        return "nothing measures " + ", ".join(labels[i] for i in dead)
+        return "no measurement depends on " + ", ".join(labels[i] for i in dead)
     scale = 1.0 / np.sqrt(diagonal)
     _, vectors = np.linalg.eigh(information * scale[:, None] * scale[None])
     direction = vectors[:, 0] * scale
     direction = direction / np.abs(direction).max()
     terms = [f"{value:+.2g} {labels[i]}" for i, value in enumerate(direction) if abs(value) > _TELLING]
-    return "undetermined along " + " ".join(terms)
+    return "the data do not determine the direction " + " ".join(terms)
 
 
 def _corners(problem: Problem) -> Array:
-    """Return vectors (N, q, size) of problems of one position at the corners of a box around the stations."""
+    """Return vectors (N, q, size) with the position at the corners of a box around the stations."""
     centre, spread = spread_of(problem)
     corners = _AWAY * np.array(list(product((-1.0, 1.0), repeat=problem.dimension)))
     places = centre[:, None] + spread[:, None, None] * corners
@@ -144,7 +146,10 @@ def _corners(problem: Problem) -> Array:
 
 
 def is_measured(problem: Problem) -> Array:
-    """Return whether rows and equalities determine the position at most places, (N,); False where it is not one."""
+    """Return flags (N,) of problems whose rows and equalities determine the position around the stations.
+
+    A problem passes if they do so at most corners of a box; False for problems of several positions.
+    """
     size = problem.batch_shape[0]
     if not one_position(problem):
         return np.zeros(size, dtype=bool)
@@ -160,31 +165,32 @@ def is_measured(problem: Problem) -> Array:
 
 
 def unmeasured_direction(problem: Problem) -> str:
-    """Return a sentence that names what no row of one problem of one position measures, wherever it is; or ""."""
+    """Return a sentence that names the unknowns that no row measures at any position; "" without such unknowns."""
     if not one_position(problem):
         return ""
     x = _corners(problem)[0]
     with np.errstate(all="ignore"):
         information, _, _ = marginal(equations_at(problem.take(np.zeros(len(x), dtype=int)), x))
     dead = np.asarray((np.diagonal(information, axis1=-2, axis2=-1) <= _DEAD).all(0))
-    return "nothing measures " + ", ".join(np.array(problem.layout.labels())[: len(dead)][dead]) if dead.any() else ""
+    names = np.array(problem.layout.labels())[: len(dead)][dead]
+    return "no measurement depends on " + ", ".join(names) if dead.any() else ""
 
 
 def station_direction(problem: Problem) -> str:
-    """Return a sentence that names why the stations of one problem cannot fix a position."""
+    """Return a sentence that names why the stations of one problem cannot determine a position."""
     position = problem.stations.position.reshape(-1, problem.dimension)
     used = sorted({int(s) for rows in problem.rows for s in (*rows.a, *rows.b) if s >= 0})
     places = position[used]
     values, vectors = np.linalg.eigh(np.cov(places.T, bias=True)) if len(used) > 1 else (np.zeros(1), np.eye(1))
     spread = np.sqrt(np.maximum(values, 0.0))
     if spread[-1] <= _POINT * (1.0 + np.abs(places).max()):
-        return "the stations stand at one point"
+        return "all stations are at the same point"
     flat = int((spread < _FLAT * spread[-1]).sum())
     axis = ", ".join(f"{v:.2f}" for v in vectors[:, -1])
     if flat >= problem.dimension - 1 and problem.dimension > 1:
-        return f"the stations stand on one line along ({axis}); turning about it changes nothing"
+        return f"all stations are on one line along ({axis}); a rotation about this line changes no measurement"
     axis = ", ".join(f"{v:.2f}" for v in vectors[:, 0])
-    return f"the rows leave more than one direction open; the stations spread least along ({axis})"
+    return f"the measurements leave more than one direction undetermined; the stations spread least along ({axis})"
 
 
 Equations = Callable[[Problem, Array], Normal]
@@ -193,8 +199,9 @@ Equations = Callable[[Problem, Array], Normal]
 def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = equations_at) -> Pool:
     """Return the pool of the distinct minima of every problem: the best one first, with its curvature.
 
-    Runs to infinity leave the pool where a finite minimum rivals them, and their cost is kept; candidates that lie
-    within a tenth of a standard deviation of another, or cost too much to matter, leave it too.
+    Three groups of candidates are dropped. Runs to infinity are dropped if a finite minimum costs about as little;
+    their cost is kept. The others are within a tenth of a standard deviation of a candidate, or cost too much to
+    matter.
 
     Parameters
     ----------
@@ -203,11 +210,11 @@ def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = eq
     pool : Pool
         Their refined candidates.
     stage : Stage
-        What refined them.
+        The refinement stage.
     equations : callable
-        Maps (problem, x) to the `Normal` equations at vectors (N, size) of the cost that was minimised.
+        Maps (problem, x) to the `Normal` equations at vectors (N, size) of the minimised cost.
     """
-    # a wave that runs backwards explains nothing
+    # a wave that travels backwards is not physical
     good = np.isfinite(pool.cost) & ~runs_backwards(problem, pool.x)
     pool = replace(pool, cost=np.where(good, pool.cost, np.inf))
     pool, infinity = _without_runs_to_infinity(problem, pool)
@@ -216,7 +223,7 @@ def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = eq
     x, cost, face = pool.x[rows, best], pool.cost[rows, best], pool.face[rows, best]
     found = np.isfinite(cost)
     with np.errstate(all="ignore"):
-        # unfound ones are evaluated at zero: a batch has no holes, and their curvature is not shown
+        # problems without a candidate are evaluated at zero, to fill the batch; their curvature is not shown
         at = equations(problem, np.where(found[:, None], x, 0.0))
         curvature = measure_curvature(problem, at, x, np.where(found, face, 0))
     slots = _rivals(problem, pool, x, cost, curvature)
@@ -236,20 +243,21 @@ def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = eq
 
 
 def _without_runs_to_infinity(problem: Problem, pool: Pool) -> tuple[Pool, Array]:
-    """Return the pool without runs to infinity where a finite minimum rivals them, and their least cost, (N,)."""
+    """Return the pool without runs to infinity that a finite minimum rivals, and the least cost (N,) of these runs."""
     none = np.full(len(pool), np.nan)
     if not problem.layout.shares("position"):
         return pool, none
     distance = distance_of(problem, problem.layout.take(pool.x, "position"))
     with np.errstate(invalid="ignore"):
-        # an unfinished point out there is on its way; a finished one counts up to where fronts are flat
+        # an unfinished point beyond FAR is on its way to infinity; beyond FLAT wave fronts are flat, so finished points
+        # count too
         remote = (distance > FLAT) | ((distance > FAR) & (pool.code != Status.OK))
     if not remote.any():
         return pool, none
     near = np.where(~remote & (pool.code == Status.OK), pool.cost, np.inf).min(1)
     far = np.where(remote, pool.cost, np.inf).min(1)
     with np.errstate(invalid="ignore"):
-        # the finite minimum is answered; what infinity costs is for the verdict
+        # the finite minimum is the answer; the verdict uses the cost at infinity
         rivals = np.isfinite(near) & (near - far <= AMBIGUOUS_GAP)
     return replace(pool, cost=np.where(remote & rivals[:, None], np.inf, pool.cost)), np.where(
         np.isfinite(far), far, np.nan
@@ -257,7 +265,7 @@ def _without_runs_to_infinity(problem: Problem, pool: Pool) -> tuple[Pool, Array
 
 
 def _sort(pool: Pool) -> Pool:
-    """Return the candidates of every problem, the cheapest first."""
+    """Return the pool with the candidates of every problem in ascending order of cost."""
     if pool.cost.shape[1] == 1:
         return pool
     order = np.argsort(pool.cost, axis=1, kind="stable")
@@ -266,9 +274,9 @@ def _sort(pool: Pool) -> Pool:
 
 
 def _choose(problem: Problem, pool: Pool) -> Array:
-    """Return the slot to answer with: the cheapest, or of finished ones that cost the same the likelier by their place.
+    """Return the slot (N,) of the answer: the cheapest candidate, or the likeliest of finished ones with equal costs.
 
-    Which of these is the cheapest is a matter of rounding, and another processor's is another.
+    Rounding, which differs between processors, must not choose between equal costs.
     """
     finished, least = pool.code == Status.OK, pool.cost[:, :1]
     with np.errstate(invalid="ignore"):
@@ -284,26 +292,27 @@ def _choose(problem: Problem, pool: Pool) -> Array:
 
 
 def likelihood_of(problem: Problem, x: Array) -> tuple[Array, Array]:
-    """Return two numbers each, (N,), by which vectors (N, size) of one cost are told apart: the larger is likelier.
+    """Return two numbers (N,) that rank vectors (N, size) of equal cost by their positions: larger is likelier.
 
-    On Earth by how well all stations see them, elsewhere by how near to the stations they are; mirror images, equal in
-    both, by their last coordinate: the upper one. What is equal but for rounding must be equal here.
+    The first number on Earth is the lowest elevation from a station, elsewhere the nearness to the stations. The second
+    number is the last coordinate: it chooses the upper one of two mirror images. The first number is rounded, so that
+    rounding errors do not rank equal positions.
     """
     place = problem.layout.take(x, "position")
     if problem.frame.geodetic:
         first = lowest_sight(problem, x)  # sines of elevations
     else:
-        # of stations with rows: another station changes nothing
+        # only stations with rows count, so that an unused station changes nothing
         with np.errstate(divide="ignore", over="ignore"):
             first = -0.5 * np.log(((place - centre_of(problem)) ** 2).sum(-1))
     return np.round(first, 6), place[:, -1]
 
 
 def _rivals(problem: Problem, pool: Pool, x: Array, cost: Array, curvature: Curvature) -> Array:
-    """Return the slots (N, r) of the other finished minima within the listed gap, cheapest first; -1 where none.
+    """Return the slots (N, r) of the other finished minima within the listed gap, cheapest first; -1 for empty slots.
 
-    Each is listed once. Those of a run are listed whatever they cost: they are few, and by how much the data exclude
-    them is what its user asks.
+    Each minimum is listed once. For a run all minima are listed at any cost: they are few, and users need to know by
+    how much the data exclude them.
     """
     n, limit = problem.layout.n_shared, np.inf if problem.epochs > 1 else LISTED_GAP
     with np.errstate(invalid="ignore"):
@@ -330,11 +339,11 @@ def _at(values: Array, slots: Array, empty: float) -> Array:
 
 
 def _same(x: Array, y: Array, curvature: Curvature) -> Array:
-    """Return where two points are nearer than a tenth of a standard deviation in every direction, or equal."""
+    """Return flags (N,) of point pairs that are equal, or closer than 0.1 standard deviations in all directions."""
     difference = x - y
     with np.errstate(all="ignore"):  # a point that constraints hold has no spread
         squared = (difference[:, None, :] @ curvature.information @ difference[..., None])[:, 0, 0]
         spread = np.trace(curvature.covariance, axis1=-2, axis2=-1)  # constraints leave directions without information
         squared = np.maximum(squared, (difference**2).sum(-1) / spread)
-        equal = (np.abs(difference) <= 1e-9 * (1.0 + np.abs(x))).all(-1)  # rounding of two ways to one point
+        equal = (np.abs(difference) <= 1e-9 * (1.0 + np.abs(x))).all(-1)  # rounding of one point
     return np.asarray(equal | (squared < SAME_PLACE))

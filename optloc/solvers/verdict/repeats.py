@@ -1,8 +1,8 @@
-"""The measurement repeated: how often the ellipse of a fix holds the true place.
+"""Simulated repeats of a measurement: how often the ellipse of a fix contains the true position.
 
-A test of the likelihood three deviations away refuses many fixes whose 95 % ellipse covers. For these
-the measurement is simulated at places drawn from the Gaussian of the fix. Each result is refined from its place. The
-share of ellipses that hold their place decides.
+A test of the likelihood three deviations away refuses many fixes whose 95 % ellipse covers. For these fixes, optloc
+draws true positions from the Gaussian of the fix and simulates a measurement at each. It refines each repeat from its
+true position. The share of ellipses that contain their true position decides.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from optloc.problem.problem import Problem
 LEVELS = (0.95, 0.999)
 """Levels of the ellipses that are counted."""
 ENOUGH = (0.88, 0.97)
-"""Shares of the repeats whose ellipses must hold: with 48 repeats most good covariances pass.
+"""Least shares of the repeats whose ellipses contain the truth: with 48 repeats most good covariances pass.
 
 These shares keep 83 % of 6 423 fixes that were `ok` or `curved`. Of those kept, 7.2 % are outside 95 %, and 0.9 % are
 outside 99.9 %. In geometries with more than 70 % kept, 6.0 % are outside 95 %.
 """
 
 TOLERANCE = 1e-3
-"""Length of the last step of a repeat in standard deviations: it does not change an ellipse."""
+"""Length of the last refinement step of a repeat, in standard deviations: too small to change an ellipse."""
 
-# Repeats of a measurement: the share of 95 % is then known to 3 %.
+# Repeats per fix: they give the share of 95 % with a standard error of 3 %.
 _REPEATS = 48
-# Steps at most.
+# Most steps of a refinement.
 _STEPS = 30
-# Vectors that are refined at a time: tens of megabytes of rows.
+# Vectors that are refined together: their rows take tens of megabytes.
 _PART = 2**15
 
 
 def is_repeatable(problem: Problem) -> bool:
-    """Return whether a measurement can be repeated: one position, no equality, priors on shared unknowns.
+    """Return whether a measurement can be simulated again: one position, no equality, priors on shared unknowns only.
 
-    Inequalities that hold no fix do not matter.
+    Inequalities are allowed if none holds the fix.
     """
     free = not exact(problem) and not problem.stations.errors and problem.medium is None
     walks = any(form_of(bias).steps is not None for bias in problem.biases)
@@ -61,24 +61,24 @@ def is_repeatable(problem: Problem) -> bool:
 
 
 def holds(found: Array) -> Array:
-    """Return a flag for repeats (N, 3) whose shares are large enough, (N,); False for NaN."""
+    """Return flags (N,) of repeats (N, 3) whose shares reach `ENOUGH`; False for NaN."""
     with np.errstate(invalid="ignore"):
         return np.asarray((found[:, :2] >= ENOUGH).all(-1))
 
 
 def repeat(problem: Problem, x: Array, covariance: Array) -> Array:
-    """Return the shares of repeats whose ellipses at `LEVELS` hold their places, and an inflation, (N, 3).
+    """Return the shares of repeats whose ellipses at `LEVELS` contain the truth, and an inflation, (N, 3).
 
-    The inflation is the factor of the covariance with which 95 % of the ellipses would hold; it is 1 or more.
+    The inflation is the factor of the covariance at which 95 % of the ellipses contain the truth; it is 1 or more.
 
     Parameters
     ----------
     problem : Problem
-        Flat batch of N problems that can be repeated.
+        Flat batch of N problems for which `is_repeatable` is true.
     x : array (N, size)
         Fixes.
     covariance : array (N, n, n)
-        Of their shared unknowns.
+        Covariances of their shared unknowns.
     """
     return repeated(problem, x, covariance, _refine)
 
@@ -98,16 +98,16 @@ def repeated(
     refit: Callable[[Problem, Array], Repeats],
     wrong: Array | None = None,
 ) -> Array:
-    """Return the shares and inflations (N, 3) of repeats that are fixed by a function of the problems and places.
+    """Return the shares and inflations (N, 3) of repeats that a given function fixes.
 
     Parameters
     ----------
     problem, x, covariance : Problem, array (N, size), array (N, n, n)
-        As of `repeat`.
+        See `repeat`.
     refit : callable
         Maps repeated measurements and their true vectors to fixes.
     wrong : array (N, m), optional
-        Errors that rows have in all repeats.
+        Errors that are added to the rows of all repeats.
     """
     out, problem = np.empty((len(x), len(LEVELS) + 1)), replace(problem, constraints=())
     for items in _parts(len(x)):
@@ -119,13 +119,14 @@ def repeated(
 
 
 def _parts(count: int) -> Iterator[Array]:
+    """Yield the numbers of fixes whose repeats fit in one part."""
     size = max(1, _PART // _REPEATS)
     for first in range(0, count, size):
         yield np.arange(first, min(first + size, count))
 
 
 def _measured(problem: Problem, x: Array, covariance: Array, wrong: Array | None) -> tuple[Problem, Array]:
-    """Return repeated measurements (N r) and their true vectors (N r, size)."""
+    """Return repeated measurements, N r problems, and their true vectors (N r, size)."""
     each = np.repeat(np.arange(len(x)), _REPEATS)
     truth, noise, means = _drawn(problem, x, covariance)
     many = _with_priors(problem.take(each), means)
@@ -140,7 +141,7 @@ def _measured(problem: Problem, x: Array, covariance: Array, wrong: Array | None
 
 
 def _refine(problem: Problem, truth: Array) -> Repeats:
-    """Return the least-squares fixes next to true places."""
+    """Return the least-squares fixes that start at the true vectors."""
     with np.errstate(all="ignore"):
         done = refine(problem, truth, tolerance=TOLERANCE, limit=_STEPS)
         information, _, ok = marginal(done.equations)
@@ -149,17 +150,17 @@ def _refine(problem: Problem, truth: Array) -> Repeats:
 
 
 def _shares(problem: Problem, truth: Array, found: Repeats) -> Array:
-    """Return the shares and inflations of a part of the batch."""
+    """Return the shares and inflations (N, 3) of one part of the batch."""
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
     away = found.x[:, part] - truth[:, part]
     with np.errstate(all="ignore"):
         form = (away * linalg.solve(found.spread[:, part, part], away[..., None])[0][..., 0]).sum(-1)
-    # a repeat that ends nowhere holds nothing
+    # an unfinished repeat counts as one outside every ellipse
     form = np.where(found.good & np.isfinite(form), form, np.inf).reshape(-1, _REPEATS)
     limits = [quantile(level, problem.dimension) for level in LEVELS]
     shares = [(form <= limit).mean(1) for limit in limits]
-    # the place among 48 at which 95 % are no larger
+    # index of the 95 % quantile of 48 sorted values
     last = np.sort(form, axis=1)[:, int(np.ceil(LEVELS[0] * _REPEATS)) - 1]
     return np.stack([*shares, np.maximum(1.0, last / limits[0])], axis=-1)
 
@@ -172,9 +173,10 @@ def _with_priors(problem: Problem, means: dict[str, Array]) -> Problem:
 
 
 def _drawn(problem: Problem, x: Array, covariance: Array) -> tuple[Array, Array, dict[str, Array]]:
-    """Return vectors (N r, size) drawn about fixes, noise (N r, m) of their rows, and means of their priors.
+    """Return true vectors (N r, size) drawn about fixes, noise (N r, m) of their rows, and means of their priors.
 
-    A prior is a measurement as well, so its mean is drawn about each vector. The data of a fix seed its draws.
+    A prior acts as a measurement, so its mean is drawn about each true vector. A checksum of the measurements seeds the
+    draws of each fix.
     """
     n, count = problem.layout.n_shared, problem.count
     truth, noise = np.repeat(x, _REPEATS, axis=0), np.empty((len(x) * _REPEATS, count))

@@ -363,7 +363,7 @@ def test_a_region_may_be_asked_for():
     problem = simulate(made, truth=truth, seed=1)
     fix = solve(problem)
     assert fix.status == Status.UNPROVEN
-    assert "state a box and a greatest speed" in fix.certificate.reason
+    assert "add constraints: a box and a greatest speed" in fix.certificate.reason
     corners = [-1e5, -1e5, -1e5, -300.0, -300.0, -300.0], [1e5, 1e5, 1e5, 300.0, 300.0, 300.0]
     asked = certify(problem, fix, corners)
     assert asked.status == Status.OK

@@ -294,7 +294,7 @@ def test_what_is_admitted_is_what_is_claimed():
     problem = simulate(made, truth=truth, seed=1)
     fix = solve(problem)
     assert fix.status == Status.UNPROVEN  # it might be faster, or farther away
-    assert "state a box and a greatest speed" in fix.certificate.reason
+    assert "add constraints: a box and a greatest speed" in fix.certificate.reason
     around = certify(problem, fix)
     assert "at a velocity from (-700, -700) to (700, 700) m/s" in around.certificate.reason
     assert around.status == Status.UNPROVEN

@@ -175,8 +175,8 @@ def test_bounds_of_other_costs_are_never_claimed():
             "biases",
         ),
         ({"priors": (Prior("position", TARGET[3], 1e6 * np.eye(3)),)}, "priors"),
-        ({"motions": (Motion(order=1),)}, "stays"),
-        ({"stations": stations(3, covariance=np.full((len(STATIONS[3]), 3, 3), 25.0))}, "stations"),
+        ({"motions": (Motion(order=1),)}, "at rest"),
+        ({"stations": stations(3, covariance=np.full((len(STATIONS[3]), 3, 3), 25.0))}, "station errors"),
     ],
 )
 def test_what_is_beyond_the_relaxation_says_so(more, word):
@@ -190,10 +190,10 @@ def test_what_is_beyond_the_relaxation_says_so(more, word):
 def test_kinds_without_ranges_and_unknown_methods():
     problem = drawn("angles", 1)
     fix = optloc.solve(problem)
-    assert "no sums of ranges" in reference_bound(problem, fix, "moment").reason[0]
+    assert "not sums of ranges" in reference_bound(problem, fix, "moment").reason[0]
     with pytest.raises(optloc.InvalidProblem, match="moment"):
         reference_bound(problem, fix, "moments")
-    with pytest.raises(optloc.InvalidProblem, match="behind a refinement"):
+    with pytest.raises(optloc.InvalidProblem, match="after a refinement"):
         compare_bounds(problem, None)
 
 

@@ -10,7 +10,7 @@ from optloc import constraints, solve
 from optloc.problem.loss import LOSSES
 from optloc.solvers.policy import AMBIGUOUS_GAP
 from optloc.solvers.robust.stage import Robust
-from optloc.solvers.robust.statement import NEEDS, _changes, _squared, _squared_position, stated
+from optloc.solvers.robust.statement import NEEDS, _changes, _squared, _squared_position, check_minima
 
 MORE = np.concatenate([SQUARE, [[-400.0, 500.0], [1300.0, 300.0], [600.0, 1500.0]]])
 ERROR = np.array([0.5, -1.0, 200.0, -0.5, 1.0, 0.3, -0.8, 0.2])
@@ -34,11 +34,11 @@ def test_every_row_changes_alone_and_a_doubted_one_is_exchanged_for_each_other()
 
 def test_one_gross_row_of_eight_passes_and_of_four_does_not(searched):
     problem, found = searched
-    pool = stated(problem, LOSSES["cauchy"], found)
+    pool = check_minima(problem, LOSSES["cauchy"], found)
     assert pool.robust.tolist() == [True]
     assert pool.remark[0] == ""
     few = ranges_to(PLACE, 1.0, ERROR[:4], SQUARE[:4])
-    pool = stated(few, LOSSES["cauchy"], Robust(LOSSES["cauchy"])(few, None))
+    pool = check_minima(few, LOSSES["cauchy"], Robust(LOSSES["cauchy"])(few, None))
     assert pool.robust.tolist() == [False]
     assert pool.remark[0]
 
@@ -46,7 +46,7 @@ def test_one_gross_row_of_eight_passes_and_of_four_does_not(searched):
 def test_constraints_are_not_checked_and_said(searched):
     problem, found = searched
     boxed = replace(problem, constraints=tuple(constraints.box([-1e4, -1e4], [1e4, 1e4])))
-    pool = stated(boxed, LOSSES["cauchy"], found)
+    pool = check_minima(boxed, LOSSES["cauchy"], found)
     assert pool.remark[0] == NEEDS
 
 

@@ -36,7 +36,7 @@ def test_one_explanation_is_taken_and_named(problem, rest):
 def test_little_redundancy_makes_it_unproven(problem, rest):
     fix = conclude(problem, Conclusion((explanation(rest),), rest, rest.alternatives, spent=5))
     assert fix.code[0] == Status.UNPROVEN
-    assert "another explanation would not be noticed" in fix.reason[0]
+    assert "too small to exclude another explanation" in fix.reason[0]
 
 
 def test_several_explanations_elsewhere_are_ambiguous(problem, rest):

@@ -94,7 +94,7 @@ def test_the_centre_is_of_stations_with_rows():
 
 def test_a_rival_is_told_with_its_gap():
     problem = ranges_to(PLACE, 1.0)
-    assert ambiguity(problem, 0.0) == "another position fits as well"
-    assert ambiguity(problem, 2.34) == "another position costs only 2.3 more"
+    assert ambiguity(problem, 0.0) == "another position fits equally well"
+    assert ambiguity(problem, 2.34) == "another position raises chi-square by only 2.3"
     two = solve(ranges_to(PLACE, 1.0, stations=SQUARE[:2]))
     assert two.has(Status.AMBIGUOUS)[0]

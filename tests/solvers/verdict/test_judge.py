@@ -61,17 +61,17 @@ def test_stations_without_a_common_row_are_disconnected():
     problem = assemble(SQUARE[:4], measured("tdoa", [100.0, -50.0], a=a, b=b, sigma=1.0)).flat()
     fix = judge(problem, settled(problem))
     assert fix.code[0] == Status.DISCONNECTED
-    assert fix.reason[0].startswith("no row links {")
+    assert fix.reason[0].startswith("no measurement links {")
 
 
 def test_a_ruling_hides_what_has_no_place():
     problem = ranges_to(PLACE, 2.0, ERROR)
     pool = settled(problem)
     ruling = decide_statuses(problem, pool, np.full((1, 0), np.inf))
-    assert not ruling.gone[0]
+    assert not ruling.no_position[0]
     assert ruling.marks[0] & Status.UNPROVEN.mark
     short = replace(pool, dof=np.array([-1]))
-    assert decide_statuses(problem, short, np.full((1, 0), np.inf)).gone[0]
+    assert decide_statuses(problem, short, np.full((1, 0), np.inf)).no_position[0]
     fix = judge(problem, short)
     assert np.isnan(fix.x).all()
     assert np.isnan(surviving_candidates(short, fix)[:, 0]).all()
