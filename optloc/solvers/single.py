@@ -536,7 +536,7 @@ def _alone(problem: Problem) -> Problem:
 
 
 # A prepared problem takes two milliseconds to make and about 50 kB of memory.
-_KEPT = Cache["Single | None"](64)
+_KEPT = Cache["PreparedFix | None"](64)
 
 
 def at_once(problem: Problem, method: Method) -> Fix | None:
