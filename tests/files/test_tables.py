@@ -469,7 +469,7 @@ def test_broken_records_are_one_sentence(text, tmp_path):
 
 def test_options_of_tables_are_not_for_problem_files(tmp_path):
     told = run("fix", table(tmp_path, "format = 1\n", "site.toml"), "--unit", "ns", code=2)
-    assert told.stderr.startswith("--unit: it is for a table; site.toml is a problem file")
+    assert told.stderr.startswith("--unit: this option is for a table; site.toml is a problem file")
 
 
 def test_without_out_a_table_is_only_looked_at(tmp_path):

@@ -123,7 +123,7 @@ def test_files_say_so(tmp_path):
     assert {"late_rows", "on_late_rows"} <= found["fixes"][0].keys()
     assert found["stages"][0]["name"] == found["late_signals"]["method"]
     clean = written(tmp_path, late(1, 0.0, 10.0, epochs=5)[0])
-    assert "no rows are seen to be late" in told("fix", clean, "--late-from-data").lower()
+    assert "no late rows are found" in told("fix", clean, "--late-from-data").lower()
 
 
 def test_rows_late_alike_are_an_offset(tmp_path):
