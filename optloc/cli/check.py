@@ -386,7 +386,7 @@ def _show_health(checked: Checked, console: Console) -> None:
         table.add_row(health.names[i], *cells)
     console.print(table)
     levels = health.levels
-    chi = f"chi-square per degree of freedom: {levels.before:.3g} with stated noise, {levels.after:.3g} with estimated noise"
+    chi = f"chi-square per degree of freedom: {levels.before:.3g} as stated, {levels.after:.3g} as estimated"
     what = "bias and noise refer to measurements minus their predictions from the other stations"
     say_all(console, (f"{levels.fixes} fixes; {what}; {chi}", *health.sentences))
 

@@ -207,7 +207,8 @@ def missing() -> list[str]:
 def make(tell: Callable[[int, int], None] = lambda done, total: None) -> list[str]:
     """Compile all kernels that are not on disk yet, in two processes, and return the kernels that are still missing.
 
-    The callback `tell` receives the number of compiled functions and the approximate total. The list is empty on success.
+    The callback `tell` receives the number of compiled functions and the approximate total. The list is empty if all
+    kernels compile.
     """
     names = [name for name, part in parts().items() if part.missing()]
     known, done, lock = dict[str, set[str]](), set[str](), Lock()
