@@ -30,9 +30,9 @@ class Ephemeris(NamedTuple):
 
     SI units, radians, seconds of GPS time since 1980.
 
-    The names are those of the interface document: `toe` and `toc` are the reference times of elements and clock, `af0`
-    to `af2` the polynomial of the clock, `tgd` its delay for the first frequency. `week` is the start of the week of
-    `toe`, s.
+    Names are as in the interface document. `toe` and `toc` are the reference times of elements and clock, `af0` to
+    `af2` the polynomial of the clock. `tgd` is the clock delay for the first frequency. `week` is the start of the
+    week of `toe`, s.
     """
 
     toc: Array

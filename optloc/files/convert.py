@@ -345,7 +345,7 @@ def _with_declination(section: Section, found: Readings, told: ColumnHints) -> S
 
 
 def _share(sigma: str, unit: str) -> str:
-    """Return the standard deviation of one station from the one of a difference, as text with a unit."""
+    """Return the standard deviation of one station from the standard deviation of a difference, as text with a unit."""
     number, own = re.fullmatch(r"\s*([-+.\deE]*)\s*(.*?)\s*", sigma, re.DOTALL).groups()  # type: ignore[union-attr]
     try:
         return f"{float(number) / np.sqrt(2.0):.9g} {own or unit}"

@@ -81,8 +81,8 @@ def declinations(position: Array, frame: Frame, day: date, where: str) -> Array:
     Raises
     ------
     InvalidProblem
-        If the frame is not on Earth, pygeomag is not installed, no model is valid at the date, or the place is too
-        close to a magnetic pole.
+        If the frame is not on Earth, or pygeomag is not installed. Also if no model is valid at the date, or the place
+        is too close to a magnetic pole.
     """
     if not frame.geodetic:
         raise InvalidProblem("a declination by date needs stations on Earth", where, _GIVE)

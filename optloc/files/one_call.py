@@ -142,12 +142,12 @@ def locate(
     speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
     method: str = "auto",
 ) -> Fix:
-    """Return the position of a target from the measurements of receivers, in one call.
+    """Return the fix of a target from the measurements of receivers, in one call.
 
     Measurements are mappings of station names to values, arrays (..., s) in the order of the stations, pandas series,
     or data frames. A data frame has one column for each station (each row is a separate fix), or the columns station,
     value and optionally epoch. An unknown station name raises an error. Missing measurements are NaN. You can give
-    several kinds together. The position has as many coordinates as the stations: without altitudes, a target on Earth
+    several kinds together. The position has the same coordinates as the stations: without altitudes, a target on Earth
     is assumed to be at the level of the stations, 0 m.
 
     Parameters
@@ -430,7 +430,7 @@ def _rows(
     a, b = np.array(found.keys, dtype=np.int64).T
     values = found.values
     if word == "toa":
-        # Dates become seconds, whatever the unit of sigma is.
+        # Dates always become seconds, independent of the unit of sigma.
         unit = conversion("s", "length", propagation_speed=speed) if values.dtype.kind == "M" else unit
         values = _since_first(values, sigma, unit)
     z = np.asarray(unit.to_si(values), dtype=float)

@@ -77,7 +77,7 @@ _TURN = 6.2832
 COMPASS, CARTESIAN = "north-clockwise", "east-counterclockwise"
 COUNTER, BOW = "north-counterclockwise", "bow-clockwise"
 CONVENTIONS = (COMPASS, CARTESIAN, COUNTER, BOW)
-"""Conventions of azimuths in tables: as in a problem file, or from the bow of a vehicle, to which headings are added."""
+"""Conventions of azimuths in tables: as in a problem file, or relative to the bow of a vehicle."""
 
 
 @dataclass(frozen=True, slots=True)

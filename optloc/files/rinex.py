@@ -74,7 +74,10 @@ class Navigation:
 
 @dataclass(frozen=True, slots=True)
 class _File:
-    """A RINEX file: header lines as (label, text), and the lines after the header; `first` is the number of the first."""
+    """A RINEX file: header lines as (label, text), and the lines after the header.
+
+    first: number of the first line after the header, for messages.
+    """
 
     source: str
     version: float

@@ -39,7 +39,7 @@ def test_sentences_on_the_noise_say_what_uses_them():
 def test_late_rows_outweigh_the_noise():
     late = SimpleNamespace(sentence="a tenth of the rows is late", alike=False)
     assert tell_level(level(suspect=True), late=late) == (
-        "a tenth of the rows is late: --late-from-data fixes with that",
+        "a tenth of the rows is late: --late-from-data fixes with this loss",
     )
 
 

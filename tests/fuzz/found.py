@@ -109,7 +109,7 @@ FOUND = {
     "header with a break": (
         FIX,
         table("r.csv", 'a,"z\rx,y\n'),
-        ["r.csv, header", "this is no CSV table: "],
+        ["r.csv, header", "this is not a CSV table: "],
     ),
     "the plane beside a place on Earth": (FIX, problem("[stations]", f"{ENU}[stations]"), None),
     "numbers and words in one column": (

@@ -116,7 +116,7 @@ def told(*arguments):
 @pytest.mark.slow
 def test_files_say_so(tmp_path):
     path = written(tmp_path, late(1, 0.2, 10.0, epochs=20)[0])
-    assert "--late-from-data fixes with that" in told("check", path)
+    assert "--late-from-data fixes with this loss" in told("check", path)
     found = json.loads(told("fix", path, "--late-from-data", "--json"))
     assert found["late_signals"]["share"] == pytest.approx(0.2, abs=0.08)
     assert found["late_signals"]["used"]
