@@ -149,7 +149,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
     apart = _apart(problem, alone)
     redundancy = degrees_of_freedom(apart)
     parts = _components(problem)
-    flattest, widest = _spread(_together(problem, alone))
+    flattest, widest = _spread(_station_positions(problem, alone))
     # If epochs are fixed separately, report the epoch whose stations are closest to a line or plane.
     worst = int(np.argmin(flattest / widest))
     return {
@@ -243,7 +243,7 @@ def _components(problem: Problem) -> Array:
     return np.bincount(pairs[0], minlength=k)
 
 
-def _together(problem: Problem, alone: bool) -> Array:
+def _station_positions(problem: Problem, alone: bool) -> Array:
     """Return the station positions of each epoch (k, s, d), or of a whole run (1, k s, d), m."""
     position = problem.stations.position
     return position if alone else position.reshape(1, -1, position.shape[-1])

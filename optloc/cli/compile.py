@@ -57,20 +57,20 @@ def problem_of(kind: str, stations: Stations | Array = _STATIONS, **more: Any) -
     return assemble(stations, measured(kind, a=np.arange(1, 6), sigma=1.0, **rows), **more)
 
 
-def _drawn(kind: str, count: int, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
+def _simulated(kind: str, count: int, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
     problem = problem_of(kind, stations, **more)
     place = np.append(TARGET, np.zeros(problem.layout.size - 3)) if problem.layout.size > 3 else TARGET
     return simulate(problem, place, 1, count).flat()
 
 
 def _fix_ranges() -> None:
-    problem = _drawn("tdoa", _FEW)
+    problem = _simulated("tdoa", _FEW)
     solve(problem, "gtrs+lsr")
     prepare(problem_of("tdoa"), "gtrs+lsr")(problem.z[0])
 
 
 def _fix_tapes() -> None:
-    problem = _drawn("groa", _FEW)
+    problem = _simulated("groa", _FEW)
     solve(problem, "gtrs+lsr")
     prepare(problem_of("groa"), "gtrs+lsr")(problem.z[0])
 
@@ -82,7 +82,7 @@ def _filter() -> None:
 
 
 def _refine() -> None:
-    solve(_drawn("elevation", _MANY), "lsr", start=np.tile(TARGET, (_MANY, 1)))
+    solve(_simulated("elevation", _MANY), "lsr", start=np.tile(TARGET, (_MANY, 1)))
     # a run with the emission times of its two epochs as unknowns
     rows = measured("toa", a=np.tile(np.arange(6), 2), epoch=np.repeat([0, 1], 6), sigma=1.0)
     run = assemble(_STATIONS, rows)
@@ -90,7 +90,7 @@ def _refine() -> None:
     solve(simulate(run, truth, 1, _MANY).flat(), "lsr", start=np.tile(truth, (_MANY, 1)))
 
 
-def _plainly_solved(problem: Problem) -> Fix:
+def _solve_without_machine_code(problem: Problem) -> Fix:
     """Return fixes computed without machine code.
 
     Another process compiles the code of fixes; this process does not wait for it.
@@ -100,8 +100,8 @@ def _plainly_solved(problem: Problem) -> Fix:
 
 
 def _prove() -> None:
-    problem = _drawn("tdoa", _FEW)
-    certify(problem, _plainly_solved(problem))
+    problem = _simulated("tdoa", _FEW)
+    certify(problem, _solve_without_machine_code(problem))
 
 
 def _prove_runs() -> None:
@@ -111,33 +111,33 @@ def _prove_runs() -> None:
     place = _STATIONS + 10.0 * np.arange(epochs)[:, None, None] * speed
     rows = measured("tdoa", a=np.tile(np.arange(1, 6), epochs), b=0, epoch=np.repeat(np.arange(epochs), 5), sigma=1.0)
     problem = simulate(assemble(Stations(place, tuple("ABCDEF")), rows), TARGET, 1, _FEW).flat()
-    certify(problem, _plainly_solved(problem))
+    certify(problem, _solve_without_machine_code(problem))
     moving = assemble(_STATIONS[:, :2], rows, times=np.arange(float(epochs)), motions=(Motion(1),))
     problem = simulate(moving, np.append(TARGET[:2], [30.0, -10.0]), 1).flat()
-    certify(problem, _plainly_solved(problem))
+    certify(problem, _solve_without_machine_code(problem))
 
 
 def _prove_scaled() -> None:
     problem = with_bias(problem_of("toa"), "speed", form="scale", per="kind", sigma=0.05)
     found = simulate(problem, np.append(TARGET, np.zeros(problem.layout.size - 3)), 1, _FEW).flat()
-    certify(found, _plainly_solved(found))
+    certify(found, _solve_without_machine_code(found))
 
 
 def _search() -> None:
     velocity = np.broadcast_to([50.0, -30.0, 0.0], _STATIONS.shape)
     moving = Stations(_STATIONS[None], tuple("ABCDEF"), velocity=velocity[None])
     # Three search domains: the whole space, a shell around the Earth at one height, and a bounded enclosure.
-    best_first_starts(_drawn("fdoa", _FEW, moving))
+    best_first_starts(_simulated("fdoa", _FEW, moving))
     frame = Frame.enu(lat_deg=47.0, lon_deg=8.0, height=400.0)
-    best_first_starts(_drawn("tdoa", _FEW, frame=frame, constraints=height(exactly=4400.0)))
-    best_first_starts(_drawn("range", _FEW))
+    best_first_starts(_simulated("tdoa", _FEW, frame=frame, constraints=height(exactly=4400.0)))
+    best_first_starts(_simulated("range", _FEW))
 
 
 def _cover() -> None:
     # a target inside the array, and a target so far outside that infinity is as likely
     for times in (1.0, 1000.0):
         problem = simulate(problem_of("tdoa"), times * TARGET, 1)
-        likelihood_region(problem, _plainly_solved(problem))
+        likelihood_region(problem, _solve_without_machine_code(problem))
 
 
 # The longest parts come first. Each process needs a gigabyte of memory, so at most two run at once. Parts that share
@@ -214,7 +214,7 @@ def make(tell: Callable[[int, int], None] = lambda done, total: None) -> list[st
     known, done, lock = dict[str, set[str]](), set[str](), Lock()
 
     def follow(name: str) -> None:
-        for line in _started(name, shared):
+        for line in _run_part(name, shared):
             word, _, rest = line.partition(" ")
             with lock:
                 if word == "all":
@@ -235,7 +235,7 @@ def environment(**more: str) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": path, **more}
 
 
-def _started(name: str, variables: Mapping[str, str]) -> Iterator[str]:
+def _run_part(name: str, variables: Mapping[str, str]) -> Iterator[str]:
     """Start a process that compiles a part, and yield the lines that it writes. It ends with this process."""
     # -P: do not import from the current folder.
     command = [sys.executable, "-P", "-m", "optloc.cli.compile", name]
@@ -313,7 +313,7 @@ def _print(found: dict[str, int], place: str | None) -> None:
         )
 
 
-def _make_alone() -> None:
+def _make_in_background() -> None:
     """Compile all missing kernels at low priority, unless another process already does."""
     with alone() as only:
         if only:
@@ -326,4 +326,4 @@ if __name__ == "__main__":
     if sys.argv[1:]:
         _compile(parts()[sys.argv[1]])
     else:
-        _make_alone()
+        _make_in_background()

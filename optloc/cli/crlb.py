@@ -63,7 +63,7 @@ def run_crlb(
     if not problem.layout.n_shared:
         raise InvalidProblem("no unknown is shared by the epochs", loaded.source, "add a bias")
     # Biases of known targets alone need no target position: their bound does not depend on it.
-    truth = _solve(file) if at is None and _sought(problem) else vector(problem, at, velocity, geodetic)
+    truth = _solve(file) if at is None and _has_unknown_position(problem) else vector(problem, at, velocity, geodetic)
     bound = np.asarray(crlb(problem, truth))
     # Identical epochs have one bound: broadcast it to all epochs.
     bound = np.broadcast_to(bound, (*problem.batch_shape, *bound.shape[-2:])).reshape(-1, *bound.shape[-2:])
@@ -90,7 +90,7 @@ def run_crlb(
     return 0 if all(np.isfinite(row["sigma"]).all() for row in rows) and rows else 1
 
 
-def _sought(problem: Problem) -> bool:
+def _has_unknown_position(problem: Problem) -> bool:
     """Return whether a target has an unknown position, so that the bound depends on it."""
     return any(motion.known is None for motion in problem.motions)
 
@@ -109,7 +109,7 @@ def _draw(path: Path, loaded: Loaded, over_time: tuple[Course, Course | None] | 
     if over_time is None:
         advice = "add a motion or biases that the epochs share, but not hundreds of targets"
         raise InvalidProblem("the epochs share no unknowns, or too many to draw", "--plot", advice)
-    names = _shown(over_time[0].layout)
+    names = _shown_unknowns(over_time[0].layout)
     write_picture(plot_course(*over_time, title=f"{loaded.title}: Cramer-Rao bound", names=names), path)
 
 
@@ -147,7 +147,7 @@ def _sigmas(row: dict[str, Any], loaded: Loaded) -> str:
 # Unnoticed errors.
 
 # Largest number of epochs to evaluate; the table holds the worst values.
-_LOOKED_AT = 100
+_MAX_EPOCHS = 100
 
 
 def reliability_of(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) -> Reliability | None:
@@ -161,7 +161,7 @@ def reliability_of(problem: Problem, x: Array, suspects: Sequence[Suspect] = ())
     places = np.broadcast_to(x, (*problem.batch_shape, flat.layout.size)).reshape(-1, flat.layout.size)
     items = np.flatnonzero(np.isfinite(places).all(-1))
     # evenly spaced epochs suffice: the geometry of a run changes slowly
-    items = items[np.unique(np.linspace(0, len(items) - 1, min(len(items), _LOOKED_AT)).astype(int))]
+    items = items[np.unique(np.linspace(0, len(items) - 1, min(len(items), _MAX_EPOCHS)).astype(int))]
     worst: dict[str, tuple[float, float]] = {}
     for i in items:
         told = reliability(flat.take(np.array([i])), places[i], suspects)
@@ -239,7 +239,7 @@ def _course_records(course: Course, known: Course | None) -> list[dict[str, Any]
             "sigma": dict(zip(labels, _sigmas_at(course, i), strict=True)),
             "biases_known": None if known is None else dict(zip(labels, _sigmas_at(known, i), strict=True)),
         }
-        for i in _few(course)
+        for i in _sparse_indices(course)
     ]
 
 
@@ -247,14 +247,14 @@ def _sigmas_at(course: Course, i: int) -> Array:
     return np.asarray(np.sqrt(np.diagonal(course.covariance[i])))
 
 
-def _few(course: Course) -> list[int]:
+def _sparse_indices(course: Course) -> list[int]:
     """Return the indices of a few times, denser at the start."""
     wanted = np.geomspace(1, course.counts[-1], _LINES)
     # Geometric spacing, since a bound falls with the root of the number of epochs.
     return [int(i) for i in np.unique(np.searchsorted(course.counts, np.floor(wanted)))]
 
 
-def _shown(layout: Layout) -> tuple[str, ...]:
+def _shown_unknowns(layout: Layout) -> tuple[str, ...]:
     """Return the names of the unknowns that fit a table or a picture: the states of two targets, and four biases."""
     states = [slot.name for slot in layout.shared if not slot.members]
     biases = [slot.name for slot in layout.shared if slot.members]
@@ -267,14 +267,14 @@ def _course_table(course: Course, known: Course | None, loaded: Loaded) -> Table
     for name in ("epochs", "time, s"):
         table.add_column(name, justify="right")
     values: list[Array] = []
-    for slot in (course.layout.find(name)[0] for name in _shown(course.layout)):
+    for slot in (course.layout.find(name)[0] for name in _shown_unknowns(course.layout)):
         unit, size = loaded.bias_unit(slot.name, slot.unit)
         table.add_column(f"{slot.name}{_RMS[bool(slot.members)]}, {unit}".rstrip(", "), justify="right")
         values.append(course.total(slot.name) / (abs(size) * np.sqrt(slot.size if slot.members else 1)))
         if known is not None and not slot.members:
             table.add_column("biases known", justify="right")
             values.append(known.total(slot.name))
-    for i in _few(course):
+    for i in _sparse_indices(course):
         numbers = [f"{value[i]:.4g}" if np.isfinite(value[i]) else "-" for value in values]
         table.add_row(str(course.counts[i]), f"{course.times[i]:g}", *numbers)
     return table
@@ -409,7 +409,7 @@ def run_status(file: Path, wanted: Simulated, *, as_json: bool, quiet: bool) -> 
 
     problem = _of_one_epoch(loaded.problem)
     truth = vector(problem, wanted.at, wanted.velocity, wanted.geodetic)
-    if wanted.at is None and _sought(problem):
+    if wanted.at is None and _has_unknown_position(problem):
         truth = _solve(file).reshape(-1, len(truth))[0]
         if not np.isfinite(truth).all():
             raise InvalidProblem("the file has no fix as true position", loaded.source, "give a position with --at")

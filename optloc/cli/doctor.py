@@ -19,7 +19,7 @@ from optloc.cli.options import Json, Verbose
 from optloc.cli.output import Screen, dumps, say
 
 # Extras for the development of optloc, which users do not need.
-_OURS = frozenset({"test", "lint", "docs"})
+_DEVELOPMENT_EXTRAS = frozenset({"test", "lint", "docs"})
 _REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)[^<>=!~;]*(?:>=([\d.]+))?")
 _EXTRA = re.compile(r"""extra\s*==\s*['"]([\w-]+)['"]""")
 
@@ -63,16 +63,16 @@ def _numbers(text: str) -> tuple[int, ...]:
 def packages() -> list[Package]:
     """Return the packages that optloc requires, core packages first; empty if optloc is not installed as a package."""
     found = []
-    for line in _asked(requires, "optloc") or ():
+    for line in _or_none(requires, "optloc") or ():
         named, extra = _REQUIREMENT.match(line), _EXTRA.search(line)
-        if named is None or (extra is not None and extra[1] in _OURS):
+        if named is None or (extra is not None and extra[1] in _DEVELOPMENT_EXTRAS):
             continue
         name = named[1]
-        found.append(Package(name, _asked(version, name), named[2] or "", "" if extra is None else extra[1]))
+        found.append(Package(name, _or_none(version, name), named[2] or "", "" if extra is None else extra[1]))
     return sorted(found, key=lambda one: (one.extra, one.name))
 
 
-def _asked(of: Any, name: str) -> Any:
+def _or_none(of: Any, name: str) -> Any:
     try:
         return of(name)
     except PackageNotFoundError:
@@ -135,7 +135,7 @@ def doctor(as_json: Json = False, verbose: Verbose = False) -> None:
     """Print versions, machine, machine code on disk, missing packages and the commands that install them."""
     found, code = packages(), machine_code()
     told = {
-        "optloc": {"version": _asked(version, "optloc"), "folder": str(Path(__file__).resolve().parents[1])},
+        "optloc": {"version": _or_none(version, "optloc"), "folder": str(Path(__file__).resolve().parents[1])},
         "python": {"version": platform.python_version(), "executable": sys.executable},
         "machine": machine(),
         "packages": [asdict(one) | {"state": one.state} for one in found],

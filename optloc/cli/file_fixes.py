@@ -192,7 +192,7 @@ def fixes_json(found: FileFixes) -> dict[str, Any]:
     searched = found.apart and found.fix.explanations is not None
     groups = epoch_groups(found.loaded.problem) if searched else ()
     per_fix = [
-        fix_detail(fix, found.seen, reweighted=found.reweighted) | _unnoticed(fix, found, groups, i)
+        fix_detail(fix, found.seen, reweighted=found.reweighted) | _unnoticed_errors(fix, found, groups, i)
         for i, fix in enumerate(found.singles)
     ]
     # With one target and one epoch for each fix, row and fix are merged; otherwise "runs" has the data of the fixes.
@@ -211,7 +211,7 @@ def fixes_json(found: FileFixes) -> dict[str, Any]:
     }
 
 
-def _unnoticed(fix: Fix, found: FileFixes, groups: Sequence[EpochGroup], item: int) -> dict[str, Any]:
+def _unnoticed_errors(fix: Fix, found: FileFixes, groups: Sequence[EpochGroup], item: int) -> dict[str, Any]:
     """Return the station errors that the search for suspects would not notice; empty without a search."""
     if fix.explanations is None or not fix.answered:
         return {}

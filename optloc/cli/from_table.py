@@ -222,7 +222,7 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
     told, console = ColumnHints(**given), Screen(quiet=quiet or as_json)
     if out is None:
         table_problem = understood(file, told)
-        _tell(table_problem, console)
+        _print_interpretation(table_problem, console)
         table_problem.read()
         say_next(
             console,
@@ -231,7 +231,7 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
         if as_json:
             write_text(Path("-"), dumps(table_problem.as_read))
         return 0
-    found = written(file, out, told, tell=lambda table_problem: _tell(table_problem, console))
+    found = written(file, out, told, tell=lambda table_problem: _print_interpretation(table_problem, console))
     if as_json:
         write_text(Path("-"), dumps(_json(found)))
     elif found.loaded is None:
@@ -253,7 +253,7 @@ def say_next(console: Console, line: str) -> None:
     say(console, line)
 
 
-def _tell(table_problem: TableProblem, console: Console) -> None:
+def _print_interpretation(table_problem: TableProblem, console: Console) -> None:
     """Print the interpretation of a table, and the assumptions."""
     from optloc.cli.output import say, say_all
 
@@ -317,5 +317,5 @@ def read_problem(
     from optloc.files.convert import understood
 
     table_problem = understood(file, told)
-    _tell(table_problem, Screen(quiet=quiet, stderr=on_error))
+    _print_interpretation(table_problem, Screen(quiet=quiet, stderr=on_error))
     return table_problem.read(more or {})

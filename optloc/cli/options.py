@@ -124,7 +124,7 @@ def _flush(code: Any) -> Any:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         if isinstance(error, BrokenPipeError):
             return READER_GONE
-        return _refuse(f"Standard output cannot be written ({error.strerror or error}).")
+        return _print_bad_input(f"Standard output cannot be written ({error.strerror or error}).")
     return code
 
 
@@ -141,7 +141,7 @@ class CommandGroup(TyperGroup):
             # Usage errors. Their module differs between releases of typer, but all have format_message.
             if not standalone or not hasattr(error, "format_message"):
                 raise
-            code = _refuse(_usage(error))
+            code = _print_bad_input(_usage(error))
         if not standalone:
             return code
         sys.exit(code if isinstance(code, int) else 0)
@@ -152,13 +152,13 @@ class CommandGroup(TyperGroup):
             with access(anew=True):
                 return super().invoke(ctx)
         except InvalidProblem as error:
-            raise typer.Exit(_refuse(str(error))) from None
+            raise typer.Exit(_print_bad_input(str(error))) from None
         except BrokenPipeError:
             raise typer.Exit(READER_GONE) from None
         except MemoryError:
-            raise typer.Exit(_refuse("There is not enough memory; solve fewer epochs at once.")) from None
+            raise typer.Exit(_print_bad_input("There is not enough memory; solve fewer epochs at once.")) from None
         except OSError as error:
-            raise typer.Exit(_refuse(f"{error.filename or 'optloc'}: {error.strerror or error}.")) from None
+            raise typer.Exit(_print_bad_input(f"{error.filename or 'optloc'}: {error.strerror or error}.")) from None
         except KeyboardInterrupt:
             typer.echo("Stopped.", err=True)
             raise typer.Exit(STOPPED) from None
@@ -171,7 +171,7 @@ class CommandGroup(TyperGroup):
         return super().resolve_command(ctx, args)
 
 
-def _refuse(sentence: str) -> int:
+def _print_bad_input(sentence: str) -> int:
     """Print one line on standard error, and return the exit code of bad input."""
     typer.echo(visible(" ".join(sentence.split())), err=True)
     return BAD_INPUT

@@ -62,7 +62,7 @@ _END = """
 _SECTIONS = ((_FIX, "demo"), (_AMBIGUOUS, "ambiguous"), (_REGISTRATION, "clocks"))
 PICTURE = Path("optloc-demo.png")
 # Expected statuses of shipped problems other than `ok` alone. Plain Python does not finish the proof of the long run.
-_SHOWN = {"ambiguous": (Status.AMBIGUOUS,), "registration": (Status.OK, Status.UNPROVEN)}
+_EXPECTED_STATUS = {"ambiguous": (Status.AMBIGUOUS,), "registration": (Status.OK, Status.UNPROVEN)}
 
 
 def titles() -> dict[str, str]:
@@ -80,7 +80,7 @@ def run_demo(name: str | None, plot: Path | None, *, as_json: bool, quiet: bool)
         raise InvalidProblem(f"there is no demo {name!r}", "demo", nearest(name, list(known)))
     claim_outputs(picture=plot)
     if name is None and not as_json:
-        return _walk(plot, quiet)
+        return _run_examples(plot, quiet)
     found = _fix(name or "demo", quiet or as_json)
     if as_json:
         write_text(Path("-"), dumps(fixes_json(found)))
@@ -88,10 +88,10 @@ def run_demo(name: str | None, plot: Path | None, *, as_json: bool, quiet: bool)
         show(found, Screen())
     if plot is not None or not as_json:
         _draw(found, plot, quiet or as_json)
-    return 0 if _shows(found, name or "demo") else 1
+    return 0 if _has_expected_status(found, name or "demo") else 1
 
 
-def _walk(plot: Path | None, quiet: bool) -> int:
+def _run_examples(plot: Path | None, quiet: bool) -> int:
     """Fix and explain three shipped problems; return exit code 0 if each has the status in its text."""
     console = Screen(quiet=quiet)
     code = 0
@@ -101,14 +101,14 @@ def _walk(plot: Path | None, quiet: bool) -> int:
         show(found, console)
         if i == 0:
             _draw(found, plot, quiet)
-        code = code if _shows(found, name) else 1
+        code = code if _has_expected_status(found, name) else 1
     _explain(_END, console)
     return code
 
 
-def _shows(found: FileFixes, name: str) -> bool:
+def _has_expected_status(found: FileFixes, name: str) -> bool:
     """Return whether the fixes of a shipped problem have the expected status."""
-    shown = _SHOWN.get(name, (Status.OK,))
+    shown = _EXPECTED_STATUS.get(name, (Status.OK,))
     return bool(np.isin(found.fix.code, shown).all())
 
 

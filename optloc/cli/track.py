@@ -132,11 +132,11 @@ def run_track(
                 start = _start(one.problem, dynamics, wanted)
                 for entry in tracked(one.problem, dynamics, update, start=start, rules=wanted.rules):
                     one.entries.append(entry)
-                    _grow(growing, ones, _LATE)
+                    _append_new_rows(growing, ones, _LATE)
                     advance(1)
     # After an interrupt or an error, write the results so far.
     finally:
-        _grow(growing, ones)
+        _append_new_rows(growing, ones)
         columns = (
             join_tables([track_columns(one) for one in ones if one.entries]) if any(o.entries for o in ones) else {}
         )
@@ -149,7 +149,7 @@ def run_track(
     return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
 
 
-def _grow(table: GrowingTable | None, ones: list[TargetTrack], late: float = 0.0) -> None:
+def _append_new_rows(table: GrowingTable | None, ones: list[TargetTrack], late: float = 0.0) -> None:
     """Append the missing entries to the table, unless the last addition is less than `late` seconds ago."""
     if table is None or monotonic() - table.when < late:
         return

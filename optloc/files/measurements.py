@@ -28,7 +28,7 @@ ESTIMATE = "estimate"
 """Keyword instead of a standard deviation: estimate it from the data."""
 
 # Start of the search for a noise level, in SI units; it only affects the relative weights of kinds in the first fixes.
-_BEGIN = {"angle": 1e-2, "ratio": 1e-2, "speed": 0.1}
+_START_SIGMA = {"angle": 1e-2, "ratio": 1e-2, "speed": 0.1}
 # Columns of the table of repeats: chunk number, the values that make rows equal, and the index in the chunk.
 _PLACE = 8
 # Asymmetry and negative eigenvalues below this share of a covariance are rounding of the file.
@@ -156,7 +156,7 @@ def _chunk(c: Context, kind: str) -> RowChunk:
     z = values_of(c, unit, weight)
     a, b = ends_of(c, kind, model.stations)
     # Reverse a difference by exchanging its stations, not by changing the value: noise and biases then stay valid.
-    if section.positive == "b-farther" and _compares(model):
+    if section.positive == "b-farther" and _is_difference(model):
         a, b = b, a
     sigma, arrival, covariance = spread_of(c, model, units, unit, z)
     seconds = Units("time").conversion(section.time_unit, join(c.where, "key 'time_unit'")).factor
@@ -170,7 +170,7 @@ def _chunk(c: Context, kind: str) -> RowChunk:
         table.times("time", seconds) if table.has("time") else None,
         table.labels("time") if table.has("time") and not table.has("epoch") else None,
         table.labels("target") if table.has("target") else None,
-        section.excess and _adds_up(model), table, day,
+        section.excess and _is_range_sum(model), table, day,
     )  # fmt: skip
 
 
@@ -178,11 +178,11 @@ def _check_options(c: Context, kind: str, model: Model) -> None:
     section = c.section
     if section.kind is None:
         return  # settings of a table of several kinds apply to the kinds that use them
-    if section.excess and not _adds_up(model):
+    if section.excess and not _is_range_sum(model):
         raise InvalidProblem(
             f"{kind} has no excess path", join(c.where, "key 'excess'"), "remove it; it is for range_sum"
         )
-    if section.positive == "b-farther" and not _compares(model):
+    if section.positive == "b-farther" and not _is_difference(model):
         raise InvalidProblem(f"{kind} has no sign", join(c.where, "key 'positive'"), "remove the key")
     if kind != "azimuth":
         north = section.azimuth not in {None, "east-counterclockwise"}
@@ -191,14 +191,14 @@ def _check_options(c: Context, kind: str, model: Model) -> None:
             raise InvalidProblem(f"{kind} is not an azimuth", join(c.where, f"key {key!r}"), "remove the key")
 
 
-def _adds_up(model: Model) -> bool:
+def _is_range_sum(model: Model) -> bool:
     """Return whether a row is a sum of two ranges; then a file may omit the distance between the stations."""
     return model.ranges is not None and sum(model.ranges) > 1
 
 
-def _compares(model: Model) -> bool:
+def _is_difference(model: Model) -> bool:
     """Return whether a row is a difference or ratio between two stations, so that its sign can be reversed."""
-    return model.stations > 1 and not _adds_up(model)
+    return model.stations > 1 and not _is_range_sum(model)
 
 
 def _unit(section: MeasurementsTable, kind: str, where: str) -> str | None:
@@ -339,7 +339,7 @@ def spread_of(
         advice = "give sigma, arrival_sigma, covariance or snr"
         raise InvalidProblem("the noise is given more than once", c.where, advice)
     if section.sigma == ESTIMATE and not column:
-        return np.full(z.shape, _BEGIN.get(model.quantity, 1.0)), None, None
+        return np.full(z.shape, _START_SIGMA.get(model.quantity, 1.0)), None, None
     if (sigma := sigma_of(c, units, unit, z)) is not None:
         return sigma, None, None
     if section.arrival_sigma is not None:

@@ -322,7 +322,7 @@ def _scale(
     """Return the conversion of values to SI units, and their standard deviation in SI units."""
     units = Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed)
     step = replace(units, convention=convention).conversion(unit, f"unit of {word}")
-    return step, _spread(_per_word(sigma, word, words, "sigma"), word, units, unit)
+    return step, _sigma_si(_per_word(sigma, word, words, "sigma"), word, units, unit)
 
 
 # Length of a speed with its standard deviation.
@@ -403,7 +403,7 @@ def _per_word(given: Any, word: str, words: Collection[str], name: str) -> Any:
     return given
 
 
-def _spread(sigma: Any, word: str, units: Units, unit: str) -> float:
+def _sigma_si(sigma: Any, word: str, units: Units, unit: str) -> float:
     """Return the standard deviation of one value, SI."""
     noun, default = ARGUMENTS[word].noun, units.conversion(unit, f"unit of {word}")
     if sigma is None:
@@ -438,7 +438,7 @@ def _rows(
     if np.isinf(z).any():
         raise InvalidProblem("a value is infinite", word, "use NaN for missing values")
     if word in ("toa", "tdoa"):
-        _check_far(word, z, sigma, places)
+        _check_time_unit(word, z, sigma, places)
     own = {"weight": heard.astype(float), "a": a, "b": None if word != "tdoa" else b}
     # Differences to one station share its error, and each arrival has half of the variance of a difference. If pairs
     # form loops, this is the cautious choice: a difference that follows from others adds no information.
@@ -480,7 +480,7 @@ def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:
     return counted
 
 
-def _check_far(word: str, z: Array, sigma: float, places: _Receivers) -> None:
+def _check_time_unit(word: str, z: Array, sigma: float, places: _Receivers) -> None:
     """Raise InvalidProblem for times longer than any path between stations: their unit is wrong."""
     most = float(np.fmax.reduce(np.abs(z), axis=None, initial=0.0))
     if most > _TOO_FAR * max(places.extent, sigma):

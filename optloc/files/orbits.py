@@ -38,7 +38,7 @@ _EPOCH_1970 = 2440587.5  # Julian date of 1970-01-01
 _AT_ONCE = 4096
 # Points of the interpolation of SP3 positions, points of a second one for comparison, and the permitted difference, m.
 # For positions of GNSS satellites 15 minutes apart, both agree within 0.1 m, even near the ends.
-_POINTS, _FEWER, _APART = 10, 8, 1.0
+_POINTS, _CHECK_POINTS, _MAX_DIFFERENCE = 10, 8, 1.0
 # Relative difference of time steps above which a position is missing; less is rounding of times.
 _UNEVEN = 1e-3
 # Offset from the clocks of SP3 files to atomic time (TAI), s; None is UTC.
@@ -146,7 +146,7 @@ class _Set:
 
     def satellite(self) -> Any:
         """Return the satellite object of skyfield; raise InvalidProblem for invalid elements."""
-        with _telling(self.where):
+        with _as_invalid_problem(self.where):
             found = self.made()
         if found.model.error:
             raise _no_elements(self.where)
@@ -158,7 +158,7 @@ def _no_elements(where: str) -> InvalidProblem:
 
 
 @contextmanager
-def _telling(where: str) -> Iterator[None]:
+def _as_invalid_problem(where: str) -> Iterator[None]:
     """Convert errors of the library to InvalidProblem."""
     try:
         yield
@@ -185,10 +185,10 @@ def _of_elements(sets: Sequence[_Set], source: str) -> Orbits:
     # Pieces of one launch share names such as OBJECT A; use their catalogue numbers instead.
     shared = {name for name, count in Counter(held.values()).items() if count > 1}
     names = {number: number if name in shared else name for number, name in held.items()}
-    return Orbits(source, {names[number]: partial(_follow, own) for number, own in by_number.items()}, names)
+    return Orbits(source, {names[number]: partial(_propagate_sets, own) for number, own in by_number.items()}, names)
 
 
-def _follow(sets: Sequence[_Set], seconds: Array) -> tuple[Array, Array]:
+def _propagate_sets(sets: Sequence[_Set], seconds: Array) -> tuple[Array, Array]:
     """Return position and velocity (k, 3) at each time from the element set with the nearest epoch."""
     found = [one.satellite() for one in sets]
     epochs = np.array([sat.model.jdsatepoch + sat.model.jdsatepochF for sat in found])
@@ -299,11 +299,11 @@ def _csv_sets(path: Path) -> list[_Set]:
 
 
 # Conventions of SGP4 elements; a message may state others.
-_MEANT = {"REF_FRAME": "TEME", "TIME_SYSTEM": "UTC", "MEAN_ELEMENT_THEORY": "SGP4", "CENTER_NAME": "EARTH"}
+_CONVENTIONS = {"REF_FRAME": "TEME", "TIME_SYSTEM": "UTC", "MEAN_ELEMENT_THEORY": "SGP4", "CENTER_NAME": "EARTH"}
 
 
 def _of_fields(fields: Mapping[str, Any], where: str) -> _Set:
-    for key, meant in _MEANT.items():
+    for key, meant in _CONVENTIONS.items():
         if fields.get(key) not in (None, "", meant):
             what = f"{key} is {str(fields[key])[:40]!r}"
             raise InvalidProblem(what, where, f"only elements with {key} = {meant} are supported")
@@ -355,7 +355,7 @@ def _sp3(text: str, source: str) -> Orbits:
         if has_controls(name) or (np.diff(seconds) <= 0.0).any():
             raise InvalidProblem(f"the times of satellite {name!r} do not increase", source, "download the file again")
         nodes = np.array(seconds), _KILOMETRE * np.array(places[name])
-        courses[name] = partial(_between, *nodes, _CLOCKS[clock], name, source)
+        courses[name] = partial(_interpolate, *nodes, _CLOCKS[clock], name, source)
     return Orbits(source, courses, {})
 
 
@@ -380,14 +380,14 @@ def _calendar(line: str, where: str) -> float:
     return date.timestamp() + _number(parts[5] if len(parts) > 5 else "", where)
 
 
-def _between(
+def _interpolate(
     nodes: Array, places: Array, ahead: float | None, name: str, source: str, seconds: Array
 ) -> tuple[Array, Array]:
     """Return interpolated position and velocity (k, 3), from positions (n, 3) at the clock times `nodes` (n,).
 
     `ahead` is the offset of the clock from TAI, s; None for UTC.
     """
-    at = seconds + (0.0 if ahead is None else ahead + _leap(seconds))
+    at = seconds + (0.0 if ahead is None else ahead + _leap_seconds(seconds))
     where = f"{source}, satellite {name}"
     if len(nodes) < _POINTS:
         raise InvalidProblem(f"there are {len(nodes)} positions", where, f"interpolation needs {_POINTS}")
@@ -396,8 +396,8 @@ def _between(
         what = f"{_date(seconds[outside[0]])} is before the first or after the last position"
         raise InvalidProblem(what, where, "use the file of that day; times are dates, or seconds since 1970, UTC")
     position, velocity = _polynomial(nodes, places, at, _POINTS, where)
-    off = np.linalg.norm(position - _polynomial(nodes, places, at, _FEWER, where)[0], axis=1).max(initial=0.0)
-    if off > _APART:
+    off = np.linalg.norm(position - _polynomial(nodes, places, at, _CHECK_POINTS, where)[0], axis=1).max(initial=0.0)
+    if off > _MAX_DIFFERENCE:
         step = float(np.diff(nodes).min())
         what = f"the positions are {step:g} s apart, so the interpolation is accurate to {off:.2g} m only"
         raise InvalidProblem(what, where, "use a file with smaller steps")
@@ -423,7 +423,7 @@ def _polynomial(nodes: Array, places: Array, at: Array, count: int, where: str) 
     return position, velocity
 
 
-def _leap(seconds: Array) -> Array:
+def _leap_seconds(seconds: Array) -> Array:
     """Return the leap seconds (k,) of atomic time over UTC."""
     ahead = np.concatenate([_instants(part).tai for part in np.split(seconds, range(_AT_ONCE, len(seconds), _AT_ONCE))])
     return np.asarray(np.round((ahead - (seconds / _DAY + _EPOCH_1970)) * _DAY))

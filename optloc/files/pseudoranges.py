@@ -27,15 +27,15 @@ from optloc.files.table import Table, of_rows
 from optloc.problem.build import assemble, measured, station_array
 
 # Largest time from the reference time of a valid ephemeris, s: fits of GPS and Galileo cover four hours.
-_FRESH = 7200.0
+_MAX_AGE = 7200.0
 # Elevation, degrees, below which refraction and reflections exceed the noise: the usual mask of surveyors.
 MASK = 10.0
 # Satellites needed for a receiver and its clock; greatest distance of a receiver from the Earth's centre, m.
-_ENOUGH, _BEYOND = 4, 1e7
+_MIN_SATELLITES, _MAX_RADIUS = 4, 1e7
 # State bits of an Android measurement: code lock, and known time of week.
 _TRACKED, _TIMED = 1, 8 | 16384
 # Largest uncertainty of an Android time, ns; lowest frequency of L1 and E1 signals, Hz.
-_SHARP, _FIRST = 500.0, 1.5e9
+_MAX_UNCERTAINTY, _MIN_FREQUENCY = 500.0, 1.5e9
 _CONSTELLATIONS = {"1": "G", "4": "J", "6": "E"}
 _QZSS = 192  # QZSS satellite numbers start after it
 
@@ -121,7 +121,7 @@ def received(
     least = np.radians(MASK) if mask is None else Units("angle").plain(mask, "deg", "--mask")
     seen = read_observations(source, letter) if is_rinex(source) else read_log(source, letter)
     known = read_navigation(navigation)
-    chosen, place, z, notes = _sent(seen, known.ephemerides, letter)
+    chosen, place, z, notes = _at_transmission(seen, known.ephemerides, letter)
     times, epoch = np.unique(seen.time[chosen], return_inverse=True)
     rough = _first_pass(source, epoch, turned(place, z / SPEED_OF_LIGHT), z, len(times))[epoch]
     # from the distance, since a pseudorange includes the receiver clock error
@@ -150,7 +150,7 @@ def received(
     return Received(epoch[high], seen.time[chosen], seen.satellite[chosen], place[high], z[high], error, about, remarks)
 
 
-def _sent(
+def _at_transmission(
     seen: Observations, ephemerides: Mapping[str, Ephemeris], system: str
 ) -> tuple[Array, Array, Array, tuple[str, ...]]:
     """Return the indices (n,) of observations with an ephemeris, satellite positions (n, 3), ranges (n,), and notes.
@@ -167,14 +167,14 @@ def _sent(
         every = ephemerides[name]
         apart = np.abs(sent[rows, None] - every.toe) + np.where(every.health == 0.0, 0.0, np.inf)
         nearest = apart.argmin(1)
-        fresh = np.take_along_axis(apart, nearest[:, None], axis=1)[:, 0] <= _FRESH
+        fresh = np.take_along_axis(apart, nearest[:, None], axis=1)[:, 0] <= _MAX_AGE
         rows, own = rows[fresh], Ephemeris(*(column[nearest[fresh]] for column in every))
         # transmission time = time of the satellite clock minus its error
         _, ahead = orbit(own, system, sent[rows])
         place[rows], clock[rows] = orbit(own, system, sent[rows] - ahead)
         good[rows] = True
     if not good.any():
-        what = f"no satellite has a healthy ephemeris within {_FRESH / 3600.0:g} hours"
+        what = f"no satellite has a healthy ephemeris within {_MAX_AGE / 3600.0:g} hours"
         raise InvalidProblem(what, "--navigation", "use the navigation file of that day")
     left = int((~good).sum())
     notes = (f"{left} pseudoranges of satellites without a healthy ephemeris are left out",) if left else ()
@@ -200,14 +200,14 @@ def _first_pass(source: Path, epoch: Array, place: Array, z: Array, count: int, 
     stations, ranges, weight = np.zeros((count, width, 3)), np.zeros((count, width)), np.zeros((count, width))
     stations[:] = place[0]
     stations[epoch, slot], ranges[epoch, slot], weight[epoch, slot] = place, z, 1.0
-    least, held = (_ENOUGH - 1, height(0.0, 0.0)) if level else (_ENOUGH, ())
+    least, held = (_MIN_SATELLITES - 1, height(0.0, 0.0)) if level else (_MIN_SATELLITES, ())
     enough = np.flatnonzero(weight.sum(1) >= least)
     found = np.full((count, 3), np.nan)
     if len(enough):
         rows = measured("toa", ranges[enough], a=np.arange(width), sigma=10.0, weight=weight[enough])
         problem = assemble(station_array(stations[enough, None]), rows, frame=ECEF, constraints=held)
         fix = solve(problem, "auto" if level else "gtrs+lsr")
-        found[enough] = np.where(np.linalg.norm(fix.position, axis=-1)[:, None] < _BEYOND, fix.position, np.nan)
+        found[enough] = np.where(np.linalg.norm(fix.position, axis=-1)[:, None] < _MAX_RADIUS, fix.position, np.nan)
     good = np.flatnonzero(np.isfinite(found).all(-1))
     if not len(good):
         what = f"no epoch has {least} satellites that give a position"
@@ -236,14 +236,14 @@ def at_reception(source: Path, epoch: Array, place: Array, z: Array) -> Array:
     number, place, z = number[order], place[order], z[order]
     now = place
     for _ in range(_PASSES):
-        rough = _rough(source, number, now, z, len(labels))[number]
+        rough = _rough_position(source, number, now, z, len(labels))[number]
         now = turned(place, np.linalg.norm(now - rough, axis=-1) / SPEED_OF_LIGHT)
     out = np.empty_like(now)
     out[order] = now
     return out
 
 
-def _rough(source: Path, epoch: Array, place: Array, z: Array, count: int) -> Array:
+def _rough_position(source: Path, epoch: Array, place: Array, z: Array, count: int) -> Array:
     """Return the receiver position of a table at each epoch (count, 3), ECEF, accurate to some hundred metres."""
     try:
         return _first_pass(source, epoch, place, z, count)
@@ -281,9 +281,9 @@ def read_log(path: Path, system: str) -> Observations:
     letters = np.array([_CONSTELLATIONS.get(str(v).split(".")[0], "") for v in table.raw("ConstellationType")])
     state = _or_zero(table, "State").astype(np.int64)
     good = (letters == system) & ((state & _TRACKED) > 0) & ((state & _TIMED) > 0)
-    good &= _or_zero(table, "ReceivedSvTimeUncertaintyNanos") < _SHARP
+    good &= _or_zero(table, "ReceivedSvTimeUncertaintyNanos") < _MAX_UNCERTAINTY
     carrier = _or_zero(table, "CarrierFrequencyHz")
-    good &= (carrier > _FIRST) | (carrier == 0.0)
+    good &= (carrier > _MIN_FREQUENCY) | (carrier == 0.0)
     if not good.any():
         advice = "use another with --system; phones need a minute to find the time"
         raise InvalidProblem(f"there is no {SYSTEMS[system]} signal with a known time", path.name, advice)

@@ -29,7 +29,7 @@ from optloc.files.table import Table
 from optloc.files.words import numbered
 
 # Largest number of column names in one line of the report.
-_NAMED = 4
+_MAX_NAMES = 4
 # Description of azimuths for each convention.
 _ORIENTED = {
     COMPASS: "compass bearings",
@@ -111,7 +111,9 @@ def about(
     out: list[tuple[str, str]] = []
     for one in found:
         cells = one.columns
-        shown = ", ".join(cells[:_NAMED]) + (f" and {len(cells) - _NAMED} more columns" if len(cells) > _NAMED else "")
+        shown = ", ".join(cells[:_MAX_NAMES]) + (
+            f" and {len(cells) - _MAX_NAMES} more columns" if len(cells) > _MAX_NAMES else ""
+        )
         unit = f" in {one.unit}" if one.unit != "1" else ""
         text = _ORIENTED.get(str(one.azimuth))
         text = text if one.heading is None else f"bearings from the bow, plus {one.heading}"
@@ -148,7 +150,7 @@ def farther(found: Readings) -> str:
 
 
 # Roles that columns often have in a table with a column for each receiver: time, label and true position of a row.
-_BESIDE = frozenset(("message", "id", "time", "target", "x", "y", "z", "lat", "lon", "height", "depth"))
+_AUXILIARY_ROLES = frozenset(("message", "id", "time", "target", "x", "y", "z", "lat", "lon", "height", "depth"))
 # Names with words of at most two letters and equal patterns are one series, such as A1 and B7. Longer words of equal
 # length, such as Lake and note, have nothing in common.
 _SERIES = 2
@@ -213,10 +215,10 @@ def _name_in(column: str, pattern: _Pattern, stations: Sequence[str]) -> str | N
         return None  # another column of a known receiver, such as its signal level
     if _is_like(name, stations):
         return name
-    if not around and (pattern.unit is None or role_of(column) in _BESIDE):
+    if not around and (pattern.unit is None or role_of(column) in _AUXILIARY_ROLES):
         return None
     # A single name may lack the unit.
-    forgotten = around > 0 and any_unit(column) is None and role_of(name) not in _BESIDE
+    forgotten = around > 0 and any_unit(column) is None and role_of(name) not in _AUXILIARY_ROLES
     return name if same or forgotten else None
 
 

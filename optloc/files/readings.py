@@ -52,7 +52,7 @@ class Form:
         return MODELS[self.kind].quantity
 
 
-_OWN = {
+_SPECIAL_FORMS = {
     "arrivals": Form("toa", "toa", "arrival times"),
     "times": Form("toa", "time", "arrival times"),
     "sp": Form("range", "sp", "times from P to S of an earthquake, as ranges"),
@@ -61,13 +61,13 @@ _OWN = {
 
 def sort_named(name: str) -> Form:
     """Return a sort of reading by name: "arrivals", "times" (arrivals in the time column), "sp" or a kind."""
-    return _OWN[name] if name in _OWN else Form(name, name, MODELS[name].summary)
+    return _SPECIAL_FORMS[name] if name in _SPECIAL_FORMS else Form(name, name, MODELS[name].summary)
 
 
 # Kinds that a column name can suggest, in the order of the sections of a problem file.
-_SEEN = ("tdoa", "range", "range_sum", "azimuth", "elevation", "range_rate", "fdoa", "groa", "rss_difference")
+_KINDS_BY_NAME = ("tdoa", "range", "range_sum", "azimuth", "elevation", "range_rate", "fdoa", "groa", "rss_difference")
 # Numbers that programs write for a missing reading.
-_MARKS = tuple(map(Decimal, (0, -1, *(sign * (10**n - 1) for n in (2, 3, 4, 5, 6, 9) for sign in (1, -1)))))
+_MISSING_VALUES = tuple(map(Decimal, (0, -1, *(sign * (10**n - 1) for n in (2, 3, 4, 5, 6, 9) for sign in (1, -1)))))
 # Names that without a unit can mean an angle or a height.
 _ANGLE_OR_HEIGHT = ("elevation", "elev")
 # Names with at most this number of letters, such as d, r and el, have many other uses.
@@ -306,7 +306,7 @@ def _form_of(word: str, unit: str | None) -> str | None:
         return "elevation"  # a station has one height, but a different elevation angle in each row
     if role in ("toa", "time"):
         return "arrivals"
-    return role if role == "sp" or role in _SEEN else None
+    return role if role == "sp" or role in _KINDS_BY_NAME else None
 
 
 def sigma_told(told: ColumnHints, kind: str) -> str | None:
@@ -350,7 +350,7 @@ def sorts_of(roles: Roles, told: ColumnHints) -> list[str]:
         return ["sp"]
     if roles.find("p") and roles.find("s") and roles.find("station"):
         return ["sp"]
-    fitting = [name for name in _SEEN if roles.find(name)]
+    fitting = [name for name in _KINDS_BY_NAME if roles.find(name)]
     fitting += ["arrivals"] if roles.find("toa") else []
     if fitting or not (roles.find("station") and roles.find("time")):
         return fitting
@@ -469,7 +469,7 @@ def without_gaps(found: Readings, epoch: Array, told: ColumnHints, table: Table,
     marks = marks_of(told)
     if marks is None:
         marks = frozenset()
-        doubtful = _doubtful(found, epoch)
+        doubtful = _suspicious_number(found, epoch)
         if doubtful is not None:
             own = np.flatnonzero(found.values.units == found.values.number(doubtful))
             times = f"{len(own)} times, first here" if len(own) > 1 else "once"
@@ -491,18 +491,18 @@ def _cells(count: int) -> str:
     return "1 cell" if count == 1 else f"{count} cells"
 
 
-def _doubtful(found: Readings, epoch: Array) -> Decimal | None:
+def _suspicious_number(found: Readings, epoch: Array) -> Decimal | None:
     """Return a number that may mean a missing reading, or None.
 
     A typical number is suspicious if it is the smallest or the largest, or more frequent than all others.
     """
     values, counts = np.unique(found.values.units, return_counts=True)
-    for mark in _MARKS:
+    for mark in _MISSING_VALUES:
         number = found.values.number(mark)
         here = np.flatnonzero(values == number)
         if number is None or not len(here) or len(values) == 1:
             continue
-        if mark == 0 and found.form.kind == "toa" and _begins(found, epoch):
+        if mark == 0 and found.form.kind == "toa" and _is_relative_to_first(found, epoch):
             continue
         beyond = int(here[0]) in (0, len(values) - 1)
         count, others = counts[here[0]], np.delete(counts, here[0])
@@ -511,7 +511,7 @@ def _doubtful(found: Readings, epoch: Array) -> Decimal | None:
     return None
 
 
-def _begins(found: Readings, epoch: Array) -> bool:
+def _is_relative_to_first(found: Readings, epoch: Array) -> bool:
     """Return whether each epoch has one zero and no negative number: then arrivals are relative to the first."""
     units = found.values.units
     zeros = np.bincount(epoch[units == 0], minlength=int(epoch.max()) + 1)

@@ -41,7 +41,7 @@ GEOJSON = (".geojson", ".json")
 # Properties of a GeoJSON point that may be its name or its height, the most likely first.
 _NAMES = ("name", "station", "title", "callsign", "id", "receiver", "sensor")
 _HEIGHTS = ("height", "height_m", "altitude", "alt", "elevation", "ele", "h_m", "h")
-_FLAT = "no heights are given: all stations are assumed at height 0"
+_NO_HEIGHTS = "no heights are given: all stations are assumed at height 0"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class Roles:
         which have no other role. Raise InvalidProblem for an unknown role or column, a unit that does not fit, and a
         column with two roles.
         """
-        given = _given(table, told)
+        given = _stated_columns(table, told)
         used = {part for name in given.values() for part in name.split("+")} | set(readings)
         found: dict[str, str] = {}
         for column in table.columns:
@@ -129,7 +129,7 @@ class Roles:
 _NAMES_STATION = ("station", "name", "id")
 
 
-def _given(table: Table, told: Mapping[str, str]) -> dict[str, str]:
+def _stated_columns(table: Table, told: Mapping[str, str]) -> dict[str, str]:
     """Return the columns that the user states, by role.
 
     Raise InvalidProblem for a column that does not fit its role.
@@ -288,7 +288,7 @@ _OTHER = {
     "east-counterclockwise": "north-clockwise",
     "north-counterclockwise": "north-clockwise",
 }
-_COUNTED = {
+_CONVENTION_TEXT = {
     "north-clockwise": "the compass, clockwise from north (+y)",
     "east-counterclockwise": "the axes, anticlockwise from east (+x)",
     "north-counterclockwise": "north (+y), anticlockwise",
@@ -305,7 +305,7 @@ def azimuths_of(written: ProblemFile, read: ProblemFile) -> str:
         if after.azimuth is not None:
             assumed = before.azimuth is None and str(before.kind).lower() != BEARING
             why = ASSUMED if assumed and written.format == 1 else ""
-            said[f'{_COUNTED[after.azimuth]}{why}; otherwise write azimuth = "{_OTHER[after.azimuth]}"'] = None
+            said[f'{_CONVENTION_TEXT[after.azimuth]}{why}; otherwise write azimuth = "{_OTHER[after.azimuth]}"'] = None
     return "; ".join(said)
 
 
@@ -350,7 +350,9 @@ def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> ColumnP
 
 def place_roles(roles: Roles) -> tuple[str, ...]:
     """Return the roles of the position columns that `placed` reads."""
-    across, ups = (("lat", "lon"), _UPS["height"]) if roles.find("lat") is not None else (("x", "y"), _UPS["z"])
+    across, ups = (
+        (("lat", "lon"), _HEIGHT_ROLES["height"]) if roles.find("lat") is not None else (("x", "y"), _HEIGHT_ROLES["z"])
+    )
     return (*across, *[role for role in ups if roles.find(role) is not None][:1])
 
 
@@ -371,15 +373,15 @@ def placed(roles: Roles, frame: str | None, names: Array | None = None) -> Colum
         raise InvalidProblem("no columns look like latitude and longitude, or x and y", roles.table.source, advice)
     if lat is not None:
         degrees = {f"{axis}_deg": scaled(roles, axis, "angle", "deg") for axis in ("lat", "lon")}
-        height, unit = _upwards(roles, "height")
+        height, unit = _heights(roles, "height")
         degrees["height"] = np.zeros(len(names)) if height is None else height
-        return ColumnPlaces({"name": names} | degrees, "geodetic", unit, _FLAT if height is None else "")
-    up, unit = _upwards(roles, "z")
+        return ColumnPlaces({"name": names} | degrees, "geodetic", unit, _NO_HEIGHTS if height is None else "")
+    up, unit = _heights(roles, "z")
     assert x is not None
     unit = unit_of(x, UNITS["length"]) or "m"
     axes = {axis: scaled(roles, axis, "length", unit) for axis in "xy"}
     if up is not None:
-        axes["z"] = _upwards(roles, "z", unit)[0]
+        axes["z"] = _heights(roles, "z", unit)[0]
     # Columns with "ecef" in the name are in ECEF, so fixes have latitudes.
     return ColumnPlaces({"name": names} | axes, frame or ("ecef" if "ecef" in stem(x) else "cartesian"), unit)
 
@@ -389,7 +391,7 @@ def in_space(place: ColumnPlaces) -> ColumnPlaces:
     if place.frame == "geodetic" or "z" in place.columns:
         return place
     flat = {"z": np.zeros(len(place.names))}
-    return replace(place, columns={**place.columns, **flat}, note=_FLAT.replace("height 0", "z = 0"))
+    return replace(place, columns={**place.columns, **flat}, note=_NO_HEIGHTS.replace("height 0", "z = 0"))
 
 
 def scaled(roles: Roles, role: str, quantity: Literal["length", "angle"], unit: str) -> Array:
@@ -400,12 +402,12 @@ def scaled(roles: Roles, role: str, quantity: Literal["length", "angle"], unit: 
 
 
 # Roles of the third coordinate, the most likely first: with latitude and longitude, and with x and y.
-_UPS = {"height": ("height", "depth"), "z": ("z", "height", "depth")}
+_HEIGHT_ROLES = {"height": ("height", "depth"), "z": ("z", "height", "depth")}
 
 
-def _upwards(roles: Roles, role: Literal["height", "z"], unit: str | None = None) -> tuple[Any, str]:
+def _heights(roles: Roles, role: Literal["height", "z"], unit: str | None = None) -> tuple[Any, str]:
     """Return heights or None, and their unit; depths become negative heights."""
-    found = next((one for one in _UPS[role] if roles.find(one) is not None), None)
+    found = next((one for one in _HEIGHT_ROLES[role] if roles.find(one) is not None), None)
     if found is None:
         return None, unit or "m"
     unit = unit or unit_of(roles.column(found), UNITS["length"]) or "m"
@@ -430,7 +432,7 @@ def _of_geojson(data: Any, source: str) -> ColumnPlaces:
     known = [h is not None for h in height]
     columns["height"] = np.array([0.0 if h is None else h for h in height])
     lacking = "" if all(known) else f"{known.count(False)} of {len(known)} points have no height: 0 is assumed"
-    return ColumnPlaces(columns, "geodetic", "m", _FLAT if not any(known) else lacking)
+    return ColumnPlaces(columns, "geodetic", "m", _NO_HEIGHTS if not any(known) else lacking)
 
 
 def _kind(feature: Mapping[str, Any]) -> Any:

@@ -30,7 +30,7 @@ from optloc.files.writer import write_csv
 _SURFACE = 6.4e6
 # Comment on satellites in a problem file, and the note on satellites that were rotated.
 AT_RECEPTION = ("# Satellite positions are at transmission, in the Earth axes at reception.",)
-_TURNED = "satellite positions are rotated with the Earth during the signal flight; --turned uses them unchanged"
+_ROTATED_NOTE = "satellite positions are rotated with the Earth during the signal flight; --turned uses them unchanged"
 
 
 def pseudoranges(source: Path, roles: Roles, told: ColumnHints) -> TableProblem:
@@ -51,7 +51,7 @@ def pseudoranges(source: Path, roles: Roles, told: ColumnHints) -> TableProblem:
     if not told.turned:
         metres, ranges = place * UNITS["length"][length], Units("length").conversion(unit, "--unit").to_si(z)
         place = at_reception(source, epoch, metres, ranges) / UNITS["length"][length]
-        notes += (_TURNED,)
+        notes += (_ROTATED_NOTE,)
     columns = {"epoch": epoch, "a": satellite, "z": z}
     when = roles.find("time")
     if when is not None:
@@ -138,7 +138,7 @@ def write_satellites(
         rows = rows[np.unique(seconds[rows], return_index=True)[1]]
         parts.append((np.full(len(rows), name, dtype=object), rows, *orbits.at(name, seconds[rows])))
     rows = np.unique(seconds, return_index=True)[1]
-    for name, place in _resting(stations, told).items():
+    for name, place in _fixed_stations(stations, told).items():
         still = np.zeros((len(rows), 3))
         parts.append((np.full(len(rows), name, dtype=object), rows, place + still, still))
     names, rows, position, velocity = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -147,7 +147,7 @@ def write_satellites(
     return Converted((out,), None, ('positions are in ECEF: write kind = "ecef" in [frame]',))
 
 
-def _resting(path: Path | None, told: Mapping[str, str]) -> dict[str, np.ndarray]:
+def _fixed_stations(path: Path | None, told: Mapping[str, str]) -> dict[str, np.ndarray]:
     """Return the ECEF positions of fixed stations by name, m."""
     if path is None:
         return {}

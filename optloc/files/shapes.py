@@ -103,7 +103,7 @@ def _wide_sort(
     )
     if len(deviations) == len(columns):
         found = replace(found, sigma=np.concatenate(deviations), errors=tuple(dict.fromkeys(errors_used)))
-    return _settled(found, roles, told, place, empty, "a-farther" if minus else None)
+    return _checked(found, roles, told, place, empty, "a-farther" if minus else None)
 
 
 def _in_unit(values: Decimals, unit: str, wanted: str, form: Form) -> Decimals:
@@ -222,12 +222,12 @@ def long(
     if not len(pick):
         raise InvalidProblem("no cell has a reading", table.where(column), "check the column")
     a = roles.labels("station") if heard is None else heard
-    positive, b = ("a-farther", None) if form.stations == 1 else _others(roles, told)
+    positive, b = ("a-farther", None) if form.stations == 1 else _second_station(roles, told)
     found = _of_column(form, unit, held, column, a)
     found = replace(found, b=None if b is None else b[pick], notes=(note,) if note else ())
     if (own := sigma_column(roles, form, told, forms)) is not None:
         found = replace(found, sigma=sigma_of(table, own, form, unit, pick), errors=(own,))
-    return _settled(found, roles, told, place, table.count - len(pick), positive)
+    return _checked(found, roles, told, place, table.count - len(pick), positive)
 
 
 def _of_column(form: Form, unit: str, held: NumberColumn, column: str, a: Array) -> Readings:
@@ -235,7 +235,7 @@ def _of_column(form: Form, unit: str, held: NumberColumn, column: str, a: Array)
     return Readings(form, unit, held.values, held.row, (column,), np.zeros(len(held.row), dtype=int), a[held.row])
 
 
-def _others(roles: Roles, told: ColumnHints) -> tuple[str | None, Array]:
+def _second_station(roles: Roles, told: ColumnHints) -> tuple[str | None, Array]:
     """Return the sign of differences, None if unknown, and the second station of each row."""
     column = roles.find("reference")
     if told.reference is not None:
@@ -290,13 +290,13 @@ def _picks(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> Readings:
     found = _of_column(sort_named("sp"), "s", held, roles.find("s") or roles.column("time"), station)
     lone = len({*station.tolist()}) - len({*found.a.tolist()})
     found = replace(found, notes=(f"{lone} stations without both P and S are left out",) if lone else ())
-    return _settled(found, roles, told, place, 0, "a-farther")
+    return _checked(found, roles, told, place, 0, "a-farther")
 
 
 # Checks for both forms: known stations, no missing readings, no repeats, sign and convention.
 
 
-def _settled(
+def _checked(
     found: Readings, roles: Roles, told: ColumnHints, place: ColumnPlaces, empty: int, positive: str | None
 ) -> Readings:
     """Return checked readings.
@@ -334,7 +334,7 @@ def _settled(
         what = "the sign of differences is unknown: positive values may mean that the first or the second is farther"
         raise InvalidProblem(what, table.source, advice)
     found = replace(found, positive=told.positive or positive or "a-farther")
-    return _oriented(found, told, place, table.source) if found.form.kind == "azimuth" else found
+    return _with_convention(found, told, place, table.source) if found.form.kind == "azimuth" else found
 
 
 # Significant digits of a recent time in seconds or nanoseconds; rounding, m, that has no effect on a fix.
@@ -359,7 +359,7 @@ def _with_digits(found: Readings, table: Table) -> Readings:
     return replace(found, notes=(*found.notes, note))
 
 
-def _oriented(found: Readings, told: ColumnHints, place: ColumnPlaces, source: str) -> Readings:
+def _with_convention(found: Readings, told: ColumnHints, place: ColumnPlaces, source: str) -> Readings:
     """Return azimuths with their convention: from the options, the column name or, on Earth, the compass."""
     named = any(word in stem(found.columns[0]) for word in (BEARING, "brg", "compass", "heading"))
     if found.heading is not None:

@@ -21,7 +21,7 @@ from optloc.files.words import Words, distinct, objects, words_of
 
 _PARQUET = (".parquet", ".pq")
 _FILES = (".csv", ".txt", ".tsv", *_PARQUET)
-_TWICE = "column {!r} occurs twice"
+_REPEATED_COLUMN = "column {!r} occurs twice"
 # Largest number of characters of an invalid cell in a message.
 _WORD = 40
 
@@ -284,7 +284,7 @@ def _header(line: str, separator: str, source: str) -> list[str]:
         raise InvalidProblem(
             "the file is empty or has no header", source, "begin the file with the names of its columns"
         )
-    check_once(header, _TWICE, join(source, "header"))
+    check_once(header, _REPEATED_COLUMN, join(source, "header"))
     return header
 
 
@@ -338,7 +338,7 @@ def _check_size(about: Any, schema: Any, source: str) -> None:
     at_most("bytes", sum(max(group.total_byte_size, 0) for group in groups), source)
     if sum(group.num_rows for group in groups) != about.num_rows:
         raise InvalidProblem("the numbers of rows in the file do not agree", source, "save it again")
-    check_once(schema.names, _TWICE, source)
+    check_once(schema.names, _REPEATED_COLUMN, source)
 
 
 def _fits(pa: Any, kind: Any) -> bool:

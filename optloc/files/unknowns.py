@@ -184,7 +184,7 @@ def bias_of(
         if np.isin(bias.row, numbers).any()
     }
     # the constructor of the problem rejects epochs without times
-    bias = complete(bias, epochs.clock, where, **_change(table, [units for units, _ in spelled], where))
+    bias = complete(bias, epochs.clock, where, **_walk_parameters(table, [units for units, _ in spelled], where))
     form = form_of(bias)
     mean, sigma = _prior(table, form, [units for units, _ in spelled], form.shape(bias, dimension), where)
     return replace(bias, mean=mean, sigma=sigma), _unit_to_read(form, spelled, where)
@@ -205,7 +205,7 @@ def _check_sense(bias: Bias, rows: Sequence[Rows], written: Sequence[tuple[Array
         raise InvalidProblem(what, where, 'use the form "offset", or azimuth = "east-counterclockwise"')
 
 
-def _change(table: BiasTable, rows: Sequence[Units], where: str) -> dict[str, Any]:
+def _walk_parameters(table: BiasTable, rows: Sequence[Units], where: str) -> dict[str, Any]:
     """Return the parameters of the change of a bias in time, SI units."""
     found: dict[str, Any] = {}
     for key, power in (("density", 1), ("rate_density", 3)):
@@ -426,7 +426,7 @@ def _make(table: ConstraintTable, stations: Stations, frame: Frame, where: str, 
     if table.kind == "speed":
         least, most = _bounds(table, "speed", where, c)
         return speed(most, lower=least)
-    return _region(table, frame, where, c) if table.kind == "polygon" else _sight(table, stations, frame, where)
+    return _region(table, frame, where, c) if table.kind == "polygon" else _visibility(table, stations, frame, where)
 
 
 def _bounds(table: ConstraintTable, quantity: Quantity, where: str, c: float) -> tuple[float, float]:
@@ -485,7 +485,7 @@ def _region(table: ConstraintTable, frame: Frame, where: str, c: float) -> Seque
     return polygon(corners)
 
 
-def _sight(table: ConstraintTable, stations: Stations, frame: Frame, where: str) -> Sequence[Constraint]:
+def _visibility(table: ConstraintTable, stations: Stations, frame: Frame, where: str) -> Sequence[Constraint]:
     if not frame.geodetic or stations.dimension != 3:
         raise InvalidProblem("a horizon needs a geodetic frame", where, "use frame ecef or enu with 3-D stations")
     if stations.position.shape[-3] > 1:

@@ -118,7 +118,7 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
     copies: dict[Path, Path] = {}
     for i, section in enumerate(kept):
         if "file" in section:
-            copies |= _keep(section, source.parent, out, "stations" if i == 0 else f"target-{i}")
+            copies |= _relocate(section, source.parent, out, "stations" if i == 0 else f"target-{i}")
     tables = [out.with_name(f"{out.stem}-{i + 1}.csv") for i in range(len(made.tables))]
     claim(out, *copies, *tables, inputs=[source])
     with together():
@@ -135,7 +135,7 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
     return [out, *copies, *tables]
 
 
-def _keep(section: dict[str, Any], folder: Path, out: Path, role: str) -> dict[Path, Path]:
+def _relocate(section: dict[str, Any], folder: Path, out: Path, role: str) -> dict[Path, Path]:
     """Update the path of a table that is not written again; return its copy and its original if a copy is needed."""
     path = folder / section["file"]
     section["file"] = os.path.relpath(path, out.parent)

@@ -25,7 +25,7 @@ UNNAMED = "target"
 """Name of the target of events without a target in tracks, as in files."""
 
 # Seconds after which a target is removed from the list; maps of aircraft use this limit.
-_GONE = 60.0
+_MAX_AGE = 60.0
 
 
 def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Record]:
@@ -60,14 +60,14 @@ def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Re
             record["reason"] = fix.reason[i]
         if wild[i].any():
             record["undetermined"] = ["xyz"[axis] for axis in np.flatnonzero(wild[i])]
-        _mark(record, event)
+        _add_exceptions(record, event)
     return made
 
 
 def unsolved(event: Event, phase: str = "fix", **why: Any) -> Record:
     """Return the answer to an event without a position; `why` is its status, or an error."""
     record = {"event": event.name, "phase": phase, **why, "position": None}
-    _mark(record, event)
+    _add_exceptions(record, event)
     return record
 
 
@@ -91,7 +91,7 @@ def _alternatives(fix: Fix) -> dict[int, list[Record]]:
     return out
 
 
-def _mark(record: Record, event: Event) -> None:
+def _add_exceptions(record: Record, event: Event) -> None:
     """Add the unusual properties of an event: closing reason, revision, conflict, target."""
     if event.closed != "whole":
         record["closed"] = event.closed
@@ -118,7 +118,7 @@ def proof_records(fix: Fix, events: Sequence[Event], before: Sequence[Record | N
             proof["why"] = reason
         if old is None:
             out.append(new | proof)
-        elif _same(new, old):
+        elif _is_same_fix(new, old):
             changed = {key: new[key] for key in ("alternatives", "revision", "reason", "target") if new.get(key)}
             out.append({"event": new["event"], "phase": "proof", "status": new["status"], **proof, **changed})
         else:
@@ -131,7 +131,7 @@ def proof_records(fix: Fix, events: Sequence[Event], before: Sequence[Record | N
 _ROUNDING = 1e-9
 
 
-def _same(new: Record, old: Record) -> bool:
+def _is_same_fix(new: Record, old: Record) -> bool:
     """Return whether the whole method gives the same fix as the first phase."""
     if new["position"] is None or old["position"] is None:
         return bool(new["position"] == old["position"])
@@ -159,7 +159,7 @@ def track_record(event: Event, time: float, entry: Entry, problem: Problem) -> R
     record |= {"nis": nis if np.isfinite(nis) else None, "rows": int(entry.updated.count), "rejected": entry.rejected}
     if entry.reason:
         record["reason"] = entry.reason
-    _mark(record, event)
+    _add_exceptions(record, event)
     return record
 
 
@@ -230,7 +230,12 @@ def to_mark(record: Record, frame: Frame) -> Mark:
     position, d = np.array(record["position"], dtype=float), len(record["position"])
     spread = np.full((d, d), np.nan) if record.get("cov") is None else np.array(record["cov"], dtype=float)[:d, :d]
     others = [
-        Other(x := np.array(each["position"], dtype=float), earth_points(frame, x[None])[0], each["gap"], _doubt(each))
+        Other(
+            x := np.array(each["position"], dtype=float),
+            earth_points(frame, x[None])[0],
+            each["gap"],
+            _probability(each),
+        )
         for each in record.get("alternatives", ())
     ]
     name = record.get("target") or record["event"]
@@ -248,7 +253,7 @@ def to_mark(record: Record, frame: Frame) -> Mark:
     )
 
 
-def _doubt(each: Record) -> float:
+def _probability(each: Record) -> float:
     """Return the probability of an alternative, as `optloc.problem.fix.Alternatives` does."""
     return float(1.0 / (1.0 + np.exp(min(each["gap"] / 2.0, 700.0))))  # exp overflows beyond 700
 
@@ -307,7 +312,7 @@ class Latest:
 
     def _present(self) -> list[tuple[float, Record]]:
         now = time()
-        return [(now - when, record) for when, record in list(self._held.values()) if now - when < _GONE]
+        return [(now - when, record) for when, record in list(self._held.values()) if now - when < _MAX_AGE]
 
     def features(self) -> Record:
         """Return the latest fixes as a GeoJSON feature collection."""

@@ -16,7 +16,7 @@ _FORMAT = "optloc live 1"
 # Bytes of a checkpoint with the largest state: 4096 open events of 64 kB and 65 536 ids.
 _BUDGET = Budget(text=1 << 29)
 # Largest count: a million a second for 30 000 years, which is exact as a float.
-_MOST = 1 << 60
+_MAX_COUNT = 1 << 60
 # Largest number of characters of an invalid value in a message.
 _SHOWN = 40
 _NAMES: dict[type, str] = {list: "list", dict: "object", str: "text", int: "whole number", bool: "true or false"}
@@ -121,7 +121,7 @@ def _parts(found: Any, count: int, where: str) -> list[Any]:
 def _count(found: Any, where: str) -> int:
     """Return a valid count."""
     number = _typed(found, int, where)
-    if not 0 <= number <= _MOST:
+    if not 0 <= number <= _MAX_COUNT:
         raise InvalidProblem(f"{str(number)[:_SHOWN]} is not a count", where, "remove it")
     return number
 

@@ -281,7 +281,7 @@ def run_live(file: Path, asked: ServiceOptions) -> int:
         stops.callback(stream.close)  # also if a source cannot be opened
         if settings.track and stream.untracked:
             raise InvalidProblem(stream.untracked, "--track", "remove this option")
-        interrupted = stops.enter_context(_obeying(stream))  # before the first line is read
+        interrupted = stops.enter_context(_signal_handlers(stream))  # before the first line is read
         places = _open(asked, stream, adapter, stops)
         say(f"ready: {site.title!r}, {len(site.rows)} rows of {len(site.stations)} stations{places}")
         _read(asked, stream, adapter, recording)
@@ -364,7 +364,7 @@ def wait(stream: Stream, interrupted: Event) -> int:
 
 
 @contextmanager
-def _obeying(stream: Stream) -> Iterator[Event]:
+def _signal_handlers(stream: Stream) -> Iterator[Event]:
     """Let signals end a stream or reload its site; Ctrl-C sets the event that is yielded."""
     interrupted = Event()
 

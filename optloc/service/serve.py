@@ -104,7 +104,7 @@ def application(stream: Stream, *, local: bool = True) -> Any:
 
     routes = [
         Route("/", page),
-        *_questions(stream),
+        *_line_routes(stream),
         Route("/health", health),
         Route("/metrics", metrics),
         Route("/fixes.geojson", fixes),
@@ -115,7 +115,7 @@ def application(stream: Stream, *, local: bool = True) -> Any:
     return Starlette(routes=routes, middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=names)])
 
 
-def _questions(stream: Stream) -> list[Any]:
+def _line_routes(stream: Stream) -> list[Any]:
     """Return the routes that accept lines and return tracks."""
     from starlette.responses import JSONResponse, Response
     from starlette.routing import Route
@@ -124,7 +124,7 @@ def _questions(stream: Stream) -> list[Any]:
         return JSONResponse({"error": why}, code, headers)
 
     async def answer(request: Any, *, track: bool) -> Any:
-        if not _is_own(request):
+        if not _is_same_origin(request):
             return refused(403, "requests from pages of other sites are refused")
         body = await _body(request)
         if body is None:
@@ -133,7 +133,7 @@ def _questions(stream: Stream) -> list[Any]:
         lines = [body.replace(b"\n", b" ")] if single else [each for each in body.split(b"\n") if each.strip()]
         if not 0 < len(lines) <= WAITING:
             return refused(400, f"send 1 to {WAITING} lines")
-        records = await _answered(stream, lines, track=track)
+        records = await _answers_to(stream, lines, track=track)
         if isinstance(records, int):
             said = {
                 429: "the input queue is full",
@@ -176,7 +176,7 @@ def page_of(site: Site) -> str:
     return live_page(ready.fast.problem, site.title)
 
 
-def _is_own(request: Any) -> bool:
+def _is_same_origin(request: Any) -> bool:
     """Return whether a request comes from a program, or from a page of this server."""
     origin = request.headers.get("origin")
     return origin is None or urlsplit(origin).netloc == request.headers.get("host")
@@ -193,7 +193,7 @@ async def _body(request: Any) -> bytes | None:
     return b"".join(parts)
 
 
-async def _answered(stream: Stream, lines: list[bytes], *, track: bool) -> list[Record] | int:
+async def _answers_to(stream: Stream, lines: list[bytes], *, track: bool) -> list[Record] | int:
     """Return the answers to lines, or an HTTP status code if there are none."""
     loop = asyncio.get_running_loop()
     future: asyncio.Future[list[Record]] = loop.create_future()
@@ -223,7 +223,7 @@ async def _listen(stream: Stream, socket: Any) -> None:
     """Send all records to a websocket, and accept lines from it."""
     from starlette.websockets import WebSocketDisconnect
 
-    if not _is_own(socket):
+    if not _is_same_origin(socket):
         await socket.close(1008, "requests from pages of other sites are refused")
         return
     await socket.accept()

@@ -309,13 +309,13 @@ def _table(table: Table, kinds: bool, rows: Sequence[SiteRow], present: Sequence
         stated = key == "sigma" and any(row.sigma is not None for row in rows)
         if given is None and not stated and (key != "weight" or all(present)):
             continue
-        columns[key] = np.array([_own(given, key, row, table.source) for row in rows])
+        columns[key] = np.array([_row_setting(given, key, row, table.source) for row in rows])
     if not all(present):
         columns["weight"] = np.where(present, columns["weight"], 0.0)
     return Table(table.source, columns, len(rows))
 
 
-def _own(given: Array | None, key: str, row: SiteRow, source: str) -> float:
+def _row_setting(given: Array | None, key: str, row: SiteRow, source: str) -> float:
     """Return the standard deviation, weight or correction of a row."""
     if key == "sigma" and row.sigma is not None:
         return row.sigma

@@ -33,7 +33,7 @@ _LINES = 256
 _PAUSE = 1e-3
 # Share of the time that does not count for waiting events while lines wait to be read. Rows of an event that were
 # written together then stay together at any reading speed, and events with missing rows still close.
-_STILL = 0.98
+_UNCOUNTED = 0.98
 # Bytes of a recording that are collected before writing.
 _GATHERED = 1 << 16
 
@@ -237,22 +237,22 @@ class Stream:
                     self._events.due(line.when, self.clock())
                 self._read(line)
                 if len(self._events.ready) >= BATCH:
-                    self._settle()
+                    self._answer_closed()
             # while lines wait, use the time of the last line: rows of an open event may be among the waiting lines
             if not (self._replayed or pending or len(self.inbox)):
                 self._events.due(self._time(), self.clock())
-            self._tend()
+            self._do_timed_work()
         if not self._outbox.failed:
             self._finish()
 
-    def _tend(self) -> None:
+    def _do_timed_work(self) -> None:
         """Do all timed work."""
         now = self.clock()
-        self._settle()
+        self._answer_closed()
         self._engine.expire()
         if self._reload:
             self._reload = False
-            self._renew()
+            self._reload_site()
         if now >= self._next_health:
             self._next_health = now + self._settings.health
             self._say(json.dumps({"health": self.health()}))
@@ -264,7 +264,7 @@ class Stream:
     def _finish(self) -> None:
         """Answer all waiting events, and store the last state."""
         self._events.flush(self.clock())
-        self._settle()
+        self._answer_closed()
         self._engine.stop()
         self._outbox.close()
         self._checkpoint()
@@ -279,16 +279,16 @@ class Stream:
             track = self._settings.track if line.track is None else line.track
             try:
                 message = parse(data, self.site)
-                self._keep(data, line.stamp)
+                self._record_line(data, line.stamp)
                 if message.command:
-                    refused = self._obey(message.command)
+                    refused = self._run_command(message.command)
                 else:
                     self._events.take(message, line.stamp, line.when, ticket, track=track)
             except Exception as error:  # an error of one line must not end the stream
                 if not isinstance(error, InvalidProblem):
                     LOG.exception("line %d of %s failed", line.number, line.source)
                 if isinstance(error, UnknownName):
-                    self._keep(data, line.stamp)
+                    self._record_line(data, line.stamp)
                     self._events.refuse(error, line.stamp, line.when, track=track)
                 counts["malformed"] += 1
                 refused = {"error": str(error), "line": line.number, "source": line.source}
@@ -297,7 +297,7 @@ class Stream:
         if ticket is not None:
             ticket.handled(refused)
 
-    def _obey(self, command: str) -> Record:
+    def _run_command(self, command: str) -> Record:
         if command == "flush":
             self._events.flush(self.clock())
             return {"flushed": True}
@@ -305,7 +305,7 @@ class Stream:
         self._emit(record)
         return record
 
-    def _settle(self) -> None:
+    def _answer_closed(self) -> None:
         closed = list(self._events.closing())
         for event in closed:
             self._unwritten[event.name] = event
@@ -337,7 +337,7 @@ class Stream:
 
     # Files.
 
-    def _renew(self) -> None:
+    def _reload_site(self) -> None:
         """Reload the file of the site after the events of the old site are answered."""
         if self._again is None:
             return
@@ -349,7 +349,7 @@ class Stream:
             self._say(f"The site is not changed: {error}")
             return
         self._events.flush(self.clock())
-        self._settle()
+        self._answer_closed()
         self._engine.stop()
         self.site = self._events.site = site
         self._engine = self._new_engine(site)
@@ -365,7 +365,7 @@ class Stream:
             except InvalidProblem as error:
                 self._say(f"No checkpoint is written: {error}")  # a full disk must not end the stream
 
-    def _keep(self, data: bytes, stamp: float) -> None:
+    def _record_line(self, data: bytes, stamp: float) -> None:
         """Record a line, which has one JSON object, with its time of reading."""
         if self._record is not None:
             self._recorded += b'{"received":%.6f,' % stamp + data[1:] + b"\n"
@@ -434,7 +434,7 @@ def read_lines(
         if not (piece := read(LINE)):
             break
         now = stream.clock()
-        stream.held += _STILL * (now - last) if waited else 0.0
+        stream.held += _UNCOUNTED * (now - last) if waited else 0.0
         last = now
         *whole, rest = (rest + piece).split(b"\n")
         if len(rest) > 2 * LINE:

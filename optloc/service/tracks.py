@@ -59,7 +59,7 @@ class Scan(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Kept:
+class _StoredTrack:
     """A stored track.
 
     origin: time of its first event, picoseconds. heard: time of its last event by the clock, s. last: last answer.
@@ -98,7 +98,7 @@ class Tracks:
     ) -> None:
         self._how, self._metrics, self._emit, self._clock = how, metrics, emit, clock
         # in the order of their last events
-        self._kept: dict[str, _Kept] = {}
+        self._kept: dict[str, _StoredTrack] = {}
         self._waiting, self._ends = deque[Scan](), False
         self._changed = Condition()
         self._thread: Thread | None = None
@@ -108,7 +108,7 @@ class Tracks:
     @cached_property
     def why(self) -> str:
         """Return the reason for which events of the site make no tracks; empty if they do."""
-        return _why_not(self._problem, self._how)
+        return _reason_without_tracks(self._problem, self._how)
 
     def take(self, scans: Sequence[Scan]) -> None:
         """Add events in the order in which they closed; the caller waits while the queue is full."""
@@ -146,7 +146,7 @@ class Tracks:
                 scan = self._waiting.popleft()
                 self._changed.notify_all()
             try:
-                record = self._follow(*scan)
+                record = self._track_event(*scan)
             except Exception as error:  # noqa: BLE001  # an error of one event must not end the stream
                 record = self._failed(scan.event, error)
             self._metrics.took("track", [self._clock() - scan.event.stamp])
@@ -164,7 +164,7 @@ class Tracks:
         self._metrics.add("forgotten")
         return unsolved(event, phase="track", error=f"{type(error).__name__}: {error}; a new track starts")
 
-    def _follow(self, event: Event, problem: Problem, z: Array) -> Record:
+    def _track_event(self, event: Event, problem: Problem, z: Array) -> Record:
         """Return the answer to an event from the track of its target."""
         if self.why:
             raise InvalidProblem(self.why, None, "request fixes instead of tracks")
@@ -173,7 +173,7 @@ class Tracks:
             raise InvalidProblem("a track needs the time of the event", "time", "add time, time_ns or time_ps")
         name = event.target or UNNAMED
         kept = self._kept.get(name)
-        track = kept or _Kept(Follower(self._how.dynamics, self._how.update, self._how.rules), when)
+        track = kept or _StoredTrack(Follower(self._how.dynamics, self._how.update, self._how.rules), when)
         # subtract integers of picoseconds first, since a float would lose digits
         time = (when - track.origin) * 1e-12
         if track.follower.last >= time:
@@ -219,7 +219,7 @@ def _told(event: Event, when: int, entry: Entry | None, follower: Follower, prob
     return unsolved(event, phase="track", target=event.target or UNNAMED, time=when * 1e-12, **said)
 
 
-def _why_not(problem: Problem, how: Following) -> str:
+def _reason_without_tracks(problem: Problem, how: Following) -> str:
     """Return the reason for which events of a site make no tracks; empty if they do."""
     if problem.priors:
         return f"the file has a prior of {problem.priors[0].name!r}; a track cannot use priors"
