@@ -208,7 +208,7 @@ def test_simulate_keeps_units_kinds_and_geodesy(tmp_path):
         "several trials"
         in run("simulate", DEMOS / "run.toml", "--truth", "1,2", "--trials", 2, "--out", out, "--force", code=2).stderr
     )
-    assert "no list" in run("simulate", path, "--truth", "1;2", "--out", out, "--force", code=2).stderr
+    assert "not a list" in run("simulate", path, "--truth", "1;2", "--out", out, "--force", code=2).stderr
     assert "dimensions" in run("simulate", path, "--truth", "1,2", "--out", out, "--force", code=2).stderr
 
 

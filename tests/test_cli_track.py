@@ -158,7 +158,7 @@ def test_a_given_state_needs_no_start(tmp_path):
         (["--model", "csm", "--memory", "0"], "time_constant"),
         (["--start", "1,2,3,4"], "--start-sigma"),
         (["--start", "1,2", "--start-sigma", "1,1"], "2 numbers for a state of 4"),
-        (["--start", "1,2,x,4", "--start-sigma", "1,1"], "no list of numbers"),
+        (["--start", "1,2,x,4", "--start-sigma", "1,1"], "not a list of numbers"),
         (["--start", "1,2,3,4", "--start-sigma", "1"], "give 2 positive numbers"),
         (["--start", "1,2,3,4", "--start-sigma", "1,-1"], "give 2 positive numbers"),
         (["--start", "900,900,0,0", "--start-sigma", "1,1"], "contradicts the first scan"),

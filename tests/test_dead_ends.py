@@ -76,7 +76,7 @@ def test_a_track_goes_on_over_a_single_arrival(tmp_path):
 def test_a_track_of_single_arrivals_alone_is_refused(tmp_path):
     done = run(*table(tmp_path, lambda k: [k % 6]))
     assert done.exit_code == 2
-    assert "has a single arrival" in " ".join(done.output.split())
+    assert "has one arrival" in " ".join(done.output.split())
 
 
 # Health without redundancy.
@@ -102,7 +102,7 @@ def test_check_says_that_nothing_checks_the_measurements(tmp_path):
     done = run("check", tmp_path / "u.csv", "--stations", tmp_path / "s.csv", "--sigma", "10 cm", "--as", "range")
     said = " ".join(done.output.split())
     assert done.exit_code == 0, done.output
-    assert "Station health could not be told: no fix has redundancy" in said
+    assert "Station health could not be computed: no fix has redundancy" in said
 
 
 # Known targets beside an unknown one.

@@ -150,7 +150,7 @@ def test_a_prior_in_hertz_needs_one_carrier(tmp_path):
     path = passing(
         tmp_path, ('[[biases]]\nname = "freq', other + '[[biases]]\nname = "freq'), (name, 'sigma = "9 Hz"\n' + name)
     )
-    with pytest.raises(InvalidProblem, match="several carriers; give it in m/s"):
+    with pytest.raises(InvalidProblem, match="several carriers; give the value in m/s"):
         read(path)
 
 
@@ -225,7 +225,7 @@ def test_a_file_says_the_same_of_shared_errors(tmp_path):
     path.write_text(f'{head}kind = "rss_difference"\narrival_sigma = {{ {sigma} }}\n')
     assert np.allclose(noises.dense(load(path).noise, np.arange(4)), expected)  # of levels the same
     path.write_text(f'{head}kind = "groa"\narrival_sigma = {{ {sigma} }}\n')
-    with pytest.raises(InvalidProblem, match="do not add up what single stations measure; give sigma or covariance"):
+    with pytest.raises(InvalidProblem, match="are not sums or differences of arrivals; give sigma or covariance"):
         load(path)
 
 
@@ -341,7 +341,7 @@ def test_every_emitter_has_its_own_frequency(tmp_path):
     path.write_text(text)
     assert read(path).problem.biases[0].members == ("blue", "red")
     path.write_text(text.replace('motion = "static"', 'motion = "free"'))
-    with pytest.raises(InvalidProblem, match="free targets are fixed apart, and so are their errors"):
+    with pytest.raises(InvalidProblem, match="free targets are fixed separately, so they share no bias"):
         read(path)
 
 

@@ -1,4 +1,4 @@
-"""The command line: ``optloc fix``, ``check``, ``track`` and so on; ``optloc --help`` lists them."""
+"""The command line of optloc: ``optloc fix``, ``check``, ``track`` and other commands; ``optloc --help`` lists them."""
 
 from typing import TYPE_CHECKING
 

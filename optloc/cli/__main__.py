@@ -1,4 +1,4 @@
-"""The command line as ``python -m optloc.cli``."""
+"""Entry point of ``python -m optloc.cli``."""
 
 from optloc.cli.app import main
 

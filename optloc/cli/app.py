@@ -1,4 +1,4 @@
-"""The commands of ``optloc`` with their arguments and help; what each does is in the module that it calls."""
+"""The commands of ``optloc``: arguments and help texts. Each command calls the module that does the work."""
 
 from __future__ import annotations
 
@@ -56,15 +56,15 @@ from optloc.cli.options import (
     run_process,
 )
 
-# Heavy libraries are imported inside the commands, so that --help answers at once.
+# Import heavy libraries inside the commands, so that --help prints without delay.
 
 app = typer.Typer(
     cls=CommandGroup,
     no_args_is_help=True,
     rich_markup_mode="rich",
-    pretty_exceptions_enable=False,  # a mistake of optloc shows its whole traceback
-    help="Position fixes from time, gain, angle and Doppler measurements, with covariance and verdict.",
-    epilog=f"{EXIT_CODES} With --install-completion the Tab key completes commands, options and their values.\n\n"
+    pretty_exceptions_enable=False,  # an internal error of optloc prints the whole traceback
+    help="Position fixes from time, gain, angle and Doppler measurements, with covariance and status.",
+    epilog=f"{EXIT_CODES} With --install-completion, the Tab key completes commands, options and values.\n\n"
     + example("optloc demo", "optloc new tdoa --out site.toml", "optloc fix site.toml --plot fix.png"),
 )
 
@@ -93,7 +93,7 @@ def _options(
     ] = False,
     plugin: Annotated[
         list[str] | None,
-        typer.Option(metavar="MODULE", help="Run a Python file or module first that adds kinds, losses, solvers."),
+        typer.Option(metavar="MODULE", help="Python file or module to run first; it adds kinds, losses or solvers."),
     ] = None,
 ) -> None:
     import os
@@ -103,10 +103,11 @@ def _options(
 
     from optloc.base.registry import load_plugin
 
-    # Who looks on sees answers at once. Elsewhere, and in studies, nothing is left running that nobody asked for.
+    # On a terminal, compile in a child process, so that the first answers come without delay. Elsewhere, and in
+    # studies, do not leave a background process behind.
     if sys.stderr is not None and sys.stderr.isatty() and context.invoked_subcommand != "study":
         os.environ.setdefault("OPTLOC_COMPILE", "child")
-    # What has no value is judged, and its status says so; a warning of NumPy beside it would tell nobody anything.
+    # A status reports values that are not finite, so NumPy warnings are redundant.
     context.with_resource(np.errstate(all="ignore"))
     for name in plugin or ():
         load_plugin(name)
@@ -148,7 +149,7 @@ def fix(
     verbose: Verbose = False,
     given: Any = None,
 ) -> None:
-    """Fix the target of a problem file, or of a table of readings, at every epoch if there are several.
+    """Fix the target of a problem file or of a measurement table, at each epoch.
 
     Options such as --height add to the constraints of the file. A table needs --stations and --sigma.
     """
@@ -185,31 +186,32 @@ def fix(
 @takes_table
 def track(
     file: ProblemPath,
-    model: Annotated[str, name_in("motions", "How the target moves, such as cv or csm", "--model")] = "cv",
-    filter_: Annotated[str, name_in("trackers", "How a scan updates the state", "--filter")] = "iekf",
-    loss: Annotated[str | None, name_in("losses", "Weigh the rows of a scan by a robust loss", "--loss")] = None,
+    model: Annotated[str, name_in("motions", "Motion model, such as cv or csm", "--model")] = "cv",
+    filter_: Annotated[str, name_in("trackers", "Filter", "--filter")] = "iekf",
+    loss: Annotated[str | None, name_in("losses", "Robust loss that weights the rows of a scan", "--loss")] = None,
     noise: Annotated[
         float | None,
         typer.Option(
             metavar="SD",
-            help="Standard deviation, SI units, of what drives the target, or csm's largest acceleration; by default "
-            "what [bold]optloc list motions[/bold] says.",
+            help="Standard deviation of the process noise, SI units; for csm the largest acceleration. "
+            "[bold]optloc list motions[/bold] shows the defaults.",
         ),
     ] = None,
     memory: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Time over which accelerations last (singer, csm).")
+        float, typer.Option(metavar="SECONDS", help="Correlation time of accelerations (singer, csm).")
     ] = 10.0,
     out: Out = None,
     as_json: Json = False,
     plot: Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw track, sigma and NIS.")] = None,
     html: Html = None,
     gap: TrackGap = None,
-    gate: Annotated[float, typer.Option(metavar="SIGMAS", help="Rows further from the prediction are left out.")] = 5.0,
+    gate: Annotated[float, typer.Option(metavar="SIGMAS", help="Reject rows further from the prediction.")] = 5.0,
     start: Annotated[
-        str | None, typer.Option(metavar="X,Y[,Z],VX...", help="Known state at the first scan; needs none.")
+        str | None, typer.Option(metavar="X,Y[,Z],VX...", help="Known state at the first scan, if you have it.")
     ] = None,
     start_sigma: Annotated[
-        str | None, typer.Option(metavar="P[,V[,A]]", help="Its standard deviations: position, velocity, acceleration.")
+        str | None,
+        typer.Option(metavar="P[,V[,A]]", help="Standard deviations of --start: position, velocity, acceleration."),
     ] = None,
     outside: Outside = False,
     budget: Budget = None,
@@ -218,9 +220,9 @@ def track(
     verbose: Verbose = False,
     given: Any = None,
 ) -> None:
-    """Track the targets of a problem file, or of a table, through its scans, from fixes of its first ones.
+    """Track the targets of a problem file or of a table over time. Fixes of the first scans start the tracks.
 
-    It needs no guess. A table needs --stations and --sigma.
+    You need no first guess. A table needs --stations and --sigma.
     """
     from optloc.cli.track import TrackOptions, rules, run_track
 
@@ -249,7 +251,7 @@ def separate(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Find several emitters when no row says which emitter it came from; a channel is one kind at its stations."""
+    """Locate several emitters if the rows have no emitter labels. A channel is one kind at its stations."""
     from optloc.cli.separate import run_separate
 
     raise typer.Exit(run_separate(file, detection, false, emitters, region, as_json=as_json, quiet=quiet))
@@ -263,19 +265,19 @@ def simulate(
     file: ProblemPath,
     truth: Annotated[str, typer.Option(metavar="X,Y[,Z]", help="True position, metres in the frame of the file.")],
     out: Annotated[
-        Path, typer.Option(metavar="OUT.toml", help="Problem file to write; rows go to CSV files beside it.")
+        Path, typer.Option(metavar="OUT.toml", help="Problem file to write; rows go to CSV files in its folder.")
     ],
     velocity: TrueVelocity = None,
     geodetic: Geodetic = False,
-    seed: Annotated[int, typer.Option(min=0, help="Decides the draw.")] = 0,
-    trials: Annotated[int, typer.Option(min=1, help="Independent draws; each becomes an epoch.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
+    trials: Annotated[int, typer.Option(min=1, help="Number of independent trials; each becomes an epoch.")] = 1,
     outside: Outside = False,
     budget: Budget = None,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Draw measurements of a known target and write them as a problem file."""
+    """Simulate measurements of a target at a known position and write them as a problem file."""
     from optloc.cli.crlb import run_simulate
 
     raise typer.Exit(run_simulate(file, truth, velocity, out, geodetic=geodetic, seed=seed, trials=trials, quiet=quiet))
@@ -306,7 +308,7 @@ def crlb(
     dilution: Annotated[bool, typer.Option("--dilution", help="Map the geometric dilution of precision.")] = False,
     status: StatusShares = False,
     trials: SimulatedFixes = None,
-    seed: Annotated[int, typer.Option(min=0, help="Decides the draws of --status.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers of --status.")] = 0,
     as_json: Json = False,
     outside: Outside = False,
     budget: Budget = None,
@@ -314,18 +316,18 @@ def crlb(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Print the Cramer-Rao bound: the accuracy that no unbiased estimate beats.
+    """Print the Cramer-Rao bound: no unbiased estimate is more accurate.
 
-    Of a run whose epochs share unknowns (a motion, biases) it is also given after its first 1, 2, ... epochs.
-    With --map it is drawn over the place of the target instead.
-    With --status measurements are simulated, and the share of each status of their fixes is given, or mapped.
+    If the epochs of a run share unknowns (a motion, biases), the bound after the first 1, 2, ... epochs is printed as
+    well. With --map, the bound is drawn as a map over target positions instead. With --status, measurements are
+    simulated; the share of fixes with each status is printed, or drawn as a map.
     """
     if status:
         from optloc.cli.crlb import Simulated, run_status
 
         wanted = Simulated(map_, at, height, extent, velocity, trials, seed, geodetic)
         raise typer.Exit(run_status(file, wanted, as_json=as_json, quiet=quiet))
-    # A map needs no truth: it is drawn around the stations, or the place of the fix.
+    # A map needs no true position: it is drawn around the stations, or around the fix.
     if map_ is not None:
         from optloc.cli.crlb import run_map
 
@@ -346,12 +348,12 @@ def crlb(
 def check(
     file: ProblemPath,
     as_json: Json = False,
-    by: Annotated[str, typer.Option(metavar="station|pair|kind", help="Whose health is told.")] = "station",
+    by: Annotated[str, typer.Option(metavar="station|pair|kind", help="Groups of the health table.")] = "station",
     method: Annotated[
-        str | None, typer.Option("--method", "-m", help="How epochs are fixed; a method that resists outliers.")
+        str | None, typer.Option("--method", "-m", help="Method of the fixes; choose a method that resists outliers.")
     ] = None,
     no_solve: Annotated[bool, typer.Option("--no-solve", help="Only read the file.")] = False,
-    out: Annotated[Path | None, typer.Option(metavar="OUT", help="Write station health as .csv or .parquet.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="OUT", help="Write the health table: .csv or .parquet.")] = None,
     plot: Annotated[Path | None, typer.Option("--plot", metavar="OUT.svg", help="Draw the residuals.")] = None,
     outside: Outside = False,
     budget: Budget = None,
@@ -360,9 +362,9 @@ def check(
     verbose: Verbose = False,
     given: Any = None,
 ) -> None:
-    """Say what a file or a table holds (rows, redundancy, geometry) and, of many epochs, how healthy its stations are.
+    """Summarise a file or a table (rows, redundancy, geometry) and check the health of its stations over many epochs.
 
-    Each epoch is fixed, and each station compared with what the others say: bias, scale, noise, outliers.
+    Each epoch is fixed. Each station is compared with the other stations: bias, scale, noise, outliers.
     """
     from optloc.cli.check import CheckOptions, run_check
 
@@ -390,11 +392,11 @@ def plot(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option(metavar="OUT", help="Picture to write: .png, .svg or .pdf; NAME.png by default.")
+        Path | None, typer.Option(metavar="OUT", help="Picture to write: .png, .svg or .pdf; by default NAME.png.")
     ] = None,
     method: Method = "auto",
     epoch: Annotated[
-        str | None, typer.Option(metavar="LABEL", help="Epoch that is drawn, or case of a study; the first by default.")
+        str | None, typer.Option(metavar="LABEL", help="Epoch to draw, or case of a study; by default the first.")
     ] = None,
     outside: Outside = False,
     budget: Budget = None,
@@ -404,9 +406,10 @@ def plot(
 ) -> None:
     """Draw a picture of a problem and its fix.
 
-    fix: stations, fix, 95 % ellipse and alternatives. landscape: the cost over the place of the target. convergence:
-    where iterations from many starts end. residuals: by station. biases: of a run against time, with 95 %. bound: map
-    of the Cramer-Rao bound. track: of a run. accuracy: errors of a study's methods against the bound.
+    fix: stations, fix, 95 % ellipse and alternatives. landscape: the cost over target positions. convergence: the end
+    points of iterations from many starts. residuals: residuals by station. biases: biases of a run against time, with
+    95 % intervals. bound: map of the Cramer-Rao bound. track: track of a run. accuracy: errors of the methods of a
+    study against the bound.
     """
     from optloc.cli.pictures import run_plot
 
@@ -420,14 +423,14 @@ def plot(
 def demo(
     name: Annotated[str | None, name_in("demos", "A shipped problem")] = None,
     plot: Annotated[
-        Path | None, typer.Option(metavar="OUT.png", help="Where to draw the fix; optloc-demo.png by default.")
+        Path | None, typer.Option(metavar="OUT.png", help="Picture of the fix; by default optloc-demo.png.")
     ] = None,
     as_json: Json = False,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Walk through a fix, two possible places and a registration; or fix one shipped problem."""
+    """Run three examples (a fix, an ambiguity, a registration), or fix one shipped problem."""
     from optloc.cli.starters import run_demo
 
     raise typer.Exit(run_demo(name, plot, as_json=as_json, quiet=quiet))
@@ -440,13 +443,13 @@ def demo(
 def new(
     kind: Annotated[str, name_in("starters", "A measurement kind (tdoa, range, ...) or a common mixture")],
     out: Annotated[
-        Path | None, typer.Option(metavar="OUT.toml", help="File to write; standard output by default.")
+        Path | None, typer.Option(metavar="OUT.toml", help="File to write; by default standard output.")
     ] = None,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Write a problem file with comments that can be fixed as it is, to begin with."""
+    """Write a commented example problem file. You can fix it as it is, then replace its numbers by yours."""
     from optloc.cli.starters import run_new
 
     raise typer.Exit(run_new(kind, out, quiet=quiet))
@@ -455,7 +458,7 @@ def new(
 app.command(rich_help_panel=FIRST, epilog=example(*CONVERSIONS))(convert)
 
 
-# The names of the lists are known without making one of them.
+# The names of the lists are available without computing any list.
 def _lists() -> list[str]:
     from optloc.cli.listing import lists
 
@@ -478,7 +481,7 @@ def list_(
     as_json: Json = False,
     verbose: Verbose = False,
 ) -> None:
-    """List measurement kinds, methods, solvers with the back ends found here, and everything else that has a name."""
+    """List measurement kinds, methods, solvers with installed back ends, and all other named entries."""
     from optloc.cli.listing import run_list
 
     raise typer.Exit(run_list(what, as_json))
@@ -490,15 +493,16 @@ def list_(
     epilog=example("optloc compile", "optloc compile --check", "optloc compile --wheel dist"),
 )
 def compile_(
-    check: Annotated[bool, typer.Option("--check", help="Compile nothing: only say what there is.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Do not compile; only print the state.")] = False,
     wheel: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Pack it as a wheel for computers of this platform.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Pack the machine code as a wheel for computers of this platform."),
     ] = None,
     as_json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Make the machine code of all kernels for this computer at once, which takes minutes and is kept on disk."""
+    """Compile the machine code of all kernels for this computer and store it on disk. It takes minutes, once."""
     if wheel is not None:
         from optloc.cli.wheel import run_wheel
 
@@ -510,7 +514,7 @@ def compile_(
 
 @app.command(rich_help_panel=MORE, epilog=example("optloc schema > optloc.schema.json"))
 def schema(verbose: Verbose = False) -> None:
-    """Print the JSON schema of problem files, from which editors complete and check them."""
+    """Print the JSON schema of problem files. Editors use it to complete and check files."""
     from optloc.cli.output import dumps
     from optloc.files.schema import schema as of_files
 

@@ -1,4 +1,4 @@
-"""What ``optloc check`` does: say what a file holds, how healthy its stations are, and what may be wrong."""
+"""The command ``optloc check``: summary of a file, health of its stations, and advice on possible errors."""
 
 from __future__ import annotations
 
@@ -42,13 +42,17 @@ from optloc.show.fixes import with_sigma
 from optloc.solvers.methods import Method
 from optloc.station_health.stations import Health, health_of
 
-# Members of a bias that are named; the others are counted.
+# A bias with many members prints at most this number of names, so that the line stays readable.
 _MEMBERS = 8
 
 
 @dataclass(frozen=True, slots=True)
 class CheckOptions:
-    """What is wanted of station health: whether at all, how epochs are fixed, what makes a group, where it goes."""
+    """Options of the station health check.
+
+    solve: whether epochs are fixed at all. method: method of the fixes. by: grouping of the errors, "station", "pair"
+    or "kind". out, plot: files for the table and the picture.
+    """
 
     solve: bool = True
     method: str | None = None
@@ -65,11 +69,11 @@ def run_check(
     quiet: bool = False,
     table: ColumnHints | None = None,
 ) -> int:
-    """Print a summary of a file and its health; the exit code is 1 where some epoch cannot be fixed."""
+    """Print a summary of a file and the health of its stations; return exit code 1 if an epoch has too few rows."""
     asked = asked or CheckOptions()
-    # A file without measured values can be checked, too, before the campaign.
+    # A file without measured values is valid here: you can check the geometry before a campaign.
     outputs = partial(claim_outputs, table=asked.out, picture=asked.plot, inputs=[file])
-    outputs()  # before a long table is read, and once it is known what else was read
+    outputs()  # check twice: before the reader spends time on a long table, and after it has recorded all input files
     loaded = read_problem(file, table, values=False, quiet=quiet or as_json)
     outputs()
     found = summary(loaded)
@@ -93,31 +97,33 @@ def run_check(
 
 
 def _health(loaded: Loaded, asked: CheckOptions, quiet: bool) -> Checked | None:
-    """Return the health of a file's stations and write what was asked for; None where it was not to be solved."""
+    """Return the health of the stations of a file and write its table and picture; None with --no-solve."""
     if not asked.solve:
         if asked.out is not None or asked.plot is not None:
-            raise InvalidProblem("table and picture need the fixes", "--no-solve", "leave it or --out and --plot out")
+            raise InvalidProblem(
+                "table and picture need the fixes", "--no-solve", "remove it, or remove --out and --plot"
+            )
         return None
     by = grouping_of(asked.by, "--by")
-    # Health is told of stations that may be wrong: by default a loss that turns gross errors down.
+    # Stations may be faulty here, so the default is a loss that reduces the weight of gross errors.
     method = asked.method or "cauchy"
-    Method.parse(method)  # a misspelt method is refused before the work
+    Method.parse(method)  # reject a misspelt method before the work starts
     checked = _check_health(loaded, method, by, quiet)
-    # A table or picture that was asked for and cannot be made is an error, where a summary would say why.
+    # If the user requests a table or picture that cannot be made, raise; the summary alone would only print the reason.
     for path, option in ((asked.out, "--out"), (asked.plot, "--plot")):
         if path is not None and checked.health is None:
-            raise InvalidProblem(checked.why, option, "leave it out")
+            raise InvalidProblem(checked.why, option, "remove this option")
     if checked.health is not None:
         _write_health(checked.health, loaded.title, asked)
     return checked
 
 
 def _advice(loaded: Loaded, checked: Checked | None) -> tuple[Advice, ...]:
-    """Return what geometry, and where epochs are solved their values, suggest."""
+    """Return the advice from the geometry, and from the values as well if the epochs are solved."""
     vectors = None if checked is None else checked.vectors
     problem = loaded.problem if vectors is None else _with_noise(loaded.problem)
     if checked is None:
-        # the file was only to be read: what it says of values is not looked at
+        # --no-solve only reads the file, so no advice comes from values
         problem = problem.with_rows(z=np.full_like(problem.z, np.nan))
     elif problem.epochs == 1 and np.isfinite(problem.z[problem.weight > 0.0]).all():
         from optloc.solvers.solution import solve
@@ -137,14 +143,14 @@ def _spell(value: Any) -> str:
 
 
 def summary(loaded: Loaded) -> dict[str, Any]:
-    """Return what a file holds, as numbers and words."""
+    """Return the summary of a file: names with numbers or words."""
     problem = loaded.problem
     alone = separable(problem)
     apart = _apart(problem, alone)
     redundancy = degrees_of_freedom(apart)
     parts = _components(problem)
-    flattest, widest = _spread(_together(problem, alone))
-    # Of epochs that are fixed one by one, that at which stations are nearest to a line or plane.
+    flattest, widest = _spread(_station_positions(problem, alone))
+    # If epochs are fixed separately, report the epoch whose stations are closest to a line or plane.
     worst = int(np.argmin(flattest / widest))
     return {
         "file": loaded.source,
@@ -172,13 +178,13 @@ def summary(loaded: Loaded) -> dict[str, Any]:
 
 
 def _count_moving(stations: Stations) -> int:
-    """Return how many stations have a velocity, or are not at one place in all epochs."""
+    """Return the number of stations that have a velocity, or whose position changes between epochs."""
     moving = np.ptp(stations.position, axis=0).max(-1) > 0.0
     return int((moving if stations.velocity is None else moving | stations.velocity.any((0, -1))).sum())
 
 
 def _errors(problem: Problem) -> str:
-    """Return the size of the errors of station positions and velocities, and how long they last."""
+    """Return a text with the standard deviations of station positions and velocities, and the span of these errors."""
     sizes, span = [], problem.stations.unknown_for
     for _, unit, covariance in problem.stations.errors:
         sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
@@ -189,17 +195,17 @@ def _errors(problem: Problem) -> str:
 
 
 def _bias(loaded: Loaded, bias: Bias) -> str:
-    """Return form, members and prior of a bias in words."""
+    """Return a text with the form, members and prior of a bias."""
     slot, _ = loaded.problem.layout.find(bias.name)
     unit, size = loaded.bias_unit(bias.name, slot.unit)
     names = ", ".join(bias.members[:_MEMBERS]) + (
         f" and {len(bias.members) - _MEMBERS} more" if len(bias.members) > _MEMBERS else ""
     )
     if bias.density is not None:
-        # a person knows how far a clock has gone after a second, or an hour
+        # the drift after one second is easier to judge than a spectral density
         ends = np.sqrt([bias.density[:, 0].min(), bias.density[:, 0].max()])
-        gone = " to ".join(dict.fromkeys(f"{v:.3g}" for v in ends))
-        names += f", {gone} {slot.unit} after a second" + (", rates walk too" if bias.density.shape[1] > 1 else "")
+        drift = " to ".join(dict.fromkeys(f"{v:.3g}" for v in ends))
+        names += f", {drift} {slot.unit} after a second" + (", rates walk too" if bias.density.shape[1] > 1 else "")
     if bias.sigma is None:
         return f"{bias.form} of {names}, unknown"
     low, high = np.min(bias.sigma) / abs(size), np.max(bias.sigma) / abs(size)
@@ -208,12 +214,15 @@ def _bias(loaded: Loaded, bias: Bias) -> str:
 
 
 def _apart(problem: Problem, alone: bool) -> Problem:
-    """Return the epochs of a problem as a batch where they are fixed one by one, else the run as a batch of one."""
+    """Return the epochs as a batch if they are fixed separately, else the run as a batch of one."""
     return (by_epoch(problem) if alone else problem).flat()
 
 
 def _components(problem: Problem) -> Array:
-    """Return how many groups of stations the differences of each epoch (k,) fall into; 0 where there are none."""
+    """Return the number of connected groups of stations in each epoch (k,); 0 without differences.
+
+    Differences and ratios connect the two stations of a row.
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -221,10 +230,10 @@ def _components(problem: Problem) -> Array:
     ends = []
     for block in problem.rows:
         ranges = MODELS[block.kind].ranges
-        # Differences and ratios tie two stations; ranges and angles stand by themselves, sums of ranges too.
+        # Differences and ratios connect two stations; ranges, angles and sums of ranges do not.
         if MODELS[block.kind].stations == 2 and (ranges is None or sum(ranges) == 0):
             present = block.weight > 0.0
-            # One graph of all epochs: station i of epoch k is node k s + i.
+            # One graph holds all epochs: station i of epoch k is node k s + i.
             ends.append(np.stack([block.epoch * s + block.a, block.epoch * s + block.b])[:, present])
     edges = np.concatenate(ends, axis=-1) if ends else np.zeros((2, 0), dtype=int)
     graph = coo_array((np.ones(edges.shape[1]), (edges[0], edges[1])), shape=(k * s, k * s))
@@ -234,28 +243,32 @@ def _components(problem: Problem) -> Array:
     return np.bincount(pairs[0], minlength=k)
 
 
-def _together(problem: Problem, alone: bool) -> Array:
-    """Return the places (k, s, d) that a fix is seen from: those of an epoch, or (1, k s, d) of a whole run."""
+def _station_positions(problem: Problem, alone: bool) -> Array:
+    """Return the station positions of each epoch (k, s, d), or of a whole run (1, k s, d), m."""
     position = problem.stations.position
     return position if alone else position.reshape(1, -1, position.shape[-1])
 
 
 def _spread(position: Array) -> tuple[Array, Array]:
-    """Return the least and the greatest root mean square extent (k,) of stations (k, s, d) about their centre."""
+    """Return the smallest and the largest root mean square extent (k,) of stations (k, s, d) about their centre, m."""
     centred = position - position.mean(-2, keepdims=True)
     values = np.linalg.svd(centred, compute_uv=False) / np.sqrt(position.shape[-2])
-    # Too few stations to span the space have no extent in the last direction.
+    # Too few stations to span the space have zero extent in the last direction.
     if position.shape[-2] <= position.shape[-1]:
         values = np.concatenate([values, np.zeros((*values.shape[:-1], 1))], axis=-1)
     return values[..., -1], np.maximum(values[..., 0], np.finfo(float).tiny)
 
 
-# Health of stations.
+# Station health.
 
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """Health of the stations of a file, or why there is none; of solved epochs vectors (k, size) and noise level."""
+    """Result of the health check.
+
+    health: health of the stations, or None. why: reason for None. vectors: parameters of the solved epochs (k, size).
+    level: common factor of the noise. late: late rows.
+    """
 
     health: Health | None
     why: str = ""
@@ -265,23 +278,23 @@ class Checked:
 
 
 def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
-    """Return the health of the stations of a file, each of whose epochs is fixed by itself."""
+    """Return the health of the stations of a file. Each epoch is fixed separately."""
     problem = loaded.problem
     if problem.epochs < 2:
-        return Checked(None, "station health needs several epochs, and the file has one")
-    # Epochs of a calibration share nothing, though a known track ties their problem together.
+        return Checked(None, "station health needs several epochs; the file has one")
+    # Epochs of a calibration share no unknowns, though the known track makes their problem inseparable.
     calibrating = all(motion.known is not None for motion in problem.motions)
     if not separable(problem) and not (calibrating and not problem.biases):
-        return Checked(None, "station health needs epochs that are fixed one by one, and these share unknowns")
+        return Checked(None, "station health needs separate epochs; the epochs of this file share unknowns")
     if not np.isfinite(problem.z[problem.weight > 0.0]).all():
         return Checked(None, "station health needs measured values")
     try:
         return _solve_health(loaded, method, by, quiet)
     except InvalidProblem as error:
-        # A wrong word is the user's error; data that cannot tell are a sentence of the answer.
+        # A misspelt option is an error of the user; insufficient data is a normal result with a reason.
         if error.where in ("by", "method"):
             raise
-        return Checked(None, f"station health could not be told: {error.what}; {error.advice}")
+        return Checked(None, f"station health could not be computed: {error.what}; {error.advice}")
 
 
 def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
@@ -290,7 +303,7 @@ def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
         count = batch.batch_shape[0]
         return Checked(health_of(batch, (np.arange(count), np.zeros((count, 0))), by))
     fix = _fix(loaded, batch, method, quiet)
-    # What has no answer is NaN, and left out.
+    # Fixes without an answer are set to NaN and left out.
     vectors = np.where(fix.answered[:, None], fix.x, np.nan)
     kept = np.flatnonzero(np.isfinite(vectors).all(-1))
     if not len(kept):
@@ -302,7 +315,7 @@ def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
 
 
 def _fix(loaded: Loaded, batch: Problem, method: str, quiet: bool) -> Fix:
-    """Return the fixes of epochs by `optloc fix`, with errors of stations as noise and rows as of the batch."""
+    """Return the fixes of the epochs. Station errors count as noise, and rows are numbered as in the batch."""
     problem = _with_noise(loaded.problem)
     if not separable(problem):
         from optloc.solvers import solve
@@ -315,12 +328,12 @@ def _fix(loaded: Loaded, batch: Problem, method: str, quiet: bool) -> Fix:
 
 
 def _with_noise(problem: Problem) -> Problem:
-    """Return a problem whose errors of stations in an epoch are noise: health is of fixes without them."""
+    """Return the problem with station errors as noise of each epoch, since the health check does not estimate them."""
     return replace(problem, stations=problem.stations.with_noise())
 
 
 def _health_columns(health: Health) -> Columns:
-    """Return the table of health: one row for each station, SI units and radians, NaN where there is no number."""
+    """Return the health table: one row for each group, SI units and radians, NaN for missing numbers."""
     return {
         "name": np.array(health.names, dtype=object),
         "unit": np.array(health.units, dtype=object),
@@ -338,7 +351,7 @@ def _health_columns(health: Health) -> Columns:
 
 
 def _health_json(checked: Checked) -> dict[str, Any]:
-    """Return health as one JSON value."""
+    """Return the health of the stations as a JSON value."""
     if checked.health is None:
         return {"stations": [], "sentences": [checked.why]}
     levels = checked.health.levels
@@ -351,16 +364,16 @@ def _health_json(checked: Checked) -> dict[str, Any]:
 
 
 def _show_health(checked: Checked, console: Console) -> None:
-    """Print health as a table, the largest biases first."""
+    """Print the health of the stations as a table, sorted by decreasing bias."""
     health = checked.health
     if health is None:
         say_all(console, [checked.why])
         return
-    # Columns that no station has a number in are left out.
+    # Leave out columns without any number.
     scaled, suspected = np.isfinite(health.scale).any(), np.isfinite(health.suspect).any()
     table = Table(title=f"Health by {health.by}", title_justify="left")
     table.add_column(health.by)
-    wanted = ["fixes", "bias", *(["scale, ppm"] if scaled else []), "noise", "outliers", "shows from"]
+    wanted = ["fixes", "bias", *(["scale, ppm"] if scaled else []), "noise", "outliers", "detectable from"]
     for name in [*wanted, *(["suspect"] if suspected else [])]:
         table.add_column(name, justify="right")
     seen = health.least_noticed
@@ -373,15 +386,15 @@ def _show_health(checked: Checked, console: Console) -> None:
         table.add_row(health.names[i], *cells)
     console.print(table)
     levels = health.levels
-    chi = f"chi-square per degree of freedom {levels.before:.3g} with the noise as stated, {levels.after:.3g} as found"
-    what = "bias and noise are of measured less predicted by the rest of each fix"
+    chi = f"chi-square per degree of freedom: {levels.before:.3g} as stated, {levels.after:.3g} as estimated"
+    what = "bias and noise refer to measurements minus their predictions from the other stations"
     say_all(console, (f"{levels.fixes} fixes; {what}; {chi}", *health.sentences))
 
 
 def _order(health: Health) -> Array:
-    """Return the groups in the order of their biases, those in one unit together."""
+    """Return the order of the groups: by unit, then by decreasing bias."""
     bias = np.where(np.isfinite(health.bias), health.bias, np.inf)
-    # Biases of one unit can be compared; metres and radians cannot.
+    # Only biases with the same unit can be compared.
     return np.lexsort((-bias, np.array(health.units)))
 
 
@@ -392,7 +405,7 @@ def _told(value: float, error: float, unit: str) -> str:
 
 
 def _write_health(health: Health, title: str, asked: CheckOptions) -> None:
-    """Write the table and the picture of health that were asked for: both, or none."""
+    """Write the requested table and picture of the health: both, or none if one fails."""
     with replace_together():
         if asked.out is not None:
             write_table(asked.out, _health_columns(health))

@@ -1,7 +1,7 @@
-"""What ``optloc compile`` does: make the machine code of all kernels at once, or say what there is.
+"""The command ``optloc compile``: compile the machine code of all kernels, or print what is on disk.
 
-Few kernels are called from Python, each with arrays of one type, so a handful of small problems has everything compiled
-that others will ask for; processes of their own do so side by side.
+Python calls few kernels, each with arrays of one type. So a small set of problems compiles all machine code that other
+problems need. Two child processes compile side by side.
 """
 
 from __future__ import annotations
@@ -47,30 +47,30 @@ from optloc.uncertainty.region import likelihood_region
 
 _STATIONS = 1e3 * np.array([[0.0, 0, 0], [10, 0, 1], [0, 10, 2], [-9, 1, 0.5], [1, -8, 3], [6, 7, 0]])
 TARGET = np.array([2e3, 3e3, 4e3])
-# More problems than plain Python answers, and than the stages of numpy sum the equations of.
+# _FEW exceeds the number of problems that plain Python solves; _MANY exceeds the number that numpy sums.
 _FEW, _MANY = 40, 500
 
 
 def problem_of(kind: str, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
-    """Return a problem of five rows of one kind, without values."""
+    """Return a problem of one kind with five rows and without measured values."""
     rows = {"b": np.zeros(5, dtype=int)} if kind in ("tdoa", "fdoa", "groa") else {}
     return assemble(stations, measured(kind, a=np.arange(1, 6), sigma=1.0, **rows), **more)
 
 
-def _drawn(kind: str, count: int, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
+def _simulated(kind: str, count: int, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
     problem = problem_of(kind, stations, **more)
     place = np.append(TARGET, np.zeros(problem.layout.size - 3)) if problem.layout.size > 3 else TARGET
     return simulate(problem, place, 1, count).flat()
 
 
 def _fix_ranges() -> None:
-    problem = _drawn("tdoa", _FEW)
+    problem = _simulated("tdoa", _FEW)
     solve(problem, "gtrs+lsr")
     prepare(problem_of("tdoa"), "gtrs+lsr")(problem.z[0])
 
 
 def _fix_tapes() -> None:
-    problem = _drawn("groa", _FEW)
+    problem = _simulated("groa", _FEW)
     solve(problem, "gtrs+lsr")
     prepare(problem_of("groa"), "gtrs+lsr")(problem.z[0])
 
@@ -82,63 +82,66 @@ def _filter() -> None:
 
 
 def _refine() -> None:
-    solve(_drawn("elevation", _MANY), "lsr", start=np.tile(TARGET, (_MANY, 1)))
-    # a run whose emission times are unknowns of its two epochs
+    solve(_simulated("elevation", _MANY), "lsr", start=np.tile(TARGET, (_MANY, 1)))
+    # a run with the emission times of its two epochs as unknowns
     rows = measured("toa", a=np.tile(np.arange(6), 2), epoch=np.repeat([0, 1], 6), sigma=1.0)
     run = assemble(_STATIONS, rows)
     truth = np.append(TARGET, np.zeros(run.layout.size - 3))
     solve(simulate(run, truth, 1, _MANY).flat(), "lsr", start=np.tile(truth, (_MANY, 1)))
 
 
-def _plainly_solved(problem: Problem) -> Fix:
-    """Return fixes made without machine code: that of fixes is made by another process, which nobody waits for."""
+def _solve_without_machine_code(problem: Problem) -> Fix:
+    """Return fixes computed without machine code.
+
+    Another process compiles the code of fixes; this process does not wait for it.
+    """
     with plain():
         return solve(problem, "gtrs+lsr")
 
 
 def _prove() -> None:
-    problem = _drawn("tdoa", _FEW)
-    certify(problem, _plainly_solved(problem))
+    problem = _simulated("tdoa", _FEW)
+    certify(problem, _solve_without_machine_code(problem))
 
 
 def _prove_runs() -> None:
-    speed = np.random.default_rng(1).normal(0.0, 100.0, _STATIONS.shape)  # any
-    # With more nodes than those runs have that are proven like one epoch.
+    speed = np.random.default_rng(1).normal(0.0, 100.0, _STATIONS.shape)  # any velocities serve
+    # Longer than the runs whose proof is the same as for one epoch.
     epochs = SHORT // len(_STATIONS) + 1
     place = _STATIONS + 10.0 * np.arange(epochs)[:, None, None] * speed
     rows = measured("tdoa", a=np.tile(np.arange(1, 6), epochs), b=0, epoch=np.repeat(np.arange(epochs), 5), sigma=1.0)
     problem = simulate(assemble(Stations(place, tuple("ABCDEF")), rows), TARGET, 1, _FEW).flat()
-    certify(problem, _plainly_solved(problem))
+    certify(problem, _solve_without_machine_code(problem))
     moving = assemble(_STATIONS[:, :2], rows, times=np.arange(float(epochs)), motions=(Motion(1),))
     problem = simulate(moving, np.append(TARGET[:2], [30.0, -10.0]), 1).flat()
-    certify(problem, _plainly_solved(problem))
+    certify(problem, _solve_without_machine_code(problem))
 
 
 def _prove_scaled() -> None:
     problem = with_bias(problem_of("toa"), "speed", form="scale", per="kind", sigma=0.05)
     found = simulate(problem, np.append(TARGET, np.zeros(problem.layout.size - 3)), 1, _FEW).flat()
-    certify(found, _plainly_solved(found))
+    certify(found, _solve_without_machine_code(found))
 
 
 def _search() -> None:
     velocity = np.broadcast_to([50.0, -30.0, 0.0], _STATIONS.shape)
     moving = Stations(_STATIONS[None], tuple("ABCDEF"), velocity=velocity[None])
-    # Through all space, all around the Earth at a height, and where an enclosure bounds the cheap positions.
-    best_first_starts(_drawn("fdoa", _FEW, moving))
+    # Three search domains: the whole space, a shell around the Earth at one height, and a bounded enclosure.
+    best_first_starts(_simulated("fdoa", _FEW, moving))
     frame = Frame.enu(lat_deg=47.0, lon_deg=8.0, height=400.0)
-    best_first_starts(_drawn("tdoa", _FEW, frame=frame, constraints=height(exactly=4400.0)))
-    best_first_starts(_drawn("range", _FEW))
+    best_first_starts(_simulated("tdoa", _FEW, frame=frame, constraints=height(exactly=4400.0)))
+    best_first_starts(_simulated("range", _FEW))
 
 
 def _cover() -> None:
-    # of a fix inside, and of one so far outside that infinity is as likely
+    # a target inside the array, and a target so far outside that infinity is as likely
     for times in (1.0, 1000.0):
         problem = simulate(problem_of("tdoa"), times * TARGET, 1)
-        likelihood_region(problem, _plainly_solved(problem))
+        likelihood_region(problem, _solve_without_machine_code(problem))
 
 
-# The longest first: there are as many processes as processors, at most two, and memory is a gigabyte each. Those that
-# share what they call do not begin side by side.
+# The longest parts come first. Each process needs a gigabyte of memory, so at most two run at once. Parts that share
+# callees do not start together.
 _PARTS: Mapping[str, KernelPart] = {
     "proofs": KernelPart(
         "proofs of fixes", "optloc.proof", (_prove,), ("optloc.proof.batch._loop", "optloc.proof.batch._evaluate")
@@ -192,33 +195,26 @@ _PARTS: Mapping[str, KernelPart] = {
 
 @cache
 def parts() -> Mapping[str, KernelPart]:
-    """Return all that is compiled, by name; neighbours add theirs."""
+    """Return all parts to compile, by name, including the parts of neighbours."""
     return {**_PARTS, **{name: part for one in extensions() for name, part in one.kernels().items()}}
 
 
 def missing() -> list[str]:
-    """Return the kernels that Python calls of which there is no machine code on disk."""
+    """Return the kernels without machine code on disk."""
     return [name for part in parts().values() for name in part.missing()]
 
 
 def make(tell: Callable[[int, int], None] = lambda done, total: None) -> list[str]:
-    """Compile what is not on disk yet, in two processes.
+    """Compile all kernels that are not on disk yet, in two processes, and return the kernels that are still missing.
 
-    Parameters
-    ----------
-    tell : callable
-        Told how many functions are compiled, and about how many there are.
-
-    Returns
-    -------
-    list of str
-        The kernels that Python calls of which there is no machine code even now; empty if all went well.
+    The callback `tell` receives the number of compiled functions and the approximate total. The list is empty if all
+    kernels compile.
     """
     names = [name for name, part in parts().items() if part.missing()]
     known, done, lock = dict[str, set[str]](), set[str](), Lock()
 
     def follow(name: str) -> None:
-        for line in _started(name, shared):
+        for line in _run_part(name, shared):
             word, _, rest = line.partition(" ")
             with lock:
                 if word == "all":
@@ -234,14 +230,14 @@ def make(tell: Callable[[int, int], None] = lambda done, total: None) -> list[st
 
 
 def environment(**more: str) -> dict[str, str]:
-    """Return the variables of a process that is to import this very optloc, and more of them."""
+    """Return the environment of a child process that imports this installation of optloc, with more variables."""
     path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
     return os.environ | {"PYTHONPATH": path, **more}
 
 
-def _started(name: str, variables: Mapping[str, str]) -> Iterator[str]:
-    """Begin a process that compiles a part, and yield the lines that it writes; it ends with this process."""
-    # -P: nothing is imported from the current folder.
+def _run_part(name: str, variables: Mapping[str, str]) -> Iterator[str]:
+    """Start a process that compiles a part, and yield the lines that it writes. It ends with this process."""
+    # -P: do not import from the current folder.
     command = [sys.executable, "-P", "-m", "optloc.cli.compile", name]
     with subprocess.Popen(  # noqa: S603  (this interpreter, and this module)
         command,
@@ -258,21 +254,21 @@ def _started(name: str, variables: Mapping[str, str]) -> Iterator[str]:
 
 
 def _compile(part: KernelPart) -> None:
-    """Compile a part in this process, and write what is done to standard output."""
+    """Compile a part in this process, and write its progress to standard output."""
     for entry in (entry for each in parts().values() for entry in each.entries):
-        import_module(entry.rpartition(".")[0])  # all kernels are known then
+        import_module(entry.rpartition(".")[0])  # the import registers the kernels
     print("all", *names_in(part.package), flush=True)  # noqa: T201
 
     def tell(name: str, done: bool) -> None:
         if done:
             try:
                 print("made", name, flush=True)  # noqa: T201
-            except BrokenPipeError:  # the process that began this one has ended
+            except BrokenPipeError:  # the parent process has ended
                 os._exit(1)
 
-    REPORTER.muted = True  # the process that began this one tells
-    # What a compiler makes is mostly kept: to look for garbage at each 700 new objects is a sixth of its time. At each
-    # 50 000, with what is imported left out, memory grows by a twentieth.
+    REPORTER.muted = True  # the parent process prints the progress
+    # Most objects of the compiler live long. A garbage collection each 700 new objects takes a sixth of the time. A
+    # collection each 50 000, without the imported objects, costs a twentieth more memory.
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
     with compiling(tell):
@@ -281,7 +277,7 @@ def _compile(part: KernelPart) -> None:
 
 
 def run_compile(check: bool, as_json: bool, *, quiet: bool = False) -> int:
-    """Compile what is not on disk, and print what is; the exit code is 1 where something is missing at the end."""
+    """Compile the missing kernels and print the state of all parts; return exit code 1 if a part is still missing."""
     place = folder_in_use() if enabled() else None
     if place is not None and not check:
         with meter("making machine code", quiet) as tell:
@@ -298,8 +294,8 @@ def run_compile(check: bool, as_json: bool, *, quiet: bool = False) -> int:
 def _print(found: dict[str, int], place: str | None) -> None:
     screen = Screen()
     if place is None:
-        reason = "no folder can be written" if enabled() else "numba is not installed, or switched off"
-        screen.print(f"no machine code can be kept: {reason}", highlight=False)
+        reason = "no folder can be written" if enabled() else "numba is not installed, or disabled"
+        screen.print(f"no machine code can be stored: {reason}", highlight=False)
         return
     table = Table()
     for title in ("machine code of", "on disk"):
@@ -308,20 +304,21 @@ def _print(found: dict[str, int], place: str | None) -> None:
         table.add_row(parts()[name].summary, "no" if missing else "yes")
     screen.print(table)
     shipped = installed()
-    before = "" if shipped is None else f"installed in {shipped[0]}; what is missing is "
-    screen.print(f"{before}kept in {place}", highlight=False, soft_wrap=True)
+    before = "" if shipped is None else f"installed in {shipped[0]}; missing parts are "
+    screen.print(f"{before}stored in {place}", highlight=False, soft_wrap=True)
     if any(found.values()):
         screen.print(
-            "`optloc compile` makes what is missing; until then few problems take plain Python", highlight=False
+            "`optloc compile` compiles the missing parts; until then, small batches run in plain Python",
+            highlight=False,
         )
 
 
-def _make_alone() -> None:
-    """Make all behind whatever else the computer does, unless another process is at it."""
+def _make_in_background() -> None:
+    """Compile all missing kernels at low priority, unless another process already does."""
     with sole_compiler() as only:
         if only:
             if hasattr(os, "nice"):
-                os.nice(10)  # what answers in plain Python meanwhile goes first
+                os.nice(10)  # the processes that wait for this code, and answer in plain Python, go first
             make()
 
 
@@ -329,4 +326,4 @@ if __name__ == "__main__":
     if sys.argv[1:]:
         _compile(parts()[sys.argv[1]])
     else:
-        _make_alone()
+        _make_in_background()

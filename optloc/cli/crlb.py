@@ -1,4 +1,4 @@
-"""What ``optloc crlb`` and ``optloc simulate`` do: the bound at a place, against time, over a map; and draws."""
+"""The commands ``optloc crlb`` and ``optloc simulate``: Cramer-Rao bounds, status shares and simulated data."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from optloc.problem.problem import Problem
 if TYPE_CHECKING:
     from optloc.solvers.shares import StatusShares
 
-# Lines of the table against time, and of the bounds and of their members: what a screen holds.
+# Maximum lines that fit a screen: of the table against time, of the bounds, and of the members of a bias.
 _LINES, _BOUNDS, _MEMBERS = 10, 30, 16
-# Points of a course, as many as a picture shows apart; and unknowns beyond which nobody reads a curve of each.
+# A picture resolves at most 400 points of a curve. More than 100 unknowns give more curves than a reader can use.
 _POINTS, _UNKNOWNS = 400, 100
-# Points along each side of a map: isolines are smooth, and the 9216 bounds take less than a second.
+# Points along each side of a map: isolines are smooth, and 9216 bounds take less than a second.
 _MAP_POINTS = 96
-# The same of a map of statuses, whose places need a hundred fixes each.
+# Points along each side of a status map: each point needs 50 simulated fixes.
 _STATUS_POINTS = 24
-# Simulated fixes at a place, whose shares are then known to 3 %, and at each place of a map, to 7 %.
+# Simulated fixes at one position, and at each point of a map. The shares have errors of 3 % and 7 %.
 _TRIALS, _TRIALS_OF_A_MAP = 200, 50
 _UNITS = {"length": "m", "speed": "m/s"}
 _RMS = {True: " (rms)", False: ""}
@@ -54,18 +54,18 @@ def run_crlb(
     plot: Path | None = None,
     quiet: bool = False,
 ) -> int:
-    """Print the Cramer-Rao bound at a truth or at the fix, draw it against time, and return the exit code."""
+    """Print the Cramer-Rao bound at a true position or at the fix, draw it against time, and return the exit code."""
     from optloc.bounds.cramer_rao import crlb
 
     loaded = read(file, values=False)
     claim_outputs(picture=plot, inputs=[file])
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
     if not problem.layout.n_shared:
-        raise InvalidProblem("nothing is unknown but what each epoch has of its own", loaded.source, "give a bias")
-    # Biases alone, of known targets, need no place: their bound does not depend on a guess.
-    truth = _solve(file) if at is None and _sought(problem) else vector(problem, at, velocity, geodetic)
+        raise InvalidProblem("no unknown is shared by the epochs", loaded.source, "add a bias")
+    # Biases of known targets alone need no target position: their bound does not depend on it.
+    truth = _solve(file) if at is None and _has_unknown_position(problem) else vector(problem, at, velocity, geodetic)
     bound = np.asarray(crlb(problem, truth))
-    # One bound for all epochs where they are alike.
+    # Identical epochs have one bound: broadcast it to all epochs.
     bound = np.broadcast_to(bound, (*problem.batch_shape, *bound.shape[-2:])).reshape(-1, *bound.shape[-2:])
     labels = loaded.epochs if problem.batch_shape else ("run" if loaded.problem.epochs > 1 else loaded.epochs[0],)
     rows = [
@@ -90,13 +90,13 @@ def run_crlb(
     return 0 if all(np.isfinite(row["sigma"]).all() for row in rows) and rows else 1
 
 
-def _sought(problem: Problem) -> bool:
-    """Return whether the position of some target is unknown, so that it matters where it is."""
+def _has_unknown_position(problem: Problem) -> bool:
+    """Return whether a target has an unknown position, so that the bound depends on it."""
     return any(motion.known is None for motion in problem.motions)
 
 
 def _solve(file: Path) -> Array:
-    """Return the fix of a file that has measured values."""
+    """Return the estimate of a file that has measured values."""
     from optloc.solvers.solution import solve
 
     problem = read(file).problem
@@ -107,9 +107,9 @@ def _draw(path: Path, loaded: Loaded, over_time: tuple[Course, Course | None] | 
     from optloc.show.pictures import plot_course
 
     if over_time is None:
-        advice = "give the epochs something in common, a motion or biases, but not hundreds of targets"
-        raise InvalidProblem("the epochs share no unknowns, or too many to be drawn", "--plot", advice)
-    names = _shown(over_time[0].layout)
+        advice = "add a motion or biases that the epochs share, but not hundreds of targets"
+        raise InvalidProblem("the epochs share no unknowns, or too many to draw", "--plot", advice)
+    names = _shown_unknowns(over_time[0].layout)
     write_picture(plot_course(*over_time, title=f"{loaded.title}: Cramer-Rao bound", names=names), path)
 
 
@@ -134,7 +134,7 @@ def _bound_table(loaded: Loaded, rows: list[dict[str, Any]]) -> Table:
 
 
 def _sigmas(row: dict[str, Any], loaded: Loaded) -> str:
-    """Return standard deviations in a line, those of members one below the other in the unit of the file."""
+    """Return the standard deviations in a line; members of a bias have one line each, in the unit of the file."""
     if set(row["entries"]) <= set("xyz"):
         return f"{', '.join(f'{v:.4g}' for v in row['sigma'])} {row['unit']}"
     unit, size = loaded.bias_unit(row["unknown"], row["unit"])
@@ -144,34 +144,24 @@ def _sigmas(row: dict[str, Any], loaded: Loaded) -> str:
     return "\n".join([*lines, *([f"... and {more} more"] if more > 0 else [])])
 
 
-# What goes unnoticed.
+# Unnoticed errors.
 
-# Epochs of one run or batch that are looked at: the worst of them is told.
-_LOOKED_AT = 100
+# Largest number of epochs to evaluate; the table holds the worst values.
+_MAX_EPOCHS = 100
 
 
 def reliability_of(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) -> Reliability | None:
-    """Return the least errors of stations that a search for suspects notices, in the worst epoch that is looked at.
+    """Return the smallest station errors that a search for suspects notices: the worst values over the epochs.
 
-    Parameters
-    ----------
-    problem : Problem
-        One problem, or epochs (...) that share nothing.
-    x : array (..., size)
-        Where they are linearised; those that are not finite are left out.
-    suspects : sequence of Suspect
-        What the fix of a single problem left out.
-
-    Returns
-    -------
-    Reliability or None
-        None where no epoch has a place.
+    `problem` is one problem, or a batch (...) of separate epochs. `x` (..., size) are the points of linearisation;
+    points that are not finite are left out. `suspects` were left out by the fix. The result is None without a finite
+    point.
     """
     flat = problem.flat()
     places = np.broadcast_to(x, (*problem.batch_shape, flat.layout.size)).reshape(-1, flat.layout.size)
     items = np.flatnonzero(np.isfinite(places).all(-1))
-    # evenly spaced: the geometry of a run changes slowly
-    items = items[np.unique(np.linspace(0, len(items) - 1, min(len(items), _LOOKED_AT)).astype(int))]
+    # evenly spaced epochs suffice: the geometry of a run changes slowly
+    items = items[np.unique(np.linspace(0, len(items) - 1, min(len(items), _MAX_EPOCHS)).astype(int))]
     worst: dict[str, tuple[float, float]] = {}
     for i in items:
         told = reliability(flat.take(np.array([i])), places[i], suspects)
@@ -185,7 +175,7 @@ def reliability_of(problem: Problem, x: Array, suspects: Sequence[Suspect] = ())
 
 
 def reliability_json(told: Reliability | None) -> list[dict[str, Any]]:
-    """Return the least errors that are noticed as records, in SI units and radians; infinite ones as null."""
+    """Return the smallest noticed errors as records, in SI units and radians; infinite values are null."""
     if told is None:
         return []
     parts = zip(told.names, told.least, told.shift, strict=True)
@@ -193,7 +183,7 @@ def reliability_json(told: Reliability | None) -> list[dict[str, Any]]:
 
 
 def show_reliability(told: Reliability | None, console: Console) -> None:
-    """Print the least errors that are noticed, the largest displacement first."""
+    """Print the smallest noticed errors, sorted by decreasing displacement of the position."""
     if told is None:
         return
     table = Table(title="Errors that go unnoticed", title_justify="left")
@@ -220,16 +210,19 @@ def _length(value: float) -> str:
     return f"{value:.4g}" if np.isfinite(value) else "anywhere"
 
 
-# Against time.
+# Bound against time.
 
 
 def courses(problem: Problem, truth: Array) -> tuple[Course, Course | None] | None:
-    """Return the bound against time with biases unknown and, if there are some, known; None where it has none."""
+    """Return the bound against time with biases unknown and, if the problem has biases, known.
+
+    The result is None for a single epoch, a batch, no shared unknowns, or too many.
+    """
     n, k = problem.layout.n_shared, problem.epochs
     if k == 1 or not 0 < n <= _UNKNOWNS or has_correlated_epochs(problem) or problem.batch_shape:
         return None
     counts = np.arange(1, k + 1) if k <= _POINTS else np.unique(np.geomspace(1, k, _POINTS).round().astype(int))
-    # Families of biases have members; states of targets have not.
+    # Only biases have members; target states have none.
     names = [slot.name for slot in problem.layout.shared if slot.members]
     course = crlb_course(problem, truth, counts)
     targets = len(names) < len(problem.layout.shared)
@@ -237,7 +230,7 @@ def courses(problem: Problem, truth: Array) -> tuple[Course, Course | None] | No
 
 
 def _course_records(course: Course, known: Course | None) -> list[dict[str, Any]]:
-    """Return the bound at a few times: epochs, time, sigma of every unknown by name, and with biases known."""
+    """Return records of the bound at a few times: epochs, time (s), and sigma by unknown, also with biases known."""
     labels = course.layout.labels()
     return [
         {
@@ -246,7 +239,7 @@ def _course_records(course: Course, known: Course | None) -> list[dict[str, Any]
             "sigma": dict(zip(labels, _sigmas_at(course, i), strict=True)),
             "biases_known": None if known is None else dict(zip(labels, _sigmas_at(known, i), strict=True)),
         }
-        for i in _few(course)
+        for i in _sparse_indices(course)
     ]
 
 
@@ -254,40 +247,40 @@ def _sigmas_at(course: Course, i: int) -> Array:
     return np.asarray(np.sqrt(np.diagonal(course.covariance[i])))
 
 
-def _few(course: Course) -> list[int]:
-    """Return the places of a few times, closer together at the start."""
+def _sparse_indices(course: Course) -> list[int]:
+    """Return the indices of a few times, denser at the start."""
     wanted = np.geomspace(1, course.counts[-1], _LINES)
-    # Geometric: a bound falls with the root of the number of epochs.
+    # Geometric spacing, since a bound falls with the root of the number of epochs.
     return [int(i) for i in np.unique(np.searchsorted(course.counts, np.floor(wanted)))]
 
 
-def _shown(layout: Layout) -> tuple[str, ...]:
-    """Return the names of the unknowns that a table or a picture has room for: of two targets, and four biases."""
+def _shown_unknowns(layout: Layout) -> tuple[str, ...]:
+    """Return the names of the unknowns that fit a table or a picture: the states of two targets, and four biases."""
     states = [slot.name for slot in layout.shared if not slot.members]
     biases = [slot.name for slot in layout.shared if slot.members]
     return (*states[:4], *biases[:4])
 
 
 def _course_table(course: Course, known: Course | None, loaded: Loaded) -> Table:
-    """Return the bound at a few times, as root sum of squares over coordinates and root mean square over members."""
+    """Return the table of the bound at a few times: root sum of squares of coordinates, root mean square of members."""
     table = Table(title="Bound after the first epochs", title_justify="left")
     for name in ("epochs", "time, s"):
         table.add_column(name, justify="right")
     values: list[Array] = []
-    for slot in (course.layout.find(name)[0] for name in _shown(course.layout)):
+    for slot in (course.layout.find(name)[0] for name in _shown_unknowns(course.layout)):
         unit, size = loaded.bias_unit(slot.name, slot.unit)
         table.add_column(f"{slot.name}{_RMS[bool(slot.members)]}, {unit}".rstrip(", "), justify="right")
         values.append(course.total(slot.name) / (abs(size) * np.sqrt(slot.size if slot.members else 1)))
         if known is not None and not slot.members:
             table.add_column("biases known", justify="right")
             values.append(known.total(slot.name))
-    for i in _few(course):
+    for i in _sparse_indices(course):
         numbers = [f"{value[i]:.4g}" if np.isfinite(value[i]) else "-" for value in values]
         table.add_row(str(course.counts[i]), f"{course.times[i]:g}", *numbers)
     return table
 
 
-# Over a map.
+# Maps.
 
 
 def run_map(
@@ -301,7 +294,7 @@ def run_map(
     geodetic: bool,
     dilution: bool,
 ) -> int:
-    """Write the map of the bound of a file, of the first epoch where each has a position of its own."""
+    """Write the map of the bound of a file. If epochs are separate, the map is of the first epoch."""
     if out.suffix.lower() not in (*PICTURES, ".html", ".geojson"):
         advice = "use .png, .svg, .pdf, .geojson or .html"
         raise InvalidProblem(f"maps of type {out.suffix or out.name!r} are unknown", str(out), advice)
@@ -317,7 +310,7 @@ def run_map(
 
 
 def _of_one_epoch(problem: Problem) -> Problem:
-    """Return a problem, of epochs that share nothing the first: they are mapped as it is."""
+    """Return the first epoch if epochs are separate, else the problem; maps show one epoch."""
     apart = by_epoch(problem) if separable(problem) else problem
     return apart.flat().take(np.zeros(1, dtype=int)) if apart.batch_shape else apart
 
@@ -325,14 +318,14 @@ def _of_one_epoch(problem: Problem) -> Problem:
 def _grid(
     file: Path, problem: Problem, at: str | None, truth: Array, height: str | None, limits: str | None, points: int
 ) -> tuple[tuple[Array, Array], float]:
-    """Return the coordinates of a map, with a number of points along each side, and its height, metres."""
+    """Return the coordinates (points,) of a map along both sides, and its height, m."""
     place = _place(file, problem, at, truth, needed=height is None and problem.dimension == 3)
     x0, x1, y0, y1 = extent(problem, place) if limits is None else _limits(limits, problem)
     return (np.linspace(x0, x1, points), np.linspace(y0, y1, points)), _height(problem, place, height)
 
 
 def _place(file: Path, problem: Problem, at: str | None, truth: Array, *, needed: bool) -> Array | None:
-    """Return the place (1, d) that is given or fixed, None where it is not needed."""
+    """Return the position (1, d) that the user states, or the fix; None if no position is needed."""
     sought = [i for i, motion in enumerate(problem.motions) if motion.known is None]
     names = [slot for slot in problem.layout.shared if slot.name.partition("[")[0] == "position"]
     if at is not None and len(sought) == 1 and names:
@@ -345,8 +338,8 @@ def _place(file: Path, problem: Problem, at: str | None, truth: Array, *, needed
     place = fix.position.reshape(-1, problem.dimension)
     good = place[np.isfinite(place).all(-1)]
     if not len(good):
-        advice = "give the height of the map with --height, or a place with --at"
-        raise InvalidProblem("the file has no fix that tells the height", "--map", advice)
+        advice = "give the height of the map with --height, or a position with --at"
+        raise InvalidProblem("the file has no fix with a height", "--map", advice)
     return np.asarray(good[:1])
 
 
@@ -360,17 +353,17 @@ def _height(problem: Problem, place: Array | None, height: str | None) -> float:
 
 
 def _limits(text: str, problem: Problem) -> tuple[float, float, float, float]:
-    """Return the limits of a map; raise InvalidProblem where they are none."""
+    """Return the limits of a map: least x, greatest x, least y, greatest y. Raise InvalidProblem for invalid limits."""
     earth = problem.frame.geodetic and problem.dimension == 3
     advice = "write west,east,south,north in degrees" if earth else "write least x, greatest x, least y, greatest y"
     values = coordinates(text, "--extent", advice)
     if len(values) == 4:
         x0, x1, y0, y1 = values
-        # East may be beyond 180 degrees, for a map across the date line.
+        # East may exceed 180 degrees, for a map across the date line.
         fits = not earth or (-360.0 <= x0 and x1 <= 540.0 and x1 - x0 <= 360.0 and y0 >= -90.0 and y1 <= 90.0)
         if x0 < x1 and y0 < y1 and fits:
             return x0, x1, y0, y1
-    raise InvalidProblem(f"{text!r} is no extent of a map", "--extent", advice)
+    raise InvalidProblem(f"{text!r} is not an extent of a map", "--extent", advice)
 
 
 def _write_map(found: BoundMap, out: Path, title: str, *, dilution: bool) -> None:
@@ -381,7 +374,7 @@ def _write_map(found: BoundMap, out: Path, title: str, *, dilution: bool) -> Non
         write_picture(plot_bound_map(found, title, dilution=dilution), out)
         return
     if dilution:
-        raise InvalidProblem("the dilution is drawn as a picture only", str(out), "use .png, .svg or .pdf")
+        raise InvalidProblem("the dilution of precision can only be a picture", str(out), "use .png, .svg or .pdf")
     if ending == ".geojson":
         write_text(out, dumps(map_geojson(found)))
         return
@@ -390,11 +383,11 @@ def _write_map(found: BoundMap, out: Path, title: str, *, dilution: bool) -> Non
     write_text(out, map_page(found, title))
 
 
-# The status of fixes.
+# Status of simulated fixes.
 
 
 class Simulated(NamedTuple):
-    """The places at which fixes are simulated, as asked for: a map, or one place; and their number and seed."""
+    """Options of a simulation of fixes: the map, or one position; number of fixes and seed."""
 
     out: Path | None
     at: str | None
@@ -416,10 +409,10 @@ def run_status(file: Path, wanted: Simulated, *, as_json: bool, quiet: bool) -> 
 
     problem = _of_one_epoch(loaded.problem)
     truth = vector(problem, wanted.at, wanted.velocity, wanted.geodetic)
-    if wanted.at is None and _sought(problem):
+    if wanted.at is None and _has_unknown_position(problem):
         truth = _solve(file).reshape(-1, len(truth))[0]
         if not np.isfinite(truth).all():
-            raise InvalidProblem("the file has no fix to simulate at", loaded.source, "give a place with --at")
+            raise InvalidProblem("the file has no fix as true position", loaded.source, "give a position with --at")
     found = status_shares(problem, truth, wanted.trials or _TRIALS, wanted.seed)
     if as_json:
         share = dict(zip((one.label for one in found.statuses), found.share, strict=True))
@@ -440,11 +433,13 @@ def _show_status(found: StatusShares, title: str) -> None:
     console = Screen()
     console.print(table)
     if np.isfinite(found.covered):
-        console.print(f"Of the ok fixes {100.0 * float(found.covered):.1f} % hold the true place in their 95 % region.")
+        console.print(
+            f"The 95 % region contains the true position in {100.0 * float(found.covered):.1f} % of the ok fixes."
+        )
 
 
 def _map_status(file: Path, loaded: Loaded, wanted: Simulated, out: Path) -> None:
-    """Write the map of the share of `ok` fixes of a file."""
+    """Write the map of the share of fixes with the status `ok`."""
     from optloc.show.pictures import plot_status_map, status_geojson
     from optloc.solvers.shares import status_map
 
@@ -464,13 +459,13 @@ def _map_status(file: Path, loaded: Loaded, wanted: Simulated, out: Path) -> Non
         write_picture(plot_status_map(found, f"{loaded.title}: share of ok fixes"), out)
 
 
-# Draws.
+# Simulation.
 
 
 def run_simulate(
     file: Path, truth: str, velocity: str | None, out: Path, *, geodetic: bool, seed: int, trials: int, quiet: bool
 ) -> int:
-    """Draw measurements, write them as a problem file, and return the exit code."""
+    """Simulate measurements, write them as a problem file, and return the exit code."""
     from tempfile import TemporaryDirectory
 
     from optloc.files.writer import write_measured
@@ -479,9 +474,9 @@ def run_simulate(
 
     claim_outputs(out, inputs=[file])
     problem = read(file, values=False).problem
-    check_budget("rows", trials * problem.count, "--trials")  # what is written can be read
+    check_budget("rows", trials * problem.count, "--trials")  # the reader rejects files with more rows
     x = vector(problem, truth, velocity, geodetic)
-    # A spread in decibels depends on the values: the noise is that of the true ones.
+    # The standard deviation of a level in decibels depends on its value, so the noise is computed at the exact values.
     with TemporaryDirectory() as folder:
         exact, *_ = write_measured(file, Path(folder) / out.name, np.atleast_2d(predict(problem, x)), note="")
         drawn = simulate(read(exact).problem, x, seed, trials)
@@ -492,17 +487,17 @@ def run_simulate(
 
 
 def vector(problem: Problem, position: str | None, velocity: str | None, geodetic: bool) -> Array:
-    """Return the true parameter vector of targets at a position; biases have their prior means, the rest is zero."""
+    """Return the true parameters (size,) for a target position; biases have their prior means, the rest is zero."""
     if velocity is not None and all(motion.order == 0 for motion in problem.motions):
         what = "the target of this file does not move"
-        raise InvalidProblem(what, "--velocity", 'write motion = "constant_velocity"')
+        raise InvalidProblem(what, "--velocity", 'write motion = "constant_velocity" in the file')
     place = None if position is None else np.array(coordinates(position, "position"))
     if geodetic and place is not None:
         if not problem.frame.geodetic or len(place) != 3:
             what = "latitude, longitude and height need a geodetic frame and three numbers"
-            raise InvalidProblem(what, "--geodetic", "leave it out")
+            raise InvalidProblem(what, "--geodetic", "remove this option")
         place = problem.frame.from_geodetic(np.radians(place[0]), np.radians(place[1]), place[2])[: problem.dimension]
-    # Several targets, if there are, are all put at the same place and velocity.
+    # All targets get the same position and velocity.
     values = {"position": place, "velocity": None if velocity is None else coordinates(velocity, "--velocity")}
     layout = problem.layout
     shared, local = np.zeros(layout.n_shared), np.zeros((problem.epochs, layout.n_local))
@@ -515,7 +510,7 @@ def vector(problem: Problem, position: str | None, velocity: str | None, geodeti
                 continue
             if len(value) != problem.dimension:
                 what = f"{len(value)} coordinates do not fit {problem.dimension} dimensions"
-                raise InvalidProblem(what, name, "give one each")
+                raise InvalidProblem(what, name, "give one number for each dimension")
             slot, is_shared = layout.find(name)
             (shared if is_shared else local)[..., slot.start : slot.start + slot.size] = value
     for bias in problem.biases:

@@ -1,4 +1,4 @@
-"""``optloc doctor``: versions, machine, caches, what is missing, and the command that brings it."""
+"""The command ``optloc doctor``: versions, machine, caches, missing packages and the commands that install them."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from optloc.cli.extensions import extensions
 from optloc.cli.options import Json, Verbose
 from optloc.cli.output import Screen, dumps, say
 
-# Extras for work on optloc itself, which users do not miss.
-_OURS = frozenset({"test", "lint", "docs"})
+# Extras for the development of optloc, which users do not need.
+_DEVELOPMENT_EXTRAS = frozenset({"test", "lint", "docs"})
 _REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)[^<>=!~;]*(?:>=([\d.]+))?")
 _EXTRA = re.compile(r"""extra\s*==\s*['"]([\w-]+)['"]""")
 
 
 @dataclass(frozen=True, slots=True)
 class Package:
-    """A package that optloc uses: its version, None where it is missing, the least one, and the extra that brings it.
+    """A package that optloc uses.
 
-    The extra is empty for what every installation has.
+    version: installed version, or None. least: smallest version that works. extra: extra that installs the package,
+    empty for packages that each installation has.
     """
 
     name: str
@@ -46,7 +47,7 @@ class Package:
 
 @dataclass(frozen=True, slots=True)
 class MissingPackage:
-    """What is missing, what it is for, and the command that brings it."""
+    """A missing package, its use, and the command that installs it."""
 
     missing: str
     used_for: str
@@ -54,24 +55,24 @@ class MissingPackage:
 
 
 def _numbers(text: str) -> tuple[int, ...]:
-    """Return the leading numbers of a version, so that 1.10 is above 1.9."""
+    """Return the leading numbers of a version, so that 1.10 sorts above 1.9."""
     found = re.match(r"\d+(?:\.\d+)*", text)
     return tuple(map(int, found[0].split("."))) if found else ()
 
 
 def packages() -> list[Package]:
-    """Return what this optloc requires, the core first; nothing where it was not installed but put on the path."""
+    """Return the packages that optloc requires, core packages first; empty if optloc is not installed as a package."""
     found = []
-    for line in _asked(requires, "optloc") or ():
+    for line in _or_none(requires, "optloc") or ():
         named, extra = _REQUIREMENT.match(line), _EXTRA.search(line)
-        if named is None or (extra is not None and extra[1] in _OURS):
+        if named is None or (extra is not None and extra[1] in _DEVELOPMENT_EXTRAS):
             continue
         name = named[1]
-        found.append(Package(name, _asked(version, name), named[2] or "", "" if extra is None else extra[1]))
+        found.append(Package(name, _or_none(version, name), named[2] or "", "" if extra is None else extra[1]))
     return sorted(found, key=lambda one: (one.extra, one.name))
 
 
-def _asked(of: Any, name: str) -> Any:
+def _or_none(of: Any, name: str) -> Any:
     try:
         return of(name)
     except PackageNotFoundError:
@@ -79,7 +80,7 @@ def _asked(of: Any, name: str) -> Any:
 
 
 def machine() -> dict[str, Any]:
-    """Return what this computer is, and what of it may be used."""
+    """Return the properties of this computer, the usable processors and the settings of optloc."""
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     settings = ("OPTLOC_THREADS", "OPTLOC_COMPILE", "OPTLOC_DATA", "NUMBA_CACHE_DIR", "NUMBA_DISABLE_JIT")
     return {
@@ -92,7 +93,7 @@ def machine() -> dict[str, Any]:
 
 
 def machine_code() -> dict[str, Any]:
-    """Return where machine code is kept, for which processor, and which parts of it are there."""
+    """Return the folder of the machine code, its processor, and the parts on disk."""
     from optloc.kernels.jit import enabled
 
     if not enabled():
@@ -111,16 +112,16 @@ def machine_code() -> dict[str, Any]:
 
 
 def advice(found: list[Package], code: dict[str, Any]) -> list[MissingPackage]:
-    """Return what is missing with the command that brings it: what everybody needs first."""
+    """Return the missing packages with their install commands, packages that all users need first."""
     told = [
         MissingPackage(f"{one.name} >= {one.least}", "everything", f"pip install '{one.name}>={one.least}'")
         for one in found
         if not one.extra and one.state != "ok"
     ]
     if not found:
-        told.append(MissingPackage("the installed package", "versions, extras of other packages", "pip install ."))
+        told.append(MissingPackage("the installed package", "versions, extras", "pip install ."))
     if not code["parts"]:
-        told.append(MissingPackage("machine code", "speed: a thousand times", "unset NUMBA_DISABLE_JIT"))
+        told.append(MissingPackage("machine code", "speed, about 1000 times", "unset NUMBA_DISABLE_JIT"))
     elif not all(code["parts"].values()):
         lacking = [name for name, there in code["parts"].items() if not there]
         told.append(MissingPackage("machine code", ", ".join(lacking), "optloc compile"))
@@ -131,10 +132,10 @@ def advice(found: list[Package], code: dict[str, Any]) -> list[MissingPackage]:
 
 
 def doctor(as_json: Json = False, verbose: Verbose = False) -> None:
-    """Print versions, machine, where machine code lies and whether it is there, what is missing and what brings it."""
+    """Print versions, machine, machine code on disk, missing packages and the commands that install them."""
     found, code = packages(), machine_code()
     told = {
-        "optloc": {"version": _asked(version, "optloc"), "folder": str(Path(__file__).resolve().parents[1])},
+        "optloc": {"version": _or_none(version, "optloc"), "folder": str(Path(__file__).resolve().parents[1])},
         "python": {"version": platform.python_version(), "executable": sys.executable},
         "machine": machine(),
         "packages": [asdict(one) | {"state": one.state} for one in found],
@@ -152,7 +153,7 @@ def _show(told: dict[str, Any]) -> None:
     screen, here, code = Screen(), told["machine"], told["machine_code"]
     say(screen, f"optloc {told['optloc']['version'] or '(not installed)'} in {told['optloc']['folder']}")
     say(screen, f"Python {told['python']['version']}: {told['python']['executable']}")
-    say(screen, f"{here['system']}; {here['usable']} of {here['processors']} processors may be used")
+    say(screen, f"{here['system']}; {here['usable']} of {here['processors']} processors are usable")
     for name, value in here["settings"].items():
         say(screen, f"{name}={value}")
     table = Table("package", "version", "needed", "for", "state")
@@ -161,7 +162,7 @@ def _show(told: dict[str, Any]) -> None:
         table.add_row(one["name"], one["version"] or "-", needed, one["extra"] or "all", one["state"])
     screen.print(table)
     if code["parts"]:
-        say(screen, f"Machine code for {code['made_for']} is kept in {code['folder'] or 'no folder'}")
+        say(screen, f"Machine code for {code['made_for']} is stored in {code['folder'] or 'no folder'}")
         for name, there in code["parts"].items():
             say(screen, f"  {'yes' if there else 'no ':3} {name}")
     if told.get("datasets", {}).get("folder"):

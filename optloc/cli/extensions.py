@@ -1,4 +1,4 @@
-"""Extensions of the command line by neighbours: commands, lists, pictures, kernels and facts of the machine."""
+"""Extensions of the command line by neighbour packages: commands, lists, pictures, kernels and facts of the machine."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ if TYPE_CHECKING:
 Rows = list[dict[str, str]]
 
 NEIGHBOURS = ("optloc.sites", "optloc.service", "optloc.lab")
-"""Packages beside the core. Each has a module ``extension`` with an `Extension`; a missing package adds nothing."""
+"""Packages outside the core. Each has a module ``extension`` with an `Extension`; a missing package adds nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class PictureRequest:
-    """A problem or study to be drawn.
+    """A request to draw a problem or a study.
 
     Parameters
     ----------
     file : Path
         Problem file, or folder of a study.
     out : Path
-        Picture to write.
+        Picture file to write.
     method : str
         Method of the fix.
     epoch : str, optional
@@ -43,7 +43,11 @@ class PictureRequest:
 
 @dataclass(frozen=True, slots=True)
 class KernelPart:
-    """Kernels that a process compiles: calls that compile them, and the kernels that Python calls."""
+    """A group of kernels that one process compiles.
+
+    summary: title. package: package of the kernels. works: calls that compile them. entries: names of the kernels that
+    Python calls.
+    """
 
     summary: str
     package: str

@@ -1,4 +1,4 @@
-"""The fixes of a file: one problem or its epochs in batches, as a long table, as JSON, and for every format."""
+"""The fixes of a problem file: solved epoch by epoch in batches or as one run, as a table, JSON or export format."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ from optloc.show.formats.marks import Results
 
 LOG = logging.getLogger("optloc.problem.fix")
 
-# Epochs that are solved at once: large enough for batched kernels, small enough for a bar that moves.
+# Epochs per batch: large enough for batched kernels, small enough for a smooth progress bar.
 _CHUNK = 1024
-# The same where a plan fixes them: a second of `auto`. Of `gtrs+lsr`, 1024 epochs at a time took 2.4 times as long.
+# Epochs per batch for methods with an engine plan: about one second of `auto`. `gtrs+lsr` with 1024 epochs at a time
+# took 2.4 times as long.
 _QUICK_CHUNK = 8192
 
 
@@ -42,13 +43,13 @@ class FileFixes:
     loaded : Loaded
         The file.
     fix : Fix
-        A batch of the epochs in order; one fix without batch axes where the epochs share unknowns.
+        A batch of the epochs in order; one fix without batch axes if the epochs share unknowns.
     columns : dict of str to array
-        The long table.
+        Table with one row for each epoch and target.
     reweighted : bool
-        Whether the method gave rows other weights than the file states.
+        Whether the method changed the weights of rows.
     seen : Observability, optional
-        What the data of a run show of its biases.
+        Observability of the biases of a run.
     """
 
     loaded: Loaded
@@ -58,7 +59,7 @@ class FileFixes:
     seen: Observability | None = None
 
     def passes(self, allow: Sequence[Status] = ()) -> bool:
-        """Return whether every status is ok, or among those that are allowed."""
+        """Return whether each status is ok or allowed."""
         return bool(np.isin(self.fix.code, [Status.OK, *allow]).all())
 
     @property
@@ -68,13 +69,13 @@ class FileFixes:
 
     @property
     def singles(self) -> Iterator[Fix]:
-        """Yield the fixes one by one."""
+        """Yield the single fixes."""
         flat = self.fix if self.apart else self.fix.flat()
         yield from (flat[i] for i in range(len(flat)))
 
 
 def fix_file(loaded: Loaded, method: str, quiet: bool) -> FileFixes:
-    """Return the fixes of a file; a bar moves on a terminal's standard error."""
+    """Return the fixes of a file; on a terminal, a progress bar is drawn on standard error."""
     from optloc.solvers.solution import solve
 
     if separable(loaded.problem):
@@ -87,7 +88,7 @@ def fix_file(loaded: Loaded, method: str, quiet: bool) -> FileFixes:
 
 
 def fix_epochs(loaded: Loaded, method: str, quiet: bool) -> tuple[Fix, bool]:
-    """Return the fixes of epochs that share nothing, in their order, and whether weights of rows are not as stated."""
+    """Return the fixes of separate epochs in the order of the epochs, and whether weights of rows changed."""
     from optloc.solvers.methods import is_quick
     from optloc.solvers.solution import solve
 
@@ -110,7 +111,7 @@ def fix_epochs(loaded: Loaded, method: str, quiet: bool) -> tuple[Fix, bool]:
 
     with bar(loaded.title, loaded.problem.epochs, quiet) as advance:
         fix = join(parts(), loaded.problem.epochs)
-    # Groups come one after the other, and a table has its epochs in the order of time.
+    # Epochs are solved by groups of equal structure; the table is sorted by time.
     epochs = np.concatenate(order)
     fix = fix if (np.diff(epochs) > 0).all() else fix[np.argsort(epochs)]
     _release_memory()
@@ -118,7 +119,7 @@ def fix_epochs(loaded: Loaded, method: str, quiet: bool) -> tuple[Fix, bool]:
 
 
 def _release_memory() -> None:
-    """Give free memory back to the system: glibc keeps the holes that a long table leaves, a fifth of all memory."""
+    """Return free memory to the system: after a long table, glibc would keep a fifth of all memory."""
     import pyarrow as pa
 
     pa.default_memory_pool().release_unused()
@@ -127,7 +128,7 @@ def _release_memory() -> None:
 
 
 def _is_reweighted(fix: Fix, problem: Problem) -> bool:
-    """Return whether a loss or a search for suspects changed weights, whatever the method is called."""
+    """Return whether a loss or a search for suspects changed weights, independent of the name of the method."""
     return bool((fix.weights != problem.weight)[fix.answered].any())
 
 
@@ -137,31 +138,20 @@ def _log_stages(fix: Fix) -> None:
 
 
 def _observe(problem: Problem, fix: Fix) -> Observability | None:
-    """Return what the data show of biases, at the fix or else at an alternative; None without either, or a bias."""
+    """Return the observability of biases at the fix or, without a fix, at an alternative; else None."""
     points = [x for x in (fix.x, *fix.alternatives.x) if np.isfinite(x).all()]
     biased = any(slot.members for slot in fix.layout.shared)
     return observability(problem, points[0]) if biased and points else None
 
 
 def fix_columns(loaded: Loaded, fix: Fix, first: int | None) -> Columns:
-    """Return the table of fixes.
+    """Return the table of fixes: metres, seconds and degrees; NaN for missing numbers.
 
-    Parameters
-    ----------
-    loaded : Loaded
-        Names of epochs and targets.
-    fix : Fix
-        A batch (n,) of single epochs, or the fix of a whole run, without batch axes.
-    first : int or None
-        Epoch of the first fix of a batch; None: the fix belongs to the whole run.
-
-    Returns
-    -------
-    dict of str to array (rows,)
-        Metres, seconds and degrees; NaN where there is no number.
+    `loaded` has the names of epochs and targets. `fix` is a batch (n,) of single epochs, or one fix of a whole run.
+    `first` is the epoch of the first fix of a batch; None for a whole run.
     """
     motions, n = loaded.problem.motions, 1 if first is None else len(fix)
-    # A file of known targets alone (a calibration) has a row for each of them all the same.
+    # A file with known targets only (a calibration) has one row for each target.
     shown = [i for i, m in enumerate(motions) if m.known is None] or range(len(motions))
     return told.fix_columns(
         fix,
@@ -173,7 +163,7 @@ def fix_columns(loaded: Loaded, fix: Fix, first: int | None) -> Columns:
 
 
 def _labels(loaded: Loaded, n: int, first: int | None, target: int, spread: bool) -> Columns:
-    """Return epoch, time and target of every row."""
+    """Return the columns epoch, time and target of all rows."""
     k = loaded.problem.epochs
     part = slice(0, k) if first is None else slice(first, first + n)
     if first is None and not spread:
@@ -186,11 +176,11 @@ def _labels(loaded: Loaded, n: int, first: int | None, target: int, spread: bool
     return {"epoch": np.array(epochs, dtype=object), "time": times, "target": np.array(names, dtype=object)}
 
 
-# All of it for machines.
+# JSON output.
 
 
 def table_json(loaded: Loaded) -> dict[str, Any]:
-    """Return how a foreign table was read, as a part of a JSON value; nothing of a problem file."""
+    """Return the interpretation of a measurement table as a JSON part; empty for a problem file."""
     return {"table": dict(loaded.table)} if loaded.table else {}
 
 
@@ -202,12 +192,12 @@ def fixes_json(found: FileFixes) -> dict[str, Any]:
     searched = found.apart and found.fix.explanations is not None
     groups = epoch_groups(found.loaded.problem) if searched else ()
     per_fix = [
-        fix_detail(fix, found.seen, reweighted=found.reweighted) | _unnoticed(fix, found, groups, i)
+        fix_detail(fix, found.seen, reweighted=found.reweighted) | _unnoticed_errors(fix, found, groups, i)
         for i, fix in enumerate(found.singles)
     ]
-    # One row a fix wherever it has one target and one epoch; else what belongs to the fix stands with the run.
+    # With one target and one epoch for each fix, row and fix are merged; otherwise "runs" has the data of the fixes.
     single = len(rows) == len(per_fix)
-    if len(rows) == 1 == len(per_fix):  # tables of many have their covariances
+    if len(rows) == 1 == len(per_fix):  # for long tables the covariances suffice
         per_fix[0]["accuracy"] = asdict(accuracy(level_covariance(found.columns, 0)))
     origin = None if frame.origin is None else [*np.degrees(frame.origin[:2]).tolist(), frame.origin[2]]
     return {
@@ -221,8 +211,8 @@ def fixes_json(found: FileFixes) -> dict[str, Any]:
     }
 
 
-def _unnoticed(fix: Fix, found: FileFixes, groups: Sequence[EpochGroup], item: int) -> dict[str, Any]:
-    """Return which errors of the stations a search for suspects would not have noticed; nothing where nobody asked."""
+def _unnoticed_errors(fix: Fix, found: FileFixes, groups: Sequence[EpochGroup], item: int) -> dict[str, Any]:
+    """Return the station errors that the search for suspects would not notice; empty without a search."""
     if fix.explanations is None or not fix.answered:
         return {}
     from optloc.cli.crlb import reliability_json, reliability_of
@@ -232,6 +222,6 @@ def _unnoticed(fix: Fix, found: FileFixes, groups: Sequence[EpochGroup], item: i
 
 
 def results_of(found: FileFixes) -> Results:
-    """Return the fixes as formats take them."""
+    """Return the fixes in the form that the export formats need."""
     problem = found.loaded.problem
     return Results(found.columns, problem.frame, (found.fix,), problem, found.loaded.title)

@@ -1,4 +1,4 @@
-"""`optloc fix`: fixes of a file as a table, with what speaks against them, what might be the cause and what helps."""
+"""The command ``optloc fix``: fixes of a file as a table, with misfits, possible causes and advice."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ from optloc.station_health.levels import (
 )
 from optloc.station_health.structure import with_estimated_noise
 
-# What a screen holds of each list; the rest is counted, and --json and --out have all of it.
+# Largest number of lines of each list on a screen. The remaining lines are counted; --json and --out have all lines.
 _STATES, _FAILURES = SHOWN, 10
-# Columns of text; those of numbers stand on the right.
+# Columns of text; columns of numbers are aligned to the right.
 _TEXTS = {"name", "member", "estimate", "suspect"}
 _GOOD, _CARE, _BAD = "green", "yellow", "red"
 
@@ -88,11 +88,11 @@ def run_fix(
     allow: tuple[Status, ...] = (),
     table: ColumnHints | None = None,
 ) -> int:
-    """Fix a file, or a table with what is told of it, under more constraints; write and print; return the exit code."""
+    """Fix a problem file or a table under more constraints, write and print the result, and return the exit code."""
     on_output = geojson_path is not None and str(geojson_path) == "-"
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
-    claim(out, geojson_path, html, plot, inputs=[file])  # before a long table is read, and once its frame is known
+    claim(out, geojson_path, html, plot, inputs=[file])  # before a long table is read
     loaded = read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
     claim_outputs(geojson_path, html, results=(out, loaded.problem.frame), picture=plot, inputs=[file])
     loaded = _estimate_noise(loaded, noise)
@@ -107,7 +107,7 @@ def run_fix(
     _write(found, out, geojson_path, plot, html)
     if quiet and not as_json:
         return 0 if found.passes(allow) else 1
-    # many statuses are told by their own sentence; causes take a search, which only readers need
+    # the search for causes takes time, so do it only if the result is printed
     level = rescaled or _level_of(found)
     used = rescaled is not None or bool(np.any(found.fix.has(Status.RESCALED)))
     signals = signals or _late_of(found)
@@ -133,7 +133,7 @@ def run_fix(
 
 
 def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: Path | None, html: Path | None) -> None:
-    """Write the files that were asked for: all of them, or none."""
+    """Write the requested files: all of them, or none if one fails."""
     with replace_together():
         if out is not None:
             write_results(out, results_of(found))
@@ -149,14 +149,14 @@ def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: 
 
 
 def draw(found: FileFixes, path: Path) -> None:
-    """Draw fixes to a picture file; raise InvalidProblem where that fails."""
+    """Draw fixes to a picture file; raise InvalidProblem if that fails."""
     from optloc.show.pictures import plot_fixes
 
     write_picture(plot_fixes(found.loaded.problem, (found.fix,), title=found.loaded.title), path)
 
 
 def show(found: FileFixes, console: Console) -> None:
-    """Print fixes: one in full, a few of a run below each other, many as a count by status."""
+    """Print the fixes: one fix in full, the states of a run one below the other, many fixes as a count by status."""
     fix = found.fix
     if len(found.columns["x"]) == 1:
         _show_one(found, fix[0] if found.apart else fix, console)
@@ -183,7 +183,7 @@ def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
 
 
 def _show_sheet(sheet: FixSheet | None, console: Console) -> None:
-    """Print a sheet with names of columns; nothing where there is none."""
+    """Print a sheet with column names; print nothing without a sheet."""
     if sheet is None:
         return
     table = Table(title=sheet.title, title_justify="left")
@@ -199,7 +199,7 @@ def _colour(verdict: Status) -> str:
 
 
 def _show_unnoticed(found: FileFixes, fix: Fix, console: Console) -> None:
-    """Print which errors a search for suspects would not have noticed; nothing where nobody asked."""
+    """Print the errors that the search for suspects would not notice; print nothing without a search."""
     if fix.explanations is None or not fix.answered:
         return
     from optloc.cli.crlb import reliability_of, show_reliability
@@ -227,40 +227,40 @@ def _show_many(found: FileFixes, console: Console) -> None:
 
 # Noise from data.
 
-# The grouping that means the structure with the best explanation of the data.
+# The word for the grouping that explains the data best.
 _AUTO = "auto"
 
 
 def _estimate_noise(loaded: Loaded, by: str | None) -> Loaded:
-    """Return a file's problem with its noise estimated for each station, pair or kind; unchanged where not asked."""
+    """Return the file with noise estimated for each station, pair or kind; unchanged if `by` is None."""
     if by is None:
         return loaded
     grouping, plus, more = by.partition("+")
     if grouping == _AUTO and plus:
         raise InvalidProblem(
-            f"{_AUTO} chooses the error of an epoch itself", "--noise-from-data", f"write {_AUTO} alone"
+            f"{_AUTO} already chooses the error of an epoch", "--noise-from-data", f"write {_AUTO} alone"
         )
     if plus and more != "epoch":
-        raise InvalidProblem(f"unknown component {more!r}", "--noise-from-data", "write +epoch or nothing behind it")
+        raise InvalidProblem(f"unknown component {more!r}", "--noise-from-data", "write +epoch, or remove it")
     group = None if grouping == _AUTO else grouping_of(grouping, "--noise-from-data")
     problem, levels = with_estimated_noise(loaded.problem, group, common=bool(plus))
     return replace(loaded, problem=problem, levels=levels)
 
 
 def _common_level(problem: Problem) -> CommonLevel:
-    """Return whether the noise of a file is stated wrong; raise InvalidProblem where its epochs cannot tell."""
+    """Return the common factor of the stated noise; raise InvalidProblem if the epochs cannot determine it."""
     try:
         return common_level(problem)
     except InvalidProblem as error:
-        raise InvalidProblem(error.what, "--rescale-noise", "leave it out") from None
+        raise InvalidProblem(error.what, "--rescale-noise", "remove this option") from None
 
 
-# Probability below which the number of refuted fixes is not chance: then the noise as stated is tested.
+# If chance explains the number of refuted fixes with less than this probability, the stated noise is tested.
 _BY_CHANCE = 0.01
 
 
 def _are_refuted(fix: Fix) -> bool:
-    """Return whether more fixes of a batch are refuted than chance refutes, or a search for suspects was asked for."""
+    """Return whether a batch has more refuted fixes than chance explains, or a search for suspects was requested."""
     from scipy.special import bdtrc
 
     refuted = np.isin(fix.code, [Status.MISFIT, Status.CONTRADICTORY])
@@ -269,14 +269,14 @@ def _are_refuted(fix: Fix) -> bool:
 
 
 def _level_of(found: FileFixes) -> CommonLevel | None:
-    """Return whether the fixes of a file accuse its noise; None of few fixes, and where they are not refuted."""
+    """Return the common factor of the stated noise; None for few fixes, and if the fixes are not refuted."""
     if not found.apart or len(found.fix) < SEVERAL or not _are_refuted(found.fix):
         return None
     return common_level_at(batch_of(found.loaded.problem), found.fix.x)
 
 
 def _late_of(found: FileFixes) -> LateSignals | None:
-    """Return whether rows of a file are late, by its fixes; None of few fixes, and where they are not refuted."""
+    """Return the late rows of a file at its fixes; None for few fixes, and if the fixes are not refuted."""
     if not found.apart or len(found.fix) < SEVERAL or not _are_refuted(found.fix):
         return None
     x, answered = found.fix.x, found.fix.answered
@@ -287,42 +287,42 @@ def _late_of(found: FileFixes) -> LateSignals | None:
 def tell_level(
     level: CommonLevel | None, used: bool = False, late: LateSignals | None = None, late_used: bool = False
 ) -> tuple[str, ...]:
-    """Return what the fixes of a file say of the noise as stated and of late rows, as sentences, and what helps."""
+    """Return sentences on the stated noise and on late rows, each with the option that helps."""
     said = []
     if late is not None and late.sentence:
-        # Noise of a larger size explains late rows badly, and nothing well that they do not.
-        use = "this is used" if late_used else "--late-from-data fixes with that"
+        # If rows are late, do not report the noise: larger noise explains late rows badly, and no other rows well.
+        use = "this is used" if late_used else "--late-from-data fixes with this loss"
         said.append(late.sentence if late.alike else f"{late.sentence}: {use}")
     elif late_used:
-        said.append("no rows are seen to be late")
+        said.append("no late rows are found")
     if level is not None and level.suspect and (used or not said):
         said.append(f"{level.sentence}: {'this is used' if used else '--rescale-noise uses it'}")
     elif level is not None and level.alone:
         said.append(f"{level.sentence}: see `optloc check`, or --noise-from-data auto")
     elif used:
-        said.append("the noise is used as stated: no common factor explains more")
+        said.append("the noise is used as stated: no common factor explains the residuals better")
     return tuple(said)
 
 
 def late_json(late: LateSignals, used: bool = False) -> dict[str, Any]:
-    """Return what is said of late rows as one JSON value."""
+    """Return the result for late rows as a JSON value."""
     return asdict(late) | {"method": late.method, "used": used and late.share > 0.0, "sentence": late.sentence}
 
 
 def level_json(level: CommonLevel, used: bool = False) -> dict[str, Any]:
-    """Return what is said of the noise as stated as one JSON value."""
+    """Return the result for the stated noise as a JSON value."""
     return asdict(level) | {"used": used and level.suspect, "sentence": level.sentence}
 
 
 def grouping_of(by: str, where: str) -> By:
-    """Return what makes a group of errors; raise InvalidProblem for an unknown word."""
+    """Return the grouping of errors with this name; raise InvalidProblem for an unknown word."""
     if by not in GROUPINGS:
         raise InvalidProblem(f"unknown grouping {by!r}", where, nearest(by, (*GROUPINGS, _AUTO)))
     return cast("By", by)
 
 
 def _levels_json(levels: NoiseLevels) -> dict[str, Any]:
-    """Return noise levels as one JSON value, SI units."""
+    """Return noise levels as a JSON value, SI units."""
     columns: Columns = {"name": np.array(levels.names), "sigma": levels.sigma, "sigma_error": levels.sigma_error}
     columns |= {"low": levels.low * levels.stated, "high": levels.high * levels.stated}
     columns |= {
@@ -345,15 +345,15 @@ def _levels_json(levels: NoiseLevels) -> dict[str, Any]:
 
 def _show_levels(levels: NoiseLevels, console: Console) -> None:
     """Print noise levels as a table."""
-    besides = f", and what rows of each {levels.common} have in common in an epoch" if levels.common else ""
-    table = Table(title=f"Noise from data, by {levels.by}{besides}", title_justify="left")
+    common = f", and the error that rows of each {levels.common} share in an epoch" if levels.common else ""
+    table = Table(title=f"Noise from data, by {levels.by}{common}", title_justify="left")
     table.add_column(levels.by)
     for name in ("sigma, SI", "95 %", "stated", "redundancy", "errors", "gross"):
         table.add_column(name, justify="right")
     low, high = levels.low * levels.stated, levels.high * levels.stated
     for i, name in enumerate(levels.names):
-        # What is not told alone is used all the same: as stated, by a common factor, or none.
-        sigma = f"{levels.used[i] * levels.stated[i]:.3g}" + ("" if np.isfinite(levels.error[i]) else ", not told")
+        # A level without an estimate is used as stated, or with a common factor.
+        sigma = f"{levels.used[i] * levels.stated[i]:.3g}" + ("" if np.isfinite(levels.error[i]) else ", not estimated")
         within = f"{low[i]:.3g} to {high[i]:.3g}" if np.isfinite(high[i]) else "-"
         cells = (f"{levels.stated[i]:.3g}", f"{levels.redundancy[i]:.0%}", str(levels.count[i]), str(levels.gross[i]))
         table.add_row(name, sigma, within, *cells)
@@ -361,11 +361,11 @@ def _show_levels(levels: NoiseLevels, console: Console) -> None:
     say_all(console, levels.sentences)
 
 
-# What might be the cause, and what helps.
+# Causes and advice.
 
 
 def advice_for_fixes(found: FileFixes) -> tuple[Advice, ...]:
-    """Return the advice for all fixes of a file together; nothing where every one is ok."""
+    """Return the advice for all fixes of a file together; empty if all are ok."""
     if bool((found.fix.code == Status.OK).all()):
         return ()
     problem = found.loaded.problem
@@ -373,7 +373,7 @@ def advice_for_fixes(found: FileFixes) -> tuple[Advice, ...]:
 
 
 def advice_for_vectors(problem: Problem, vectors: Array | None) -> tuple[Advice, ...]:
-    """Return the advice for a problem at the vectors (k, size) of its epochs, or without any."""
+    """Return the advice for a problem at the parameters (k, size) of its epochs, or from the geometry alone."""
     return advise_at(problem, np.full((1, problem.layout.size), np.nan) if vectors is None else vectors)
 
 
@@ -383,7 +383,7 @@ def advice_json(found: tuple[Advice, ...]) -> list[dict[str, Any]]:
 
 
 def show_advice(found: tuple[Advice, ...], console: Console) -> None:
-    """Print what is seen and what helps, the lines of a problem file below it as they are to be copied."""
+    """Print each observation and its advice, followed by the lines to copy into a problem file."""
     if not found:
         return
     say(console, "Advice")
@@ -394,17 +394,17 @@ def show_advice(found: tuple[Advice, ...], console: Console) -> None:
             say(console, f"      {line}")
 
 
-# The fix with what would explain most of its misfit, on request.
+# Option --explain: a second fix with the error that explains most of the misfit.
 
 
 def _explain(found: FileFixes, method: str) -> FileFixes | None:
-    """Return the fixes of a file with the error among its unknowns that explains most, or None where none does."""
+    """Return the fixes with the most likely error as an additional unknown; None if no error explains the misfit."""
     larger = explained_at(found.loaded.problem, found.fix.x)
     return None if larger is None else fix_file(replace(found.loaded, problem=larger), method, True)
 
 
 def explained_json(found: FileFixes, other: FileFixes | None) -> dict[str, Any] | None:
-    """Return what is explained, and the fixes with it, as one JSON value; None where nothing is."""
+    """Return the explaining error and the fixes with it as a JSON value; None without an explanation."""
     if other is None:
         return None
     moved = {f"change_{axis}": other.columns[axis] - found.columns[axis] for axis in _axes(found)}
@@ -412,13 +412,13 @@ def explained_json(found: FileFixes, other: FileFixes | None) -> dict[str, Any] 
 
 
 def _show_explained(found: FileFixes, other: FileFixes | None, console: Console) -> None:
-    """Print a fix before and after what would explain most of its misfit became unknown."""
+    """Print the fix without and with the explaining error as an unknown."""
     if other is None:
-        say(console, "No single error explains what does not fit.")
+        say(console, "No single error explains the misfit.")
         return
     bias, fix = other.loaded.problem.biases[-1], other.fix
     table = Table(title=f"With the {bias.name}", title_justify="left")
-    for name in ("", "as it was", "with it", "change"):
+    for name in ("", "without it", "with it", "change"):
         table.add_column(name, justify="left" if not name else "right")
     table.add_row("status", Status(int(found.fix.flat().code[0])).label, Status(int(fix.code)).label, "")
     before = "-" if found.apart else as_p(float(found.fix.p_value))
@@ -433,12 +433,12 @@ def _show_explained(found: FileFixes, other: FileFixes | None, console: Console)
             table.add_row(f"{axis}{owner}", *told, f"{two - one:+.4g} m")
     console.print(table)
     if rows < len(found.columns["x"]):
-        say(console, f"{len(found.columns['x']) - rows} more positions changed: --json has all of them.")
+        say(console, f"{len(found.columns['x']) - rows} more positions changed; --json prints all.")
     if np.isfinite(fix.x).all():
         slot, _ = fix.layout.find(bias.name)
         values = zip(fix.take(bias.name), fix.sigma(bias.name), strict=True)
         sizes = ", ".join(with_sigma(float(value), float(sigma), slot.unit) for value, sigma in values)
-        say(console, f"The {bias.name} is {sizes}; the fix above is without it.")
+        say(console, f"The {bias.name} is {sizes}; the first fix above does not include it.")
 
 
 def _axes(found: FileFixes) -> list[str]:

@@ -1,4 +1,4 @@
-"""`optloc convert`, and tables in the place of problem files: the options that say what a table does not say itself."""
+"""The command ``optloc convert``, and the options for measurement tables that several commands share."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from optloc.files.table_problem import Converted, TableProblem
 
 _TABLES = (".csv", ".tsv", ".txt", ".log", ".json", ".jsonl", ".ndjson", ".parquet", ".pq", ".rnx", ".obs")
-# RINEX observations of a year, such as site1230.21o.
+# RINEX observation files end in the year, such as site1230.21o.
 _YEAR = re.compile(r"\.\d\do")
 PANEL = "A table"
 EXAMPLES = (
@@ -46,51 +46,65 @@ def _flag(text: str, flag: str) -> Any:
 
 
 _TEXT = str | None
-# Field of `optloc.files.table_import.ColumnHints`: its option. All commands that take tables use this one list.
+# Options by field of `optloc.files.table_import.ColumnHints`. All commands that read tables use this list.
 _OPTIONS: dict[str, Any] = {
     "stations": Annotated[
-        Path | None, _option("FILE", "Where the stations are: GeoJSON, CSV, Parquet or JSON.", "--stations")
+        Path | None, _option("FILE", "File of station positions: GeoJSON, CSV, Parquet or JSON.", "--stations")
     ],
     "sigma": Annotated[
         _TEXT,
-        _option("AMOUNT", "Error of each row: '20 ns', '6 m', 'range=6 m,azimuth=2 deg', or estimate.", "--sigma"),
+        _option(
+            "AMOUNT",
+            "Standard deviation of each row: '20 ns', '6 m', 'range=6 m,azimuth=2 deg', or estimate.",
+            "--sigma",
+        ),
     ],
     "columns": Annotated[
         list[str] | None,
         _option(
             "ROLE=NAME",
-            "Column of a role that its name does not tell: message, station, time, target, reference, sigma, heading, "
-            "or a kind; epoch, satellite, pseudorange, x, y, z; name, lat, lon, height, depth; p, s, phase. Once for "
-            "each; message=set+msg joins two.",
+            "Column of a role, if its name is not clear: message, station, time, target, reference, sigma, heading, "
+            "or a kind; epoch, satellite, pseudorange, x, y, z; name, lat, lon, height, depth; p, s, phase. Repeat "
+            "the option for more columns; message=set+msg joins two.",
             "--column",
         ),
     ],
     "ignore": Annotated[
         list[str] | None,
-        _option("COLUMN", "Column that is left out although it may be a measurement. Once for each.", "--ignore"),
+        _option(
+            "COLUMN",
+            "Column to leave out, although it may be a measurement. Repeat the option for more columns.",
+            "--ignore",
+        ),
     ],
     "time_unit": Annotated[
-        _TEXT, _option("UNIT", "Of the column of times, where its name does not end in it.", "--time-unit")
+        _TEXT, _option("UNIT", "Unit of the time column, if its name does not end in the unit.", "--time-unit")
     ],
-    "unit": Annotated[_TEXT, _option("UNIT", "Of the values, where the column's name does not end in it.", "--unit")],
+    "unit": Annotated[
+        _TEXT, _option("UNIT", "Unit of the values, if the column name does not end in the unit.", "--unit")
+    ],
     "what": Annotated[
         _TEXT,
-        _option("WHAT", "arrivals, sp, pseudoranges, stations or a kind such as range; as columns tell.", "--as"),
+        _option(
+            "WHAT",
+            "Content: arrivals, sp, pseudoranges, stations or a kind such as range; by default from the column names.",
+            "--as",
+        ),
     ],
     "frame": Annotated[
-        _TEXT, _option("cartesian|ecef", "Frame of stations in x, y, z; cartesian by default.", "--frame")
+        _TEXT, _option("cartesian|ecef", "Frame of stations with x, y, z; by default cartesian.", "--frame")
     ],
     "missing": Annotated[
         _TEXT,
-        _option("N,...", "Numbers that stand for no reading, such as 0,-1,9999, or none.", "--missing"),
+        _option("N,...", "Numbers that mean no reading, such as 0,-1,9999, or none.", "--missing"),
     ],
-    "average": Annotated[bool, _flag("Take the mean of several readings of the same.", "--average")],
+    "average": Annotated[bool, _flag("Average repeated readings of one measurement.", "--average")],
     "azimuth": Annotated[
         _TEXT,
         _option(
             "CONVENTION",
-            "Of bearings: north-clockwise, north-counterclockwise, east-counterclockwise, or bow-clockwise, to which "
-            "the column of headings is added.",
+            "Convention of bearings: north-clockwise, north-counterclockwise, east-counterclockwise, or bow-clockwise, "
+            "which adds the heading column.",
             "--azimuth",
         ),
     ],
@@ -100,21 +114,32 @@ _OPTIONS: dict[str, Any] = {
             "ANGLE|DATE", "Magnetic declination of bearings, east positive: '4 deg', or 2026-06-01.", "--declination"
         ),
     ],
-    "positive": Annotated[_TEXT, _option("a-farther|b-farther", "Where differences are positive.", "--positive")],
-    "reference": Annotated[_TEXT, _option("STATION", "The other station of all differences.", "--reference")],
-    "vp": Annotated[_TEXT, _option("SPEED", "Of P waves, such as '6 km/s'.", "--vp")],
-    "vs": Annotated[_TEXT, _option("SPEED", "Of S waves, such as '3.5 km/s'.", "--vs")],
-    "window": Annotated[_TEXT, _option("TIME", "Readings within it belong together, such as '0.1 s'.", "--window")],
-    "still": Annotated[bool, _flag("The target stays: all readings belong together.", "--still")],
-    "zone": Annotated[_TEXT, _option("NAME", "Time zone of dates without one: UTC, Europe/Rome.", "--zone")],
+    "positive": Annotated[
+        _TEXT,
+        _option(
+            "a-farther|b-farther",
+            "Sign of the differences: positive if a, or b, is farther from the target.",
+            "--positive",
+        ),
+    ],
+    "reference": Annotated[_TEXT, _option("STATION", "Reference station of all differences.", "--reference")],
+    "vp": Annotated[_TEXT, _option("SPEED", "Speed of P waves, such as '6 km/s'.", "--vp")],
+    "vs": Annotated[_TEXT, _option("SPEED", "Speed of S waves, such as '3.5 km/s'.", "--vs")],
+    "window": Annotated[
+        _TEXT, _option("TIME", "Time within which readings belong to one epoch, such as '0.1 s'.", "--window")
+    ],
+    "still": Annotated[bool, _flag("The target does not move: all readings form one epoch.", "--still")],
+    "zone": Annotated[
+        _TEXT, _option("NAME", "Time zone of dates without a zone, such as UTC or Europe/Rome.", "--zone")
+    ],
     "navigation": Annotated[
-        Path | None, _option("FILE", "RINEX navigation beside RINEX observations or Android's log.", "--navigation")
+        Path | None, _option("FILE", "RINEX navigation file for RINEX observations or an Android log.", "--navigation")
     ],
-    "system": Annotated[_TEXT, _option("G|E|J", "Satellites that are taken; GPS by default.", "--system")],
+    "system": Annotated[_TEXT, _option("G|E|J", "Satellite system: GPS (default), Galileo or QZSS.", "--system")],
     "turned": Annotated[
-        bool, _flag("Satellites of a table are along ECEF at reception, not transmission.", "--turned")
+        bool, _flag("Satellite positions are in ECEF axes at reception, not at transmission.", "--turned")
     ],
-    "mask": Annotated[_TEXT, _option("ANGLE", "Lowest elevation of satellites; 10 deg by default.", "--mask")],
+    "mask": Annotated[_TEXT, _option("ANGLE", "Lowest elevation of satellites; by default 10 deg.", "--mask")],
 }
 
 
@@ -122,7 +147,7 @@ _FLAGS = ("average", "still", "turned")
 
 
 def takes_table(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command with the options of tables; it is given them as one mapping, `given`."""
+    """Return a command with the table options. The command receives their values as one mapping, `given`."""
     own = signature(command, eval_str=True)
 
     @wraps(command)
@@ -153,11 +178,16 @@ def convert(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(metavar="OUT.toml", help="Problem file to write, with CSV files beside it; without: only look."),
+        typer.Option(
+            metavar="OUT.toml",
+            help="Problem file to write, with CSV files in its folder. Without it, nothing is written.",
+        ),
     ] = None,
     times: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Table of measurements whose times (UTC) orbits are wanted at."),
+        typer.Option(
+            metavar="FILE", help="Table of measurements; satellite positions are computed at its times (UTC)."
+        ),
     ] = None,
     as_json: Json = False,
     budget: Budget = None,
@@ -166,23 +196,25 @@ def convert(
     verbose: Verbose = False,
     given: Any = None,
 ) -> None:
-    """Make a problem file of a table of readings, of stations or of orbits, and say what it was taken for."""
+    """Convert a table of measurements, stations or orbits to a problem file, and print how it is understood."""
     raise typer.Exit(_run(file, out, {**given, "times": times}, as_json, quiet))
 
 
 def columns_of(pairs: Sequence[str] | None) -> dict[str, str]:
-    """Return the columns of roles that --column names; raise InvalidProblem where it names none."""
+    """Return the column of each role that --column states; raise InvalidProblem for a wrong form."""
     columns = {}
     for pair in pairs or ():
         role, sign, name = pair.partition("=")
         if not (role and sign and name):
-            raise InvalidProblem(f"{pair!r} names no column", "--column", "write ROLE=NAME, such as station=receiver")
+            raise InvalidProblem(
+                f"{pair!r} does not name a column", "--column", "write ROLE=NAME, such as station=receiver"
+            )
         columns[role] = name
     return columns
 
 
 def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, quiet: bool) -> int:
-    """Convert a file, say what is understood before it is written, and return the exit code."""
+    """Convert a file, print its interpretation before writing, and return the exit code."""
     from optloc.cli.output import Screen, dumps, write_text
     from optloc.files.convert import convert as written, interpret_table
     from optloc.files.table_import import ColumnHints
@@ -190,20 +222,23 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
     told, console = ColumnHints(**given), Screen(quiet=quiet or as_json)
     if out is None:
         table_problem = interpret_table(file, told)
-        _tell(table_problem, console)
+        _print_interpretation(table_problem, console)
         table_problem.read()
-        say_next(console, f"Nothing is written: --out names the problem file, and optloc fix {file} fixes it as it is.")
+        say_next(
+            console,
+            f"Nothing is written. To write a problem file, add --out; to fix the table itself, use optloc fix {file}.",
+        )
         if as_json:
             write_text(Path("-"), dumps(table_problem.as_read))
         return 0
-    found = written(file, out, told, tell=lambda table_problem: _tell(table_problem, console))
+    found = written(file, out, told, tell=lambda table_problem: _print_interpretation(table_problem, console))
     if as_json:
         write_text(Path("-"), dumps(_json(found)))
     elif found.loaded is None:
         from optloc.cli.output import say_all
 
         say_all(console, found.notes)
-        say_next(console, f'{out} is a table of stations: name it in a problem file, [stations] file = "{out.name}".')
+        say_next(console, f'{out} is a table of stations. In a problem file, write [stations] file = "{out.name}".')
     else:
         problem = found.loaded.problem
         held = f"{problem.count} rows of {problem.epochs} epochs at {problem.stations.count} stations"
@@ -212,14 +247,14 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
 
 
 def say_next(console: Console, line: str) -> None:
-    """Print a line about what comes next."""
+    """Print a line about the next step."""
     from optloc.cli.output import say
 
     say(console, line)
 
 
-def _tell(table_problem: TableProblem, console: Console) -> None:
-    """Print what a table is understood to be, and what was assumed."""
+def _print_interpretation(table_problem: TableProblem, console: Console) -> None:
+    """Print the interpretation of a table, and the assumptions."""
     from optloc.cli.output import say, say_all
 
     say(console, f"{table_problem.source.name} is understood as")
@@ -238,11 +273,14 @@ def _json(found: Converted) -> dict[str, Any]:
     return about | {"stations": problem.stations.count, "epochs": problem.epochs, "rows": problem.count}
 
 
-# A table in the place of a problem file.
+# Tables instead of problem files.
 
 
 def table_told(file: Path, given: Mapping[str, Any]) -> ColumnHints | None:
-    """Return what is said of a table, None of a problem file; raise InvalidProblem where something is said of that."""
+    """Return the column hints of a table, None for a problem file.
+
+    Raise InvalidProblem for a problem file with hints.
+    """
     from optloc.files.table_import import ColumnHints
 
     if file.suffix.lower() in _TABLES or _YEAR.fullmatch(file.suffix.lower()):
@@ -250,8 +288,10 @@ def table_told(file: Path, given: Mapping[str, Any]) -> ColumnHints | None:
     said = [name for name, value in given.items() if value]
     if said:
         flag = {"what": "--as", "columns": "--column"}.get(said[0], f"--{said[0].replace('_', '-')}")
-        what = f"it is for a table; {file.name} is a problem file"
-        raise InvalidProblem(what, flag, "write it in the file, or name a table that ends in .csv, .json or .parquet")
+        what = f"this option is for a table; {file.name} is a problem file"
+        raise InvalidProblem(
+            what, flag, "write the setting in the file, or name a table with the ending .csv, .json or .parquet"
+        )
     return None
 
 
@@ -264,20 +304,10 @@ def read_problem(
     quiet: bool = False,
     on_error: bool = False,
 ) -> Loaded:
-    """Return a problem file with more constraints, or a table with what is told of it, and say how that is understood.
+    """Return the content of a problem file with more constraints, or of a table with column hints.
 
-    Parameters
-    ----------
-    file : Path
-        Problem file, or table.
-    told : ColumnHints, optional
-        What is said of a table; None of a problem file.
-    more : mapping, optional
-        Further constraints.
-    values : bool
-        Whether a problem file needs measured values.
-    quiet, on_error : bool
-        Whether nothing is said of a table, and whether it is said on standard error.
+    For a table, print its interpretation, unless `quiet`; with `on_error`, print to standard error. `values` requires
+    measured values in a problem file. `told` has the column hints of a table; it is None for a problem file.
     """
     from optloc.files.reader import read
 
@@ -287,5 +317,5 @@ def read_problem(
     from optloc.files.convert import interpret_table
 
     table_problem = interpret_table(file, told)
-    _tell(table_problem, Screen(quiet=quiet, stderr=on_error))
+    _print_interpretation(table_problem, Screen(quiet=quiet, stderr=on_error))
     return table_problem.read(more or {})

@@ -1,4 +1,4 @@
-"""What ``optloc list`` prints: the tables of everything that has a name, as their entries describe themselves."""
+"""The command ``optloc list``: tables of all named entries, made from the descriptions of the entries."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from optloc.cli.extensions import Rows, extensions
 from optloc.cli.output import Screen, dumps
 from optloc.models import MODELS
 
-# Widths of the console that a table may wrap over: beyond, entries are easier to read one below the other.
+# A table may wrap over this number of console widths. Longer entries are easier to read as paragraphs.
 _WRAPS = 4
 
 
@@ -37,11 +37,11 @@ def run_list(what: str, as_json: bool) -> int:
 
 
 def _print(rows: Rows, console: Console) -> None:
-    """Print entries as a table, or one below the other where they are too long for one."""
-    # Entries of one table may have different fields: all of them, in the order in which they first occur.
+    """Print the entries as a table, or as paragraphs if they are too long."""
+    # Entries of one table may have different fields: use all fields, in the order of their first occurrence.
     title, *names = dict.fromkeys(name for row in rows for name in row)
     widths = [max(len(row.get(name, "")) for row in rows) for name in names]
-    # Where a word would be cut, a table does not fit either: three signs stand between two columns.
+    # A table must also hold the longest word of each column; three characters separate two columns.
     texts = {name: " ".join([name, *(row.get(name, "") for row in rows)]) for name in names}
     words = {name: max(map(len, text.split())) for name, text in texts.items()}
     least = max(len(row[title]) for row in rows) + sum(words.values()) + 3 * len(names) + 4
@@ -60,19 +60,14 @@ def _print(rows: Rows, console: Console) -> None:
     console.print(table)
 
 
-# An entry tells what can be said in words of its fields, and its summary last.
+# An entry shows its fields of text and numbers, and its summary at the end.
 
 
 def describe(title: str, table: Mapping[str, Any]) -> Rows:
-    """Return name, text fields and summary of every entry of a registry.
+    """Return name, text fields and summary of each entry of a registry.
 
-    Parameters
-    ----------
-    title : str
-        What an entry is.
-    table : mapping of str to anything
-        Dataclasses show their fields of text and numbers; code is left out. The summary is a field, the first line of
-        a function's docstring, or the entry itself where it is text.
+    `title` is the name of the first column. Entries of `table` that are dataclasses show their fields of text and
+    numbers; code is left out. The summary is a field, the first line of a docstring, or the entry if it is text.
     """
     rows = []
     for name, entry in table.items():
@@ -100,7 +95,10 @@ def _summary(entry: Any) -> str:
 
 
 def registry(title: str, place: str) -> Callable[[], Rows]:
-    """Return what lists a table, or what a function makes of it, by its place: it is imported when it is asked for."""
+    """Return a function that lists a table or the result of a function.
+
+    It imports `place`, "module:name", when called.
+    """
 
     def rows() -> Rows:
         module, _, name = place.partition(":")
@@ -128,7 +126,7 @@ def _solvers() -> Rows:
     from optloc.solvers.back_ends import backends
     from optloc.solvers.methods import SOLVERS
 
-    # Back ends of the relaxations are found at run time: those of packages that are installed.
+    # Back ends of the relaxations come from installed packages, found at run time.
     found = {
         name: {"solver": name, "role": f"back end, {entry.kind}", "version": entry.version, "summary": entry.summary}
         for name, entry in backends().items()
@@ -152,5 +150,5 @@ _LISTS: dict[str, Callable[[], Rows]] = {
 
 
 def lists() -> dict[str, Callable[[], Rows]]:
-    """Return what can be listed, by name; `optloc list` and the completion of the shell read it."""
+    """Return the functions of all lists by name; `optloc list` and the shell completion use them."""
     return {**_LISTS, **{name: rows for one in extensions() for name, rows in one.lists.items()}}

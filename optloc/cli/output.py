@@ -1,4 +1,4 @@
-"""What commands print and write: numbers with their errors, sentences, tables, JSON, pictures, a progress bar."""
+"""Output of the commands: sentences, tables, JSON, pictures, progress bars."""
 
 from __future__ import annotations
 
@@ -28,43 +28,43 @@ if TYPE_CHECKING:
 LOG = logging.getLogger("optloc.write")
 
 PICTURES = (".png", ".svg", ".pdf")
-"""Types of pictures that commands write."""
+"""Picture formats that commands write."""
 
 
 class Screen(Console):
-    """The terminal, or whatever standard output is: names of strangers are printed letter by letter and do nothing."""
+    """Console on standard output or standard error. Control characters in names from files are printed as escapes."""
 
     def __init__(self, *, stderr: bool = False, quiet: bool = False) -> None:
         super().__init__(stderr=stderr, quiet=quiet, markup=False, emoji=False)
 
     def render_str(self, text: str, **style: Any) -> Text:
-        """Return text as it is shown: what would steer the terminal is spelled."""
+        """Return printable text, with control characters as escapes."""
         return super().render_str(visible(text), **style)
 
     def on_broken_pipe(self) -> None:
-        """Let the command end: the reader of a pipe has gone."""
+        """Raise BrokenPipeError to end the command after the reader has closed the pipe."""
         raise BrokenPipeError
 
 
 def say(console: Console, line: str) -> None:
-    """Print a line as it is: rich would colour its numbers, take brackets for marks and break it."""
+    """Print a line unchanged: rich would colour numbers, interpret brackets and wrap the line."""
     console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def say_all(console: Console, sentences: Sequence[str]) -> None:
-    """Print what a result says in words, each with a capital letter and a full stop."""
+    """Print the sentences of a result, each with a capital letter and a full stop."""
     for text in sentences:
         say(console, f"{text[0].upper()}{text[1:]}.")
 
 
 def dumps(value: Any) -> str:
     """Return strict JSON."""
-    # NaN and infinity are no JSON: they were made null, and a leftover is a mistake.
+    # JSON has no NaN or infinity: `plain` replaces them by null, so a remaining one is a programming error.
     return json.dumps(plain(value), allow_nan=False, indent=2)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, or standard output where the path is "-"; raise InvalidProblem where that fails."""
+    """Write a text file, or standard output for the path "-"; raise InvalidProblem if that fails."""
     if str(path) == "-":
         sys.stdout.write(text + "\n")
         return
@@ -73,7 +73,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_table(path: Path, columns: Columns) -> None:
-    """Write a long table as CSV or Parquet, by the ending of its name; NaN is an empty cell."""
+    """Write a table as CSV or Parquet, chosen by the file ending; NaN is an empty cell."""
     from optloc.show.formats import write_csv, write_parquet
 
     (write_csv if is_csv(path) else write_parquet)(path, columns)
@@ -81,7 +81,7 @@ def write_table(path: Path, columns: Columns) -> None:
 
 
 def write_results(path: Path, results: Results) -> None:
-    """Write fixes or tracks in the format that the ending of the name says."""
+    """Write fixes or tracks in the format of the file ending."""
     from optloc.show.formats import format_of
 
     format_of(path).write(path, results)
@@ -89,7 +89,7 @@ def write_results(path: Path, results: Results) -> None:
 
 
 def is_csv(path: Path) -> bool:
-    """Return whether a table goes to CSV; what has no ending, such as a pipe, gets that too."""
+    """Return whether a table is written as CSV; streams without an ending, such as a pipe, get CSV too."""
     return path.suffix.lower() == ".csv" or is_stream(path)
 
 
@@ -100,18 +100,18 @@ def claim_outputs(
     picture: Path | None = None,
     inputs: Sequence[Path] = (),
 ) -> None:
-    """Refuse outputs of a command that cannot or must not be written, before the work.
+    """Raise InvalidProblem before the work for outputs that cannot or must not be written.
 
     Parameters
     ----------
     *others : Path, optional
-        Files of text.
+        Text files.
     table, picture : Path, optional
-        Files whose endings say their types.
+        Files with a type by their ending.
     results : (Path or None, Frame), optional
-        A file whose ending says the format, and the frame of the fixes or tracks in it.
+        File with a format by its ending, and the frame of the fixes or tracks in it.
     inputs : sequence of Path
-        What the command reads, beside what was read already.
+        Further inputs of the command; inputs that were already read are recorded.
     """
     if table is not None and not is_csv(table) and table.suffix.lower() not in {".parquet", ".pq"}:
         what = f"results of type {table.suffix or table.name!r} are unknown"
@@ -128,7 +128,7 @@ def claim_outputs(
 
 
 def write_picture(figure: Figure, path: Path) -> None:
-    """Write a picture; raise InvalidProblem where that fails."""
+    """Write a picture; raise InvalidProblem if that fails."""
     from optloc.show.pictures import save
 
     save(figure, path)
@@ -137,10 +137,10 @@ def write_picture(figure: Figure, path: Path) -> None:
 
 @contextmanager
 def bar(title: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
-    """Yield a function that moves a progress bar on standard error; it is drawn on terminals only."""
+    """Yield a function that advances a progress bar on standard error; only terminals show the bar."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    # Results may be piped from standard output; one step is too short for a bar.
+    # Standard output may be piped, so the bar is on standard error. One step needs no bar.
     console = Screen(stderr=True)
     shown = console.is_terminal and not quiet and total > 1
     parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -151,7 +151,7 @@ def bar(title: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
 
 @contextmanager
 def meter(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function that is told how much of how much is done: a bar on terminals, elsewhere a line now and then."""
+    """Yield a function of the finished and the total steps: a bar on terminals, elsewhere a line every few seconds."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     console, known = Screen(stderr=True), [0, 0]
@@ -174,7 +174,7 @@ def meter(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def line(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Yield a function that is told how far something is, in words: a line on terminals, elsewhere one now and then."""
+    """Yield a function of a progress text: one changing line on terminals, elsewhere a line every few seconds."""
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     console, known = Screen(stderr=True), [""]

@@ -1,4 +1,4 @@
-"""What ``optloc plot`` draws: one function for each picture, whose first line is what ``optloc list pictures`` says."""
+"""The command ``optloc plot``: one function for each picture. ``optloc list pictures`` prints their first lines."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run_plot(what: str, asked: PictureRequest, quiet: bool) -> int:
 
 
 def _solve_all(asked: PictureRequest) -> tuple[Loaded, Problem, Fix]:
-    """Return a file, its problem (epochs that share nothing as a batch) and its fixes."""
+    """Return a file, its problem (separate epochs as a batch) and its fixes."""
     from optloc.solvers.solution import solve
 
     loaded = read(asked.file)
@@ -50,7 +50,7 @@ def _solve_one(asked: PictureRequest) -> tuple[Problem, Fix, str]:
     label = labels[0] if asked.epoch is None else asked.epoch
     if label not in labels:
         raise InvalidProblem(f"there is no epoch {label!r}", "--epoch", nearest(label, labels))
-    # One epoch as a batch of one: its picture says the label.
+    # Take one epoch as a batch of one, so that the picture shows its label.
     problem = by_epoch(loaded.problem).take(np.array([labels.index(label)]))
     return problem, solve(problem, asked.method), f"{loaded.title}, epoch {label}"
 
@@ -77,21 +77,21 @@ def _draw_one(draw: Callable[..., Figure], asked: PictureRequest) -> None:
 
 
 def _landscape(asked: PictureRequest) -> None:
-    """Cost over the place of the target."""
+    """Cost over target positions."""
     from optloc.show.pictures import plot_landscape
 
     _draw_one(plot_landscape, asked)
 
 
 def _convergence(asked: PictureRequest) -> None:
-    """Where iterations from many starts end."""
+    """End points of iterations from many starts."""
     from optloc.show.pictures import plot_convergence
 
     _draw_one(plot_convergence, asked)
 
 
 def _biases(asked: PictureRequest) -> None:
-    """Biases of a run against time, with 95 %."""
+    """Biases of a run against time, with 95 % intervals."""
     from optloc.show.pictures import plot_biases
     from optloc.solvers.running import growing
 
@@ -125,5 +125,5 @@ _PICTURES: dict[str, Callable[[PictureRequest], None]] = {
 
 
 def pictures() -> dict[str, Callable[[PictureRequest], None]]:
-    """Return the pictures by name, with those of the neighbours."""
+    """Return the functions of all pictures by name, including the pictures of neighbours."""
     return {**_PICTURES, **{name: draw for one in extensions() for name, draw in one.pictures.items()}}

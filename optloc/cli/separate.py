@@ -1,4 +1,4 @@
-"""What ``optloc separate`` does: tell the rows of several emitters apart."""
+"""The command ``optloc separate``: assign rows to several emitters, and locate the emitters."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from optloc.multi_target.answer import Emitters, evenly
 from optloc.multi_target.assign import separate
 from optloc.problem.problem import Problem
 
-# Digits of a number of rows: no file holds more.
+# Largest number of digits for a number of emitters; no file has more rows.
 _DIGITS = 12
 
 
@@ -32,12 +32,12 @@ def run_separate(
     as_json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Tell the emitters of each epoch of a file apart, and return the exit code: 1 where some status is not ok."""
+    """Separate the emitters of each epoch of a file; return exit code 1 if a status is not ok."""
     loaded = read(file)
     problem = loaded.problem
     clutter = evenly(problem, detection, false)
     found = separate(problem, clutter, count=_count(emitters, problem.count), region=_region(problem, region))
-    # Epochs without rows have no answer, and no label.
+    # Epochs without rows have no answer, so leave out their labels.
     labels = [loaded.epochs[k] for k in np.unique(problem.epoch)]
     if as_json:
         epochs = [{"epoch": label, **_record(loaded, one)} for label, one in zip(labels, found, strict=True)]
@@ -49,11 +49,11 @@ def run_separate(
 
 
 def _count(text: str, rows: int) -> int | None:
-    """Return a number of emitters, each of which has a row at least; None where the data are to tell it."""
+    """Return the number of emitters, at most the number of rows; None for "auto"."""
     if text == "auto":
         return None
     if not (text.isascii() and text.isdigit() and len(text) < _DIGITS and int(text) <= rows):
-        what = f"{text!r} is no number of emitters that {rows} rows can be of"
+        what = f"{text!r} is not a number of emitters up to the {rows} rows of the file"
         raise InvalidProblem(what, "--emitters", "give a whole number, or auto")
     return int(text)
 
@@ -63,8 +63,8 @@ def _region(problem: Problem, text: str | None) -> tuple[Any, Any] | None:
         return None
     lower, colon, upper = text.partition(":")
     if not colon:
-        raise InvalidProblem(f"{text!r} is no region", "--region", "give LOW:HIGH, such as 0,0:2000,3000")
-    # A corner is written as a place: the same units and the same complaints.
+        raise InvalidProblem(f"{text!r} is not a region", "--region", "give LOW:HIGH, such as 0,0:2000,3000")
+    # Parse a corner as a position, with the same units and errors.
     return vector(problem, lower, None, False), vector(problem, upper, None, False)
 
 
@@ -95,7 +95,7 @@ def _record(loaded: Loaded, found: Emitters) -> dict[str, Any]:
 
 
 def _names(loaded: Loaded, wanted: Any) -> list[str]:
-    """Return rows in words: kind, stations, and the number of the row."""
+    """Return the rows as text: kind, stations and row number."""
     stations, words = loaded.problem.stations.names, list[str]()
     for block, start in zip(loaded.problem.rows, loaded.problem.starts, strict=True):
         for i in np.asarray(wanted)[(np.asarray(wanted) >= start) & (np.asarray(wanted) < start + block.count)]:
@@ -126,7 +126,7 @@ def _rows(found: Emitters) -> Iterator[tuple[str, ...]]:
             status,
         )
     for ghost in found.ghosts:
-        yield "ghost", _numbers(ghost.position), "", str(len(ghost.rows)), "", f"costs {ghost.gap:.1f} more"
+        yield "ghost", _numbers(ghost.position), "", str(len(ghost.rows)), "", f"cost higher by {ghost.gap:.1f}"
 
 
 def _numbers(values: Any) -> str:

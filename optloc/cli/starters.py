@@ -1,4 +1,4 @@
-"""What ``optloc demo`` and ``new`` do: a first problem file, shipped or written."""
+"""The commands ``optloc demo`` and ``optloc new``: shipped example problems and starter problem files."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ _END = """
 """
 _SECTIONS = ((_FIX, "demo"), (_AMBIGUOUS, "ambiguous"), (_REGISTRATION, "clocks"))
 PICTURE = Path("optloc-demo.png")
-# Statuses that a shipped problem may have, if not `ok` alone. Plain Python does not finish the proof of the long run.
-_SHOWN = {"ambiguous": (Status.AMBIGUOUS,), "registration": (Status.OK, Status.UNPROVEN)}
+# Expected statuses of shipped problems other than `ok` alone. Plain Python does not finish the proof of the long run.
+_EXPECTED_STATUS = {"ambiguous": (Status.AMBIGUOUS,), "registration": (Status.OK, Status.UNPROVEN)}
 
 
 def titles() -> dict[str, str]:
@@ -80,7 +80,7 @@ def run_demo(name: str | None, plot: Path | None, *, as_json: bool, quiet: bool)
         raise InvalidProblem(f"there is no demo {name!r}", "demo", nearest(name, list(known)))
     claim_outputs(picture=plot)
     if name is None and not as_json:
-        return _walk(plot, quiet)
+        return _run_examples(plot, quiet)
     found = _fix(name or "demo", quiet or as_json)
     if as_json:
         write_text(Path("-"), dumps(fixes_json(found)))
@@ -88,11 +88,11 @@ def run_demo(name: str | None, plot: Path | None, *, as_json: bool, quiet: bool)
         show(found, Screen())
     if plot is not None or not as_json:
         _draw(found, plot, quiet or as_json)
-    return 0 if _shows(found, name or "demo") else 1
+    return 0 if _has_expected_status(found, name or "demo") else 1
 
 
-def _walk(plot: Path | None, quiet: bool) -> int:
-    """Fix and explain three shipped problems; return the exit code, 0 if each has the status that its text states."""
+def _run_examples(plot: Path | None, quiet: bool) -> int:
+    """Fix and explain three shipped problems; return exit code 0 if each has the status in its text."""
     console = Screen(quiet=quiet)
     code = 0
     for i, (text, name) in enumerate(_SECTIONS):
@@ -101,14 +101,14 @@ def _walk(plot: Path | None, quiet: bool) -> int:
         show(found, console)
         if i == 0:
             _draw(found, plot, quiet)
-        code = code if _shows(found, name) else 1
+        code = code if _has_expected_status(found, name) else 1
     _explain(_END, console)
     return code
 
 
-def _shows(found: FileFixes, name: str) -> bool:
-    """Return whether the fixes of a shipped problem have the status that the problem is there to show."""
-    shown = _SHOWN.get(name, (Status.OK,))
+def _has_expected_status(found: FileFixes, name: str) -> bool:
+    """Return whether the fixes of a shipped problem have the expected status."""
+    shown = _EXPECTED_STATUS.get(name, (Status.OK,))
     return bool(np.isin(found.fix.code, shown).all())
 
 
@@ -123,19 +123,19 @@ def _explain(text: str, console: Console) -> None:
 
 
 def _draw(found: FileFixes, plot: Path | None, quiet: bool) -> None:
-    """Draw a fix; where no picture was asked for and none can be drawn, or one is there, say so and go on."""
+    """Draw a fix. Without a requested picture, print a line and go on if drawing is impossible or a file exists."""
     from importlib.util import find_spec
 
     console = Screen(quiet=quiet)
-    # Without a request a missing library is no error: the numbers are there.
+    # Without a requested picture, a missing library is no error: the numbers are already printed.
     if plot is None and find_spec("matplotlib") is None:
-        say(console, "There is no picture, as matplotlib is not installed: pip install 'optloc[plot]'.")
+        say(console, "No picture is drawn, because matplotlib is not installed: pip install 'optloc[plot]'.")
         return
     if plot is None:
         try:
             claim_outputs(picture=PICTURE)
         except InvalidProblem as refused:
-            say(console, f"There is no new picture. {refused}")
+            say(console, f"No new picture is written. {refused}")
             return
     draw(found, plot or PICTURE)
     say(console, f"The picture is in {plot or PICTURE}.")
@@ -146,19 +146,19 @@ def _draw(found: FileFixes, plot: Path | None, quiet: bool) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Starter:
-    """One line on what it is, the text of its file, and the commands that take it."""
+    """A starter: a summary of one line, the text of the file, and the commands that accept the file."""
 
     summary: str
     text: str
     commands: tuple[str, ...] = ("check", "fix")
 
 
-# Files of other commands than fix.
+# Starters for other commands than `fix`.
 _OTHERS = {"calibration": ("calibrate",)}
 
 
 def starters() -> dict[str, Starter]:
-    """Return the starters by name: the shipped ones, then those of kinds that have none."""
+    """Return the starters by name: the shipped starters, and one for each further kind."""
     folder = files("optloc") / "starters"
     found = {}
     for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
@@ -166,7 +166,7 @@ def starters() -> dict[str, Starter]:
             text = entry.read_text(encoding="utf-8")
             name, summary = entry.name.removesuffix(".toml"), text.partition("\n")[0].removeprefix("# ")
             found[name] = Starter(summary, text, *([_OTHERS[name]] if name in _OTHERS else []))
-    # A kind of another package gets a starter, too. One that needs ECEF has no place among stations around an origin.
+    # A kind of a plugin gets a starter as well. A kind that needs ECEF does not fit stations around an origin.
     for kind, model in MODELS.items():
         if kind not in found and not model.ecef:
             found[kind] = Starter(f"{kind}: {model.summary}.", _compose(kind, model))
@@ -174,7 +174,7 @@ def starters() -> dict[str, Starter]:
 
 
 def run_new(kind: str, out: Path | None, *, quiet: bool) -> int:
-    """Write a starter, to standard output where no file is named, and return the exit code."""
+    """Write a starter to a file or to standard output, and return the exit code."""
     known = starters()
     if kind not in known:
         raise InvalidProblem(f"there is no starter {kind!r}", "new", nearest(kind, known))
@@ -182,15 +182,15 @@ def run_new(kind: str, out: Path | None, *, quiet: bool) -> int:
         write_text(Path("-"), known[kind].text.rstrip("\n"))
         return 0
     if out.suffix.lower() != ".toml":
-        raise InvalidProblem("a problem file ends in .toml", str(out), "let the name behind --out end in it")
+        raise InvalidProblem("a problem file ends in .toml", str(out), "use this ending after --out")
     write_text(out, known[kind].text.rstrip("\n"))
     commands = ", then ".join(f"optloc {command} {out}" for command in known[kind].commands)
-    say(Screen(quiet=quiet), f"{out} can be changed and used: {commands}.")
+    say(Screen(quiet=quiet), f"{out} is written. Change its numbers, then run {commands}.")
     return 0
 
 
-# Six stations some 4 km around the origin, two of them high, so that heights are seen as well as plans; the truth is
-# inside, moves like a small aircraft, and each kind has the error of an ordinary receiver.
+# Six stations about 4 km from the origin, two of them high, so that the height is observable. The target is inside and
+# moves like a small aircraft. Each kind has the error of an ordinary receiver.
 _PLACES = {
     "North": (200.0, 4100.0, 35.0),
     "East": (4300.0, 300.0, 80.0),
@@ -204,16 +204,16 @@ _SIGMA = {"length": 3.0, "angle": 0.005, "ratio": 0.01, "speed": 0.5}
 
 
 def _compose(kind: str, model: Model) -> str:
-    """Return a starter of a kind that has none of its own: rows of it beside ranges, drawn at a known place."""
+    """Return the starter of a kind without a shipped starter: its rows and ranges, simulated at a known position."""
     from optloc.base.types import Motion
     from optloc.linear.simulate import simulate
     from optloc.problem.build import assemble, measured, station_array
 
     names, d = list(_PLACES), max(model.dimensions)
     one = np.arange(len(names)) if model.stations == 1 else np.arange(1, len(names))
-    # Differences against the first station; ranges beside them make every kind solvable.
+    # Differences refer to the first station. The additional ranges make each kind solvable.
     a, b = (one if model.stations else None), (np.zeros_like(one) if model.stations == 2 else None)
-    # Levels and plain numbers of kinds from elsewhere: a tenth of whatever they are in.
+    # Quantities of plugins without a typical error here get 0.1 of their unit.
     sigma = _SIGMA.get(model.quantity, 0.1)
     place = np.array(list(_PLACES.values()))[:, :d]
     rows = [measured(kind, a=a, b=b, sigma=sigma), measured("range", a=np.arange(len(names)), sigma=_RANGE_SIGMA)]
@@ -224,7 +224,7 @@ def _compose(kind: str, model: Model) -> str:
         f"# {kind}: {model.summary}.",
         f"# truth: {', '.join(f'{v:g}' for v in _TRUTH[:d])}",
         "format = 2",
-        f'title = "Rows of {kind} beside ranges"',
+        f'title = "Rows of {kind} and ranges"',
         "",
         "[stations]",
         'unit = "m"',
@@ -239,7 +239,7 @@ def _compose(kind: str, model: Model) -> str:
 
 
 def _measurements(block: Rows, sigma: float, names: list[str]) -> list[str]:
-    """Return the lines of a table of measurements."""
+    """Return the lines of a measurement table."""
     model = MODELS[block.kind]
     known = ", ".join(UNITS[model.quantity])  # type: ignore[index]  # models hold known quantities only
     unit = SI_UNIT[model.quantity]  # type: ignore[index]  # as above

@@ -1,4 +1,4 @@
-"""What ``optloc track`` does."""
+"""The command ``optloc track``: track targets through the scans of a file; write tables, pictures and pages."""
 
 from __future__ import annotations
 
@@ -47,30 +47,30 @@ from optloc.tracking.track import State
 from optloc.tracking.updates import filter_of, reweighted
 
 _CLEAN = {"ok", "started", "starting"}
-# Seconds between two additions to the table of a run that goes on: each takes a millisecond, ten scans' time.
+# Seconds between two additions to the growing table: each addition takes a millisecond, the time of ten scans.
 _LATE = 0.1
-# Scans that are told of one by one; --out has all of them.
+# Largest number of reasons on the screen; --out has all of them.
 _REASONS = 10
 
 
 @dataclass(frozen=True, slots=True)
 class TrackOptions:
-    """How a file is to be tracked; see the help of the command.
+    """Options of a track; see the help of the command.
 
     Parameters
     ----------
     model, filter : str
-        Names.
+        Names of the motion model and of the filter.
     noise : float, optional
-        Standard deviation of what drives the target.
+        Standard deviation of the process noise, SI units.
     memory : float
-        Seconds over which an acceleration is correlated.
+        Correlation time of an acceleration, s.
     rules : Rules
-        When rows are left out and tracks begin anew.
+        Rules for the gate, and for the start and end of tracks.
     start, sigma : str, optional
         Initial state and its standard deviations.
     loss : str, optional
-        By which rows are weighed.
+        Loss that weights the rows.
     """
 
     model: str = "cv"
@@ -87,16 +87,8 @@ class TrackOptions:
 class TargetTrack:
     """The track of one target so far.
 
-    Parameters
-    ----------
-    name : str
-        Of the target.
-    problem : Problem
-        Its run.
-    labels : tuple of k str
-        Labels of its epochs.
-    entries : list of Entry
-        What became of the scans.
+    name: name of the target. problem: run of the target. labels: labels of the epochs (k). entries: results of the
+    scans.
     """
 
     name: str
@@ -105,7 +97,7 @@ class TargetTrack:
     entries: list[Entry]
 
     def since(self, first: int) -> TargetTrack:
-        """Return the track from the scan of a number on."""
+        """Return the track from scan number `first` on."""
         return replace(self, labels=self.labels[first : len(self.entries)], entries=self.entries[first:])
 
 
@@ -120,19 +112,19 @@ def run_track(
     quiet: bool = False,
     table: ColumnHints | None = None,
 ) -> int:
-    """Track the targets of a file or a table, write what was asked for, and return the exit code.
+    """Track the targets of a file or a table, write the requested files, and return the exit code.
 
-    Whatever goes wrong on the way, the track up to there is written first. A run that is killed leaves a CSV file next
-    to `out`, with ``.partial`` behind its name. It lacks at most the rows of the last tenth of a second.
+    After an error, the track so far is written first. A killed run leaves a CSV file next to `out`, with ``.partial``
+    appended to its name. At most the rows of the last tenth of a second are missing.
     """
     dynamics = dynamics_of(wanted)
-    # Wrong words are refused before the file is read.
+    # Reject wrong names before reading the file.
     update = filter_of(wanted.filter) if wanted.loss is None else reweighted(wanted.filter, wanted.loss)
     loaded = read_problem(file, table, quiet=quiet or as_json)
     claim_outputs(html, results=(out, loaded.problem.frame), picture=plot, inputs=[file])
     ones = [TargetTrack(*parts, []) for parts in runs_of(loaded)]
     if wanted.start is not None and len(ones) > 1:
-        raise InvalidProblem("one initial state does not fit several targets", "--start", "leave it out")
+        raise InvalidProblem("one initial state does not fit several targets", "--start", "remove this option")
     growing = GrowingTable(out) if out is not None and not is_stream(out) else None
     try:
         with bar(loaded.title, sum(one.problem.epochs for one in ones), quiet or as_json) as advance:
@@ -140,11 +132,11 @@ def run_track(
                 start = _start(one.problem, dynamics, wanted)
                 for entry in tracked(one.problem, dynamics, update, start=start, rules=wanted.rules):
                     one.entries.append(entry)
-                    _grow(growing, ones, _LATE)
+                    _append_new_rows(growing, ones, _LATE)
                     advance(1)
-    # Interrupted or refused half way: what is known by then is written.
+    # After an interrupt or an error, write the results so far.
     finally:
-        _grow(growing, ones)
+        _append_new_rows(growing, ones)
         columns = (
             join_tables([track_columns(one) for one in ones if one.entries]) if any(o.entries for o in ones) else {}
         )
@@ -157,8 +149,8 @@ def run_track(
     return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
 
 
-def _grow(table: GrowingTable | None, ones: list[TargetTrack], late: float = 0.0) -> None:
-    """Add the entries that a table lacks, unless it was added to less than some seconds ago."""
+def _append_new_rows(table: GrowingTable | None, ones: list[TargetTrack], late: float = 0.0) -> None:
+    """Append the missing entries to the table, unless the last addition is less than `late` seconds ago."""
     if table is None or monotonic() - table.when < late:
         return
     first = table.rows
@@ -175,14 +167,14 @@ def _json(loaded: Loaded, columns: Columns) -> dict[str, Any]:
 
 
 def dynamics_of(wanted: TrackOptions) -> Dynamics:
-    """Return the model of motion; raise InvalidProblem for an unknown one."""
+    """Return the motion model; raise InvalidProblem for an unknown name."""
     return motion_named(wanted.model, wanted.noise, wanted.memory, "--model")
 
 
 def rules(gate: float, gap: float | None, loss: str | None = None) -> Rules:
-    """Return the rules of options; raise InvalidProblem for a gate or a gap that is none.
+    """Return the tracking rules; raise InvalidProblem for a gate or a gap that is not positive.
 
-    Where a loss weighs rows, some are expected to be gross errors: starts name them, too.
+    A loss expects gross errors, so the starting fixes then use the method `robust`, which finds them too.
     """
     for value, where in ((gate, "--gate"), (gap, "--gap")):
         if value is not None and not value > 0.0:
@@ -191,16 +183,16 @@ def rules(gate: float, gap: float | None, loss: str | None = None) -> Rules:
 
 
 def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
-    """Yield name, run and labels of the epochs of each target of a file that is to be found."""
+    """Yield name, run and epoch labels of each unknown target of a file."""
     problem, source = loaded.problem, loaded.source
     if problem.priors:
-        what = f"the file has a prior of {problem.priors[0].name!r}, which a track does not take"
-        raise InvalidProblem(what, source, "leave it out, and give --start and --start-sigma")
+        what = f"the file has a prior of {problem.priors[0].name!r}; a track cannot use priors"
+        raise InvalidProblem(what, source, "remove the prior, and give --start and --start-sigma")
     if all(motion.known is not None for motion in problem.motions):
-        raise InvalidProblem("the motion of every target is known", source, "leave the places of one out")
+        raise InvalidProblem("the motion of each target is known", source, "remove the known positions of a target")
     if problem.epochs > 1 and not np.isfinite(loaded.times).all():
         raise InvalidProblem("a track needs the time of each epoch", source, "give the measurements a column 'time'")
-    # Targets free at each epoch have epochs of their own; others share them, told apart by their rows.
+    # With `own_epochs`, each epoch belongs to one target; otherwise targets share epochs, and rows name their target.
     own = np.array(loaded.targets)[problem.epoch] if loaded.own_epochs else None
     names = dict.fromkeys(loaded.targets)
     for i, name in enumerate(names):
@@ -213,19 +205,19 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
         if len(again):
             one, two = (loaded.epochs[epochs[again[0] + j]] for j in (0, 1))
             what = f"the epochs {one!r} and {two!r} of {name} have the same time"
-            raise InvalidProblem(what, source, "correct the times, or give both one label")
-        # A file without times has one epoch: any time serves.
+            raise InvalidProblem(what, source, "correct the times, or give both epochs the same label")
+        # A file without times has one epoch, so any time serves.
         times = loaded.times if np.isfinite(loaded.times).all() else problem.times
         run = alone(problem, kept, times)
         run = differences(run) if run.emitting else run
         if not run.count:
-            what = f"every epoch of {name} has a single arrival, which says nothing without its emission time"
-            raise InvalidProblem(what, source, "give arrivals at two stations or more of each emission")
+            what = f"each epoch of {name} has one arrival, which has no information without its emission time"
+            raise InvalidProblem(what, source, "give arrivals at two or more stations for each emission")
         yield name, run, tuple(loaded.epochs[k] for k in epochs)
 
 
 def _start(problem: Problem, dynamics: Dynamics, wanted: TrackOptions) -> State | None:
-    """Return the initial state that options give."""
+    """Return the initial state of the options, or None."""
     if (wanted.start is None) != (wanted.sigma is None):
         lacking = "--start" if wanted.start is None else "--start-sigma"
         raise InvalidProblem("an initial state needs numbers and standard deviations", lacking, "give both or neither")
@@ -235,17 +227,17 @@ def _start(problem: Problem, dynamics: Dynamics, wanted: TrackOptions) -> State 
     mean = np.array(coordinates(wanted.start, "--start", "separate finite numbers by commas"))
     sigma = np.array(coordinates(wanted.sigma, "--start-sigma", "separate finite numbers by commas"))
     if len(mean) != d * parts:
-        advice = "give position, velocity and acceleration as far as the model has them"
+        advice = "give position, and velocity and acceleration if the model has them"
         raise InvalidProblem(f"{len(mean)} numbers for a state of {d * parts}", "--start", advice)
     if len(sigma) != parts or (sigma <= 0.0).any():
-        what = f"{wanted.sigma!r} are no standard deviations of {'position velocity acceleration'.split()[:parts]}"
+        what = f"{wanted.sigma!r} are not standard deviations of {'position velocity acceleration'.split()[:parts]}"
         raise InvalidProblem(what.replace("'", ""), "--start-sigma", f"give {parts} positive numbers")
-    # One standard deviation for all axes of a derivative, and nothing correlated.
+    # All axes have the same standard deviation, without correlation.
     return State(float(problem.times[0]), mean, np.diag(np.repeat(sigma, d) ** 2))
 
 
 def track_columns(one: TargetTrack) -> Columns:
-    """Return the long table of a track: one row for each scan; metres, seconds, degrees; NaN where there is nothing."""
+    """Return the table of a track: one row for each scan; metres, seconds, degrees; NaN for missing numbers."""
     entries, d = one.entries, one.problem.dimension
     mean = np.stack([e.updated.mean for e in entries])
     cov = np.stack([e.updated.cov for e in entries])
@@ -269,7 +261,7 @@ def track_columns(one: TargetTrack) -> Columns:
 
 
 def _map(loaded: Loaded, ones: list[TargetTrack]) -> str:
-    """Return the page with the map of all tracks."""
+    """Return an HTML page with the map of all tracks."""
     from optloc.show.map import degrees, sentence, spots
     from optloc.show.page import track_page
 
@@ -295,7 +287,10 @@ def _write(
     places: tuple[Path | None, Path | None, Path | None],
     table: GrowingTable | None,
 ) -> None:
-    """Write table, picture and page, as far as they were asked for; rows that stand in a file already get its name."""
+    """Write the requested table, picture and page.
+
+    A growing CSV file already has all rows and only gets its final name.
+    """
     out, plot, html = places
     if table is not None and is_csv(table.path):
         table.file.finish()
@@ -314,15 +309,15 @@ def _write(
 
 
 def _show(loaded: Loaded, columns: Columns, console: Console) -> None:
-    """Print the status of the scans, and the sentences of those that are not ok."""
+    """Print the number of scans by status, and the reasons of scans that are not ok."""
     table = Table(title=f"{loaded.title}: {len(columns['time'])} scans", title_justify="left")
-    for name in ("target", "status", "scans", "median sigma, m", "NIS a row"):
+    for name in ("target", "status", "scans", "median sigma, m", "NIS per row"):
         table.add_column(name, justify="left" if name in ("target", "status") else "right")
     sigma = np.sqrt(sum(columns[f"sigma_{axis}"] ** 2 for axis in "xyz" if axis in columns))
     for (target, label), count in Counter(zip(columns["target"], columns["status"], strict=True)).items():
         inside = (columns["target"] == target) & (columns["status"] == label)
         tested = inside & np.isfinite(columns["nis"])
-        # Chi-square of all scans over their rows: about one where the noise is as stated.
+        # Chi-square of all scans over their rows: about one if the noise is as stated.
         rows = float(columns["rows"][tested].sum())
         nis = f"{columns['nis'][tested].sum() / rows:.2f}" if rows else "-"
         finite = sigma[inside][np.isfinite(sigma[inside])]
@@ -336,4 +331,4 @@ def _show(loaded: Loaded, columns: Columns, console: Console) -> None:
             console, f"{columns['target'][i]}, {columns['time'][i]:g} s: {columns['status'][i]}: {columns['reason'][i]}"
         )
     if len(told) > _REASONS:
-        say(console, f"... and {len(told) - _REASONS} more; --out writes all of them")
+        say(console, f"... and {len(told) - _REASONS} more; --out writes all")

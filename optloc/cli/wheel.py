@@ -1,4 +1,4 @@
-"""What ``optloc compile --wheel`` does: pack the machine code of all kernels for other computers of this platform."""
+"""The option ``optloc compile --wheel``: pack the machine code of all kernels for other computers of this platform."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from optloc.kernels.code_cache import files_of, folder
 from optloc.kernels.jit import enabled, named, names_in
 from optloc.kernels.manifest import FILE, INSTALLED, is_chosen, of_this_process
 
-# What wheels are made for: processors of the last ten years. The same bits come out on all of them, since no kernel has
-# its sums put in another order for the sake of wide registers.
+# Target processor of wheels: processors of the last ten years. All of them compute the same bits, since no kernel
+# reorders its sums for wider registers.
 _COMMON = {
     "x86_64": (
         "x86-64-v3",
         "avx avx2 bmi bmi2 cx16 f16c fma fxsr lzcnt mmx movbe popcnt sahf sse sse2 sse3 sse4.1 sse4.2 ssse3 xsave",
     )
 }
-# Where a wheel was installed and used: elsewhere it may work as well.
+# Platforms on which a wheel was installed and used; it may work on others as well.
 _VERIFIED = ("linux-x86_64",)
 
 
 def run_wheel(out: Path, *, quiet: bool = False) -> int:
-    """Compile all kernels for processors of a sort, pack them as a wheel and print its name; return the exit code."""
+    """Compile all kernels for a common processor, pack them as a wheel and print its path; return the exit code."""
     if not enabled():
-        raise InvalidProblem("numba is not installed, or switched off", "--wheel", "there is no machine code to pack")
+        raise InvalidProblem("numba is not installed, or disabled", "--wheel", "install or enable numba")
     chosen = _COMMON.get(machine())
     if not is_chosen() and chosen is not None:
-        # numba takes its processor when it is imported
+        # numba reads the processor at import, so a new process is needed
         with TemporaryDirectory() as cache:
             features = ",".join("+" + word for word in chosen[1].split())
             more = environment(NUMBA_CPU_NAME=chosen[0], NUMBA_CPU_FEATURES=features, NUMBA_CACHE_DIR=cache)
@@ -47,40 +47,27 @@ def run_wheel(out: Path, *, quiet: bool = False) -> int:
             return subprocess.run(words + ["-q"] * quiet, env=more, check=False).returncode  # noqa: S603
     place = folder()
     if place is None:
-        raise InvalidProblem("no folder can be written", "NUMBA_CACHE_DIR", "name one")
+        raise InvalidProblem("no folder is writable", "NUMBA_CACHE_DIR", "set it to a writable folder")
     with meter("making machine code", quiet) as tell:
-        left = make(tell)
-    if left:
-        raise InvalidProblem(f"{len(left)} kernels could not be compiled", "--wheel", "see what stands above")
+        failed = make(tell)
+    if failed:
+        raise InvalidProblem(f"{len(failed)} kernels could not be compiled", "--wheel", "see the errors above")
     made = pack(place, out)
     typer.echo(str(made))
     if get_platform() not in _VERIFIED:
-        typer.echo(f"not verified on {get_platform()}: try it before you hand it on", err=True)
+        typer.echo(f"not verified on {get_platform()}: test the wheel before you distribute it", err=True)
     return 0
 
 
 def pack(place: Path, out: Path) -> Path:
-    """Pack machine code as a wheel of the distribution ``optloc-kernels``.
+    """Pack machine code as a wheel of the distribution ``optloc-kernels`` and return its path.
 
-    Parameters
-    ----------
-    place : Path
-        The folder that holds it, of this process' sources and processor.
-    out : Path
-        Folder of the wheel, made where it is not there.
-
-    Returns
-    -------
-    Path
-        The wheel: for this version of Python and this platform, with optloc, numba and llvmlite of these versions.
-
-    Raises
-    ------
-    InvalidProblem
-        Where the library `wheel` is missing, or the folder cannot be written.
+    `place` is the folder of the machine code of these sources and this processor. `out` is the folder of the wheel; it
+    is created if missing. The wheel requires this version of Python, this platform, and these versions of optloc, numba
+    and llvmlite. Raise InvalidProblem if the library `wheel` is missing or the folder is not writable.
     """
     if find_spec("wheel") is None:
-        raise InvalidProblem("wheels are packed by the library wheel", "--wheel", "pip install 'optloc[wheel]'")
+        raise InvalidProblem("packing needs the library wheel", "--wheel", "pip install 'optloc[wheel]'")
     number, tag = version("optloc"), f"cp{sys.version_info[0]}{sys.version_info[1]}"
     manifest = of_this_process()
     about = [
@@ -107,9 +94,13 @@ def pack(place: Path, out: Path) -> Path:
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InvalidProblem(f"the folder cannot be made ({error.strerror})", str(out), "name another") from None
+            raise InvalidProblem(
+                f"the folder cannot be created ({error.strerror})", str(out), "use another folder"
+            ) from None
         words = [sys.executable, "-P", "-m", "wheel", "pack", str(root), "--dest-dir", str(out)]
         done = subprocess.run(words, capture_output=True, text=True, check=False)  # noqa: S603
     if done.returncode:
-        raise InvalidProblem(f"the wheel could not be packed ({done.stderr.strip()[-200:]})", str(out), "name another")
+        raise InvalidProblem(
+            f"the wheel could not be packed ({done.stderr.strip()[-200:]})", str(out), "use another folder"
+        )
     return out / f"optloc_kernels-{number}-{tag}-{tag}-{platform}.whl"

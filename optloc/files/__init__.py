@@ -1,4 +1,4 @@
-"""Problem files: stations and measurements in TOML, CSV and Parquet, in the units of their writers."""
+"""Problem files: stations and measurements in TOML, CSV and Parquet, in the units of the file."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Where navigation satellites say that they are: broadcast ephemerides, clocks, and what the atmosphere adds.
+"""Positions and clocks of navigation satellites from broadcast ephemerides, and delays of the atmosphere.
 
 Sources: IS-GPS-200N (2022), 20.3.3.3.3 (clocks), 20.3.3.4.3 (ephemerides) and 20.3.3.5.2.5 (Klobuchar's ionosphere);
 Galileo OS SIS ICD 2.1 (2023), 5.1, which has the same equations; J. Saastamoinen, "Contributions to the theory of
@@ -17,20 +17,22 @@ from optloc.base.units import SPEED_OF_LIGHT
 EARTH_RATE = 7.2921151467e-5
 """Radians per second by which the Earth turns, as the ephemerides of all systems here count it."""
 
-# The Earth's gravitation, m^3/s^2, as satellites of each system count it: GPS and QZSS; Galileo's is newer.
+# Gravitational parameter of the Earth, m^3/s^2, in the definition of each system: GPS, QZSS and Galileo.
 _GM = {"G": 3.986005e14, "J": 3.986005e14, "E": 3.986004418e14}
-# Newton's steps for Kepler's equation: orbits here have eccentricities of at most 0.1, and four reach rounding.
+# Newton steps for Kepler's equation: eccentricities are at most 0.1, and four steps reach rounding.
 _STEPS = 8
-# Semicircles and seconds of day of Klobuchar's model; the least delay, seconds, and the time of the greatest, 14 h.
+# Klobuchar's model: least delay (s), time of day of the greatest delay (s, 14 h), and seconds of a day.
 _LEAST, _NOON, _DAY = 5e-9, 50400.0, 86400.0
 
 
 class Ephemeris(NamedTuple):
-    """Broadcast elements of n satellites and times, arrays (n,): SI units, radians, seconds of GPS time since 1980.
+    """Broadcast elements for n pairs of a satellite and a time, arrays (n,).
 
-    Named as in the interface document: `toe` and `toc` are the reference times of elements and clock, `af0` to `af2`
-    the polynomial of the clock, `tgd` its delay for the first frequency, `week` seconds at which the week of `toe`
-    begins.
+    SI units, radians, seconds of GPS time since 1980.
+
+    Names are as in the interface document. `toe` and `toc` are the reference times of elements and clock, `af0` to
+    `af2` the polynomial of the clock. `tgd` is the clock delay for the first frequency. `week` is the start of the
+    week of `toe`, s.
     """
 
     toc: Array
@@ -59,23 +61,11 @@ class Ephemeris(NamedTuple):
 
 
 def orbit(one: Ephemeris, system: str, t: Array) -> tuple[Array, Array]:
-    """Return where satellites are and what their clocks are ahead.
+    """Return the ECEF positions (n, 3), m, and the clock errors (n,), s, of satellites.
 
-    Parameters
-    ----------
-    one : Ephemeris
-        An entry for each time.
-    system : "G", "E" or "J"
-        GPS, Galileo or QZSS.
-    t : array (n,)
-        Seconds of GPS time since 1980.
-
-    Returns
-    -------
-    position : array (n, 3)
-        ECEF of that time, metres.
-    clock : array (n,)
-        Seconds, for users of the first frequency alone, the relativistic term included.
+    `one` has an entry for each time `t` (n,), seconds of GPS time since 1980. `system` is "G" (GPS), "E" (Galileo) or
+    "J" (QZSS). Positions are in the ECEF axes at the times `t`. Clock errors are for users of the first frequency
+    alone, and include the relativistic term.
     """
     gm, a, since = _GM[system], one.root_a**2, t - one.toe
     mean = one.m0 + (np.sqrt(gm / a**3) + one.delta_n) * since
@@ -97,14 +87,14 @@ def orbit(one: Ephemeris, system: str, t: Array) -> tuple[Array, Array]:
         ],
         axis=-1,
     )
-    # how much faster a clock runs where it is high and slow
+    # the relativistic part of the clock error: an eccentric orbit changes speed and height
     relativity = -2.0 * np.sqrt(gm) / SPEED_OF_LIGHT**2 * one.e * one.root_a * np.sin(anomaly)
     late = t - one.toc
     return position, one.af0 + one.af1 * late + one.af2 * late**2 + relativity - one.tgd
 
 
 def turned(position: Array, seconds: Array) -> Array:
-    """Return places (n, 3) in the Earth's axes of so many seconds (n,) later: Sagnac's correction."""
+    """Return positions (n, 3) in ECEF axes that are `seconds` (n,) later (Sagnac correction)."""
     angle = EARTH_RATE * seconds
     x, y = position[:, 0], position[:, 1]
     turn_x, turn_y = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
@@ -112,18 +102,13 @@ def turned(position: Array, seconds: Array) -> Array:
 
 
 def ionosphere(coefficients: Array, place: tuple[Array, Array], azimuth: Array, elevation: Array, t: Array) -> Array:
-    """Return delays (n,) of the first frequency by Klobuchar's model, metres: about half of the true ones.
+    """Return ionospheric delays (n,) of the first frequency by Klobuchar's model, m.
 
-    Parameters
-    ----------
-    coefficients : array (8,)
-        Alpha and beta, as broadcast.
-    place : (latitude, longitude), arrays (n,)
-        Of receivers, radians.
-    azimuth, elevation : array (n,)
-        Of satellites, radians, clockwise from north.
-    t : array (n,)
-        Seconds of GPS time.
+    They are about half of the true delays.
+
+    `coefficients` (8,) are the broadcast alpha and beta. `place` is latitude and longitude (n,) of the receivers, rad.
+    `azimuth` (clockwise from north) and `elevation` (n,) are of the satellites, rad. `t` (n,) is in seconds of GPS
+    time.
     """
     lat, lon, high = place[0] / np.pi, place[1] / np.pi, elevation / np.pi
     angle = 0.0137 / (high + 0.11) - 0.022
@@ -139,14 +124,10 @@ def ionosphere(coefficients: Array, place: tuple[Array, Array], azimuth: Array, 
 
 
 def troposphere(latitude: Array, height: Array, elevation: Array) -> Array:
-    """Return delays (n,) by Saastamoinen's model in the standard atmosphere with 70 % humidity, metres.
+    """Return tropospheric delays (n,) by Saastamoinen's model, m: standard atmosphere, 70 % humidity.
 
-    Parameters
-    ----------
-    latitude, height : array (n,)
-        Of receivers, radians and metres; heights outside 0 to 10 km count as the nearer of these.
-    elevation : array (n,)
-        Of satellites, radians.
+    `latitude` (n,) and `height` (n,) are of the receivers, rad and m; heights are limited to 0 to 10 km. `elevation`
+    (n,) is of the satellites, rad.
     """
     height = np.clip(height, 0.0, 1e4)
     pressure = 1013.25 * (1.0 - 2.2557e-5 * height) ** 5.2568  # hPa

@@ -1,6 +1,6 @@
-"""Values of `optloc.locate` by what they belong to: a station, or of time differences a pair of them.
+"""Measurements of `optloc.locate`, assigned to stations or, for time differences, to pairs of stations.
 
-Mappings, arrays, series, and data frames with a column for each station or a row for each value say the same.
+Accepted forms: mappings, arrays, series, and data frames with a column for each station or a row for each value.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from optloc.models import MODELS
 
 
 class Argument(NamedTuple):
-    """Kind of an argument of `locate`, the unit of bare numbers, and the noun for its values in messages."""
+    """A measurement argument of `locate`: its kind, the unit of plain numbers, and a noun for messages."""
 
     kind: str
     unit: str
@@ -34,12 +34,12 @@ ARGUMENTS = {
     "bearings": Argument("azimuth", "deg", "bearings"),
     "elevations": Argument("elevation", "deg", "elevations"),
 }
-# Pairs of stations of the last some hundred kinds of values.
+# Station pairs of the last 256 sets of values.
 _ENDS = Cache[list[tuple[int, int]]](256)
 
 
 class StationValues(NamedTuple):
-    """Values (..., m) as they are given, what each belongs to, the unit that their column names, and row labels."""
+    """Values (..., m), the key of each value (a station or a pair), the unit in a column name, and row labels."""
 
     values: Array
     keys: list[Any]
@@ -48,7 +48,7 @@ class StationValues(NamedTuple):
 
 
 def station_values(word: str, given: Any, names: Sequence[str], reference: str | None) -> StationValues:
-    """Return values by what they belong to: a station, or of time differences a pair of them."""
+    """Return values with the station numbers of each: (station, -1), or a pair for time differences."""
     if reference is not None and reference not in names:
         raise no_station(reference, "reference", names)
     first = names[0] if reference is None else reference
@@ -62,7 +62,11 @@ def station_values(word: str, given: Any, names: Sequence[str], reference: str |
     elif isinstance(given, Mapping):
         columns = [_numbers(word, value) for value in given.values()]
         if len({np.shape(column) for column in columns}) > 1:
-            raise InvalidProblem("some stations have more values than others", word, "give each as many, NaN for none")
+            raise InvalidProblem(
+                "some stations have more values than others",
+                word,
+                "give equal numbers of values, NaN for missing values",
+            )
         if any(column.dtype.kind == "M" for column in columns):
             columns = [column if column.dtype.kind == "M" else _no_dates(word, column) for column in columns]
         found = StationValues(np.stack(columns, axis=-1) if columns else np.zeros(0), list(given))
@@ -72,21 +76,21 @@ def station_values(word: str, given: Any, names: Sequence[str], reference: str |
             keys.remove(first)
         if values.ndim == 0 or values.shape[-1] != len(keys):
             what = f"{values.shape[-1] if values.ndim else 1} values for {len(names)} stations"
-            raise InvalidProblem(what, word, "give one for each, NaN where there is none, or name: value")
+            raise InvalidProblem(what, word, "give one for each station, NaN for missing values, or name: value")
         found = StationValues(values, keys)
     if not found.keys:
         raise InvalidProblem("there are no values", word, "give name: value")
     ends = _ENDS.call(_all_ends, word, found.keys, names, first)
-    kept = [i for i, (a, b) in enumerate(ends) if a != b]  # the reference against itself says nothing
+    kept = [i for i, (a, b) in enumerate(ends) if a != b]  # the difference of the reference to itself is always zero
     if not kept:
-        raise InvalidProblem("there is nothing but the reference", word, "give the other stations")
+        raise InvalidProblem("the only station is the reference", word, "give the other stations")
     return found._replace(values=found.values[..., kept], keys=[ends[i] for i in kept])
 
 
 def _with_names(given: Any) -> Any:
-    """Return a structured array as a mapping, and tables of polars, pyarrow and xarray as pandas has them.
+    """Return a structured array as a mapping, and tables of polars, pyarrow and xarray as pandas objects.
 
-    Each of them names what its values belong to: an array alone would take them in the order of the stations.
+    These types name the stations of their values. As plain arrays, they would be read in the order of the stations.
     """
     fields = getattr(getattr(given, "dtype", None), "names", None)
     if fields:
@@ -99,7 +103,7 @@ def _all_ends(word: str, keys: Sequence[Any], names: Sequence[str], reference: s
 
 
 def _ends(word: str, key: Any, names: Sequence[str], reference: str) -> tuple[int, int]:
-    """Return the numbers of the stations that a key names; -1 where there is one station only."""
+    """Return the station numbers of a key; the second number is -1 for a single station."""
     pair = key if isinstance(key, tuple) else (key,)
     if word == "tdoa" and len(pair) == 1 and str(key) not in names:
         cut = [(str(key)[:i], str(key)[i + 1 :]) for i, sign in enumerate(str(key)) if sign == "-"]
@@ -107,7 +111,7 @@ def _ends(word: str, key: Any, names: Sequence[str], reference: str) -> tuple[in
     if word == "tdoa" and len(pair) == 1:
         pair = (pair[0], reference)
     if len(pair) != (2 if word == "tdoa" else 1):
-        raise InvalidProblem(f"{key!r} does not name what was measured", word, "use the name of a station")
+        raise InvalidProblem(f"{key!r} does not name a measurement", word, "use the name of a station")
     unknown = [str(name) for name in pair if str(name) not in names]
     if unknown:
         raise no_station(unknown[0], word, names)
@@ -116,7 +120,7 @@ def _ends(word: str, key: Any, names: Sequence[str], reference: str) -> tuple[in
 
 
 def _named(word: str, columns: Sequence[Any], names: Sequence[str], reference: str) -> list[Any]:
-    """Return the columns of a data frame whose names are those of stations, or of pairs of them."""
+    """Return the columns of a data frame that are named after stations or pairs of stations."""
     found = []
     for column in columns:
         try:
@@ -128,15 +132,15 @@ def _named(word: str, columns: Sequence[Any], names: Sequence[str], reference: s
 
 
 def _wide(word: str, frame: Any, names: Sequence[str], reference: str) -> StationValues:
-    """Return the values of a data frame with one column for each station or pair; every column must be one."""
+    """Return the values of a data frame with one column for each station or pair; raise for any other column."""
     columns = list(frame.columns)
     for column in columns:
         try:
             _ends(word, column, names, reference)
         except InvalidProblem as error:
-            advice = f"{error.advice}; drop a column that holds no {ARGUMENTS[word].noun}"
+            advice = f"{error.advice}; drop columns without {ARGUMENTS[word].noun}"
             raise InvalidProblem(error.what, f"{word}, column {column!r}", advice) from None
-    # By number: two columns may have one name.
+    # Select columns by number, since two columns may have the same name.
     values = [_numbers(word, frame.iloc[:, i].to_numpy()) for i in range(len(columns))]
     return StationValues(np.stack(values, axis=-1), columns, labels=list(frame.index))
 
@@ -161,9 +165,9 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
     for role, text in (("a", "station"), ("z", "value")):
         if chosen[role] is None:
             listed = ", ".join(str(name) for name in columns)
-            advice = "call columns by the stations, or use the columns station and value"
+            advice = "name the columns after stations, or use the columns station and value"
             if {str(label) for label in frame.index} <= {*names}:
-                advice = "its rows are the stations: give the transposed frame, .T"
+                advice = "the rows are the stations: give the transposed frame, .T"
             raise InvalidProblem(f"no column is a {text}; there are {listed}", word, advice)
     epochs = next((stems[each] for each in ("epoch", "message", "msg", "pulse") if each in stems), None)
     ends = [str(name) for name in frame[chosen["a"]]]
@@ -178,13 +182,13 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
         dtype=values.dtype if values.dtype.kind == "M" else float,
     )
     seen: set[tuple[int, int]] = set()
-    # Whole numbers are counted from the least, so that nanoseconds of today keep their digits as floats.
+    # Subtract the minimum from integers, so that recent times in nanoseconds keep their digits as floats.
     values = values - values.min() if values.dtype.kind in "iu" else values
     for value, key, label in zip(values, ends, labels, strict=True):
         place = (rows[label], keys[key])
         if place in seen:
             what = f"{key} has two values" + ("" if label is None else f" at {label}")
-            raise InvalidProblem(what, word, "leave one of them out, or give a column epoch")
+            raise InvalidProblem(what, word, "remove one of them, or add a column epoch")
         seen.add(place)
         grid[place] = value
     named = unit_of(str(chosen["z"]), ("s", "ms", "us", "ns", "ps", "m", "km", "cm", "mm", "ft", "deg", "rad"))
@@ -194,20 +198,20 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
 
 
 def _no_dates(word: str, values: Array) -> Array:
-    """Return missing dates in the place of missing numbers; numbers beside dates are refused."""
+    """Return missing dates instead of missing numbers; raise InvalidProblem if there are numbers as well as dates."""
     if not np.isnan(values).all():
-        raise InvalidProblem("some instants are dates, and others are numbers", word, "give all as one or the other")
+        raise InvalidProblem("some times are dates, and others are numbers", word, "give only dates or only numbers")
     return np.full(values.shape, np.datetime64("NaT", "ns"))
 
 
 def _numbers(word: str, values: Any) -> Array:
-    """Return values as an array of numbers or dates; None is NaN."""
+    """Return values as an array of numbers or dates; None becomes NaN."""
     try:
         array = np.asarray(values)
         if array.dtype.kind in "OSU":
-            array = np.where(array == None, np.nan, array).astype(float)  # noqa: E711  (of every entry)
+            array = np.where(array == None, np.nan, array).astype(float)  # noqa: E711  (elementwise)
     except (TypeError, ValueError):
         array = np.zeros(0, dtype=bool)
     if array.dtype.kind not in "iufM" or (array.dtype.kind == "M" and word != "toa"):
-        raise InvalidProblem("these are not numbers", word, "give numbers, NaN where there is none")
+        raise InvalidProblem("these are not numbers", word, "give numbers, NaN for missing values")
     return array

@@ -1,4 +1,4 @@
-"""Cells of foreign tables with all their digits: numbers, dates with their zones, and what stands for nothing."""
+"""Cells of measurement tables as decimals with all digits, dates with time zones, and empty cells."""
 
 from __future__ import annotations
 
@@ -18,25 +18,24 @@ from optloc.files.columns import unit_of
 from optloc.files.roles import Roles
 from optloc.files.table import Table
 
-# Integers up to this are exact as floats, and so are powers of ten up to this exponent: a quotient of both is then the
-# float that is nearest to the number.
+# Integers up to 2^53 and powers of ten up to 10^22 are exact as floats. Their quotient is then the nearest float.
 _EXACT, _EXACT_PLACES = 2**53, 22
-# Integers below this have sums and differences of 64 bits.
+# Sums and differences of integers below this bound fit 64 bits.
 _LARGEST = 2**62
 
 
 @dataclass(frozen=True, slots=True)
 class Decimals:
-    """NumberColumn (m,) with all their digits.
+    """Numbers (m,) with all their digits.
 
     Parameters
     ----------
     units : int array (m,), or object array (m,) of int
-        The numbers times 10 to the power of `places`; Python's integers where 64 bits do not hold them.
+        The numbers times 10 to the power of `places`; Python integers if 64 bits are too few.
     places : int
-        Decimals that all numbers have here.
+        Decimals of all numbers in `units`.
     written : int array (m,)
-        Decimals that each was written with, negative where digits before the point are unknown, as of 1.7E12.
+        Decimals of each number in the file; negative if digits before the point are unknown, as in 1.7E12.
     """
 
     units: Array
@@ -54,13 +53,13 @@ class Decimals:
 
     @classmethod
     def scaled(cls, units: Array, written: Array) -> Decimals:
-        """Return integers (m,) with a number of decimals each."""
+        """Return integers (m,) divided by ten to the power of `written` (m,) as decimals."""
         places = max(int(written.max(initial=0)), 0)
         return cls(_times_ten(units, places - written), places, written)
 
     @classmethod
     def join(cls, parts: Sequence[Decimals]) -> Decimals:
-        """Return columns one behind the other."""
+        """Return the concatenation of columns."""
         places = max(part.places for part in parts)
         units = [part.at_places(places) for part in parts]
         return cls(np.concatenate(units), places, np.concatenate([part.written for part in parts]))
@@ -69,36 +68,32 @@ class Decimals:
         return len(self.units)
 
     def __getitem__(self, item: int) -> Decimal:
-        """Return one number as it was written."""
+        """Return one number with its decimals in the file."""
         written = int(self.written[item])
         return Decimal(f"{int(self.units[item]) // 10 ** (self.places - written)}E{-written}")
 
     def take(self, pick: Any) -> Decimals:
-        """Return some of the numbers."""
+        """Return the selected numbers."""
         return Decimals(self.units[pick], self.places, self.written[pick])
 
     def tolist(self) -> list[Decimal]:
-        """Return the numbers one by one."""
+        """Return the numbers as a list."""
         return [self[i] for i in range(len(self))]
 
     def at_places(self, places: int) -> Array:
-        """Return the numbers as integers with a given number of decimals, not fewer than they have."""
+        """Return the numbers times ten to the power of `places`, which must not be less than their decimals."""
         return _times_ten(self.units, np.full(len(self), places - self.places))
 
     def number(self, value: Decimal) -> int | None:
-        """Return a number in the units of the column; None where it has more decimals than the column."""
+        """Return a number in the units of the column; None if it has more decimals than the column."""
         units = value.scaleb(self.places)
         return int(units) if units == units.to_integral_value() else None
 
     def since(self, first: Array, index: Array) -> Decimals:
-        """Return the differences to other numbers of the column, with the larger number of decimals.
+        """Return differences between the numbers (m,) and reference numbers of the same column.
 
-        Parameters
-        ----------
-        first : int array (n,)
-            NumberColumn that are subtracted.
-        index : int array (m,)
-            Which of them is subtracted from each number.
+        `first` (n,) are the indices of the references; `index` (m,) selects the reference of each number. A difference
+        has the larger number of decimals of both.
         """
         at = first[index]
         return Decimals(self.units - self.units[at], self.places, np.maximum(self.written, self.written[at]))
@@ -111,18 +106,18 @@ class Decimals:
         return np.array([float(value) for value in self.tolist()])
 
     def texts(self) -> list[str]:
-        """Return the numbers as they are written without an exponent."""
+        """Return the numbers as text without an exponent."""
         return [f"{value:f}" for value in self.tolist()]
 
 
 def _smallest(units: Array) -> Array:
-    """Return integers in 64 bits where they fit."""
+    """Return integers as 64 bits if they fit."""
     most = max(map(abs, units.tolist()), default=0)
     return units.astype(np.int64) if most < _LARGEST else units
 
 
 def _times_ten(units: Array, power: Array) -> Array:
-    """Return integers times powers of ten that are not negative."""
+    """Return integers times ten to the power of `power`, which is not negative."""
     most = int(power.max(initial=0))
     if not most:
         return units
@@ -133,11 +128,11 @@ def _times_ten(units: Array, power: Array) -> Array:
     return units * 10 ** power.astype(np.int64)
 
 
-# What cells hold that hold nothing, in the words of spreadsheets, databases and programs.
+# Spellings of empty cells in spreadsheets, databases and programs.
 NOTHING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "-", "--", "?"})
-# Decimals of an instant: no clock tells more than 20, and a float written in full has some fifty.
+# Largest number of decimals of an instant: clocks have at most 20, and a float written in full has about fifty.
 _DIGITS = 60
-# Share of the largest number that a float next to it may fall short of by rounding.
+# Share of the largest number above which a cell is checked exactly, since floats round.
 _NEARLY = 0.5
 _DATE = re.compile(r"\d{4}-\d\d?-\d\d?|\d{4}\d\d\d\dT")
 _ZONE = re.compile(r"(Z|[+-]\d\d:?(\d\d)?)$", re.IGNORECASE)
@@ -146,17 +141,17 @@ _FRACTION = re.compile(r"^(.*:\d\d)[.,](\d+)(.*)$")
 
 @dataclass(frozen=True, slots=True)
 class NumberColumn:
-    """The numbers (m,) of a column, and the row of each: cells that hold nothing are left out."""
+    """The numbers (m,) of a column and the row (m,) of each; empty cells are left out."""
 
     values: Decimals
     row: Array
 
 
 def numbers(table: Table, name: str) -> NumberColumn:
-    """Return a column with all its digits; raise InvalidProblem for other words than those of empty cells."""
+    """Return a column with all its digits; raise InvalidProblem for text other than an empty cell."""
     column = table.raw(name)
     if column.dtype.kind not in "iufO":
-        raise InvalidProblem(f"it holds {column.dtype}, not numbers", table.where(name), "give numbers")
+        raise InvalidProblem(f"the column has the type {column.dtype}, not numbers", table.where(name), "give numbers")
     return _plain_numbers(column) or _of_cells(
         [_number(table, name, row, cell) for row, cell in enumerate(column.tolist())]
     )
@@ -167,12 +162,12 @@ def _of_cells(cells: list[Decimal | None]) -> NumberColumn:
     return NumberColumn(Decimals.of([value for value in cells if value is not None]), row)
 
 
-# NumberColumn as nearly all tables have them: digits, perhaps with a point.
+# Pattern of most numbers: digits, perhaps with a point.
 _PLAIN = r"^-?([0-9]+(\.[0-9]*)?|\.[0-9]+)$"
 
 
 def _plain_numbers(column: Array) -> NumberColumn | None:
-    """Return a column of text with plain numbers of at most 64 bits; None for other columns."""
+    """Return a text column with plain numbers of at most 64 bits; None for other columns."""
     import pyarrow as pa
     from pyarrow import compute as pc
 
@@ -193,7 +188,7 @@ def _plain_numbers(column: Array) -> NumberColumn | None:
         units = pc.cast(pc.replace_substring(text, ".", "", max_replacements=1), pa.int64()).to_numpy()
     except pa.ArrowInvalid:  # more digits than 64 bits hold
         return None
-    # Values that may be too large are read cell by cell: the error names the cell.
+    # Read values that may be too large cell by cell, so that the error names the cell.
     if (np.abs(units / 10.0**written) > _NEARLY * LARGEST).any():
         return None
     return NumberColumn(Decimals.scaled(units, written), row)
@@ -204,11 +199,11 @@ def _number(table: Table, name: str, row: int, cell: Any) -> Decimal | None:
     if text.lower() in NOTHING:
         return None
     try:
-        # Python reads 1_000 as a thousand, which in a table is a slip.
+        # Python reads 1_000 as a thousand; in a table it is a typing error.
         number = Decimal("nan") if "_" in text or isinstance(cell, bool) else Decimal(text)
     except InvalidOperation:
         number = Decimal("nan")
-    # Written out, 1e-999999999 has a billion digits.
+    # Limit the exponent: 1e-999999999 has a billion digits when written in full.
     if number.is_finite() and abs(number) <= LARGEST and -int(number.as_tuple().exponent) <= _DIGITS:
         return number
     what = f"{text[:40]!r} is not a finite number"
@@ -216,7 +211,7 @@ def _number(table: Table, name: str, row: int, cell: Any) -> Decimal | None:
 
 
 def is_dated(table: Table, name: str) -> bool:
-    """Return whether a column holds dates: the first cell that holds something does."""
+    """Return whether a column has dates, by its first cell that is not empty."""
     column = table.raw(name)
     if column.dtype.kind == "M":
         return True
@@ -225,16 +220,9 @@ def is_dated(table: Table, name: str) -> bool:
 
 
 def date_seconds(table: Table, name: str, zone: str | None) -> NumberColumn:
-    """Return a column of dates as seconds since 1970, UTC.
+    """Return a column of ISO 8601 dates as seconds since 1970, UTC, with all decimals.
 
-    Parameters
-    ----------
-    table : Table
-        The table.
-    name : str
-        The column: ISO 8601, with as many decimals as it likes.
-    zone : str, optional
-        Time zone of dates that name none.
+    `zone` is the time zone of dates without a zone.
     """
     import pandas as pd
 
@@ -247,13 +235,13 @@ def date_seconds(table: Table, name: str, zone: str | None) -> NumberColumn:
     held = [row for row, cell in enumerate(cells) if cell.lower() not in NOTHING]
     bare_rows = [row for row in held if not _ZONE.search(cells[row].partition("T")[2] or cells[row].partition(" ")[2])]
     if bare_rows and len(bare_rows) < len(held):
-        what = "the date names no time zone, but others do"
-        raise InvalidProblem(what, table.where(name, bare_rows[0]), "write the zone everywhere, such as Z for UTC")
+        what = "the date has no time zone, but others have one"
+        raise InvalidProblem(what, table.where(name, bare_rows[0]), "write the zone in each date, such as Z for UTC")
     if bare_rows and zone is None:
-        advice = "say --zone UTC, or the zone of the clocks such as --zone Europe/Rome"
-        raise InvalidProblem("the dates name no time zone", table.where(name), advice)
+        advice = "use --zone UTC, or the zone of the clocks such as --zone Europe/Rome"
+        raise InvalidProblem("the dates have no time zone", table.where(name), advice)
     parts = [_FRACTION.match(cells[row]) for row in held]
-    # Whole seconds are read by pandas; it keeps nine decimals, and the rest is added.
+    # pandas keeps nine decimals only: it reads the whole seconds, and the fraction is added.
     whole = [part[1] + part[3] if part else cells[row] for part, row in zip(parts, held, strict=True)]
     try:
         read = pd.to_datetime(pd.Series(whole, dtype=object), format="ISO8601", utc=not bare_rows)
@@ -271,23 +259,14 @@ def _zone(name: str) -> ZoneInfo:
     try:
         return ZoneInfo(name)
     except (ZoneInfoNotFoundError, ValueError, OSError):
-        advice = "name it as UTC or Europe/Rome"
+        advice = "write a zone such as UTC or Europe/Rome"
         raise InvalidProblem(f"there is no time zone {name[:40]!r}", "--zone", advice) from None
 
 
 def column_times(roles: Roles, name: str, zone: str | None, told_unit: str | None = None) -> Array | None:
-    """Return a column of times as seconds (m,), None where its numbers have no unit: then they are mere labels.
+    """Return a column of times in seconds (m,); None if its numbers have no unit and so are labels.
 
-    Parameters
-    ----------
-    roles : Roles
-        The table.
-    name : str
-        The column.
-    zone : str, optional
-        Time zone of dates that name none.
-    told_unit : str, optional
-        Unit of its numbers, where its name does not end in one.
+    `zone` is the time zone of dates without a zone. `told_unit` is the unit if the column name does not end in one.
     """
     table = roles.table
     if is_dated(table, name):
@@ -296,16 +275,16 @@ def column_times(roles: Roles, name: str, zone: str | None, told_unit: str | Non
         unit = unit_of(name, UNITS["time"])
         if told_unit is not None and told_unit not in UNITS["time"]:
             raise InvalidProblem(
-                f"{told_unit!r} is no unit of time", "--time-unit", nearest(told_unit, [*UNITS["time"]])
+                f"{told_unit!r} is not a unit of time", "--time-unit", nearest(told_unit, [*UNITS["time"]])
             )
         if told_unit is not None and unit not in (None, told_unit):
             what = f"the column {name!r} ends in {unit}, not in {told_unit}"
-            raise InvalidProblem(what, "--time-unit", "leave it out, or name another column with --column time=NAME")
+            raise InvalidProblem(what, "--time-unit", "remove it, or state another column with --column time=NAME")
         unit = told_unit if unit is None else unit
         if unit is None:
             return None
         held, factor = numbers(table, name), UNITS["time"][unit]
     if len(held.row) < table.count:
         empty = int(np.setdiff1d(np.arange(table.count), held.row)[0])
-        raise InvalidProblem("the cell is empty", table.where(name, empty), "give the time, or leave the row out")
+        raise InvalidProblem("the cell is empty", table.where(name, empty), "give the time, or remove the row")
     return held.values.floats() * factor

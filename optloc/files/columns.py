@@ -1,4 +1,4 @@
-"""Names of columns in the tables of other programs: the role that each name has, and the units that fit it."""
+"""Roles of columns in measurement tables: names, and units that fit each role."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.units import UNITS
 from optloc.models import MODELS, Model, kind_named
 
-# Units as people write them in headers.
+# Spellings of units in column headers.
 _SPELLED = {
     **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
     **dict.fromkeys(("feet", "foot"), "ft"),
@@ -22,17 +22,17 @@ _SPELLED = {
     **dict.fromkeys(("°", "degree", "degrees"), "deg"),
     **dict.fromkeys(("radian", "radians"), "rad"),
 }
-# Longest first: the unit of toa_ns is ns, not s.
+# Longest first, so that the unit of toa_ns is ns, not s.
 _UNITS = sorted({*UNITS["length"], *UNITS["angle"], *UNITS["speed"], *UNITS["level"], *_SPELLED}, key=len, reverse=True)
 _SUFFIX = re.compile(rf"\s*[_ \[(/]\s*({'|'.join(map(re.escape, _UNITS))})[\])]?$", re.IGNORECASE)
-# ROS writes the fields of a message with this prefix (rostopic echo -p).
+# ROS adds this prefix to the fields of a message (rostopic echo -p).
 _PREFIX = re.compile(r"^field\.", re.IGNORECASE)
 
 _CLOCK = tuple(UNITS["time"])
 _ANGLE = tuple(UNITS["angle"])
-# A coordinate is never a time, although a measured length may be given as one.
+# A coordinate is never a time, although a measured length may be given as a time.
 _LENGTH = tuple(unit for unit in UNITS["length"] if unit not in UNITS["time"])
-# The two stations of a pair, such as anchor1 and anchor2.
+# Names of the two stations of a pair, such as anchor1 and anchor2.
 _FIRST, _SECOND = (
     " ".join(f"{word}{end}" for word in "station receiver anchor sensor node rx site".split() for end in ends)
     for ends in ("a1", "b2")
@@ -41,18 +41,18 @@ _FIRST, _SECOND = (
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """What a column of a table can be.
+    """A role that a column of a table can have.
 
     Parameters
     ----------
     text : str
-        What the column holds.
+        Content of the column.
     names : tuple of str
-        Names of such columns as `stem` returns them, the likeliest first.
+        Names of columns with this role, in the form of `stem`, the most likely first.
     units : tuple of str
-        Units in which the name of the column may end.
+        Units in which the column name may end.
     with_unit : tuple of str
-        Names that count only if they end in one of these units.
+        Names that need one of these units at the end.
     """
 
     text: str
@@ -61,7 +61,7 @@ class Role:
     with_unit: tuple[str, ...] = ()
 
     def allows(self, unit: str | None) -> bool:
-        """Return whether a column with this unit in its name, or with none, can have the role."""
+        """Return whether a column with this unit in its name, or without a unit, can have the role."""
         return unit is None or unit in self.units
 
 
@@ -74,11 +74,11 @@ _STATIONS = f"station receiver rx sensor anchor beacon site observer node statio
 _FIXED = {
     "message": _role("label of a message, pulse or epoch", _MESSAGES),
     "station": _role("station of the row", _STATIONS),
-    "name": _role("name of a station, where no column is called after stations", "name callsign user"),
-    "id": _role("name of a station; label of a message where another column names the station", "id"),
+    "name": _role("name of a station, if no column is named after stations", "name callsign user"),
+    "id": _role("name of a station; label of a message if another column names the station", "id"),
     "reference": _role("second station of the row", f"b reference ref refstation {_SECOND}"),
     "time": _role(
-        "time of the row; the arrival itself where the table has no other reading",
+        "time of the row; the arrival if the table has no other reading",
         "rxtime time timestamp utc datetime date t tgps gpstime tow", _CLOCK, "epoch",
     ),
     "target": _role("target of the row", "target tag mobile transmitter emitter icao hex mac device track"),
@@ -99,7 +99,7 @@ _FIXED = {
     "height": _role("height of a station", "height h alt altitude ellipsoidalheight elevation elev", _LENGTH),
     "depth": _role("depth of a station", "depth", _LENGTH),
 }  # fmt: skip
-# Further names of measured columns: too short for the words of a problem file, or clear in a table only.
+# Further names of measured columns: too short for a problem file, or unambiguous in a table only.
 _SHORT = {
     "toa": "pr prange rho c1c prm",
     "range": "ranges dist r d",
@@ -107,17 +107,17 @@ _SHORT = {
     "azimuth": "az bearings brg lob lineofbearing",
     "elevation": "el",
 }
-# Without a unit these are heights in a table of stations; with a unit of angle they are elevations.
+# Without a unit these names are heights in a table of stations; with a unit of angle they are elevations.
 _ANGLES_BY_UNIT = {"elevation": "elevation elev altitude alt"}
 _SIGMA = "sigma std stddev stdev sd uncertainty"
-# Roles of columns that --column may name by another word.
+# Other words for roles in --column.
 _OTHER = {"pseudorange": "toa", "arrivals": "toa"}
 PLACE = ("name", "x", "y", "z", "lat", "lon", "height", "depth")
-"""Roles of columns that say where stations are."""
+"""Roles of columns with station positions."""
 
 
 def roles() -> Mapping[str, Role]:
-    """Return all roles by name, with one for each measurement kind that has stations."""
+    """Return all roles by name, including one for each measurement kind with stations."""
     return _roles(tuple(MODELS.items()))
 
 
@@ -136,13 +136,13 @@ def _of_kind(kind: str, model: Model) -> Role:
 
 
 def role_of(column: str) -> str | None:
-    """Return the one role that the name of a column suggests, None where it suggests none."""
+    """Return the role that a column name suggests; None without a match."""
     return _by_name(tuple(MODELS.items())).get((stem(column), any_unit(column)))
 
 
 @lru_cache(maxsize=4)
 def _by_name(models: tuple[tuple[str, Model], ...]) -> Mapping[tuple[str, str | None], str]:
-    """Return the role of each name with each unit that it may have."""
+    """Return the role of each pair of a name and a permitted unit."""
     found: dict[tuple[str, str | None], str] = {}
     for role, entry in _roles(models).items():
         for name in entry.names:
@@ -155,13 +155,13 @@ def _by_name(models: tuple[tuple[str, Model], ...]) -> Mapping[tuple[str, str | 
 
 
 def rank(role: str, column: str) -> int:
-    """Return the place of a column's name in the list of its role, the likeliest first."""
+    """Return the index of a column name in the list of its role, where the most likely name is first."""
     entry = roles()[role]
     return (*entry.names, *entry.with_unit).index(stem(column))
 
 
 def role_named(word: str) -> str:
-    """Return the role that a word of --column stands for; raise InvalidProblem for an unknown one."""
+    """Return the role of a word in --column; raise InvalidProblem for an unknown word."""
     word = word.strip()
     if word in roles() or word in ("epoch", *_OTHER):
         return _OTHER.get(word, word)
@@ -175,17 +175,17 @@ def role_named(word: str) -> str:
 
 
 def check_unit(role: str, column: str) -> None:
-    """Raise InvalidProblem where the name of a column ends in a unit that does not fit the role given to it."""
+    """Raise InvalidProblem if a column name ends in a unit that does not fit the stated role."""
     entry = roles().get(role)
     unit = any_unit(column)
     if entry is not None and entry.units and not entry.allows(unit):
         some = ", ".join(entry.units[:4])
-        what = f"the column {column!r} is in {unit}, which is no unit of the role {role}"
-        raise InvalidProblem(what, "--column", f"name a column in {some}, or give this one another role")
+        what = f"the column {column!r} is in {unit}, which is not a unit of the role {role}"
+        raise InvalidProblem(what, "--column", f"state a column in {some}, or give this column another role")
 
 
 def sigma_kind(column: str) -> str | None:
-    """Return the kind whose standard deviation a column holds, such as "range" of "range_std_m"; None for others."""
+    """Return the kind of a column of standard deviations, such as "range" for "range_std_m"; None for other columns."""
     words = tokens(without_unit(column))
     rest = [word for word in words if word not in _SIGMA.split()]
     if len(rest) == len(words) or not rest:
@@ -202,27 +202,27 @@ def is_sigma(word: str) -> bool:
 
 
 def stem(column: str) -> str:
-    """Return a column's name without case, unit and signs: "TOA_ns" is "toa"."""
+    """Return a column name in lower case without unit and punctuation: "TOA_ns" gives "toa"."""
     return re.sub(r"[^a-z0-9]", "", without_unit(_PREFIX.sub("", column.strip())).lower())
 
 
 def tokens(text: str) -> tuple[str, ...]:
-    """Return the words and numbers of a name, without case."""
+    """Return the words and numbers of a name in lower case."""
     return tuple(re.findall(r"[^\W\d_]+|\d+", text.lower()))
 
 
 def without_unit(column: str) -> str:
-    """Return a column's name without its unit."""
+    """Return a column name without its unit."""
     return _SUFFIX.sub("", column.strip())
 
 
 def any_unit(column: str) -> str | None:
-    """Return the unit of any quantity in which the name of a column ends, None where it ends in none."""
+    """Return the unit at the end of a column name, of any quantity; None without a unit."""
     return unit_of(column, _UNITS)
 
 
 def unit_of(column: str, known: Iterable[str]) -> str | None:
-    """Return the unit in which the name of a column ends, None where it is none of those known."""
+    """Return the unit at the end of a column name; None if it is not in `known`."""
     found = _SUFFIX.search(column.strip())
     if found is None:
         return None

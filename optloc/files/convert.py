@@ -1,4 +1,7 @@
-"""Common tables as a problem file with CSV tables beside it: readings of receivers, pseudoranges, stations, orbits."""
+"""Conversion of measurement tables to problem files: receiver readings, pseudoranges, stations, satellite orbits.
+
+A `TableProblem` has the sections of the problem file. `optloc convert` writes it, and other commands read it directly.
+"""
 
 from __future__ import annotations
 
@@ -48,9 +51,9 @@ from optloc.models import MODELS, kind_named
 
 INPUTS = ("arrivals", "sp", "pseudoranges", "stations")
 
-# What files of orbits are called; where times are given, any file is one.
+# File endings of orbits. With --times, each file is read as orbits.
 _ORBITS = (".tle", ".2le", ".3le", ".sp3", ".omm")
-# Arrivals that place a target in the plane; of fewer the user is told.
+# Arrivals that locate a target in the plane; a note reports epochs with fewer.
 _FEW = 3
 
 
@@ -67,27 +70,27 @@ def convert(
     Parameters
     ----------
     source : Path
-        Readings of receivers or pseudoranges as CSV, Parquet or JSON, pseudoranges as RINEX or as a log of Android, the
-        navigation file beside it; or stations, as such a table or as GeoJSON; or
-        orbits of satellites, as two-line elements, OMM (JSON, CSV) or SP3.
+        Receiver readings or pseudoranges as CSV, Parquet or JSON; pseudoranges as RINEX (with a navigation file) or as
+        an Android log; stations as a table or as GeoJSON; or satellite orbits as two-line elements, OMM (JSON, CSV) or
+        SP3.
     out : Path
-        Problem file to write, .toml; its tables go to CSV files beside it. Of stations alone: the CSV file.
+        Problem file to write, .toml; its tables are CSV files in the same folder. For stations alone, the CSV file.
     told : ColumnHints, optional
-        What the table does not say itself.
+        Facts that the table does not contain.
     tell : callable, optional
-        Is given the problem of a table before it is written.
+        Receives the problem of the table before it is written.
     **options
-        The same, one by one: the fields of `ColumnHints`.
+        Single fields of `ColumnHints`.
 
     Returns
     -------
     Converted
-        The files, and the problem as it is read back from them.
+        The files, and the problem that the reader makes of them.
 
     Raises
     ------
     InvalidProblem
-        Naming the file, the row and the column.
+        The message names the file, the row and the column.
     """
     told = replace(told or ColumnHints(), **options)
     _check_told(told)
@@ -97,17 +100,17 @@ def convert(
     if told.what == "stations" or source.suffix.lower() == ".geojson":
         return _write_stations(source, out, told.columns, told.frame)
     if out.suffix.lower() != ".toml":
-        raise InvalidProblem("the problem file must end in .toml", str(out), "let the name behind --out end in it")
+        raise InvalidProblem("the name of a problem file must end in .toml", str(out), "change the name after --out")
     table_problem = interpret_table(source, told)
     tell(table_problem)
     claim(*table_problem.tables(out), inputs=[source, *(path for path in (told.stations,) if path)])
-    # Read before it is there: what cannot be read is not written.
+    # Read before writing, so that an invalid problem is not written.
     loaded = table_problem.read()
     return Converted(table_problem.write(out), loaded, table_problem.notes, table_problem.as_read)
 
 
 def _check_told(told: ColumnHints) -> None:
-    """Refuse roles, frames and conventions that there are none of."""
+    """Raise InvalidProblem for unknown roles, frames and conventions."""
     for role in told.columns:
         role_named(role)
     choices = {"frame": ("cartesian", "ecef"), "azimuth": CONVENTIONS, "positive": ("a-farther", "b-farther")}
@@ -120,7 +123,7 @@ def _check_told(told: ColumnHints) -> None:
 
 
 def _sort(word: str) -> str:
-    """Return the sort of reading that --as names."""
+    """Return the sort of readings for a word of --as."""
     if word in ("arrivals", "sp"):
         return word
     try:
@@ -133,25 +136,25 @@ def _sort(word: str) -> str:
 
 
 def interpret_table(source: Path, told: ColumnHints) -> TableProblem:
-    """Return what a table of readings or pseudoranges is, with what it does not say itself.
+    """Return the problem of a table of readings or pseudoranges; `told` has the facts that the table does not contain.
 
     Raises
     ------
     InvalidProblem
-        For what is wrong, and for what may mean two things: naming the option that says which.
+        For errors, and for ambiguous content; then the message names the option that decides.
     """
     _check_told(told)
     table_problem = gnss(source, told) if is_gnss(source) else _of_table(source, told)
     azimuths = any(section.kind == "azimuth" for section in table_problem.sections)
     if told.declination is not None and not azimuths:
-        raise InvalidProblem("the table has no bearings", "--declination", "leave it out")
+        raise InvalidProblem("the table has no bearings", "--declination", "remove this option")
     if told.turned and AT_RECEPTION != table_problem.lines:
-        raise InvalidProblem("the table has no satellites", "--turned", "leave it out")
+        raise InvalidProblem("the table has no satellites", "--turned", "remove this option")
     return table_problem
 
 
 def _of_table(source: Path, told: ColumnHints) -> TableProblem:
-    """Return what a table is."""
+    """Return the problem of a measurement table."""
     table = without_ignored_columns(read_table(source), told.ignore)
     own = {role: name for role, name in told.columns.items() if told.stations is None or role not in PLACE}
     roles = Roles.of(table, own)
@@ -173,8 +176,8 @@ def _of_table(source: Path, told: ColumnHints) -> TableProblem:
         raise _unknown(roles, told)
     if told.stations is None:
         if roles.find("lat") is None and roles.find("x") is None:
-            advice = "name a table or GeoJSON file with --stations"
-            raise InvalidProblem("nothing is known of where the stations are", "--stations", advice)
+            advice = "give a table or GeoJSON file with --stations"
+            raise InvalidProblem("the station positions are unknown", "--stations", advice)
         place, heard = read_inline(roles, told)
     forms = [sort_named(name) for name in sorts]
     return _plan(
@@ -183,12 +186,12 @@ def _of_table(source: Path, told: ColumnHints) -> TableProblem:
 
 
 def _of_receivers(roles: Roles, place: ColumnPlaces) -> list[Named]:
-    """Return the columns that are called after stations, without those that have another role.
+    """Return the columns that are named after stations, without columns that have another role.
 
     Raises
     ------
     InvalidProblem
-        For a column that is called like a station and like a role, where its cells do not tell.
+        For a column whose name is both a station and a role, if its cells do not decide.
     """
     told = {part for role in roles.told for part in roles.by_role[role].split("+")}
     found = [one for one in named_columns(list(roles.table.columns), place.names) if one.column not in told]
@@ -202,28 +205,28 @@ def _of_receivers(roles: Roles, place: ColumnPlaces) -> list[Named]:
 
 
 def _is_long(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> bool:
-    """Return whether a table has one reading a row: a column of stations, and one of readings."""
+    """Return whether a table has one reading in each row: a column of stations and a column of readings."""
     if "station" in roles.told:
         return True
     station = roles.find("station")
     if station is None or not holds_names(roles.table, station, place.names):
         return False
-    # Times beside columns of receivers are the times of their readings.
+    # If receivers have columns of readings, a time column is the time of these readings, not a reading.
     return bool({*sorts_of(roles, told)} - {"times"})
 
 
 def _unknown(roles: Roles, told: ColumnHints) -> InvalidProblem:
-    """Return what is said of a table whose columns do not tell what it is."""
+    """Return the error for a table whose columns do not identify its content."""
     columns = list(roles.table.columns)
-    what = f"the columns {', '.join(columns)} do not tell what this is"
-    advice = f"say it with --as {', --as '.join(INPUTS)} or a kind, and name columns with --column ROLE=NAME"
+    what = f"the columns {', '.join(columns)} do not identify the content"
+    advice = f"state it with --as {', --as '.join(INPUTS)} or a kind, and state columns with --column ROLE=NAME"
     if told.stations is None:
-        advice += "; columns named by receivers need --stations"
+        advice += "; columns that are named after receivers need --stations"
     return InvalidProblem(what, roles.table.source, advice)
 
 
 def _may_be(one: Named, told: ColumnHints) -> bool:
-    """Return whether a column that names stations holds what is asked for."""
+    """Return whether a column that is named after stations can have the requested content."""
     return told.what is None or one.form in (None, told.what)
 
 
@@ -238,7 +241,7 @@ def _plan(
     found: Sequence[Readings],
     named: Sequence[Named],
 ) -> TableProblem:
-    """Return what readings become; `named` are the columns that are called after stations."""
+    """Return the problem of readings; `named` are the columns that are named after stations."""
     place = in_space(place) if any(2 not in MODELS[one.form.kind].dimensions for one in found) else place
     place, turn = stations_turned(place, found)
     epochs = epochs_of(roles, told, found)
@@ -255,7 +258,7 @@ def _plan(
     if any(one.form.value == "sp" for one in found):
         speed = _sp_speed(told)
         lines = (f"propagation_speed = {speed!r}",)
-        notes.append(f"S minus P times {speed:.6g} m/s, vp vs / (vp - vs), is a range: straight rays, one speed")
+        notes.append(f"S minus P times {speed:.6g} m/s, vp vs / (vp - vs), is a range (straight rays, constant speeds)")
     after: tuple[str, ...] = ()
     if told.window is not None and "epoch" not in epochs:
         after = ("", "[epochs]", f"window = {json.dumps(told.window)}")
@@ -266,24 +269,27 @@ def _plan(
 
 
 def _height(found: Sequence[Readings], place: ColumnPlaces) -> tuple[str, str]:
-    """Return what is known of the height of a target on Earth without a reading, as a line of a file, and a remark."""
+    """Return a height constraint for a target on Earth, as a line of a problem file, and a note; empty texts for none.
+
+    Readings of azimuths alone do not determine the height.
+    """
     if place.frame != "geodetic":
         return "", ""
     heights, unit = place.columns["height"], place.unit
     if all(one.form.kind == "azimuth" for one in found):
         mean = round(float(heights.mean()), 3)
         remark = (
-            f"bearings tell no height: it is taken to be {mean:g} {unit}, the stations' mean, or what --height says"
+            f"bearings do not determine the height: {mean:g} {unit} is assumed, the mean of the stations, or --height"
         )
         return f'exactly = "{mean!r} {unit}"', remark
     if any(one.form.value == "sp" for one in found):
         top = float(heights.max())
-        return f'max = "{top!r} {unit}"', f"the earthquake is taken to be below the highest station, {top:g} {unit}"
+        return f'max = "{top!r} {unit}"', f"the earthquake is assumed below the highest station, {top:g} {unit}"
     return "", ""
 
 
 def _sigmas(told: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
-    """Return the standard deviation of each sort as it is written, None where the table has its own."""
+    """Return the standard deviation of each sort of readings as text; None if the table has a column of them."""
     if told.sigma is None:
         for one in found:
             if one.sigma is None:
@@ -292,23 +298,23 @@ def _sigmas(told: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
     if "=" not in told.sigma:
         if len({one.form.quantity for one in found}) > 1:
             advice = "write --sigma '" + ",".join(f"{one.form.kind}=1 {one.unit}" for one in found) + "'"
-            raise InvalidProblem("the readings are of several kinds, and each needs its own", "--sigma", advice)
+            raise InvalidProblem("the readings have several kinds, and each needs a sigma", "--sigma", advice)
         return [told.sigma] * len(found)
     given = sigmas_by_kind(told.sigma)
     other = next((kind for kind in given if kind not in {one.form.kind for one in found}), None)
     if other is not None:
-        raise InvalidProblem(f"the table has no readings of {other}", "--sigma", f"leave {other} out")
+        raise InvalidProblem(f"the table has no readings of {other}", "--sigma", f"remove {other}")
     lacking = next((one.form.kind for one in found if one.form.kind not in given and one.sigma is None), None)
     if lacking is not None:
-        raise InvalidProblem(f"nothing is said of {lacking}", "--sigma", f"add {lacking}=AMOUNT behind a comma")
+        raise InvalidProblem(f"{lacking} has no sigma", "--sigma", f"add {lacking}=AMOUNT after a comma")
     return [given.get(one.form.kind) for one in found]
 
 
 def _sp_speed(told: ColumnHints) -> float:
-    """Return the speed that turns S minus P into a range, metres per second."""
+    """Return the speed vp vs / (vp - vs), m/s, that converts S minus P to a range."""
     if told.vp is None or told.vs is None:
-        advice = "say both, such as --vp '6 km/s' --vs '3.5 km/s'"
-        raise InvalidProblem("the speeds of the P and S waves are not known", "--vp", advice)
+        advice = "state both, such as --vp '6 km/s' --vs '3.5 km/s'"
+        raise InvalidProblem("the speeds of the P and S waves are unknown", "--vp", advice)
     vp, vs = (Units("speed").plain(given, None, where) for given, where in ((told.vp, "--vp"), (told.vs, "--vs")))
     if not 0.0 < vs < vp:
         raise InvalidProblem(f"P waves of {vp:g} m/s are not faster than S waves of {vs:g} m/s", "--vs", "correct it")
@@ -319,21 +325,21 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
     columns: dict[str, Any] = {name: column[found.row] for name, column in epochs.items()}
     values, text = found.values, found.form.text
     if found.form.kind == "toa":
-        values, text = _from_first(found, columns), "arrivals, counted from the first of each message"
+        values, text = _from_first(found, columns), "arrivals, relative to the first of each message"
     columns |= {"a": found.a} | ({} if found.b is None else {"b": found.b}) | {"z": values}
     if found.sigma is not None and sigma is None:
         columns["sigma"] = found.sigma
     lines = [f'azimuth = "{found.azimuth}"'] if found.azimuth is not None else []
     lines += [f'positive = "{found.positive}"'] if found.positive != "a-farther" else []
     if found.b is not None and sigma not in (None, ESTIMATE) and MODELS[found.form.kind].signs == (1, -1):
-        # as `optloc.locate` takes it: differences share the errors of their stations, each half of the variance
+        # As in `optloc.locate`, differences share the errors of their stations, each with half of the variance.
         lines += [f'arrival_sigma = "{_share(str(sigma), found.unit)}"    # of one station, sigma / sqrt(2)']
         sigma = None
     return Section(found.form.kind, columns, found.unit, sigma, text, tuple(lines))
 
 
 def _with_declination(section: Section, found: Readings, told: ColumnHints) -> Section:
-    """Return a section of bearings with the declination that is told."""
+    """Return a section of bearings with the stated declination."""
     if told.declination is None or found.form.kind != "azimuth":
         return section
     declination_of(told.declination, found.azimuth, None, "--declination")
@@ -341,24 +347,24 @@ def _with_declination(section: Section, found: Readings, told: ColumnHints) -> S
 
 
 def _share(sigma: str, unit: str) -> str:
-    """Return the part of one station in the standard deviation of a difference, an amount as text."""
+    """Return the standard deviation of one station from the standard deviation of a difference, as text with a unit."""
     number, own = re.fullmatch(r"\s*([-+.\deE]*)\s*(.*?)\s*", sigma, re.DOTALL).groups()  # type: ignore[union-attr]
     try:
         return f"{float(number) / np.sqrt(2.0):.9g} {own or unit}"
-    except ValueError:  # what reads the file says what is wrong with it
+    except ValueError:  # the reader of the file reports the error
         return sigma
 
 
 def _from_first(found: Readings, columns: dict[str, Any]) -> Decimals:
-    """Return arrivals counted from the first of their message, whose time becomes a column where there is none.
+    """Return arrivals relative to the first arrival of their message; add the time of the first as a column if missing.
 
-    Seconds of today in nanoseconds have 19 digits, a float 16: differences are taken before anything is rounded.
+    Recent times in nanoseconds have 19 digits, a float has 16. So differences are taken before rounding.
     """
     keys = [columns[name] for name in ("epoch", "time", "target") if name in columns]
     _, message = equal_rows(keys, len(found.values))
     order = np.lexsort((found.values.units, message))
     first = order[np.unique(message[order], return_index=True)[1]]
-    # Arrivals that are counted from their first already say nothing of when that was.
+    # If all messages begin with the same number, arrivals are already relative and have no date.
     dated = found.unit in UNITS["time"] and len(np.unique(found.values.units[first])) == len(first)
     if dated and "time" not in columns:
         factor = Decimal(repr(UNITS["time"][found.unit]))
@@ -368,7 +374,7 @@ def _from_first(found: Readings, columns: dict[str, Any]) -> Decimals:
 
 
 def _few(sections: Sequence[Section], told: ColumnHints) -> list[str]:
-    """Return what is to be said of epochs with few readings."""
+    """Return notes on epochs with few readings."""
     names = [name for name in ("epoch", "target") if name in sections[0].columns] or ["time"]
     held = [section.columns for section in sections if set(names) <= set(section.columns)]
     if not held:
@@ -377,10 +383,10 @@ def _few(sections: Sequence[Section], told: ColumnHints) -> list[str]:
     counts = np.bincount(equal_rows(columns, len(columns[0]))[1])
     few = int((counts < _FEW).sum())
     if sections[0].kind == "toa" and few:
-        return [f"{few} of {len(counts)} messages were heard by fewer than three stations"]
+        return [f"{few} of {len(counts)} messages were received by fewer than three stations"]
     if len(counts) > 1 and counts.max() == 1 and told.window is None:
-        advice = "--still puts them together if the target stays, --window '0.1 s' those of 0.1 s"
-        return [f"each of the {len(counts)} instants has one reading: {advice}"]
+        advice = "use --still if the target does not move, or --window '0.1 s' to join readings within 0.1 s"
+        return [f"each of the {len(counts)} times has one reading: {advice}"]
     return []
 
 
@@ -389,8 +395,8 @@ def _few(sections: Sequence[Section], told: ColumnHints) -> list[str]:
 
 def _write_stations(source: Path, out: Path, told: Mapping[str, str], frame: str | None) -> Converted:
     if out.suffix.lower() != ".csv":
-        what = "stations alone are no problem: they become a CSV table"
-        raise InvalidProblem(what, str(out), "let the name behind --out end in .csv, or convert the measurements")
+        what = "stations alone are not a problem; they are written as a CSV table"
+        raise InvalidProblem(what, str(out), "use the ending .csv after --out, or convert the measurements")
     found = places_of(source, told, frame)
     write_csv(out, found.columns)
     return Converted((out,), None, (found.note,) if found.note else ())

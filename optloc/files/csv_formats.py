@@ -1,4 +1,4 @@
-"""Files of other programs as tables: CSV and Parquet, nested records such as JSON, logs of KrakenSDR."""
+"""Files of other programs as tables: CSV, Parquet, nested records such as JSON, and KrakenSDR logs."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from optloc.base.inputs import check_budget, decoded, json_of, read_bytes
 from optloc.files.columns import any_unit, stem
 from optloc.files.table import Table, csv, of_rows, parquet
 
-# mlat-server writes seconds since 1970, arrivals in microseconds and their variances in their squares.
+# mlat-server writes seconds since 1970, arrivals in microseconds, and variances in microseconds squared.
 _CLUSTER = ("ecef_x_m", "ecef_y_m", "ecef_z_m", "toa_us", "sigma_us")
-# Names of lists of two or three numbers that are the coordinates of one point.
+# Names of lists with two or three coordinates of one point.
 _POINTS = ("position", "pos", "xyz", "ecef")
-# Letters of a record that a message repeats.
+# Characters of a record that a message shows.
 _SHOWN = 80
 
 Row = dict[str, Any]
@@ -31,34 +31,34 @@ Row = dict[str, Any]
 def records(data: Any, source: str) -> Table:
     """Return the table of nested records: a list of objects, an object of objects by name, or one object.
 
-    Names of nested objects are joined by "_". Each object in a list is a row, with the values of the objects around the
-    list. Lists of equal length in one object are columns beside each other. A list of coordinates is x, y and z.
+    Names of nested objects are joined by "_". Each object in a list is a row, and repeats the values outside the list.
+    Lists of equal length in one object are columns. A list of coordinates is x, y and z.
 
     Raises
     ------
     InvalidProblem
-        Where there are no records, or the lists of an object have different lengths.
+        If there are no records, or the lists of an object have different lengths.
     """
     if isinstance(data, Mapping) and isinstance(data.get("aircraft"), list):
-        advice = "give receptions instead, such as mlat-server writes with --dump-pseudorange"
-        raise InvalidProblem("aircraft.json has positions of aircraft, no measurements", source, advice)
+        advice = "give receptions, such as the output of mlat-server with --dump-pseudorange"
+        raise InvalidProblem("aircraft.json has positions of aircraft, not measurements", source, advice)
     if isinstance(data, Mapping):
         named = data and all(isinstance(value, Mapping) for value in data.values())
         data = [{"name": name, **value} for name, value in data.items()] if named else [data]
     if not isinstance(data, list) or not data or not all(isinstance(row, Mapping) for row in data):
-        raise InvalidProblem("there is no list of records", source, "write it as a list of objects, or as CSV")
+        raise InvalidProblem("there is no list of records", source, "write a list of objects, or CSV")
     if any("cluster" in row for row in data):
         rows = list(_clusters(data, source))
     else:
         rows = [row for i, record in enumerate(data) for row in _rows(record, f"{source}, row {i + 1}")]
     check_budget("cells", sum(map(len, rows)), source)
     if not any(rows):
-        raise InvalidProblem("there is no list of records", source, "write it as a list of objects, or as CSV")
+        raise InvalidProblem("there is no list of records", source, "write a list of objects, or CSV")
     return of_rows(rows, source, {})
 
 
 def with_lists(table: Table) -> Table:
-    """Return a table whose cells hold no lists: their items are rows of their own, as in `records`."""
+    """Return a table without lists in cells: each list item becomes a row, as in `records`."""
     lists = [name for name, column in table.columns.items() if column.dtype == object and _holds_list(column)]
     if not lists:
         return table
@@ -71,13 +71,13 @@ def with_lists(table: Table) -> Table:
 
 
 def _holds_list(column: Any) -> bool:
-    """Return whether the first cell that holds something holds a list."""
+    """Return whether the first cell that is not empty has a list."""
     first = next((cell for cell in column if cell is not None and str(cell).strip()), None)
     return isinstance(_list_of(first), list)
 
 
 def _list_of(cell: Any) -> Any:
-    """Return the list that a cell spells as JSON or Python does, else the cell."""
+    """Return the list in a cell that has JSON or Python text of a list, else the cell."""
     text = cell.strip() if isinstance(cell, str) else ""
     if not (text.startswith("[") and text.endswith("]")):
         return cell
@@ -89,7 +89,7 @@ def _list_of(cell: Any) -> Any:
 
 
 def _rows(record: Mapping[str, Any], place: str) -> list[Row]:
-    """Return the rows of one record: one, or one for each item of its lists."""
+    """Return the rows of one record: one row, or one row for each item of its lists."""
     around: Row = {}
     inner: list[Row] = []
     parallel: dict[str, list[Any]] = {}
@@ -109,14 +109,14 @@ def _rows(record: Mapping[str, Any], place: str) -> list[Row]:
             parallel[key] = [_cell(item) for item in value]
     if len({len(items) for items in parallel.values()}) > 1:
         sizes = ", ".join(f"{key} has {len(items)}" for key, items in parallel.items())
-        raise InvalidProblem(f"its lists have different lengths: {sizes}", place, "give them one length")
+        raise InvalidProblem(f"the lists have different lengths: {sizes}", place, "use equal lengths")
     beside = [dict(zip(parallel, cells, strict=True)) for cells in zip(*parallel.values(), strict=True)]
     rows = [*inner, *beside]
     return [around | row for row in rows] if rows else [around]
 
 
 def _flat(record: Mapping[str, Any], place: str, before: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values of a record; the names of nested ones are joined."""
+    """Yield the names and values of a record; names of nested objects are joined."""
     for key, value in record.items():
         name = f"{before}{key}"
         if isinstance(value, Mapping):
@@ -126,18 +126,18 @@ def _flat(record: Mapping[str, Any], place: str, before: str = "") -> Iterator[t
 
 
 def _inside(row: Row, key: str, record: Mapping[str, Any]) -> Row:
-    """Return a row of a list: a name that the object around it has, too, follows that of the list."""
+    """Return a row of a list; a name that the outer object also has gets the name of the list as a prefix."""
     return {f"{key}_{name}" if name in record else name: value for name, value in row.items()}
 
 
 def _put(row: Row, key: str, value: Any, place: str) -> None:
     if key in row:
-        raise InvalidProblem(f"the value {key!r} is given twice", place, "rename one of them")
+        raise InvalidProblem(f"the value {key!r} is given twice", place, "rename one value")
     row[key] = value
 
 
 def _axis_name(key: str, axis: str) -> str:
-    """Return the name of a coordinate of a list: "x_m" of "position_m", "ecef_x" of "ecef"."""
+    """Return the name of one coordinate of a list: "x_m" for "position_m", "ecef_x" for "ecef"."""
     unit = any_unit(key)
     name = f"ecef_{axis}" if stem(key) == "ecef" else axis
     return name if unit is None else f"{name}_{unit}"
@@ -148,7 +148,7 @@ def _is_number(item: Any) -> bool:
 
 
 def _cell(value: Any) -> Any:
-    """Return a value as a cell: numbers with all their digits, truth values as words."""
+    """Return a value as a cell: numbers with all their digits, booleans as words."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str | int | float | None):
@@ -157,16 +157,16 @@ def _cell(value: Any) -> Any:
 
 
 def _clusters(data: Sequence[Mapping[str, Any]], source: str) -> Iterator[Row]:
-    """Yield the receptions of an mlat-server dump of pseudoranges, with the place of each receiver in ECEF."""
+    """Yield the receptions of an mlat-server dump of pseudoranges, with the ECEF position of each receiver."""
     for i, row in enumerate(data):
         place = f"{source}, row {i + 1}"
         cluster = row.get("cluster")
         if not isinstance(cluster, list):
-            raise InvalidProblem("there is no cluster of receptions, which other rows have", place, "leave it out")
+            raise InvalidProblem("there is no cluster of receptions, which other rows have", place, "remove the row")
         for cells in cluster:
             numbers = isinstance(cells, list) and all(type(cell) in (int, float, Decimal) for cell in cells)
             if not numbers or len(cells) < len(_CLUSTER) - 1:
-                what = f"{str(cells)[:_SHOWN]} is no reception"
+                what = f"{str(cells)[:_SHOWN]} is not a reception"
                 raise InvalidProblem(what, place, "write [x, y, z, microseconds]")
             reals = [float(cell) for cell in cells]
             reception = dict(zip(_CLUSTER, [*reals[:4], *(sqrt(max(cell, 0.0)) for cell in reals[4:5])], strict=False))
@@ -174,19 +174,19 @@ def _clusters(data: Sequence[Mapping[str, Any]], source: str) -> Iterator[Row]:
             yield {"message": i + 1, "icao": str(row.get("icao", "")) or None, "station": name} | reception
 
 
-# How Parquet spells the types of cells that hold several values.
+# Names of Parquet types whose cells have several values.
 _NESTED = ("list<", "large_list<", "fixed_size_list<", "struct<", "map<")
 _TEXT, _JSON = (".csv", ".tsv", ".txt", ".log"), (".json", ".jsonl", ".ndjson")
-# What begins a log of KrakenSDR, which has no header: milliseconds since 1970, and after the fields below one number
-# for each degree.
+# Start of a KrakenSDR log, which has no header: milliseconds since 1970, the fields below, then one number for each
+# degree.
 _KRAKEN = re.compile(rb"\d{13}\s*,(\s*[^,\n]*,){15,}")
 _FIELDS = "time_ms bearing_deg confidence power frequency array latency station lat lon heading_deg".split()
 
 
 def read_table(path: Path) -> Table:
-    """Return the table of a file, whatever program wrote it; raise InvalidProblem where it is none that is known.
+    """Return the table of a file in any known format; raise InvalidProblem for an unknown format.
 
-    What separates the fields of a CSV file is seen from its header.
+    The separator of a CSV file is found from its header.
     """
     suffix = path.suffix.lower()
     if suffix in (".parquet", ".pq"):
@@ -202,12 +202,12 @@ def read_table(path: Path) -> Table:
             return reader(decoded(data, path.name), path.name)
     found = csv(path, None, {})
     if not found.count:
-        raise InvalidProblem("the table has no rows", found.source, "give at least one")
+        raise InvalidProblem("the table has no rows", found.source, "give at least one row")
     return with_lists(found)
 
 
 def _parquet(path: Path) -> Table:
-    """Return the table of a Parquet file; rows with lists or objects in their cells are read as records."""
+    """Return the table of a Parquet file; rows with lists or objects in cells are read as records."""
     import pyarrow as pa
     from pyarrow import parquet as reader
 
@@ -219,12 +219,12 @@ def _parquet(path: Path) -> Table:
     try:
         rows = reader.read_table(pa.BufferReader(read_bytes(path)), columns=wanted, use_threads=False).to_pylist()
     except (pa.ArrowException, OSError, ValueError) as error:
-        raise InvalidProblem(f"its lists cannot be read ({error})", path.name, "write it again as CSV") from None
+        raise InvalidProblem(f"the lists cannot be read ({error})", path.name, "save the table as CSV") from None
     others = {name: kind for name, kind in found.others.items() if name not in nested}
     return replace(records(rows, path.name), others=others)
 
 
-# Logs without a header of their own.
+# Logs without a header.
 
 
 def _kraken(text: str, source: str) -> Table:
@@ -236,22 +236,22 @@ def _kraken(text: str, source: str) -> Table:
         cells = [cell.strip() for cell in line.split(",", len(_FIELDS))]
         place = f"{source}, row {number + 1}"
         if len(cells) <= len(_FIELDS):
-            raise InvalidProblem(f"the row has {len(cells)} fields", place, "a row of KrakenSDR has 17 and more")
+            raise InvalidProblem(f"the row has {len(cells)} fields", place, "a row of KrakenSDR has 17 or more")
         rows.append(dict(zip(_FIELDS, cells, strict=False)))
     return of_rows(rows, source, {})
 
 
 _LOGS: tuple[tuple[re.Pattern[bytes], Callable[[str, str], Table]], ...] = ((_KRAKEN, _kraken),)
-"""How each log begins, and what reads it."""
+"""Pattern at the start of each log format, and its reader."""
 
 
-# Records in JSON: one document, or one on each line.
+# JSON records: one document, or one document on each line.
 
 
 def _json(path: Path) -> Table:
     text = decoded(read_bytes(path, lines=True), path.name)
     lines = [line for line in text.splitlines() if line.strip()]
-    # Lines that are documents each are a log; a document of one line may be either.
+    # Several lines with an object each are a log; a single line may be either form.
     several = len(lines) > 1 and all(line.lstrip().startswith("{") and line.rstrip().endswith("}") for line in lines)
     if not several:
         return records(json_of(text, path.name, Decimal), path.name)

@@ -1,4 +1,7 @@
-"""Measurements of one table in SI units, still with the labels of their epochs and targets."""
+"""Measurements of one table in SI units, with the labels of their epochs and targets.
+
+A section of a problem file gives one `RowChunk` for each measurement kind. `reader` joins the chunks to a `Problem`.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +25,13 @@ from optloc.models import Model
 from optloc.problem.signal import Signal
 
 ESTIMATE = "estimate"
-"""Word in the place of a standard deviation that is to be found from the data."""
+"""Keyword instead of a standard deviation: estimate it from the data."""
 
-# Where the search for a level begins, in SI units: it decides nothing but how kinds are weighed in the first fixes.
-_BEGIN = {"angle": 1e-2, "ratio": 1e-2, "speed": 0.1}
-# Columns of the table of repeats: chunk, then what makes rows equal, then the place in the chunk.
+# Start of the search for a noise level, in SI units; it only affects the relative weights of kinds in the first fixes.
+_START_SIGMA = {"angle": 1e-2, "ratio": 1e-2, "speed": 0.1}
+# Columns of the table of repeats: chunk number, the values that make rows equal, and the index in the chunk.
 _PLACE = 8
-# Differences and eigenvalues of a covariance, as shares of its size, that are rounding of what was written.
+# Asymmetry and negative eigenvalues below this share of a covariance are rounding of the file.
 _ROUNDING = 1e-9
 
 
@@ -39,17 +42,17 @@ class RowChunk:
     Parameters
     ----------
     kind : str
-        Their kind.
+        Measurement kind.
     row : int array (m,)
-        Row of each in its table, from 0.
+        Row numbers in the table, from 0.
     z, a, b, weight, correction : array (m,)
-        As in `optloc.base.types.Rows`; NaN where a value is to be simulated.
+        As in `optloc.base.types.Rows`; z is NaN if a value is to be simulated.
     unit : Conversion
-        Of z.
+        Unit of z.
     units : Units
-        What z measures, and what its unit depends on.
+        Quantity of z, and the settings that its units depend on.
     written_unit : str
-        The unit of z as the file has it.
+        Unit of z in the file.
     slope : array (m,)
         SI units in one unit of the file, with sign.
     baseline : array (m,)
@@ -57,21 +60,21 @@ class RowChunk:
     sigma : array (m,), optional
         Standard deviation of each row.
     arrival : array (s,), optional
-        Standard deviation of each station's arrival.
+        Standard deviation of the arrivals at each station.
     covariance : array (r, r), optional
-        Covariance of the rows of one epoch, in the file's unit squared.
+        Covariance of the rows of one epoch, in the square of the unit of the file.
     signal : Signal, optional
-        What their noise follows from.
+        Signal that determines the noise.
     label, time, written, target : array (m,), optional
-        Columns epoch, time (seconds; as written) and target.
+        Columns epoch, time (in seconds; as text) and target.
     excess : bool
-        Whether the distance of the two stations is still to be added to z.
+        Whether the distance of the two stations must still be added to z.
     table : Table
-        Where the rows come from.
+        Source of the rows.
     declined_on : date, optional
-        Day that the magnetic declination is the one of.
+        Date of the magnetic declination.
     declination : array, optional
-        Declination of that day at the stations of the rows that are present, radians: part of the corrections.
+        Declination at that date at the stations of the present rows, radians; included in the corrections.
     """
 
     kind: str
@@ -102,7 +105,7 @@ class RowChunk:
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What all rows of a section share."""
+    """Settings of a section and its rows; propagation speed, m/s; and whether measured values are needed."""
 
     section: MeasurementsTable
     table: Table
@@ -117,20 +120,8 @@ def chunks_of(
 ) -> list[RowChunk]:
     """Return the rows of one ``[[measurements]]`` table, one chunk for each of its kinds.
 
-    Parameters
-    ----------
-    section : MeasurementsTable
-        Settings.
-    table : Table
-        Rows.
-    stations : tuple of str
-        Names of the stations.
-    where : str
-        Place of the settings.
-    speed : float
-        Propagation speed, metres per second.
-    values : bool
-        Whether measured values are needed; without them a missing column z is NaN.
+    `stations` are the names of the stations, `where` is the place for messages, `speed` is the propagation speed, m/s.
+    With `values` False, a missing column z is NaN.
     """
 
     def chunk(kind: str, pick: Array) -> RowChunk:
@@ -145,7 +136,7 @@ def chunks_of(
     labels = table.labels("kind")
     kinds, first, index = distinct(labels)
     made = []
-    # Kinds in the order of their first rows, so that a covariance across kinds keeps the order of the file.
+    # Sort kinds by their first rows, so that a covariance across kinds keeps the order of the file.
     for i in np.argsort(first).tolist():
         kind_model(kinds[i], table.where("kind", int(first[i])))
         made.append(chunk(kinds[i], np.flatnonzero(index == i)))
@@ -164,8 +155,8 @@ def _chunk(c: Context, kind: str) -> RowChunk:
     _check_weight(c, weight)
     z = values_of(c, unit, weight)
     a, b = ends_of(c, kind, model.stations)
-    # The sign of a difference is turned by its stations, not its value: noise and biases then need no second thought.
-    if section.positive == "b-farther" and _compares(model):
+    # Reverse a difference by exchanging its stations, not by changing the value: noise and biases then stay valid.
+    if section.positive == "b-farther" and _is_difference(model):
         a, b = b, a
     sigma, arrival, covariance = spread_of(c, model, units, unit, z)
     seconds = Units("time").conversion(section.time_unit, join(c.where, "key 'time_unit'")).factor
@@ -179,35 +170,35 @@ def _chunk(c: Context, kind: str) -> RowChunk:
         table.times("time", seconds) if table.has("time") else None,
         table.labels("time") if table.has("time") and not table.has("epoch") else None,
         table.labels("target") if table.has("target") else None,
-        section.excess and _adds_up(model), table, day,
+        section.excess and _is_range_sum(model), table, day,
     )  # fmt: skip
 
 
 def _check_options(c: Context, kind: str, model: Model) -> None:
     section = c.section
     if section.kind is None:
-        return  # settings of a mixed table apply to the kinds that know them
-    if section.excess and not _adds_up(model):
+        return  # settings of a table of several kinds apply to the kinds that use them
+    if section.excess and not _is_range_sum(model):
         raise InvalidProblem(
-            f"{kind} has no excess path", join(c.where, "key 'excess'"), "leave it out; it is for range_sum"
+            f"{kind} has no excess path", join(c.where, "key 'excess'"), "remove it; it is for range_sum"
         )
-    if section.positive == "b-farther" and not _compares(model):
-        raise InvalidProblem(f"{kind} has no sign to turn", join(c.where, "key 'positive'"), "leave it out")
+    if section.positive == "b-farther" and not _is_difference(model):
+        raise InvalidProblem(f"{kind} has no sign", join(c.where, "key 'positive'"), "remove the key")
     if kind != "azimuth":
         north = section.azimuth not in {None, "east-counterclockwise"}
         key = "azimuth" if north else "declination" if section.declination is not None else None
         if key is not None:
-            raise InvalidProblem(f"{kind} is no azimuth", join(c.where, f"key {key!r}"), "leave it out")
+            raise InvalidProblem(f"{kind} is not an azimuth", join(c.where, f"key {key!r}"), "remove the key")
 
 
-def _adds_up(model: Model) -> bool:
-    """Return whether a row is the sum of two ranges, of which a file may have left out the stations' distance."""
+def _is_range_sum(model: Model) -> bool:
+    """Return whether a row is a sum of two ranges; then a file may omit the distance between the stations."""
     return model.ranges is not None and sum(model.ranges) > 1
 
 
-def _compares(model: Model) -> bool:
-    """Return whether a row sets one station against another: a difference or a ratio, which has a sign to turn."""
-    return model.stations > 1 and not _adds_up(model)
+def _is_difference(model: Model) -> bool:
+    """Return whether a row is a difference or ratio between two stations, so that its sign can be reversed."""
+    return model.stations > 1 and not _is_range_sum(model)
 
 
 def _unit(section: MeasurementsTable, kind: str, where: str) -> str | None:
@@ -234,20 +225,20 @@ def _check_weight(c: Context, weight: Array) -> None:
 
 
 def values_of(c: Context, unit: Conversion, weight: Array) -> Array:
-    """Return z in SI: zero where a row is absent, NaN where values are not needed and not there."""
+    """Return z (m,) in SI units: zero for absent rows, NaN for values that are missing and not needed."""
     if not (c.values or c.table.has("z") or "z" in c.table.names):
         return np.full(c.table.count, np.nan)
     raw = c.table.numbers("z", optional=bool((weight == 0.0).any()) or not c.values)
     empty = np.flatnonzero(np.isnan(raw) & (weight > 0.0))
     if len(empty) and c.values:
-        # Read once more as numbers that must be there: the table names the empty cell.
+        # Read again as mandatory numbers: this raises with the empty cell.
         c.table.numbers("z")
         raise AssertionError
     # An absent row may have any value, or none: zero keeps sums finite.
     z = np.where(weight > 0.0, unit.to_si(raw), 0.0)
-    large = np.flatnonzero(np.abs(z) > LARGEST)  # decibels that a file may well hold are ratios that none has
+    large = np.flatnonzero(np.abs(z) > LARGEST)  # for example 5000 dB is a valid cell, but not a valid ratio
     if len(large):
-        raise InvalidProblem(f"the value is beyond {LARGEST:g}", c.table.where("z", int(large[0])), "correct it")
+        raise InvalidProblem(f"the value exceeds {LARGEST:g}", c.table.where("z", int(large[0])), "correct it")
     return z
 
 
@@ -266,7 +257,7 @@ def _stations(c: Context, key: str, needed: bool) -> Array:
 
 
 def ends_of(c: Context, kind: str, count: int) -> tuple[Array, Array]:
-    """Return the stations (m,) at both ends of rows that name `count` of them, -1 for none."""
+    """Return the station numbers (m,) a and b of rows with `count` stations; -1 for no station."""
     a, b = (_stations(c, key, count > i) for i, key in enumerate("ab"))
     same = np.flatnonzero(a == b)
     if count > 1 and len(same):
@@ -276,7 +267,7 @@ def ends_of(c: Context, kind: str, count: int) -> tuple[Array, Array]:
 
 
 def _correction(c: Context, units: Units, unit: Conversion) -> Array:
-    """Return what rows exceed the model by (m,), SI; a correction of azimuths turns them clockwise, however counted."""
+    """Return the corrections (m,), SI: offsets of rows from the model. Corrections of azimuths are clockwise."""
     if c.table.has("correction"):
         return c.table.numbers("correction") * _size(unit, units, c)
     if c.section.correction is None:
@@ -287,34 +278,25 @@ def _correction(c: Context, units: Units, unit: Conversion) -> Array:
 
 def _size(unit: Conversion, units: Units, c: Context) -> float:
     if unit.logarithmic:
-        raise InvalidProblem("a correction in dB is no sum", join(c.where, "key 'correction'"), "correct z itself")
+        raise InvalidProblem("a correction cannot be in dB", join(c.where, "key 'correction'"), "correct z itself")
     # A correction of 4 deg is added to a compass bearing: the reading is 4 deg anticlockwise of the true direction.
     return -unit.factor if units.clockwise else unit.factor
 
 
 def _declination(c: Context, unit: str) -> tuple[float, date | None]:
-    """Return the declination of a section in radians, or zero and the day that it is the one of."""
+    """Return the declination of a section in radians, or zero and its date."""
     if c.section.declination is None:
         return 0.0, None
     place = join(c.where, "key 'declination'")
-    advice = 'write azimuth = "north-clockwise" or "north-counterclockwise", or leave the declination out'
-    # Bearings from magnetic north are anticlockwise of true ones by what magnetic north is east of north.
+    advice = 'write azimuth = "north-clockwise" or "north-counterclockwise", or remove the declination'
+    # Bearings from magnetic north are smaller than true bearings by the declination (east positive).
     return declination_of(c.section.declination, c.section.azimuth, unit, place, advice)
 
 
 def with_declination(chunk: RowChunk, epoch: Array, stations: Stations, frame: Frame) -> RowChunk:
-    """Return a chunk with the magnetic declination of its day at its stations among the corrections.
+    """Return a chunk with the magnetic declination of its date added to the corrections.
 
-    Parameters
-    ----------
-    chunk : RowChunk
-        Rows of one kind.
-    epoch : int array (m,)
-        Epoch of each.
-    stations : Stations
-        Where stations are at each epoch.
-    frame : Frame
-        Of the stations.
+    `epoch` (m,) is the epoch of each row. The declination depends on the positions of the stations at that epoch.
     """
     if chunk.declined_on is None:
         return chunk
@@ -327,7 +309,7 @@ def with_declination(chunk: RowChunk, epoch: Array, stations: Stations, frame: F
 
 
 def declination_text(chunks: Sequence[RowChunk]) -> str:
-    """Return the declination that the date of a file stands for, in words; empty where no date gives one."""
+    """Return a text with the magnetic declination from a date; empty if no date is stated."""
     found = [chunk.declination for chunk in chunks if chunk.declination is not None and len(chunk.declination)]
     if not found:
         return ""
@@ -340,26 +322,15 @@ def with_baseline(chunk: RowChunk, baseline: Array) -> RowChunk:
     return replace(chunk, z=chunk.z + baseline * (chunk.weight > 0.0), baseline=baseline)
 
 
-# What a table says about its noise.
+# Noise of a table.
 
 
 def spread_of(
     c: Context, model: Model, units: Units, unit: Conversion, z: Array
 ) -> tuple[Array | None, Array | None, Array | None]:
-    """Return standard deviations (m,), arrival standard deviations (s,) and covariance (r, r): one of them, or none.
+    """Return standard deviations (m,), arrival standard deviations (s,) and covariance (r, r); at most one is not None.
 
-    Parameters
-    ----------
-    c : Context
-        Settings and rows.
-    model : Model
-        Of their kind.
-    units : Units
-        What they measure.
-    unit : Conversion
-        Of z, and of bare numbers.
-    z : array (m,)
-        Measured values in SI.
+    `unit` is the unit of z and of plain numbers; `z` (m,) are the measured values in SI units.
     """
     section = c.section
     column = c.table.has("sigma")
@@ -368,18 +339,18 @@ def spread_of(
         advice = "give sigma, arrival_sigma, covariance or snr"
         raise InvalidProblem("the noise is given more than once", c.where, advice)
     if section.sigma == ESTIMATE and not column:
-        return np.full(z.shape, _BEGIN.get(model.quantity, 1.0)), None, None
+        return np.full(z.shape, _START_SIGMA.get(model.quantity, 1.0)), None, None
     if (sigma := sigma_of(c, units, unit, z)) is not None:
         return sigma, None, None
     if section.arrival_sigma is not None:
         return None, _arrival(c, model, units, unit, section.arrival_sigma), None
-    # A matrix stays in the file's unit until the slope of each row is known.
+    # A matrix stays in the unit of the file until the slope of each row is known.
     covariance = None if section.covariance is None else square(section.covariance, join(c.where, "key 'covariance'"))
     return None, None, covariance
 
 
 def sigma_of(c: Context, units: Units, unit: Conversion, z: Array) -> Array | None:
-    """Return the standard deviations (m,) of values z (m,) by the column or the key sigma, None without either."""
+    """Return the standard deviations (m,) of values z (m,) from the column or the key sigma; None without either."""
     if c.table.has("sigma"):
         return _positive(c, unit.sigma_to_si(c.table.numbers("sigma"), z), column=True)
     if c.section.sigma is None:
@@ -389,7 +360,7 @@ def sigma_of(c: Context, units: Units, unit: Conversion, z: Array) -> Array | No
 
 
 def signal_of(c: Context) -> Signal | None:
-    """Return the signal from which the noise of rows follows, or None where the table names none."""
+    """Return the signal that determines the noise of rows, or None without a signal."""
     section, parts = c.section, ("snr", "bandwidth", "duration")
     lacking = [name for name in parts if getattr(section, name) is None]
     if section.snr is None or section.bandwidth is None or section.duration is None:
@@ -412,7 +383,7 @@ def _positive(c: Context, sigma: Array, *, column: bool) -> Array:
     bad = np.flatnonzero(~((sigma > 0.0) & (sigma <= LARGEST)))
     if len(bad):
         place = c.table.where("sigma", int(bad[0])) if column else join(c.where, "key 'sigma'")
-        why = f"beyond {LARGEST:g}" if sigma[bad[0]] > 0.0 else "not positive"
+        why = f"larger than {LARGEST:g}" if sigma[bad[0]] > 0.0 else "not positive"
         raise InvalidProblem(f"the standard deviation is {why}", place, "give a positive number")
     return sigma
 
@@ -422,10 +393,10 @@ def _arrival(
 ) -> Array:
     place = join(c.where, "key 'arrival_sigma'")
     if model.signs is None:
-        raise InvalidProblem("these rows do not add up what single stations measure", place, "give sigma or covariance")
+        raise InvalidProblem("these rows are not sums or differences of arrivals", place, "give sigma or covariance")
     if not isinstance(given, Mapping):
         given = dict.fromkeys(c.stations, given)
-    # A station that is not named measures exactly; rows without any noise are refused later.
+    # A station without an entry measures exactly; rows without any noise are rejected later.
     sigma = np.zeros(len(c.stations))
     for i, value in zip(numbers_of([*given], c.stations, place), given.values(), strict=True):
         number, own = units.amount(value, unit, place)
@@ -436,7 +407,7 @@ def _arrival(
 
 
 def square(rows: list[list[float]], where: str) -> Array:
-    """Return a covariance (r, r) as an array; raise InvalidProblem where it is none."""
+    """Return a covariance as an array (r, r); raise InvalidProblem if it is not a covariance matrix."""
     r = len(rows)
     if r == 0:
         raise InvalidProblem("the covariance is empty", where, "give a square matrix")
@@ -448,54 +419,38 @@ def square(rows: list[list[float]], where: str) -> Array:
     i, j = divmod(int(np.argmax(np.abs(matrix - matrix.T))), r)
     if abs(matrix[i, j] - matrix[j, i]) > _ROUNDING * np.abs(matrix).max():
         entries = f"({i + 1}, {j + 1}) is {matrix[i, j]:g}, ({j + 1}, {i + 1}) is {matrix[j, i]:g}"
-        raise InvalidProblem(f"the covariance is not symmetric: entry {entries}", where, "make both equal")
+        raise InvalidProblem(f"the covariance is not symmetric: entry {entries}", where, "make both entries equal")
     diagonal = np.diagonal(matrix)
     if (diagonal <= 0.0).any():
         place = int(np.flatnonzero(diagonal <= 0.0)[0]) + 1
         raise InvalidProblem(
-            f"the variance ({place}, {place}) is {diagonal[place - 1]:g}, not positive", where, "give a covariance"
+            f"the variance ({place}, {place}) is {diagonal[place - 1]:g}, not positive", where, "correct the matrix"
         )
     lowest = np.linalg.eigvalsh(matrix)[0]
     if lowest < -_ROUNDING * diagonal.max():
-        raise InvalidProblem(f"the covariance has the negative eigenvalue {lowest:g}", where, "give a covariance")
+        raise InvalidProblem(f"the covariance has the negative eigenvalue {lowest:g}", where, "correct the matrix")
     return matrix
 
 
-# Rows that a file has twice, most often because it was put together of overlapping parts.
+# Repeated rows, which occur when a file is joined from overlapping parts.
 
 
 def check_repeats(
     chunks: Sequence[RowChunk], index: Sequence[Array], target: Sequence[Array], stations: Sequence[str], epochs: Epochs
 ) -> None:
-    """Refuse a row that another one repeats.
+    """Raise InvalidProblem for a row that repeats another row; the message names both.
 
-    Two measurements of the same stations at the same epoch are welcome where each has noise of its own; the same value
-    at the same stated time or epoch is a copy. Where the noise is that of arrivals, both have the same noise and only
-    one can be right.
-
-    Parameters
-    ----------
-    chunks : sequence of RowChunk
-        Rows of each kind of each table.
-    index, target : sequence of int array (m,)
-        Epoch and target of each row of each chunk.
-    stations : sequence of str
-        Names of the stations.
-    epochs : Epochs
-        The epochs.
-
-    Raises
-    ------
-    InvalidProblem
-        Naming the row and the one that it repeats.
+    Two measurements of the same stations at the same epoch are valid if their noise is independent. The same value at
+    the same stated time or epoch is a copy. With the noise of arrivals, both rows have the same noise, so only one can
+    be right. `index` and `target` are the epoch and target (m,) of each row, for each chunk.
     """
     for kind in dict.fromkeys(chunk.kind for chunk in chunks):
         same = [i for i, chunk in enumerate(chunks) if chunk.kind == kind]
         ends = [(chunks[i].a + 1, chunks[i].b + 1, index[i], target[i]) for i in same]
         own = [np.concatenate(each) for each in zip(*ends, strict=True)]
         if len(first_rows(*own)[0]) == len(own[0]):
-            continue  # no two rows are of the same stations at the same epoch
-        # Sorted by all that makes rows equal, equal ones are neighbours, the first of the file first.
+            continue  # all rows have different stations or epochs
+        # Sort by all values that make rows equal. Equal rows are then neighbours, in the order of the file.
         table = np.concatenate([_table(chunks[i], index[i], target[i], i) for i in same], axis=1)
         order = np.lexsort(table[_PLACE:0:-1])
         keys = table[1:_PLACE, order]
@@ -508,14 +463,14 @@ def check_repeats(
 
 
 def _table(chunk: RowChunk, index: Array, target: Array, number: int) -> Array:
-    """Return the number of the chunk, what makes rows equal, and the place in the chunk, as columns (9, present)."""
-    # With noise of arrivals a second row of the same stations has the same noise, whatever its value: a copy, too.
+    """Return columns (9, present): chunk number, the values that make rows equal, and the index in the chunk."""
+    # With noise of arrivals, a second row of the same stations has the same noise. So it is a copy with any value.
     own = chunk.arrival is None and chunk.signal is None
     time = np.zeros(len(index)) if chunk.time is None or not own else chunk.time
     value = chunk.z if own else np.zeros(len(index))
     same = (chunk.a, chunk.b, index, target, np.full(len(index), own), value, time)
     table = np.array([np.full(len(index), number), *same, np.arange(len(index))], dtype=float)
-    # Rows without time and label may be repeated measurements of one still target.
+    # Rows without time and label may be repeated measurements of a static target.
     dated = not own or chunk.label is not None or chunk.time is not None
     return table[:, (chunk.weight > 0.0) & ~np.isnan(value) & dated]
 
@@ -527,7 +482,7 @@ def _repeated(
     names = "-".join(stations[s] for s in (chunk.a[i], chunk.b[i]) if s >= 0)
     row = f"row {other.row[j] + 1}" + ("" if other.table is chunk.table else f" of {other.table.source}")
     what = " ".join(f"{chunk.kind} {names} of epoch {epoch!r} is already in {row}".split())
-    advice = "leave one of them out, or give each an epoch of its own"
+    advice = "remove one row, or give the rows different epochs"
     if chunk.arrival is not None or chunk.signal is not None:
-        what += f", and by {'snr' if chunk.arrival is None else 'arrival_sigma'} both have the same noise"
+        what += f"; with {'snr' if chunk.arrival is None else 'arrival_sigma'}, both have the same noise"
     return InvalidProblem(what, chunk.table.where("z", int(chunk.row[i])), advice)

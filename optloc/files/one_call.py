@@ -1,6 +1,7 @@
-"""One call from what receivers measured to a fix: the field's words and units, numpy or pandas in.
+"""The function `locate`: from measurements to a fix in one call, with numpy or pandas input and common units.
 
-Everything becomes `optloc.problem.build.measured` and `assemble`; what these functions cannot say, those can.
+It builds a problem with `optloc.problem.build.measured` and `assemble`. Use these functions for cases that `locate`
+does not cover.
 """
 
 from __future__ import annotations
@@ -44,19 +45,23 @@ Values: TypeAlias = (
 )
 """Measurements by station or by pair of stations, in the order of the stations, or as a table."""
 
-# Nothing is nearer to the centre of the Earth than its poles, metres.
+# Smallest distance of a point on Earth from the centre (at the poles), metres.
 _SURFACE = 6.3e6
-# Arrivals differ by no more than the way between two stations; that many times as much is another unit.
+# Arrivals differ at most by the distance between two stations. This multiple of it means a wrong unit.
 _TOO_FAR = 100.0
-# Receivers, and conversions with their standard deviations, of the last some hundred calls.
+# Caches of receivers and of unit conversions with standard deviations: repeated calls reuse them.
 _PLACES, _SCALES = Cache["_Receivers"](64), Cache[tuple[Conversion, float]](256)
-# Steps between two floats that stand for an instant, as a share of its standard deviation, which nobody would see.
+# Largest rounding of an instant as a float, as a share of its standard deviation; less has no effect.
 _STEP = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class _Receivers:
-    """Stations in their frame, whether heights were left out on Earth, and the greatest distance along an axis."""
+    """Stations with their frame.
+
+    level: whether the stations are on Earth without altitudes. extent: greatest extent of the stations along an axis,
+    m.
+    """
 
     stations: Stations
     frame: Frame
@@ -69,7 +74,7 @@ class _Receivers:
 
 
 class _North(NamedTuple):
-    """From where bearings are counted, and the declination of magnetic north, None for true north."""
+    """Convention of bearings, and the declination of magnetic north; None for true north."""
 
     azimuth: str
     declination: Any
@@ -137,69 +142,69 @@ def locate(
     speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
     method: str = "auto",
 ) -> Fix:
-    """Return where something is from what receivers measured of it, in one call.
+    """Return the fix of a target from the measurements of receivers, in one call.
 
-    Measurements are mappings of a station's name to a value, arrays (..., s) in the order of the stations, pandas
-    series, or data frames with one column for each station (each row is a fix of its own) or with the columns station,
-    value and, where wanted, epoch. Every name must be that of a station, those of all columns of a frame with one for
-    each station included; an unknown one is refused. What was not heard is NaN. Several kinds may be given together. As
-    many coordinates come out as go in: without altitudes a target on Earth is taken to be at the level of the stations,
-    0 m.
+    Measurements are mappings of station names to values, arrays (..., s) in the order of the stations, pandas series,
+    or data frames. A data frame has one column for each station (each row is a separate fix), or the columns station,
+    value and optionally epoch. An unknown station name raises an error. Missing measurements are NaN. You can give
+    several kinds together. The position has the same coordinates as the stations: without altitudes, a target on Earth
+    is assumed to be at the level of the stations, 0 m.
 
     Parameters
     ----------
     stations : mapping of name to coordinates, array (s, 2 or 3), or table with name, x, y, z or name, lat, lon, alt
-        Receivers or anchors: metres; degrees and metres in columns that are called lat, lon and alt.
+        Receivers or anchors: metres; degrees and metres in columns with the names lat, lon and alt.
     latlon : mapping of name to (latitude, longitude) or (latitude, longitude, altitude), or array (s, 2 or 3)
-        Receivers in degrees and metres above the WGS 84 ellipsoid, in the place of `stations`.
+        Receivers in degrees and metres above the WGS 84 ellipsoid, instead of `stations`.
     toa : measurements, optional
         Times of arrival by one clock, seconds; numpy.datetime64 or whole nanoseconds keep all their digits.
     tdoa : measurements, optional
-        Differences of arrival times, seconds: a mapping of (A, B) to the time at A less that at B; or of A, and B is
-        the `reference`.
+        Differences of arrival times, seconds: a mapping of (A, B) to the time at A minus the time at B; or of A, and B
+        is the `reference`.
     ranges : measurements, optional
-        Distances of a tag, metres.
+        Distances to the target, metres.
     pseudoranges : measurements, optional
-        Distances that share an unknown clock error, metres. Satellites are where they were when they sent, along the
-        axes of the Earth at reception: turn places of the time of sending by the rotation of the Earth in the flight.
+        Distances that share an unknown clock error, metres. Give satellite positions at transmission, in the Earth axes
+        at reception: rotate positions in the axes at transmission by the Earth rotation during the flight time.
     bearings : measurements, optional
         Compass bearings, degrees from true north (the y axis), clockwise; see `azimuth` and `declination`.
     elevations : measurements, optional
         Angles above the horizon, degrees.
     sigma : float, str, or mapping of argument to these
-        Standard deviation of one value, in its unit, or text with a unit such as "20 ns"; of several kinds
-        ``{"toa": 20e-9, "bearings": 2.0}``. That of a time difference is of both arrivals together.
+        Standard deviation of one value, in its unit, or text with a unit such as "20 ns"; for several kinds
+        ``{"toa": 20e-9, "bearings": 2.0}``. The sigma of a time difference includes the errors of both arrivals.
     unit : str, or mapping of argument to str, optional
-        Unit of the values: "ns", "km", "rad" and so on.
+        Unit of the values: "ns", "km", "rad" and others.
     reference : str, optional
-        Station that time differences are taken to; the first by default.
+        Reference station of time differences; by default the first.
     height : float, str, or (least, greatest), optional
-        Known height of the target, metres or text such as "1640 ft": above the WGS 84 ellipsoid, or along z where
-        there is no Earth.
+        Known height of the target, metres or text such as "1640 ft": above the WGS 84 ellipsoid, or along z if the
+        frame is not on Earth.
     azimuth : "north-clockwise", "north-counterclockwise" or "east-counterclockwise"
-        Where bearings are counted from, and which way.
+        Zero direction and sense of bearings.
     declination : float, str or date, optional
-        Of bearings from magnetic north, east positive: in the unit of the bearings, text such as "4 deg", or a date
-        such as "2026-06-01", at which the World Magnetic Model gives that of each station on Earth. It is added to
-        compass bearings.
+        Declination of bearings from magnetic north, east positive: in the unit of the bearings, text such as "4 deg",
+        or a date such as "2026-06-01". For a date, the World Magnetic Model gives the declination at each station on
+        Earth. It is added to compass bearings.
     frame : "cartesian" or "ecef"
-        What x, y, z of stations mean.
+        Frame of x, y, z of the stations.
     speed : float, str, (float, float), Layers or Atmosphere
         Propagation speed, m/s or text such as "1480 m/s": light, `optloc.units.sound_in_air` or `sound_in_water`. Rays
         bend through `optloc.models.Layers` and `optloc.models.Atmosphere`. A pair is a speed and its standard
         deviation: the speed is then estimated with the position, from all measurements that are times.
     method : str
-        As of `optloc.solve`.
+        Method as in `optloc.solve`.
 
     Returns
     -------
     Fix
-        Of one position, or a batch (...) of them: print it. On Earth `Fix.latlon` has latitude and longitude.
+        One position, or a batch (...) of positions; you can print it. On Earth, `Fix.latlon` has latitude and
+        longitude.
 
     Raises
     ------
     InvalidProblem
-        Naming the argument and the station that cannot be right.
+        The message names the wrong argument and the station.
 
     Examples
     --------
@@ -217,7 +222,7 @@ def locate(
     texts = (("reference", reference), ("frame", frame), ("method", method), ("azimuth", azimuth), *_texts(unit))
     for name, text in texts:
         if text is not None and not isinstance(text, str):
-            raise InvalidProblem(f"{type(text).__name__} is no name", name, "give text, such as 'ns' for a unit")
+            raise InvalidProblem(f"{type(text).__name__} is not text", name, "give text, such as 'ns' for a unit")
     north = _North(azimuth, declination)
     _check_north(north, given)
     own, spread = _speed(speed), _speed_sigma(speed)
@@ -226,7 +231,7 @@ def locate(
 
 
 def _labelled(fix: Fix, labels: list[Any] | None) -> Fix:
-    """Return fixes with the index of the data frame that their values come from."""
+    """Return fixes with the index of the data frame of the measurements as labels."""
     if labels is None or fix.shape != (len(labels),):
         return fix
     own = np.empty(len(labels), dtype=object)
@@ -235,16 +240,16 @@ def _labelled(fix: Fix, labels: list[Any] | None) -> Fix:
 
 
 def _check_north(north: _North, given: Mapping[str, Any]) -> None:
-    """Refuse conventions of azimuths that there are none of, and a declination without bearings from north."""
+    """Raise InvalidProblem for an unknown convention of azimuths, and for a declination without bearings."""
     known = get_args(AzimuthConvention)
     if north.azimuth not in known:
         raise InvalidProblem(f"there is no convention {north.azimuth!r}", "azimuth", nearest(north.azimuth, known))
     if north.declination is not None and "bearings" not in given:
-        raise InvalidProblem("there are no bearings", "declination", "leave it out")
+        raise InvalidProblem("there are no bearings", "declination", "remove this argument")
 
 
 def _speed_sigma(given: Any) -> float | None:
-    """Return the standard deviation of a speed that is a pair."""
+    """Return the standard deviation, m/s, of a speed that is a pair; else None."""
     return float(in_si(given[1], "speed", "speed")) if isinstance(given, tuple | list) else None
 
 
@@ -256,7 +261,7 @@ def _speed(given: Any) -> float | Medium:
             raise InvalidProblem(
                 f"the speed has {len(given)} numbers", "speed", "give (speed, sigma), such as (343, 5)"
             )
-        _speed(given[1])  # as positive as the speed
+        _speed(given[1])  # the standard deviation must be positive as well
         return _speed(given[0])
     try:
         given = in_si(given, "speed", "speed")
@@ -264,12 +269,12 @@ def _speed(given: Any) -> float | Medium:
         raise InvalidProblem(error.what, "speed", f"{error.advice}, or give optloc.models.Layers") from None
     if isinstance(given, bool) or not isinstance(given, float | int | np.number) or not 0.0 < given < np.inf:
         advice = "give metres per second, optloc.models.Layers or optloc.models.Atmosphere"
-        raise InvalidProblem("the speed is no positive number", "speed", advice)
+        raise InvalidProblem("the speed is not a positive number", "speed", advice)
     return float(given)
 
 
 def _texts(unit: Any) -> list[tuple[str, Any]]:
-    """Return what must be text in an argument that may have one for each kind."""
+    """Return pairs of name and value that must be text, for a unit or a mapping of units."""
     return [("unit", each) for each in (unit.values() if isinstance(unit, Mapping) else (unit,))]
 
 
@@ -305,7 +310,7 @@ def _problem_of(
 
 
 def _with_speed(problem: Problem, speed: float, sigma: float, timed: Sequence[bool]) -> Problem:
-    """Return a problem with a scale of its times, from a speed with a standard deviation."""
+    """Return a problem with a scale bias of its times, from a speed with a standard deviation."""
     ends = [(start, start + rows.count) for rows, start in zip(problem.rows, problem.starts, strict=True)]
     times = [np.arange(*end) for end, time in zip(ends, timed, strict=True) if time]
     return replace(problem, biases=(*problem.biases, scale_of(speed, sigma, times, "speed")))
@@ -317,13 +322,13 @@ def _scale(
     """Return the conversion of values to SI units, and their standard deviation in SI units."""
     units = Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed)
     step = replace(units, convention=convention).conversion(unit, f"unit of {word}")
-    return step, _spread(_per_word(sigma, word, words, "sigma"), word, units, unit)
+    return step, _sigma_si(_per_word(sigma, word, words, "sigma"), word, units, unit)
 
 
-# Numbers of a speed with its standard deviation.
+# Length of a speed with its standard deviation.
 _PAIR = 2
 
-# Where the receivers are.
+# Receivers.
 
 
 def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
@@ -336,11 +341,13 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
     table = with_standard_columns(station_table(stations if latlon is None else latlon, where, axes), "m")
     globe = table.has("lat_deg") or table.has("lon_deg")
     if latlon is not None and not globe:
-        raise InvalidProblem("there are no latitudes", "latlon", "call the columns lat and lon, or use stations=")
+        raise InvalidProblem("there are no latitudes", "latlon", "name the columns lat and lon, or use stations=")
     kind = "enu" if globe else frame
     found, own = survey(StationsTable(), table, FrameTable(kind=cast("Any", kind)), where)
     if len(found.position) > len(found.names):
-        raise InvalidProblem("a station has several places", where, "give one for each, or use optloc.from_table")
+        raise InvalidProblem(
+            "a station has several positions", where, "give one for each station, or use optloc.from_table"
+        )
     order = np.argsort(found.index)
     axes_of = None if found.axes is None else found.axes[order]
     made = station_array(found.position[order], found.names, axes=axes_of)
@@ -349,14 +356,14 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
 
 
 def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple[Band, ...]:
-    """Return what is known of the target's height."""
+    """Return the constraint on the height of the target, or an empty tuple."""
     d = places.stations.position.shape[-1]
     if height is None and places.level:
         height = 0.0
     if height is None:
         if d == 3 and set(given) == {"bearings"}:
             advice = "give height= of the target in metres, elevations=, or stations without altitudes"
-            raise InvalidProblem("bearings alone do not tell how high the target is", "bearings", advice)
+            raise InvalidProblem("bearings alone do not determine the height of the target", "bearings", advice)
         return ()
     try:
         ends = (height, height) if isinstance(height, str) or not np.ndim(height) else height
@@ -366,49 +373,51 @@ def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple
     except (TypeError, ValueError):
         low = high = np.nan
     if not low <= high:
-        raise InvalidProblem("this is no height", "height", "give metres, or the least and the greatest")
+        raise InvalidProblem("this is not a height", "height", "give metres, or the least and the greatest height")
     if places.frame.geodetic:
         return constraints.height(low, high)
     if d == 2:
-        raise InvalidProblem("stations in the plane have no height", "height", "give x, y, z of each, or leave it out")
+        raise InvalidProblem(
+            "stations in the plane have no height", "height", "give x, y, z of each station, or remove this argument"
+        )
     if np.linalg.norm(places.stations.position, axis=-1).min() > _SURFACE:
-        advice = 'say frame="ecef" if they are Earth-centred'
-        raise InvalidProblem("the stations are some thousand kilometres from their origin", "height", advice)
+        advice = 'write frame="ecef" if they are Earth-centred'
+        raise InvalidProblem("the stations are thousands of kilometres from the origin", "height", advice)
     return constraints.box([-np.inf, -np.inf, low], [np.inf, np.inf, high])
 
 
-# What they measured.
+# Measurements.
 
 
 def _per_word(given: Any, word: str, words: Collection[str], name: str) -> Any:
-    """Return what an argument that may be one for each kind says of a kind."""
+    """Return the value of an argument for one kind; the argument may be a mapping by kind."""
     if isinstance(given, Mapping):
         unknown = [key for key in given if key not in words]
         if unknown:
             advice = f"use {', '.join(words)}"
-            raise InvalidProblem(f"there are no measurements called {unknown[0]!r}", name, advice)
+            raise InvalidProblem(f"there are no measurements with the name {unknown[0]!r}", name, advice)
         return given.get(word)
     if name == "sigma" and given is not None and not isinstance(given, str) and len(words) > 1:
         example = ", ".join(f'"{each}": ...' for each in words)
-        raise InvalidProblem("one number cannot be the error of several kinds", name, f"give {{{example}}}")
+        raise InvalidProblem("one number cannot be the sigma of several kinds", name, f"give {{{example}}}")
     return given
 
 
-def _spread(sigma: Any, word: str, units: Units, unit: str) -> float:
+def _sigma_si(sigma: Any, word: str, units: Units, unit: str) -> float:
     """Return the standard deviation of one value, SI."""
     noun, default = ARGUMENTS[word].noun, units.conversion(unit, f"unit of {word}")
     if sigma is None:
         advice = f"give their standard deviation in {unit}, such as sigma=..., or as text with a unit"
-        raise InvalidProblem(f"nothing says how accurate the {noun} are", "sigma", advice)
+        raise InvalidProblem(f"the accuracy of the {noun} is unknown", "sigma", advice)
     if not isinstance(sigma, str | float | int | np.number) or isinstance(sigma, bool):
         raise InvalidProblem(
-            f"{type(sigma).__name__} is no standard deviation", "sigma", "give a number, or optloc.measured"
+            f"{type(sigma).__name__} is not a standard deviation", "sigma", "give a number, or optloc.measured"
         )
     number, own = units.amount(sigma if isinstance(sigma, str) else float(sigma), default, "sigma")
     value = float(own.sigma_to_si(number))
     if not value > 0.0:
         raise InvalidProblem(
-            f"the standard deviation {sigma} of the {noun} is not positive", "sigma", "give what is expected"
+            f"the standard deviation {sigma} of the {noun} is not positive", "sigma", "give a positive number"
         )
     return value
 
@@ -416,34 +425,34 @@ def _spread(sigma: Any, word: str, units: Units, unit: str) -> float:
 def _rows(
     word: str, found: StationValues, sigma: float, unit: Conversion, places: _Receivers, speed: float
 ) -> Measured:
-    """Return readings in SI units as rows."""
+    """Return measurements in SI units as rows."""
     kind = ARGUMENTS[word].kind
     a, b = np.array(found.keys, dtype=np.int64).T
     values = found.values
     if word == "toa":
-        # Dates become seconds, whatever the unit of sigma is.
+        # Dates always become seconds, independent of the unit of sigma.
         unit = conversion("s", "length", propagation_speed=speed) if values.dtype.kind == "M" else unit
         values = _since_first(values, sigma, unit)
     z = np.asarray(unit.to_si(values), dtype=float)
     heard = np.isfinite(z)
     if np.isinf(z).any():
-        raise InvalidProblem("a value is infinite", word, "use NaN where there is none")
+        raise InvalidProblem("a value is infinite", word, "use NaN for missing values")
     if word in ("toa", "tdoa"):
-        _check_far(word, z, sigma, places)
+        _check_time_unit(word, z, sigma, places)
     own = {"weight": heard.astype(float), "a": a, "b": None if word != "tdoa" else b}
-    # Differences to one station share its error: half of the variance of each is that of either arrival. Of pairs that
-    # close loops this claims the least: what follows from the others says nothing more.
+    # Differences to one station share its error, and each arrival has half of the variance of a difference. If pairs
+    # form loops, this is the cautious choice: a difference that follows from others adds no information.
     noise = {"arrival_sigma": sigma / np.sqrt(2.0)} if word == "tdoa" else {"sigma": sigma}
     return measured(kind, np.where(heard, z, 0.0), **own, **noise)
 
 
 def _from_north(made: Measured, north: _North, unit: str, places: _Receivers) -> Measured:
-    """Return rows of bearings with the declination of magnetic north, and the sense in which they are counted."""
+    """Return rows of bearings with the declination of magnetic north and the sense of the convention."""
     rows, east = made.rows.clockwise() if north.azimuth == COMPASS else made.rows, north.declination
     if east is None:
         return replace(made, rows=rows)
     if isinstance(east, bool) or not isinstance(east, str | date | float | int | np.number):
-        what = f"{type(east).__name__} is no declination"
+        what = f"{type(east).__name__} is not a declination"
         raise InvalidProblem(what, "declination", 'give a number, "4 deg", or a date such as "2026-06-01"')
     angle, day = declination_of(east, north.azimuth, unit, "declination")
     at = places.stations.position[0]
@@ -452,7 +461,7 @@ def _from_north(made: Measured, north: _North, unit: str, places: _Receivers) ->
 
 
 def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:
-    """Return times counted from the first arrival, in their unit (dates in seconds), before any digit is lost."""
+    """Return times relative to the first arrival, in their unit (dates in seconds), before digits are lost."""
     if times.dtype.kind == "M":
         known = ~np.isnat(times)
         counted = times.astype("datetime64[ns]").astype(np.int64)
@@ -465,15 +474,15 @@ def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:
         first = np.fmin.reduce(times, axis=-1, keepdims=True)
         counted = np.asarray(times - np.where(np.isfinite(first), first, 0.0))
     if coarse > _STEP * sigma:
-        what = f"these instants are rounded to {coarse:.3g} m of the way, more than their sigma tells"
-        advice = "give whole nanoseconds with unit='ns', numpy.datetime64, or times since a recent instant"
+        what = f"these times are rounded to {coarse:.3g} m of path, which is too coarse for their sigma"
+        advice = "give whole nanoseconds with unit='ns', numpy.datetime64, or times relative to a recent time"
         raise InvalidProblem(what, "toa", advice)
     return counted
 
 
-def _check_far(word: str, z: Array, sigma: float, places: _Receivers) -> None:
-    """Refuse times that no signal takes between stations: they have another unit."""
+def _check_time_unit(word: str, z: Array, sigma: float, places: _Receivers) -> None:
+    """Raise InvalidProblem for times longer than any path between stations: their unit is wrong."""
     most = float(np.fmax.reduce(np.abs(z), axis=None, initial=0.0))
     if most > _TOO_FAR * max(places.extent, sigma):
-        what = f"the arrivals are {most / 1e3:.3g} km apart, and the stations {places.extent / 1e3:.3g} km"
-        raise InvalidProblem(what, word, "say the unit of the times, such as unit='ns', or correct them")
+        what = f"the arrivals are {most / 1e3:.3g} km apart, but the stations {places.extent / 1e3:.3g} km"
+        raise InvalidProblem(what, word, "state the unit of the times, such as unit='ns', or correct them")

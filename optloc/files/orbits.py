@@ -1,8 +1,8 @@
-"""Satellites as stations: places and velocities in ECEF at given times, from orbital elements or from SP3 files.
+"""Satellites as stations: ECEF positions and velocities at given times, from orbital elements or SP3 files.
 
-Two-line elements, and mean elements as OMM in JSON or CSV, are followed by SGP4 and turned from its frame of date
-(TEME) to the Earth's by the library skyfield, the rate of that turn included: velocities are those that a station on
-the ground sees. SP3 files hold places in the Earth's frame, which are interpolated; their velocities are derivatives.
+SGP4 propagates two-line elements and mean elements (OMM in JSON or CSV). The library skyfield rotates the result from
+the frame of date (TEME) to ECEF, with the rate of rotation. So velocities are relative to the ground. SP3 files have
+ECEF positions, which are interpolated; the velocities are their derivatives.
 
 Sources: D. A. Vallado, P. Crawford, R. Hujsak, T. S. Kelso, "Revisiting Spacetrack Report #3", AIAA 2006-6753;
 S. Hilla, "The Extended Standard Product 3 Orbit Format (SP3-d)" (2016).
@@ -29,23 +29,23 @@ from optloc.base.inputs import Budget, access, check_budget, has_controls, json_
 from optloc.base.types import Array, Stations
 from optloc.files.table import csv, of_frame
 
-# Days from its epoch at which an element set still says where a low satellite is: some 2 km a day are usual, and an
-# error of 60 km along the track is no longer a model of the pass.
+# Largest age of an element set, days. The error of a low satellite grows by about 2 km a day, and an error of 60 km
+# along the track is too large for a model of the pass.
 _OLDEST = 30.0
 _DAY = 86400.0
 _EPOCH_1970 = 2440587.5  # Julian date of 1970-01-01
-# Times that are turned at once: the theory of the Earth's axis takes 11 kB for each.
+# Times per call of the rotation to ECEF: the model of the Earth's axis needs 11 kB for each.
 _AT_ONCE = 4096
-# Neighbours of a time that an SP3 file is interpolated by, and how far the answer by fewer may be from theirs: between
-# positions of GNSS satellites 15 minutes apart both agree within 0.1 m, even next to the ends.
-_POINTS, _FEWER, _APART = 10, 8, 1.0
-# Unequal steps that are no rounding of times: a position is missing.
+# Points of the interpolation of SP3 positions, points of a second one for comparison, and the permitted difference, m.
+# For positions of GNSS satellites 15 minutes apart, both agree within 0.1 m, even near the ends.
+_POINTS, _CHECK_POINTS, _MAX_DIFFERENCE = 10, 8, 1.0
+# Relative difference of time steps above which a position is missing; less is rounding of times.
 _UNEVEN = 1e-3
-# Seconds that the clocks of SP3 files are ahead of atomic time (TAI); None is UTC.
+# Offset from the clocks of SP3 files to atomic time (TAI), s; None is UTC.
 _CLOCKS = {"GPS": -19.0, "GAL": -19.0, "QZS": -19.0, "IRN": -19.0, "BDT": -33.0, "TAI": 0.0, "UTC": None, "GLO": None}
 _KILOMETRE = 1e3
 
-# Position (k, 3) and velocity (k, 3) at seconds (k,) since 1970 UTC.
+# Position (k, 3), m, and velocity (k, 3), m/s, at seconds (k,) since 1970 UTC.
 _Course = Callable[[Array], tuple[Array, Array]]
 
 
@@ -58,9 +58,9 @@ class Orbits:
     source : str
         Name of the file.
     courses : mapping of str to callable
-        Position and velocity of each satellite at times.
+        Function for position and velocity of each satellite at given times.
     aliases : mapping of str to str
-        Name of the satellite of each catalogue number.
+        Name of the satellite for each catalogue number.
     """
 
     source: str
@@ -68,19 +68,10 @@ class Orbits:
     aliases: Mapping[str, str]
 
     def at(self, name: str, seconds: Array) -> tuple[Array, Array]:
-        """Return position (k, 3) and velocity (k, 3) in ECEF of a satellite, metres and metres per second.
+        """Return ECEF position (k, 3) and velocity (k, 3) of a satellite, metres and metres per second.
 
-        Parameters
-        ----------
-        name : str
-            Its name, or its catalogue number.
-        seconds : array (k,)
-            Since 1970, UTC.
-
-        Raises
-        ------
-        InvalidProblem
-            For an unknown name, a time at which the orbit is not known, and elements that are none.
+        `name` is its name or catalogue number; `seconds` (k,) are since 1970, UTC. Raise InvalidProblem for an unknown
+        name, a time outside the orbit data, and invalid elements.
         """
         course = self.courses.get(self.aliases.get(name, name))
         if course is None:
@@ -100,9 +91,9 @@ def satellites(
     times : array (k,)
         Dates (datetime64, or text in ISO 8601), or seconds since 1970; UTC.
     names : sequence of s str, optional
-        Names, or catalogue numbers; all of the file by default.
+        Names, or catalogue numbers; by default all satellites of the file.
     budget : Budget, optional
-        How much the file may hold.
+        Limits on the size of the file.
 
     Returns
     -------
@@ -112,7 +103,7 @@ def satellites(
     Raises
     ------
     InvalidProblem
-        Naming the file and the line, or the satellite.
+        The message names the file and the line, or the satellite.
     """
     with access(budget=budget):
         orbits = read_orbits(Path(path))
@@ -125,11 +116,13 @@ def satellites(
 
 
 def read_orbits(path: Path) -> Orbits:
-    """Return the satellites of a file; what it is, is seen in it."""
+    """Return the satellites of a file; the format is found from the content."""
     text = read_text(path)
     start = text.lstrip()[:1]
     if start == "<":
-        raise InvalidProblem("elements in XML are not read", path.name, "save them as JSON, CSV or two-line elements")
+        raise InvalidProblem(
+            "elements in XML are not supported", path.name, "save them as JSON, CSV or two-line elements"
+        )
     if start == "#":
         return _sp3(text, path.name)
     if start in ("{", "["):
@@ -139,12 +132,12 @@ def read_orbits(path: Path) -> Orbits:
     return _of_elements(_line_sets(text, path.name), path.name)
 
 
-# Elements: several sets of one satellite are of different days.
+# Orbital elements. A satellite may have several sets, from different days.
 
 
 @dataclass(frozen=True, slots=True)
 class _Set:
-    """Elements as they are written: two lines, or the fields of an OMM."""
+    """An element set, two lines or the fields of an OMM; `made` creates the satellite when it is needed."""
 
     name: str
     number: str
@@ -152,8 +145,8 @@ class _Set:
     made: Callable[[], Any]
 
     def satellite(self) -> Any:
-        """Return the satellite of the library; raise InvalidProblem where the elements are none."""
-        with _telling(self.where):
+        """Return the satellite object of skyfield; raise InvalidProblem for invalid elements."""
+        with _as_invalid_problem(self.where):
             found = self.made()
         if found.model.error:
             raise _no_elements(self.where)
@@ -161,40 +154,42 @@ class _Set:
 
 
 def _no_elements(where: str) -> InvalidProblem:
-    return InvalidProblem("these are no elements of an orbit", where, "fetch them again, unchanged")
+    return InvalidProblem("these are not valid elements of an orbit", where, "download them again, unchanged")
 
 
 @contextmanager
-def _telling(where: str) -> Iterator[None]:
-    """Tell what the library complains of as one sentence."""
+def _as_invalid_problem(where: str) -> Iterator[None]:
+    """Convert errors of the library to InvalidProblem."""
     try:
         yield
     except InvalidProblem:
         raise
     except KeyError as error:
-        raise InvalidProblem(f"the element {error.args[0]} is missing", where, "fetch them again, unchanged") from None
+        raise InvalidProblem(
+            f"the element {error.args[0]} is missing", where, "download them again, unchanged"
+        ) from None
     except (ValueError, TypeError, AttributeError, OverflowError, ZeroDivisionError):
         raise _no_elements(where) from None
 
 
 def _of_elements(sets: Sequence[_Set], source: str) -> Orbits:
     if not sets:
-        what = "the file holds no orbits"
+        what = "the file has no orbits"
         raise InvalidProblem(what, source, "give two-line elements, OMM as JSON or CSV, or SP3")
     by_number: dict[str, list[_Set]] = {}
     for found in sets:
         if has_controls(found.name):
-            raise InvalidProblem(f"the name {found.name!r} holds control characters", found.where, "give another")
+            raise InvalidProblem(f"the name {found.name!r} has control characters", found.where, "use another name")
         by_number.setdefault(found.number, []).append(found)
     held = {number: own[-1].name or number for number, own in by_number.items()}
-    # Pieces of one launch share names such as OBJECT A: these have their numbers.
+    # Pieces of one launch share names such as OBJECT A; use their catalogue numbers instead.
     shared = {name for name, count in Counter(held.values()).items() if count > 1}
     names = {number: number if name in shared else name for number, name in held.items()}
-    return Orbits(source, {names[number]: partial(_follow, own) for number, own in by_number.items()}, names)
+    return Orbits(source, {names[number]: partial(_propagate_sets, own) for number, own in by_number.items()}, names)
 
 
-def _follow(sets: Sequence[_Set], seconds: Array) -> tuple[Array, Array]:
-    """Return position and velocity by the set whose day is nearest to each time."""
+def _propagate_sets(sets: Sequence[_Set], seconds: Array) -> tuple[Array, Array]:
+    """Return position and velocity (k, 3) at each time from the element set with the nearest epoch."""
     found = [one.satellite() for one in sets]
     epochs = np.array([sat.model.jdsatepoch + sat.model.jdsatepochF for sat in found])
     age = np.abs(seconds[:, None] / _DAY + _EPOCH_1970 - epochs)
@@ -203,7 +198,7 @@ def _follow(sets: Sequence[_Set], seconds: Array) -> tuple[Array, Array]:
     if len(old):
         days = age[old[0], pick[old[0]]]
         what = f"the elements of {sets[0].name or sets[0].number!r} are {days:.0f} days from {_date(seconds[old[0]])}"
-        advice = "fetch those of that day; times are dates, or seconds since 1970, UTC"
+        advice = "download the elements of that day; times are dates, or seconds since 1970, UTC"
         raise InvalidProblem(what, sets[pick[old[0]]].where, advice)
     position, velocity = np.empty((len(seconds), 3)), np.empty((len(seconds), 3))
     for i in np.unique(pick).tolist():
@@ -222,8 +217,8 @@ def _propagate(satellite: Any, seconds: Array, where: str) -> tuple[Array, Array
     bad = np.flatnonzero(~np.isfinite(position).all(axis=1))
     if len(bad):
         why = str((found.message or {})[bad[0]]) if found.message is not None else "it has no position"
-        what = f"the orbit cannot be followed to {_date(seconds[bad[0]])} ({why})"
-        raise InvalidProblem(what, where, "the satellite may have come down: leave it out")
+        what = f"the orbit cannot be computed at {_date(seconds[bad[0]])} ({why})"
+        raise InvalidProblem(what, where, "the satellite may have decayed: remove it")
     return position, velocity
 
 
@@ -233,13 +228,13 @@ def _date(seconds: float) -> str:
 
 @cache
 def _library() -> Any:
-    """Return the library's clock."""
+    """Return the time scale of skyfield."""
     try:
         from skyfield.api import load
     except ImportError:
         what, advice = "orbits need the library skyfield", "pip install 'optloc[satellites]'"
         raise InvalidProblem(what, "satellites", advice) from None
-    # Leap seconds and the Earth's rotation come with the library: nothing is fetched.
+    # Leap seconds and Earth rotation come with the library: nothing is downloaded.
     return load.timescale(builtin=True)
 
 
@@ -249,7 +244,7 @@ def _instants(seconds: Array) -> Any:
 
 
 def _line_sets(text: str, source: str) -> list[_Set]:
-    """Return two-line elements, each with the name on the line before it where there is one."""
+    """Return the sets of two-line elements, each with the name in the line before, if any."""
     lines = [(i, line.rstrip()) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     sets, name = [], ""
     following = iter([*pairwise(lines), (lines[-1], (0, ""))] if lines else [])
@@ -257,12 +252,12 @@ def _line_sets(text: str, source: str) -> list[_Set]:
         where = f"{source}, line {i}"
         if not line.startswith("1 "):
             if line.startswith("2 "):
-                raise InvalidProblem("a second line of elements has no first one", where, "give both, unchanged")
-            # What is no name and no element shows what the file is not, before anything is looked for in it.
+                raise InvalidProblem("a second line of elements has no first line", where, "give both lines, unchanged")
+            # Any other line may be a name. In a file of another format, no element lines follow.
             name = re.sub("^0 ", "", line).strip()
             continue
         if not after.startswith("2 "):
-            raise InvalidProblem("a first line of elements has no second one", where, "give both, unchanged")
+            raise InvalidProblem("a first line of elements has no second line", where, "give both lines, unchanged")
         sets.append(_Set(name, line[2:7].strip(), where, partial(_from_lines, name, line, after, where)))
         name = ""
         next(following)
@@ -275,12 +270,12 @@ def _from_lines(name: str, one: str, two: str, where: str) -> Any:
     from sgp4.io import twoline2rv, verify_checksum
     from skyfield.api import EarthSatellite
 
-    # The fast reader takes anything for elements: the slow one looks at every column first.
+    # The fast reader accepts any text as elements, so the slow reader checks all columns first.
     try:
         verify_checksum(one, two)
     except ValueError:
-        what = "the check digit at the end of a line does not fit it"
-        raise InvalidProblem(what, where, "fetch them again, unchanged") from None
+        what = "the check digit at the end of a line does not match the line"
+        raise InvalidProblem(what, where, "download the elements again, unchanged") from None
     twoline2rv(one, two, wgs72)
     return EarthSatellite(one, two, name or None, _library())
 
@@ -291,7 +286,7 @@ def _json_sets(text: str, source: str) -> list[_Set]:
     check_budget("rows", len(messages), source)
     for i, fields in enumerate(messages, 1):
         if not isinstance(fields, dict):
-            what = "this is no orbit mean-elements message"
+            what = "this is not an orbit mean-elements message"
             raise InvalidProblem(what, f"{source}, message {i}", "give a list of objects with EPOCH, MEAN_MOTION ...")
     return [_of_fields(fields, f"{source}, message {i}") for i, fields in enumerate(messages, 1)]
 
@@ -303,19 +298,19 @@ def _csv_sets(path: Path) -> list[_Set]:
     return [_of_fields(fields, table.at(i)) for i, fields in enumerate(found)]
 
 
-# What the theory takes elements for; a message may say that its own are others.
-_MEANT = {"REF_FRAME": "TEME", "TIME_SYSTEM": "UTC", "MEAN_ELEMENT_THEORY": "SGP4", "CENTER_NAME": "EARTH"}
+# Conventions of SGP4 elements; a message may state others.
+_CONVENTIONS = {"REF_FRAME": "TEME", "TIME_SYSTEM": "UTC", "MEAN_ELEMENT_THEORY": "SGP4", "CENTER_NAME": "EARTH"}
 
 
 def _of_fields(fields: Mapping[str, Any], where: str) -> _Set:
-    for key, meant in _MEANT.items():
+    for key, meant in _CONVENTIONS.items():
         if fields.get(key) not in (None, "", meant):
             what = f"{key} is {str(fields[key])[:40]!r}"
-            raise InvalidProblem(what, where, f"elements are read where it is {meant}")
+            raise InvalidProblem(what, where, f"only elements with {key} = {meant} are supported")
     number = str(fields.get("NORAD_CAT_ID") or "").strip()
     name = str(fields.get("OBJECT_NAME") or "").strip()
     if not (number or name):
-        raise InvalidProblem("the element NORAD_CAT_ID is missing", where, "fetch them again, unchanged")
+        raise InvalidProblem("the element NORAD_CAT_ID is missing", where, "download the elements again, unchanged")
     return _Set(name, number or name, where, partial(_from_fields, fields))
 
 
@@ -327,7 +322,7 @@ def _from_fields(fields: Mapping[str, Any]) -> Any:
     return EarthSatellite.from_omm(load, {**fields, "EPOCH": epoch if "." in epoch else f"{epoch}.0"})
 
 
-# SP3: places at equal steps, interpolated.
+# SP3: positions at equal time steps, interpolated.
 
 
 def _sp3(text: str, source: str) -> Orbits:
@@ -338,29 +333,29 @@ def _sp3(text: str, source: str) -> Orbits:
     for i, line in enumerate(text.splitlines(), 1):
         where = f"{source}, line {i}"
         if i == 1 and line[1:2] not in tuple("abcd"):
-            raise InvalidProblem("this is no SP3 file of version a to d", where, "see the first two characters")
+            raise InvalidProblem("this is not an SP3 file of version a to d", where, "check the first two characters")
         if line.startswith("%c") and clock == "GPS" and line[9:12].strip("c "):
             clock = line[9:12]
         elif line.startswith("* "):
             time = _calendar(line, where)
         elif line.startswith("P") and line[4:].strip():
             place = [_number(line[4 + 14 * k : 18 + 14 * k], where) for k in range(3)]
-            if any(place):  # zeros stand for a place that is not known
+            if any(place):  # zeros mean an unknown position
                 name = line[1:4].strip()
                 times.setdefault(name, []).append(time)
                 places.setdefault(name, []).append(place)
         elif line.startswith("EOF"):
             break
     if clock not in _CLOCKS:
-        raise InvalidProblem(f"the clock {clock!r} is unknown", source, f"known are {', '.join(_CLOCKS)}")
+        raise InvalidProblem(f"the clock {clock!r} is unknown", source, f"use {', '.join(_CLOCKS)}")
     if not places:
-        raise InvalidProblem("the file holds no places", source, "give a file with lines that begin with P")
+        raise InvalidProblem("the file has no positions", source, "give a file with lines that begin with P")
     courses = {}
     for name, seconds in times.items():
         if has_controls(name) or (np.diff(seconds) <= 0.0).any():
-            raise InvalidProblem(f"the times of satellite {name!r} do not increase", source, "fetch it again")
+            raise InvalidProblem(f"the times of satellite {name!r} do not increase", source, "download the file again")
         nodes = np.array(seconds), _KILOMETRE * np.array(places[name])
-        courses[name] = partial(_between, *nodes, _CLOCKS[clock], name, source)
+        courses[name] = partial(_interpolate, *nodes, _CLOCKS[clock], name, source)
     return Orbits(source, courses, {})
 
 
@@ -369,45 +364,48 @@ def _number(text: str, where: str) -> float:
         value = float(text)
     except ValueError:
         value = float("nan")
-    # A place of 1e9 km is beyond any orbit round the Earth.
+    # A coordinate of 1e9 km exceeds any orbit around the Earth.
     if not (isfinite(value) and abs(value) < 1e9 and "_" not in text):
-        raise InvalidProblem(f"{text.strip()[:40]!r} is not a number", where, "fetch the file again")
+        raise InvalidProblem(f"{text.strip()[:40]!r} is not a number", where, "download the file again")
     return value
 
 
 def _calendar(line: str, where: str) -> float:
-    """Return the reading of the file's clock as seconds since 1970."""
+    """Return a time of the clock of the file as seconds since 1970."""
     parts = line[1:].split()
     try:
-        date = datetime(*(int(part) for part in parts[:5]), tzinfo=UTC)  # type: ignore[misc,arg-type]  # five of them
+        date = datetime(*(int(part) for part in parts[:5]), tzinfo=UTC)  # type: ignore[misc,arg-type]  # five integers
     except (ValueError, TypeError):
-        raise InvalidProblem("this is no date", where, "fetch the file again") from None
+        raise InvalidProblem("this is not a date", where, "download the file again") from None
     return date.timestamp() + _number(parts[5] if len(parts) > 5 else "", where)
 
 
-def _between(
+def _interpolate(
     nodes: Array, places: Array, ahead: float | None, name: str, source: str, seconds: Array
 ) -> tuple[Array, Array]:
-    """Return position and velocity between the places (n, 3) at the file's readings (n,)."""
-    at = seconds + (0.0 if ahead is None else ahead + _leap(seconds))
+    """Return interpolated position and velocity (k, 3), from positions (n, 3) at the clock times `nodes` (n,).
+
+    `ahead` is the offset of the clock from TAI, s; None for UTC.
+    """
+    at = seconds + (0.0 if ahead is None else ahead + _leap_seconds(seconds))
     where = f"{source}, satellite {name}"
     if len(nodes) < _POINTS:
-        raise InvalidProblem(f"there are {len(nodes)} places", where, f"interpolation needs {_POINTS}")
+        raise InvalidProblem(f"there are {len(nodes)} positions", where, f"interpolation needs {_POINTS}")
     outside = np.flatnonzero((at < nodes[0]) | (at > nodes[-1]))
     if len(outside):
-        what = f"{_date(seconds[outside[0]])} is before its first or after its last place"
+        what = f"{_date(seconds[outside[0]])} is before the first or after the last position"
         raise InvalidProblem(what, where, "use the file of that day; times are dates, or seconds since 1970, UTC")
     position, velocity = _polynomial(nodes, places, at, _POINTS, where)
-    off = np.linalg.norm(position - _polynomial(nodes, places, at, _FEWER, where)[0], axis=1).max(initial=0.0)
-    if off > _APART:
+    off = np.linalg.norm(position - _polynomial(nodes, places, at, _CHECK_POINTS, where)[0], axis=1).max(initial=0.0)
+    if off > _MAX_DIFFERENCE:
         step = float(np.diff(nodes).min())
-        what = f"its places are {step:g} s apart, and between them it is known to {off:.2g} m only"
+        what = f"the positions are {step:g} s apart, so the interpolation is accurate to {off:.2g} m only"
         raise InvalidProblem(what, where, "use a file with smaller steps")
     return position, velocity
 
 
 def _polynomial(nodes: Array, places: Array, at: Array, count: int, where: str) -> tuple[Array, Array]:
-    """Return values and derivatives of polynomials through the `count` neighbours of each time."""
+    """Return values and derivatives of polynomials through the `count` nearest points of each time."""
     from scipy.interpolate import KroghInterpolator
 
     start = (np.searchsorted(nodes, at) - count // 2).clip(0, len(nodes) - count)
@@ -416,8 +414,8 @@ def _polynomial(nodes: Array, places: Array, at: Array, count: int, where: str) 
         mine, own = start == first, nodes[first : first + count]
         steps = np.diff(own)
         if np.ptp(steps) > _UNEVEN * steps.min():
-            raise InvalidProblem(f"places are missing around {_date(at[mine][0])}", where, "use another file")
-        # Counted in steps from the first: powers of seconds would lose digits.
+            raise InvalidProblem(f"positions are missing around {_date(at[mine][0])}", where, "use another file")
+        # Scale time to steps from the first point: powers of seconds would lose digits.
         step = float(steps.mean())
         through = KroghInterpolator((own - own[0]) / step, places[first : first + count])
         position[mine], velocity[mine] = through.derivatives((at[mine] - own[0]) / step, 2)
@@ -425,7 +423,7 @@ def _polynomial(nodes: Array, places: Array, at: Array, count: int, where: str) 
     return position, velocity
 
 
-def _leap(seconds: Array) -> Array:
-    """Return the whole seconds that atomic time is ahead of UTC."""
+def _leap_seconds(seconds: Array) -> Array:
+    """Return the leap seconds (k,) of atomic time over UTC."""
     ahead = np.concatenate([_instants(part).tai for part in np.split(seconds, range(_AT_ONCE, len(seconds), _AT_ONCE))])
     return np.asarray(np.round((ahead - (seconds / _DAY + _EPOCH_1970)) * _DAY))

@@ -1,4 +1,4 @@
-"""The propagation speed and the medium that a problem file states."""
+"""The propagation speed and the medium of a problem file."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _MEDIA = {
 
 
 def medium_in(file: ProblemFile, source: str) -> Medium | None:
-    """Return what the waves of a problem file come through, None where their speed is one number."""
+    """Return the medium of a problem file; None if the propagation speed is one number."""
     return None if file.medium is None else _medium(file.medium, _stated_speed(file, source), source)
 
 
 def speed_of(file: ProblemFile, source: str) -> float:
-    """Return the speed by which times are lengths, metres per second: light where a problem file names none."""
+    """Return the speed that converts times to lengths, m/s; by default the speed of light."""
     medium, stated = medium_in(file, source), _stated_speed(file, source)
     if medium is not None:
         return medium.unit_speed
@@ -32,18 +32,18 @@ def speed_of(file: ProblemFile, source: str) -> float:
 
 
 def _medium(table: MediumTable, reference: float | None, source: str) -> Medium:
-    """Return the medium that a table states; `reference` is the propagation speed beside it, if there is one."""
+    """Return the medium of a table; `reference` is the propagation speed of the file, if stated."""
     place = join(source, "[medium]")
     own = _MEDIA[table.kind]
     given = {key for key in table.model_fields_set - {"kind"} if getattr(table, key) is not None}
     wrong, lacking = sorted(given - set(own)), [key for key in ("depths", "speeds") if key in own and key not in given]
     if wrong:
-        raise InvalidProblem(f"the kind {table.kind!r} has no {wrong[0]!r}", place, f"its keys are {', '.join(own)}")
+        raise InvalidProblem(f"the kind {table.kind!r} has no {wrong[0]!r}", place, f"use the keys {', '.join(own)}")
     if lacking:
         raise InvalidProblem(f"the kind {table.kind!r} needs {lacking[0]}", place, "give a list of numbers")
     if table.kind == "atmosphere" and reference is not None:
-        what = "an atmosphere has its own speed, that of light over the refractive index"
-        raise InvalidProblem(what, place, "leave propagation_speed out")
+        what = "an atmosphere determines the speed: the speed of light over the refractive index"
+        raise InvalidProblem(what, place, "remove propagation_speed")
     length, speed = (
         Units(quantity).conversion(unit, place).to_si  # type: ignore[arg-type]
         for quantity, unit in (("length", table.unit), ("speed", table.speed_unit))
@@ -62,12 +62,12 @@ def _medium(table: MediumTable, reference: float | None, source: str) -> Medium:
 
 
 def _stated_speed(file: ProblemFile, source: str) -> float | None:
-    """Return the propagation speed that a file states, metres per second."""
+    """Return the propagation speed that a file states, m/s."""
     given, place = file.propagation_speed, join(source, "key 'propagation_speed'")
     if isinstance(given, SoundTable):
         water = given.medium != "air"
         if not water and (given.salinity is not None or given.depth):
-            raise InvalidProblem("air has no salinity and no depth", place, "leave them out")
+            raise InvalidProblem("air has no salinity and no depth", place, "remove them")
         usual = 35.0 if given.medium == "sea water" else 0.0
         salinity = usual if given.salinity is None else given.salinity
         return sound_in_water(given.celsius, salinity, given.depth) if water else sound_in_air(given.celsius)
@@ -79,18 +79,18 @@ def _stated_speed(file: ProblemFile, source: str) -> float | None:
 
 
 def positive_speed(given: float | str, what: str, place: str) -> float:
-    """Return a speed or its sigma, metres per second; refuse zero and less."""
+    """Return a speed or its sigma, m/s; raise InvalidProblem for zero or negative values."""
     speed = Units("speed").plain(given, "m/s", place)
     if not speed > 0.0:
         raise InvalidProblem(f"the {what} {given} is not positive", place, 'write it as 340.0 or "340 m/s"')
     return speed
 
 
-# A speed that is not quite known: the times are too long or too short by one factor, whose error is a scale.
+# A speed with a standard deviation: one factor scales all times, so the error of the speed is a scale bias.
 
 
 def is_time(units: Units, unit: str | None, place: str) -> bool:
-    """Return whether lengths are written as times, which the speed of the wave makes lengths."""
+    """Return whether lengths are given as times, so that they depend on the propagation speed."""
     if units.quantity != "length":
         return False
     once, twice = (Units("length", speed=factor * units.speed).conversion(unit, place).factor for factor in (1.0, 2.0))
@@ -100,26 +100,18 @@ def is_time(units: Units, unit: str | None, place: str) -> bool:
 def speed_bias(
     file: ProblemFile, written: Sequence[tuple[Array, Units, str]], biases: Sequence[Bias], source: str
 ) -> tuple[Bias, ...]:
-    """Return the scale of a speed that a file states with a sigma; nothing for a speed without one.
+    """Return the scale bias of a speed with a sigma; empty for a speed without a sigma.
 
-    Parameters
-    ----------
-    file : ProblemFile
-        Settings.
-    written : sequence of (int array (m,), Units, str)
-        Global numbers of rows, the quantity of their values and the unit that they are written in.
-    biases : sequence of Bias
-        The other biases of the file.
-    source : str
-        Place to name.
+    `written` has the global row numbers (m,), the quantity and the unit of each set of values. `biases` are the other
+    biases of the file.
     """
     given, place = file.propagation_speed, join(source, "key 'propagation_speed'")
     if not isinstance(given, SpeedTable):
         return ()
     if file.medium is not None:
-        raise InvalidProblem("the medium states the speed", place, "leave the sigma out")
+        raise InvalidProblem("the medium determines the speed", place, "remove the sigma")
     if any(bias.name == SPEED for bias in biases):
-        raise InvalidProblem("the bias 'speed' is there twice", place, "leave [[biases]] 'speed' or the sigma out")
+        raise InvalidProblem("the bias 'speed' is stated twice", place, "remove [[biases]] 'speed' or the sigma")
     speed, sigma = positive_speed(given.value, "speed", place), positive_speed(given.sigma, "sigma", place)
     rows = [numbers for numbers, units, unit in written if is_time(units, unit, place)]
     return (scale_of(speed, sigma, rows, place),)

@@ -1,4 +1,4 @@
-"""From a problem file to a problem: tables are read, epochs found, everything converted to SI and checked."""
+"""Reader of problem files: read tables, find epochs, convert to SI units, check, and build the problem."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ LOG = logging.getLogger("optloc.read")
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
-    """A problem and what its file calls things.
+    """A problem with the names and units of its file.
 
     Parameters
     ----------
@@ -74,23 +74,23 @@ class Loaded:
     source : str
         Name of the file.
     title : str
-        What the file says it is, or its name.
+        Title in the file, or its name.
     epochs : tuple of k str
         Labels of the epochs.
     times : array (k,)
-        Seconds as the file gives them; NaN where it gives none.
+        Times of the epochs in the file, s; NaN if missing.
     targets : tuple of str
-        Name of each target; of the target of each epoch where `own_epochs`.
+        Name of each target; with `own_epochs`, name of the target of each epoch.
     own_epochs : bool
-        Whether every epoch belongs to one target.
+        Whether each epoch belongs to one target.
     levels : NoiseLevels, optional
-        What the data say of the noise, where it is left to them.
+        Noise estimated from the data, if the file requests it.
     bias_units : mapping of str to (str, float)
-        Unit of the file that people read each bias in, and its SI size with sign; those read in SI are left out.
+        Unit of each bias in the file, and its size in SI units with sign; biases in SI units are left out.
     azimuths : str
-        From where azimuths are counted, and how the file would say otherwise; empty where there are none.
+        Convention of azimuths, and the setting that changes it; empty without azimuths.
     table : mapping
-        How a foreign table was read, as a JSON value; empty of a problem file.
+        Interpretation of a measurement table, as a JSON value; empty for a problem file.
     """
 
     problem: Problem
@@ -106,13 +106,13 @@ class Loaded:
     table: Mapping[str, Any] = field(default_factory=dict)
 
     def bias_unit(self, name: str, unit: str) -> tuple[str, float]:
-        """Return the unit that people read an unknown in and its SI size: the file's, or what its slot says."""
+        """Return the display unit of an unknown and its size in SI units: from the file, else `unit`."""
         return self.bias_units.get(name, (unit, 1.0))
 
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """A problem with everything that is needed to write its file again.
+    """A problem with all data that are needed to write its file again.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ class Draft:
     tables : tuple of Table
         Rows of each ``[[measurements]]``.
     chunks : tuple of RowChunk
-        The same in SI units, one for each kind of each table.
+        The same rows in SI units, one chunk for each kind of each table.
     numbers : tuple of int array (m,)
         Global row number of each row of each chunk.
     moving : bool
@@ -146,14 +146,14 @@ def load(path: str | Path, *, outside: bool | None = None, budget: Budget | None
     path : str or Path
         A TOML file with ``format = 1`` or 2.
     outside : bool, optional
-        Whether it may name files that are not beneath its own folder; it may not by default.
+        Whether the file may name files outside its folder; by default not.
     budget : Budget, optional
-        How much it and its tables may hold.
+        Limits on the size of the file and its tables.
 
     Raises
     ------
     InvalidProblem
-        One sentence that names the file, the row and the column or key, and says what to do.
+        One sentence that names the file, the row and the column or key, with advice.
     """
     with access(outside=outside, budget=budget):
         return read(path).problem
@@ -167,14 +167,14 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
     path : str or Path
         A TOML file with ``format = 1`` or 2.
     values : bool
-        Whether measured values are needed; False for simulations and bounds.
+        Whether measured values are required; False for simulations and bounds.
     more : mapping of str to ConstraintTable, optional
-        Constraints in addition to those of the file, each behind the place to name.
+        Constraints in addition to those of the file, by their place for messages.
 
     Raises
     ------
     InvalidProblem
-        As `load`.
+        As in `load`.
     """
     loaded = draft(Path(path), values=values, more=more or {}).loaded
     p = loaded.problem
@@ -183,9 +183,9 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
 
 
 def draft(path: Path, *, values: bool, more: Mapping[str, ConstraintTable] | None = None) -> Draft:
-    """Return the problem of a file together with its tables; arguments as `read`."""
+    """Return the problem of a file together with its tables; arguments as in `read`."""
     file, source = read_document(path), name_of(path)
-    # Tables are read before anything is converted: a missing file is told before a wrong unit.
+    # Read tables before converting anything, so that a missing file is reported before a wrong unit.
     known = places_of(file, path.parent, source)
     stations = table_of(file.stations, path.parent, join(source, "[stations]"))
     places = [join(source, f"[[measurements]] {i + 1}") for i in range(len(file.measurements))]
@@ -214,13 +214,13 @@ def assemble(
     tables : sequence of Table
         Rows of each ``[[measurements]]``.
     source : str
-        Name to call the settings.
+        Name of the settings for messages.
     values : bool
-        Whether measured values are needed.
+        Whether measured values are required.
     known : mapping of str to Table, optional
-        Places of known targets by name; None names the target.
+        Positions of known targets by name; None is the key of the single target.
     more : mapping of str to ConstraintTable, optional
-        As `read`.
+        As in `read`.
     """
     stated = file
     file, station_table, tables = with_standard_names(file, station_table, tables, source)
@@ -238,11 +238,11 @@ def assemble(
     cuts = np.cumsum([len(chunk.z) for chunk in chunks])[:-1]
     index, target = np.split(epochs.index, cuts), np.split(epochs.target, cuts)
     check_repeats(chunks, index, target, found.names, epochs)
-    # Stations that move are needed only where somebody measured; elsewhere they may be unknown.
+    # Positions of moving stations are needed only at epochs with rows of them; elsewhere they may be unknown.
     stations = over_epochs(
         found, file.stations, epochs, [_stations_used(c, i) for c, i in zip(chunks, index, strict=True)]
     )
-    # Excess paths become path sums only now, when it is known where their stations were.
+    # Convert excess paths to path sums now, since the station positions are known.
     chunks = [_add_baseline(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
     chunks = [with_declination(chunk, i, stations, frame) for chunk, i in zip(chunks, index, strict=True)]
     if azimuths:
@@ -255,7 +255,7 @@ def assemble(
     own = tuple(bias for bias, _ in biases)
     own += speed_bias(file, written, own, source)
     problem = _problem(file, epochs, stations, rows, noise, own, frame, source, known or {}, more or {})
-    # Noise that is left to the data needs fixes, so the whole problem: it comes last.
+    # The estimation of noise needs fixes, and so the whole problem: do it last.
     problem, levels = with_noise(file, problem, source)
     title = file.title or source
     named = (epochs.labels, epochs.times, epochs.targets, epochs.own)
@@ -277,7 +277,7 @@ def _problem(
 ) -> Problem:
     speed = speed_of(file, source)
     motions = motions_of(file, epochs, known_of(file, known, epochs, frame, stations.dimension), source)
-    # Times matter to what moves or drifts; other files may leave them out, or date epochs alike.
+    # Times matter for motions and drifts; other files may omit times, or repeat them.
     why = needs_clock(motions, file.biases)
     times = epochs.clock if why is None else need_clock(epochs, why, source)
     priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
@@ -294,18 +294,20 @@ def _epochs(file: ProblemFile, chunks: Sequence[RowChunk], source: str) -> Epoch
     for key in ("label", "time", "written", "target"):
         parts = [getattr(chunk, key) for chunk in chunks]
         present = [part for part in parts if part is not None]
-        # A table of labelled epochs may leave their times to another one, but not the other way round.
+        # If a table has no labels or times, but another table has, raise.
         if 0 < len(present) < len(parts):
             name = {"label": "epoch", "written": "time"}.get(key, key)
             lacking = chunks[next(i for i, part in enumerate(parts) if part is None)].table.source
-            raise InvalidProblem(f"there is no column {name!r}, which other measurements have", lacking, "add it")
+            raise InvalidProblem(
+                f"there is no column {name!r}, which other measurements have", lacking, "add the column"
+            )
         columns[key] = np.concatenate(present) if present else None
     place = join(source, "[epochs]", "key 'window'")
     window = None if file.epochs.window is None else Units("time").plain(file.epochs.window, None, place)
     if window is not None and (window <= 0.0 or columns["time"] is None or columns["label"] is not None):
         what = "the window is not positive" if window <= 0.0 else "a window needs a column 'time' and no column 'epoch'"
-        raise InvalidProblem(what, place, "leave the key out, or correct the columns")
-    # A stated motion decides whether targets are free at each epoch; none leaves it to the number of epochs.
+        raise InvalidProblem(what, place, "remove the key, or correct the columns")
+    # A stated motion decides whether targets are free at each epoch; otherwise the number of epochs decides.
     motion = {table.moves for table in (file.target, *file.targets.values())} - {None}
     free = None if not motion else motion <= FREE
     keys = Keys(columns["label"], columns["time"], columns["written"], columns["target"])
@@ -329,8 +331,8 @@ def _rows(
     chunks: Sequence[RowChunk], index: Sequence[Array], target: Sequence[Array]
 ) -> tuple[tuple[Rows, ...], list[Array]]:
     """Return the rows of each kind, and the global number of each row of each chunk."""
-    # A problem has one block of rows for each kind, in the order of appearance; numbers lead back to the chunks.
-    # Compass bearings beside other azimuths have a block of their own, as their errors are clockwise.
+    # A problem has one block of rows for each kind, in the order of appearance; numbers refer to the chunks. Compass
+    # bearings have a separate block from other azimuths, since their errors are clockwise.
     order = list(dict.fromkeys(chunk.kind for chunk in chunks))
     distinct = dict.fromkeys((chunk.kind, chunk.units.clockwise) for chunk in chunks)
     kinds = sorted(distinct, key=lambda pair: order.index(pair[0]))
@@ -354,11 +356,11 @@ def _rows(
 
 
 def _concatenate(parts: Sequence[Array]) -> Array:
-    # One part is not copied: constant columns of millions of rows take no memory.
+    # Do not copy a single part: constant columns of millions of rows use no memory.
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-# Covariance blocks of measurements: independent rows, arrivals, a matrix for each epoch, or one over all kinds.
+# Covariance blocks of measurements: independent rows, arrivals, a matrix for each epoch, or a matrix over all kinds.
 
 
 def _noise(
@@ -373,7 +375,7 @@ def _noise(
         return noise_of(chunks, numbers, index, target)
     place = join(source, "key 'covariance'")
     if any(part is not None for c in chunks for part in (c.sigma, c.arrival, c.covariance, c.signal)):
-        raise InvalidProblem("the noise is given more than once", place, "leave out that of the single measurements")
+        raise InvalidProblem("the noise is given more than once", place, "remove the noise of the single measurements")
     matrix = square(file.covariance, place)
     slope = np.concatenate([chunk.slope for chunk in chunks])
     return Noise((per_epoch(np.concatenate(list(numbers)), np.concatenate(list(index)), slope, matrix, place),))
@@ -384,19 +386,14 @@ def noise_of(
 ) -> Noise:
     """Return the noise of chunks.
 
-    Parameters
-    ----------
-    chunks : sequence of RowChunk
-        Rows with their own noise.
-    numbers, epochs, targets : sequence of int array (m,)
-        Global row number, epoch and target of each row of each chunk.
+    `numbers`, `epochs` and `targets` are the global row number, epoch and target (m,) of each row, for each chunk.
     """
     blocks: list[Block] = []
     for chunk, number, epoch, target in zip(chunks, numbers, epochs, targets, strict=True):
         if chunk.sigma is not None:
             blocks.append(Block(number[:, None], chunk.sigma[:, None, None] ** 2))
         elif chunk.arrival is not None:
-            # Arrivals are common to the rows of one epoch and one target: another pulse has other errors.
+            # Rows of one epoch and one target share the errors of arrivals; another emission has other errors.
             members = group_members(epoch * (target.max(initial=0) + 1) + target)
             blocks += [Block(number[m], _arrivals(chunk, m)) for m in members]
         elif chunk.signal is not None:
@@ -411,7 +408,7 @@ def noise_of(
 
 
 def _arrivals(chunk: RowChunk, members: Array) -> Array:
-    """Return the covariance (g, r, r) of groups of rows (g, r) that combine what stations measure independently."""
+    """Return the covariance (g, r, r) of groups of rows (g, r) that combine independent arrivals of stations."""
     signs = MODELS[chunk.kind].signs
     assert signs is not None
     assert chunk.arrival is not None
@@ -420,7 +417,7 @@ def _arrivals(chunk: RowChunk, members: Array) -> Array:
     row, column = np.nonzero(np.diagonal(covariance, axis1=-2, axis2=-1) <= 0.0)
     if len(row):
         place = join(chunk.table.source, f"row {chunk.row[members[row[0], column[0]]] + 1}")
-        raise InvalidProblem("no station of this row has an arrival_sigma", place, "name its stations there")
+        raise InvalidProblem("no station of this row has an arrival_sigma", place, "add its stations to arrival_sigma")
     return covariance
 
 
@@ -436,30 +433,20 @@ def _per_epoch_block(chunk: RowChunk, number: Array, epoch: Array, matrix: Array
 
 
 def per_epoch(number: Array, epoch: Array, slope: Array, matrix: Array, where: str, first: int = 0) -> Block:
-    """Return the block of a matrix (r, r) that holds for the r rows of every epoch, in the order of the file.
+    """Return the covariance block of a matrix (r, r), in units of the file, that holds for the r rows of each epoch.
 
-    Parameters
-    ----------
-    number, epoch : int array (m,)
-        Global row number and epoch of each row.
-    slope : array (m,)
-        SI units in one unit of the file.
-    matrix : array (r, r)
-        In the file's units.
-    where : str
-        Place to name.
-    first : int
-        Row that the first stands in.
+    `number` and `epoch` (m,) are the global number and epoch of each row; `slope` (m,) are the SI units in one unit of
+    the file. `first` is the row number of the first row, for messages.
     """
     groups = group_members(epoch)
-    # One matrix for every epoch: absent rows keep their place with weight 0.
+    # The matrix is the same for each epoch: absent rows keep their place with weight 0.
     wrong = [g for g in groups if g.shape[1] != len(matrix)]
     if wrong:
         row = int(wrong[0][0, 0])
-        what = f"the epoch of row {row + first + 1} has {wrong[0].shape[1]} rows, but the covariance {len(matrix)}"
-        raise InvalidProblem(what, where, "give every epoch all rows, absent ones with weight 0")
+        what = f"the epoch of row {row + first + 1} has {wrong[0].shape[1]} rows, but the covariance has {len(matrix)}"
+        raise InvalidProblem(what, where, "give all rows at each epoch, absent rows with weight 0")
     members = groups[0]
-    # SI units in one unit of the file, per row: of decibels it depends on the value.
+    # SI units in one unit of the file, per row: for decibels they depend on the value.
     sizes = slope[members]
     if not np.isfinite(sizes).all():
         raise InvalidProblem("a covariance in dB needs the measured values", where, "state it in unit '1'")
@@ -467,15 +454,15 @@ def per_epoch(number: Array, epoch: Array, slope: Array, matrix: Array, where: s
 
 
 def with_noise(file: ProblemFile, problem: Problem, source: str) -> tuple[Problem, NoiseLevels | None]:
-    """Return the problem with its noise found from the data, where the file leaves it to them."""
+    """Return the problem with noise estimated from the data if the file requests it, and the noise levels."""
     if all(section.sigma != ESTIMATE for section in file.measurements):
         return problem, None
     place = join(source, "key 'sigma'")
     if any(section.sigma != ESTIMATE for section in file.measurements):
-        what = "the noise of some measurements is stated and that of others is to be estimated"
-        raise InvalidProblem(what, place, f'state all, or give sigma = "{ESTIMATE}" to all')
+        what = "some measurements state their noise, and others request an estimate"
+        raise InvalidProblem(what, place, f'state it for all, or write sigma = "{ESTIMATE}" for all')
     if not np.isfinite(problem.z[problem.weight > 0.0]).all():
-        raise InvalidProblem("without measured values there is no noise to estimate", place, "state a sigma")
+        raise InvalidProblem("the noise cannot be estimated without measured values", place, "state a sigma")
     try:
         return with_estimated_noise(problem)
     except InvalidProblem as error:
@@ -485,7 +472,7 @@ def with_noise(file: ProblemFile, problem: Problem, source: str) -> tuple[Proble
 def _check(problem: Problem, source: str, medium: Medium | None = None) -> Problem:
     try:
         return checked(problem if medium is None else problem.in_medium(medium))
-    # A complaint of the problem gets the name of the file in front.
+    # Add the name of the file to an error of the problem.
     except InvalidProblem as error:
         raise InvalidProblem(error.what, join(source, error.where), error.advice) from None
 
@@ -494,7 +481,7 @@ def _follows(problem: Problem) -> bool:
     return any(motion.known is not None and len(motion.known) > 1 for motion in problem.motions)
 
 
-# Problems from data frames: the long table that an analysis already has.
+# Problems from data frames in long form.
 
 
 def from_table(
@@ -519,34 +506,34 @@ def from_table(
     Parameters
     ----------
     table : pandas.DataFrame, or mapping of str to array (m,)
-        Columns ``kind, a, b, z`` and, where wanted, ``epoch`` or ``time``, ``sigma``, ``target``, ``weight``,
+        Columns ``kind, a, b, z`` and optionally ``epoch`` or ``time``, ``sigma``, ``target``, ``weight``,
         ``correction``.
     stations : pandas.DataFrame, mapping of str to array (s,), mapping of name to coordinates (d,), or Stations
         A table with the columns ``name, x, y, z`` or ``name, lat_deg, lon_deg, height``; or positions by name.
     kind : str, optional
-        Kind of all rows, where there is no column ``kind``.
+        Kind of all rows, if there is no column ``kind``.
     unit : str or mapping of kind to str, optional
-        Unit of ``z``; SI by default.
+        Unit of ``z``; by default SI.
     columns : mapping of str to str, optional
-        What the table calls its columns: ``{"z": "tdoa_ns"}``.
+        Names of the columns in the table: ``{"z": "tdoa_ns"}``.
     sigma : float or str, optional
-        Standard deviation of every row, in `unit` or as text with its own: ``"30 ns"``.
+        Standard deviation of each row, in `unit` or as text with a unit: ``"30 ns"``.
     motion : "static", "free", "free_velocity", "constant_velocity" or "constant_acceleration", optional
-        How the target moves; static with one epoch, free with several by default.
+        Motion of the target; by default static for one epoch, free for several.
     frame : str or mapping
         ``"cartesian"``, ``"ecef"``, ``"geodetic"``, or the table ``[frame]`` of a problem file.
     window : str, optional
         Length of an epoch, such as ``"0.1 s"``.
     propagation_speed : float, optional
-        Metres per second; light in vacuum by default.
+        Metres per second; by default light in vacuum.
     station_options : mapping, optional
         Further keys of the table ``[stations]`` of a problem file, for instance ``{"unit": "km"}``.
     constraints : sequence of mapping
         Tables ``[[constraints]]`` of a problem file, for instance ``{"kind": "height", "exactly": "500 m"}``.
     values : bool
-        Whether measured values are needed; False to simulate them.
+        Whether measured values are required; False to simulate them.
     **options
-        Further keys of a table ``[[measurements]]``: ``arrival_sigma``, ``azimuth``, ``positive`` and so on.
+        Further keys of a table ``[[measurements]]``: ``arrival_sigma``, ``azimuth``, ``positive`` and others.
 
     Returns
     -------
@@ -556,16 +543,16 @@ def from_table(
     Raises
     ------
     InvalidProblem
-        Naming the row and column.
+        The message names the row and column.
     """
     names = dict(columns or {})
     own: Any = station_options or {}
     place: dict[str, Any] = {"kind": frame} if isinstance(frame, str) else dict(frame)
     places = station_table(stations, "stations", names=own.get("columns"))
     measured = {"kind": kind, "unit": dict(unit) if isinstance(unit, Mapping) else unit, "sigma": sigma, **options}
-    # The arguments as a problem file: one reader serves both, and complaints name "arguments".
+    # Arguments are read like a problem file with the name "arguments", so both use one reader.
     settings = {
-        "format": 1,  # of arguments: azimuths are counted as they always were
+        "format": 1,  # keeps the convention of azimuths of this function
         "propagation_speed": propagation_speed,
         "frame": place,
         "stations": dict(own),

@@ -1,4 +1,4 @@
-"""How a table was read: the role of each column, and a refusal of columns that may be measurements but are not used."""
+"""Report on how a table was read: the role of each column, and errors for unused columns that may be measurements."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from optloc.files.table_import import (
 )
 from optloc.files.words import numbered
 
-# Names of columns that one line repeats of a list.
-_NAMED = 4
-# What azimuths of each convention are.
+# Largest number of column names in one line of the report.
+_MAX_NAMES = 4
+# Description of azimuths for each convention.
 _ORIENTED = {
-    COMPASS: "bearings of a compass",
+    COMPASS: "compass bearings",
     CARTESIAN: "angles from the x axis",
     COUNTER: "angles from north, anticlockwise",
 }
@@ -47,23 +47,13 @@ def uses_of(
 ) -> dict[str, str]:
     """Return the role of each column that is used.
 
-    Parameters
-    ----------
-    roles : Roles
-        The table.
-    told : ColumnHints
-        What the user says of it.
-    found : sequence of Readings
-        The readings, one set for each sort.
-    epochs : mapping of str to array (n,)
-        Columns epoch, time and target of the rows.
-    sigmas : sequence of str or None
-        Standard deviation of each sort, None where a column of the table has it.
+    `found` has the readings of each sort. `epochs` has the columns epoch, time and target of the rows. `sigmas` is the
+    stated standard deviation of each sort; None if a column of the table has it.
     """
     out = {name: one.form.kind for one in found for name in one.columns}
     long = len(out) == len(found)
     picks = any(one.form.value == "sp" for one in found)
-    # Columns of P and S, one of their difference, or one of phases with one of times: see `shapes`.
+    # The roles of S minus P: columns of P and S, a column of their difference, or columns of phase and time.
     by_phase = picks and roles.find("sp") is None and not (roles.find("p") and roles.find("s"))
     wanted = ["phase"] if by_phase else ["sp"] if roles.find("sp") is not None else ["p", "s"]
     wanted = wanted if picks else []
@@ -90,23 +80,11 @@ def uses_of(
 def unused_columns(
     roles: Roles, uses: Mapping[str, str], named: Sequence[Named] = (), *, lengths: bool = False
 ) -> list[str]:
-    """Return the columns that are not used; refuse those that could be measurements, and roles that are not used.
+    """Return the unused columns; raise InvalidProblem for possible measurements and for stated roles without use.
 
-    Parameters
-    ----------
-    roles : Roles
-        The table.
-    uses : mapping of str to str
-        Role of each column that is used.
-    named : sequence of Named
-        Columns that are called after stations.
-    lengths : bool
-        Whether measurements of this table are lengths and their rates: a satellite measures no angles.
-
-    Raises
-    ------
-    InvalidProblem
-        Naming the column, and the option that leaves it out.
+    `uses` has the role of each used column. `named` are the columns that are named after stations. With `lengths`, only
+    lengths and their rates can be measurements of this table, since satellites measure no angles. The message names the
+    option that leaves a column out.
     """
     check_column_hints(roles, {role for role, name in roles.by_role.items() if set(name.split("+")) <= set(uses)})
     columns = [*roles.table.columns, *roles.table.others]
@@ -115,9 +93,9 @@ def unused_columns(
     for name in rest:
         what = sort_named(forms[name]).text if name in forms else unused_measurement(name, lengths)
         if what is not None:
-            advice = f"--ignore {quoted(name)} leaves it out, --column ROLE={quoted(name)} names its role"
+            advice = f"--ignore {quoted(name)} leaves it out, --column ROLE={quoted(name)} states its role"
             where = f"{roles.table.source}, column {name!r}"
-            raise InvalidProblem(f"it may hold a measurement ({what}) and is not used", where, advice)
+            raise InvalidProblem(f"the column may have a measurement ({what}) but is not used", where, advice)
     return rest
 
 
@@ -129,11 +107,13 @@ def reading_lines(
     epochs: Mapping[str, Array],
     uses: Mapping[str, str],
 ) -> list[tuple[str, str]]:
-    """Return how a table was read, for a person to check: a word, and what it means for this table."""
+    """Return the interpretation of a table as lines for the user: a keyword and a text."""
     out: list[tuple[str, str]] = []
     for one in found:
         cells = one.columns
-        shown = ", ".join(cells[:_NAMED]) + (f" and {len(cells) - _NAMED} more columns" if len(cells) > _NAMED else "")
+        shown = ", ".join(cells[:_MAX_NAMES]) + (
+            f" and {len(cells) - _MAX_NAMES} more columns" if len(cells) > _MAX_NAMES else ""
+        )
         unit = f" in {one.unit}" if one.unit != "1" else ""
         text = _ORIENTED.get(str(one.azimuth))
         text = text if one.heading is None else f"bearings from the bow, plus {one.heading}"
@@ -142,7 +122,7 @@ def reading_lines(
         out.append((one.form.kind, f"{len(one.values)} readings{unit} from {shown}: {text}"))
         if one.b is not None and one.form.kind != "range_sum":
             sign = "above 1" if one.form.quantity == "ratio" and one.unit == "1" else "positive"
-            out.append(("sign", f"{sign} where the {farther_station(one)} is farther"))
+            out.append(("sign", f"{sign} if the {farther_station(one)} is farther"))
     errors = {name: role.removeprefix("sigma_") for name, role in uses.items() if role.startswith("sigma_")}
     out += [("sigma", f"of {kind}, from column {name}") for name, kind in errors.items()]
     if "epoch" in epochs:
@@ -163,24 +143,24 @@ def reading_lines(
 
 
 def farther_station(found: Readings) -> str:
-    """Return which station is farther where a difference is positive, "first" or "second"."""
-    # The level at the nearer station is higher, so a positive difference of levels has the farther station second.
+    """Return the station, "first" or "second", that is farther if a difference is positive."""
+    # The level at the nearer station is higher, so a positive difference of levels means that the second is farther.
     turned = (found.positive == "b-farther") != (found.form.quantity == "level")
     return "second" if turned else "first"
 
 
-# Roles that a column beside those of receivers has as a rule: when a row was taken, of what, and where that truly was.
-_BESIDE = frozenset(("message", "id", "time", "target", "x", "y", "z", "lat", "lon", "height", "depth"))
-# Letters up to which names with the same numbers of letters and digits are of one series, such as A1 and B7: longer
-# words of equal length, such as Lake and note, have nothing in common.
+# Roles that columns often have in a table with a column for each receiver: time, label and true position of a row.
+_AUXILIARY_ROLES = frozenset(("message", "id", "time", "target", "x", "y", "z", "lat", "lon", "height", "depth"))
+# Names with words of at most two letters and equal patterns are one series, such as A1 and B7. Longer words of equal
+# length, such as Lake and note, have nothing in common.
 _SERIES = 2
-# Share of equal letters from which a name is a misspelt one: that of wset and west. Half of them are chance: squawk
-# and Quarry.
+# Similarity above which one name is a misspelling of another, such as wset of west. A similarity of one half is
+# chance: squawk and Quarry.
 _CLOSE = 0.75
 
 
 class _Pattern(NamedTuple):
-    """How columns of receivers are named: words before and behind the stations, how many stations, and the unit."""
+    """Name pattern of receiver columns: words before and behind the stations, number of stations, and unit."""
 
     before: tuple[str, ...]
     behind: tuple[str, ...]
@@ -189,26 +169,11 @@ class _Pattern(NamedTuple):
 
 
 def check_receivers(table: Table, uses: Mapping[str, str], named: Sequence[Named], stations: Sequence[str]) -> None:
-    """Refuse a column that is named like the columns of receivers and holds numbers, but names no station.
+    """Raise InvalidProblem for a column with numbers that is named like the receiver columns but has no known station.
 
-    A column is named like them where the same words stand around a name, with a unit of the same quantity; or, where
-    their names are nothing but those of stations, if its name is nearly one of these or continues their series.
-
-    Parameters
-    ----------
-    table : Table
-        A table with a column for each receiver or pair; others pass.
-    uses : mapping of str to str
-        Role of each column that is used.
-    named : sequence of Named
-        Columns that are called after stations.
-    stations : sequence of str
-        Names of the stations.
-
-    Raises
-    ------
-    InvalidProblem
-        Naming the column, the nearest stations, and the option that leaves the column out.
+    A column is named like them if the same words surround the name, with a unit of the same quantity. If the receiver
+    columns are named by stations alone, a name counts if it is nearly a station name or continues their series. The
+    message names the nearest stations and the option that leaves the column out.
     """
     used = [one for one in named if one.column in uses and not one.sigma]
     if len(used) < 2:
@@ -232,12 +197,12 @@ def _pattern(one: Named) -> _Pattern:
 
 
 def _find(words: Sequence[str], part: Sequence[str]) -> int:
-    """Return where a part of words begins; 0 where a name without letters and digits has none."""
+    """Return the index of the start of `part` in `words`; 0 for an empty part."""
     return next((i for i in range(len(words)) if words[i : i + len(part)] == part), 0) if part else 0
 
 
 def _name_in(column: str, pattern: _Pattern, stations: Sequence[str]) -> str | None:
-    """Return what stands in the place of a station in the name of a column; None where it is named otherwise."""
+    """Return the part of a column name at the place of a station; None if the name does not match the pattern."""
     text = without_unit(column)
     words, around = tokens(text), len(pattern.before) + len(pattern.behind)
     inner = range(len(pattern.before), len(words) - len(pattern.behind))
@@ -247,18 +212,18 @@ def _name_in(column: str, pattern: _Pattern, stations: Sequence[str]) -> str | N
     name = _spelled(text, left)
     same = _same_quantity(any_unit(column), pattern.unit)
     if not left or (pattern.stations == 1 and len(left) < len(inner) and not (same and pattern.unit)):
-        return None  # a further column of a known receiver, such as its signal level
+        return None  # another column of a known receiver, such as its signal level
     if _is_like(name, stations):
         return name
-    if not around and (pattern.unit is None or role_of(column) in _BESIDE):
+    if not around and (pattern.unit is None or role_of(column) in _AUXILIARY_ROLES):
         return None
-    # The unit may be missing in one name among many.
-    forgotten = around > 0 and any_unit(column) is None and role_of(name) not in _BESIDE
+    # A single name may lack the unit.
+    forgotten = around > 0 and any_unit(column) is None and role_of(name) not in _AUXILIARY_ROLES
     return name if same or forgotten else None
 
 
 def _without_stations(words: Sequence[str], inner: range, stations: Sequence[str]) -> list[int]:
-    """Return the places of words that belong to no known station."""
+    """Return the indices of words that belong to no known station."""
     known = sorted((tokens(name) for name in stations if tokens(name)), key=len, reverse=True)
     left, at = [], inner.start
     while at < inner.stop:
@@ -269,26 +234,26 @@ def _without_stations(words: Sequence[str], inner: range, stations: Sequence[str
 
 
 def _spelled(text: str, places: Sequence[int]) -> str:
-    """Return the words of a text at some places as they are written, with what is between them."""
+    """Return the part of a text from the first to the last of the words with these indices."""
     spans = [match.span() for match in re.finditer(r"[^\W\d_]+|\d+", text.lower())]
     return text[spans[places[0]][0] : spans[places[-1]][1]] if places else ""
 
 
 def _same_quantity(one: str | None, other: str | None) -> bool:
-    """Return whether two units measure the same; no unit measures the same as no unit."""
+    """Return whether two units have the same quantity; no unit only matches no unit."""
     if one is None or other is None:
         return one is other
     return any(one in units and other in units for units in UNITS.values())
 
 
 def _is_like(name: str, stations: Sequence[str]) -> bool:
-    """Return whether a name is nearly that of a station, or of their series."""
+    """Return whether a name is close to a station name, or continues the series of station names."""
     close = get_close_matches(name.lower(), [station.lower() for station in stations], n=1, cutoff=_CLOSE)
     return bool(close) or _shape(name) in {_shape(station) for station in stations} - {None}
 
 
 def _shape(name: str) -> str | None:
-    """Return a name with one sign for all letters and one for all numbers; None for one with long words."""
+    """Return a name with "a" for each letter and "0" for each number; None for a name with long words."""
     words: Iterable[str] = tokens(name)
     if any(word.isalpha() and len(word) > _SERIES for word in words):
         return None
@@ -296,7 +261,7 @@ def _shape(name: str) -> str | None:
 
 
 def _holds_numbers(table: Table, column: str) -> bool:
-    """Return whether a cell of a column holds a number."""
+    """Return whether a cell of a column has a number."""
     for cell in table.raw(column).tolist():
         try:
             if cell is not None and not isinstance(cell, bool) and float(cell) == float(cell):

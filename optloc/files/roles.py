@@ -1,4 +1,7 @@
-"""Which column of a table plays which role: as it is told, or as its name suggests; and other words for our own."""
+"""Roles of the columns of a table, stated by the user or found by name, and alternative names in problem files.
+
+Also: stations from tables and from GeoJSON.
+"""
 
 from __future__ import annotations
 
@@ -30,29 +33,29 @@ WORDS = {
     "b": "b reference ref stationb receiverb station2 receiver2 rx2",
     "z": "z value measured measurement",
 }
-"""Other words for the columns of problem files that nothing works without, the likeliest first; without case, unit and
-what is no letter. What is measured may be called by its kind as well (`optloc.models.Model.aliases`).
-Columns that may be left out have their names alone: what a table has besides must not change what it says."""
+"""Alternative names of the required columns of problem files, the most likely first; in lower case, without unit and
+punctuation. A column of measured values may also have the name of its kind (`optloc.models.Model.aliases`). Optional
+columns have no alternative names: an unrelated column must not change the meaning of a table."""
 
 GEOJSON = (".geojson", ".json")
-# Properties of a GeoJSON point that may be its name or its height, the likeliest first.
+# Properties of a GeoJSON point that may be its name or its height, the most likely first.
 _NAMES = ("name", "station", "title", "callsign", "id", "receiver", "sensor")
 _HEIGHTS = ("height", "height_m", "altitude", "alt", "elevation", "ele", "h_m", "h")
-_FLAT = "no heights are given: all stations are taken to be at height 0"
+_NO_HEIGHTS = "no heights are given: all stations are assumed at height 0"
 
 
 @dataclass(frozen=True, slots=True)
 class Roles:
-    """The columns of a table by role: a column has one role at most.
+    """The columns of a table by role; a column has at most one role.
 
     Parameters
     ----------
     table : Table
         The table.
     by_role : mapping of str to str
-        Column of each role; several columns with "+" between them make one label.
+        Column of each role; "+" joins several columns to one label.
     told : frozenset of str
-        Roles that the user named.
+        Roles that the user stated.
     """
 
     table: Table
@@ -61,23 +64,13 @@ class Roles:
 
     @classmethod
     def of(cls, table: Table, told: Mapping[str, str], readings: Collection[str] = ()) -> Roles:
-        """Return the roles of a table: first as the user names them, then as the names of the columns suggest.
+        """Return the roles of a table: stated by the user, then suggested by column names.
 
-        Parameters
-        ----------
-        table : Table
-            The table.
-        told : mapping of str to str
-            Column by role, or by another word for the role.
-        readings : collection of str
-            Columns that hold the readings of receivers, and so have no other role.
-
-        Raises
-        ------
-        InvalidProblem
-            For an unknown role or column, a unit that does not fit, and a column with two roles.
+        `told` has columns by role, or by another word for the role. `readings` are the columns of receiver readings,
+        which have no other role. Raise InvalidProblem for an unknown role or column, a unit that does not fit, and a
+        column with two roles.
         """
-        given = _given(table, told)
+        given = _stated_columns(table, told)
         used = {part for name in given.values() for part in name.split("+")} | set(readings)
         found: dict[str, str] = {}
         for column in table.columns:
@@ -87,54 +80,60 @@ class Roles:
         return cls(table, found | given, frozenset(given))
 
     def find(self, role: str) -> str | None:
-        """Return the column of a role, None where there is none."""
+        """Return the column of a role, or None."""
         if role == "name" and stem(self.by_role.get("name", "")) != "name" and "name" not in self.told:
-            role = "station"  # a callsign names a station only where nothing else does
+            role = "station"  # a callsign names a station only if no other column does
         if role in self.by_role:
             return self.by_role[role]
         if role in ("station", "name"):
             return next((self.by_role[other] for other in _NAMES_STATION if other in self.by_role), None)
-        # An `id` that does not name the station is the label of a message.
+        # An `id` is the label of a message if another column names the station.
         if role == "message" and any(other in self.by_role for other in _NAMES_STATION[:-1]):
             return self.by_role.get("id")
         return None
 
     def without_stations(self) -> Roles:
-        """Return the roles of a table whose columns name the stations: an `id` is then the label of a message."""
+        """Return the roles of a table whose columns are named after stations.
+
+        An `id` is then the label of a message.
+        """
         kept = {role: name for role, name in self.by_role.items() if role not in (*_NAMES_STATION, "reference")}
         if "id" in self.by_role:
             kept = {"message": self.by_role["id"], **kept}
         return replace(self, by_role=kept)
 
     def column(self, role: str) -> str:
-        """Return the column of a role; raise InvalidProblem where there is none."""
+        """Return the column of a role; raise InvalidProblem without one."""
         found = self.find(role)
         if found is None:
             columns = ", ".join(self.table.columns)
-            advice = f"name it with --column {role}=NAME; the columns are {columns}"
+            advice = f"state it with --column {role}=NAME; the columns are {columns}"
             raise InvalidProblem(f"no column looks like the {role}", self.table.source, advice)
         return found
 
     def labels(self, role: str) -> Array:
-        """Return text (m,), that of several columns with "-" between it."""
+        """Return labels (m,) of a role; labels of several columns are joined by "-"."""
         parts = [self.table.labels(part) for part in self.column(role).split("+")]
         if len(parts) == 1:
             return parts[0]
         first, index = equal_rows(parts, self.table.count)
         joined = ["-".join(row) for row in zip(*(part[first] for part in parts), strict=True)]
-        return cast("Array", Words(first, index).renamed(joined))  # NumPy takes words for an array
+        return cast("Array", Words(first, index).renamed(joined))  # for type checkers, Words is an array
 
     def numbers(self, role: str) -> Array:
         """Return finite numbers (m,)."""
         return self.table.numbers(self.column(role))
 
 
-# Roles whose columns can name the station of a row, the likeliest first.
+# Roles whose columns can name the station of a row, the most likely first.
 _NAMES_STATION = ("station", "name", "id")
 
 
-def _given(table: Table, told: Mapping[str, str]) -> dict[str, str]:
-    """Return the columns that the user names, by role; raise InvalidProblem for one that cannot have its role."""
+def _stated_columns(table: Table, told: Mapping[str, str]) -> dict[str, str]:
+    """Return the columns that the user states, by role.
+
+    Raise InvalidProblem for a column that does not fit its role.
+    """
     given: dict[str, str] = {}
     owner: dict[str, str] = {}
     for word, name in told.items():
@@ -142,14 +141,14 @@ def _given(table: Table, told: Mapping[str, str]) -> dict[str, str]:
         role = _epoch_role(name) if role == "epoch" else role
         if role in given:
             what = f"the role {role} is given to two columns, {given[role]!r} and {name!r}"
-            raise InvalidProblem(what, "--column", "name one; ONE+TWO makes one label of two columns")
+            raise InvalidProblem(what, "--column", "state one column; ONE+TWO joins two columns to one label")
         for part in name.split("+"):
             if part not in table.columns:
                 what = f"there is no column {part!r} for the {word}"
                 raise InvalidProblem(what, table.source, nearest(part, list(table.columns)))
             if part in owner:
                 what = f"the column {part!r} is given two roles, {owner[part]} and {role}"
-                raise InvalidProblem(what, "--column", "a column has one role")
+                raise InvalidProblem(what, "--column", "give the column one role")
             check_unit(role, part)
             owner[part] = role
         given[role] = name
@@ -157,28 +156,19 @@ def _given(table: Table, told: Mapping[str, str]) -> dict[str, str]:
 
 
 def _epoch_role(name: str) -> str:
-    """Return the role of a column that is named as the epoch: a time, or a label."""
+    """Return the role of a column that the user states as epoch: a time, or a label."""
     return "time" if role_of(name) == "time" else "message"
 
 
-# Other words for kinds and columns of problem files, and what is left to the format.
+# Alternative names of kinds and columns in problem files, and defaults of the file format.
 
 
 def with_standard_names(
     file: ProblemFile, stations: Table, tables: Sequence[Table], source: str
 ) -> tuple[ProblemFile, Table, list[Table]]:
-    """Return a problem file and its tables with kinds and columns by our names, and with nothing left to the format.
+    """Return a problem file and its tables with standard names of kinds and columns, and with explicit defaults.
 
-    Parameters
-    ----------
-    file : ProblemFile
-        Settings.
-    stations : Table
-        Rows of the stations.
-    tables : sequence of Table
-        Rows of each ``[[measurements]]``.
-    source : str
-        Name to call the settings.
+    `tables` are the rows of each ``[[measurements]]``; `source` is the name of the settings for messages.
     """
     stations = with_standard_columns(stations, file.stations.unit)
     frame = file.frame
@@ -198,15 +188,15 @@ def with_standard_names(
 
 
 def with_standard_columns(table: Table, unit: str) -> Table:
-    """Return a table of stations with its columns by our names; coordinates become those of the table's unit."""
+    """Return a table of stations with standard column names; coordinates are converted to the unit of the table."""
     words = {key: WORDS[key] for key in ("name", "lat_deg", "lon_deg", "height")}
     found = {key: name for key, word in words.items() if (name := _column(table, word))}
-    # Of a table with latitudes, x is what it has besides.
+    # In a table with latitudes, x is an unrelated column.
     if not any(key in found or table.has(key) for key in ("lat_deg", "lon_deg")):
         axes = {key: name for key in "xyz" if (name := _column(table, key))}
         found |= {key: name for key, name in axes.items() if any_unit(name) in (None, *UNITS["length"])}
     found = {key: name for key, name in found.items() if not table.has(key) and key not in table.names}
-    # A column in a unit that does not fit stays unknown: latitudes in radians, or an angle that is called elevation.
+    # Ignore a column whose unit does not fit: latitudes in radians, or an angle with the name elevation.
     fits = {"lat_deg": ("deg",), "lon_deg": ("deg",), "height": tuple(UNITS["length"])}
     named = {key: name for key, name in found.items() if any_unit(name) in (None, *fits.get(key, (any_unit(name),)))}
     columns = dict(table.columns)
@@ -221,7 +211,7 @@ def with_standard_columns(table: Table, unit: str) -> Table:
 def _rows_in_our_words(
     section: MeasurementsTable, table: Table, where: str, compass: bool
 ) -> tuple[MeasurementsTable, Table]:
-    """Return measurements by our names, with the convention of azimuths; `compass` is that of the format."""
+    """Return measurements with standard names and an explicit azimuth convention; `compass` is the format default."""
     words = [] if section.kind is None else [section.kind]
     if section.kind is None and table.has("kind"):
         words = sorted(numbered(table.labels("kind"))[0])
@@ -231,13 +221,13 @@ def _rows_in_our_words(
     changes: dict[str, Any] = {}
     if section.azimuth is None and "azimuth" in kinds.values():
         if 0 < len(bearing) < list(kinds.values()).count("azimuth"):
-            what = "some azimuths are called bearings, and others are not"
+            what = "some azimuths have the kind bearing, and others do not"
             raise InvalidProblem(
-                what, where, 'say what all are: azimuth = "north-clockwise", or "east-counterclockwise"'
+                what, where, 'state one convention: azimuth = "north-clockwise", or "east-counterclockwise"'
             )
         changes["azimuth"] = "north-clockwise" if bearing or compass else "east-counterclockwise"
     if section.kind is None:
-        # A column without other words stays as it is: millions of rows are not spelled again.
+        # Keep a column that already has standard names: do not process millions of rows.
         if any(word != kind for word, kind in kinds.items()):
             labels = table.labels("kind")
             cells, index = numbered(labels)
@@ -247,8 +237,8 @@ def _rows_in_our_words(
     changes["kind"] = kinds[section.kind]
     table, unit = _value(_ends(section, table), kinds[section.kind], where)
     if unit is not None and isinstance(section.unit, str) and section.unit != unit:
-        what = f"the column {table.name('z')!r} is called after another unit than {section.unit!r}"
-        raise InvalidProblem(what, join(where, "key 'unit'"), "leave the key out, or rename the column")
+        what = f"the name of the column {table.name('z')!r} has another unit than {section.unit!r}"
+        raise InvalidProblem(what, join(where, "key 'unit'"), "remove the key, or rename the column")
     if section.unit is None and (unit or bearing):
         changes["unit"] = unit or "deg"
     return _units_by_kind(section.model_copy(update=changes)), table
@@ -261,20 +251,20 @@ def _units_by_kind(section: MeasurementsTable) -> MeasurementsTable:
 
 
 def _place_of(word: str, section: MeasurementsTable, table: Table, where: str) -> str:
-    """Return the place of the word for a kind: the key, or the first row."""
+    """Return the place of a kind for messages: the key, or the first row."""
     if section.kind is not None:
         return join(where, "key 'kind'")
     return table.where("kind", table.labels("kind").tolist().index(word))
 
 
 def _ends(section: MeasurementsTable, table: Table) -> Table:
-    """Return a table whose columns of stations have our names, where the section does not name the station."""
+    """Return a table with standard names of its station columns, unless the section names the station."""
     found = {key: _column(table, WORDS[key]) for key in "ab" if getattr(section, key) is None and not table.has(key)}
     return replace(table, names={**{key: name for key, name in found.items() if name}, **table.names})
 
 
 def _value(table: Table, kind: str, where: str) -> tuple[Table, str | None]:
-    """Return a table whose measured values are called z, and the unit that its name ends in, if it was another name."""
+    """Return a table whose values have the name z, and the unit at the end of the original column name."""
     if table.has("z") or "z" in table.names:
         return table, None
     model = MODELS[kind]
@@ -285,20 +275,20 @@ def _value(table: Table, kind: str, where: str) -> tuple[Table, str | None]:
 
 
 def _column(table: Table, words: str) -> str | None:
-    """Return the column that is called by one of some words and has no role yet, None where there is none."""
+    """Return the column without a role whose name is among `words`, or None."""
     taken = set(table.names.values())
     stems = {stem(name): name for name in reversed([*table.columns]) if name not in taken}
     return next((stems[word] for word in words.split() if word in stems), None)
 
 
-ASSUMED = " (no convention is named)"
-"""What is said beside azimuths of format 1 that might be meant otherwise."""
+ASSUMED = " (no convention is stated)"
+"""Remark on azimuths of format 1 without a stated convention."""
 _OTHER = {
     "north-clockwise": "east-counterclockwise",
     "east-counterclockwise": "north-clockwise",
     "north-counterclockwise": "north-clockwise",
 }
-_COUNTED = {
+_CONVENTION_TEXT = {
     "north-clockwise": "the compass, clockwise from north (+y)",
     "east-counterclockwise": "the axes, anticlockwise from east (+x)",
     "north-counterclockwise": "north (+y), anticlockwise",
@@ -306,19 +296,16 @@ _COUNTED = {
 
 
 def azimuths_of(written: ProblemFile, read: ProblemFile) -> str:
-    """Return from where azimuths are counted and how a file says otherwise; empty where it has no azimuths.
+    """Return a text with the convention of azimuths and the setting that changes it; empty without azimuths.
 
-    Parameters
-    ----------
-    written, read : ProblemFile
-        The settings as they are written, and as `in_our_words` returns them.
+    `written` are the settings of the file; `read` are the settings that `in_our_words` returns.
     """
     said: dict[str, None] = {}
     for before, after in zip(written.measurements, read.measurements, strict=True):
         if after.azimuth is not None:
             assumed = before.azimuth is None and str(before.kind).lower() != BEARING
             why = ASSUMED if assumed and written.format == 1 else ""
-            said[f'{_COUNTED[after.azimuth]}{why}; else write azimuth = "{_OTHER[after.azimuth]}"'] = None
+            said[f'{_CONVENTION_TEXT[after.azimuth]}{why}; otherwise write azimuth = "{_OTHER[after.azimuth]}"'] = None
     return "; ".join(said)
 
 
@@ -327,7 +314,7 @@ def azimuths_of(written: ProblemFile, read: ProblemFile) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ColumnPlaces:
-    """Stations: the columns of a stations table (s,), the frame that they need, and the unit of lengths."""
+    """Stations: the columns of a stations table (s,), their frame, the unit of lengths, and a note."""
 
     columns: Mapping[str, Array]
     frame: str
@@ -341,7 +328,7 @@ class ColumnPlaces:
 
 
 def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> ColumnPlaces:
-    """Return the stations of a file; `frame` is that of x, y, z."""
+    """Return the stations of a file; `frame` applies to x, y, z."""
     if path.suffix.lower() == ".geojson":
         return _of_geojson(json_of(read_text(path), path.name), path.name)
     if path.suffix.lower() == ".json":
@@ -362,63 +349,65 @@ def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> ColumnP
 
 
 def place_roles(roles: Roles) -> tuple[str, ...]:
-    """Return the roles of the columns that `placed` reads for the positions of stations."""
-    across, ups = (("lat", "lon"), _UPS["height"]) if roles.find("lat") is not None else (("x", "y"), _UPS["z"])
+    """Return the roles of the position columns that `placed` reads."""
+    across, ups = (
+        (("lat", "lon"), _HEIGHT_ROLES["height"]) if roles.find("lat") is not None else (("x", "y"), _HEIGHT_ROLES["z"])
+    )
     return (*across, *[role for role in ups if roles.find(role) is not None][:1])
 
 
 def check_column_hints(roles: Roles, used: Collection[str]) -> None:
-    """Raise InvalidProblem where the user names a role that a table of this form does not use."""
+    """Raise InvalidProblem for a stated role that a table of this form does not use."""
     for role in sorted(roles.told - set(used)):
         what = f"the role {role} of the column {roles.by_role[role]!r} is not used in {roles.table.source}"
-        raise InvalidProblem(what, "--column", "leave it out, or say with --as what the table holds")
+        raise InvalidProblem(what, "--column", "remove it, or state the content of the table with --as")
 
 
 def placed(roles: Roles, frame: str | None, names: Array | None = None) -> ColumnPlaces:
-    """Return the stations of a table; `names` (s,) are theirs where no column has them, `frame` is that of x, y, z."""
+    """Return the stations of a table; `names` (s,) are used if no column has names, `frame` applies to x, y, z."""
     names = roles.labels("name") if names is None else names
     lat, x = roles.find("lat"), roles.find("x")
     if lat is None and x is None:
         columns = ", ".join(roles.table.columns)
-        advice = f"name them with --column lat=NAME or --column x=NAME; the columns are {columns}"
+        advice = f"state them with --column lat=NAME or --column x=NAME; the columns are {columns}"
         raise InvalidProblem("no columns look like latitude and longitude, or x and y", roles.table.source, advice)
     if lat is not None:
         degrees = {f"{axis}_deg": scaled(roles, axis, "angle", "deg") for axis in ("lat", "lon")}
-        height, unit = _upwards(roles, "height")
+        height, unit = _heights(roles, "height")
         degrees["height"] = np.zeros(len(names)) if height is None else height
-        return ColumnPlaces({"name": names} | degrees, "geodetic", unit, _FLAT if height is None else "")
-    up, unit = _upwards(roles, "z")
+        return ColumnPlaces({"name": names} | degrees, "geodetic", unit, _NO_HEIGHTS if height is None else "")
+    up, unit = _heights(roles, "z")
     assert x is not None
     unit = unit_of(x, UNITS["length"]) or "m"
     axes = {axis: scaled(roles, axis, "length", unit) for axis in "xy"}
     if up is not None:
-        axes["z"] = _upwards(roles, "z", unit)[0]
-    # What calls itself so is along the axes of the Earth, and its fixes have latitudes.
+        axes["z"] = _heights(roles, "z", unit)[0]
+    # Columns with "ecef" in the name are in ECEF, so fixes have latitudes.
     return ColumnPlaces({"name": names} | axes, frame or ("ecef" if "ecef" in stem(x) else "cartesian"), unit)
 
 
 def in_space(place: ColumnPlaces) -> ColumnPlaces:
-    """Return stations with a third coordinate: 0 where their table gives none."""
+    """Return stations with a third coordinate, which is 0 if the table has none."""
     if place.frame == "geodetic" or "z" in place.columns:
         return place
     flat = {"z": np.zeros(len(place.names))}
-    return replace(place, columns={**place.columns, **flat}, note=_FLAT.replace("height 0", "z = 0"))
+    return replace(place, columns={**place.columns, **flat}, note=_NO_HEIGHTS.replace("height 0", "z = 0"))
 
 
 def scaled(roles: Roles, role: str, quantity: Literal["length", "angle"], unit: str) -> Array:
-    """Return the numbers of a role in a unit; a column whose name has none is in it."""
+    """Return the numbers of a role in a unit; this is also the unit of a column name without a unit."""
     own = unit_of(roles.column(role), UNITS[quantity]) or unit
     values = roles.numbers(role)
     return values if own == unit else values * UNITS[quantity][own] / UNITS[quantity][unit]
 
 
-# Roles that give the third coordinate, the likeliest first: of latitude and longitude, and of x and y.
-_UPS = {"height": ("height", "depth"), "z": ("z", "height", "depth")}
+# Roles of the third coordinate, the most likely first: with latitude and longitude, and with x and y.
+_HEIGHT_ROLES = {"height": ("height", "depth"), "z": ("z", "height", "depth")}
 
 
-def _upwards(roles: Roles, role: Literal["height", "z"], unit: str | None = None) -> tuple[Any, str]:
-    """Return heights, None where there are none, and their unit; depths are heights that grow downwards."""
-    found = next((one for one in _UPS[role] if roles.find(one) is not None), None)
+def _heights(roles: Roles, role: Literal["height", "z"], unit: str | None = None) -> tuple[Any, str]:
+    """Return heights or None, and their unit; depths become negative heights."""
+    found = next((one for one in _HEIGHT_ROLES[role] if roles.find(one) is not None), None)
     if found is None:
         return None, unit or "m"
     unit = unit or unit_of(roles.column(found), UNITS["length"]) or "m"
@@ -442,8 +431,8 @@ def _of_geojson(data: Any, source: str) -> ColumnPlaces:
     columns = {"name": np.array(names, dtype=object), "lat_deg": np.array(lat), "lon_deg": np.array(lon)}
     known = [h is not None for h in height]
     columns["height"] = np.array([0.0 if h is None else h for h in height])
-    lacking = "" if all(known) else f"{known.count(False)} of {len(known)} points have no height: it is taken to be 0"
-    return ColumnPlaces(columns, "geodetic", "m", _FLAT if not any(known) else lacking)
+    lacking = "" if all(known) else f"{known.count(False)} of {len(known)} points have no height: 0 is assumed"
+    return ColumnPlaces(columns, "geodetic", "m", _NO_HEIGHTS if not any(known) else lacking)
 
 
 def _kind(feature: Mapping[str, Any]) -> Any:
@@ -452,11 +441,11 @@ def _kind(feature: Mapping[str, Any]) -> Any:
 
 
 def _point(feature: Mapping[str, Any], where: str) -> tuple[str, float, float, float | None]:
-    """Return name, longitude, latitude and height of a point."""
+    """Return name, longitude, latitude and height of a point; degrees, metres."""
     about = feature.get("properties") or {}
     if not isinstance(about, dict):
-        raise InvalidProblem("the properties are no table", where, 'write "properties": {"name": "..."}')
-    # A list or a table is no name, and true is no number.
+        raise InvalidProblem("the properties are not an object", where, 'write "properties": {"name": "..."}')
+    # A list or a table is not a name, and true is not a number.
     words = [about.get(key) for key in _NAMES] + [feature.get("id")]
     name = next((str(word).strip() for word in words if type(word) in (str, int, float) and str(word).strip()), None)
     if name is None:
@@ -464,7 +453,7 @@ def _point(feature: Mapping[str, Any], where: str) -> tuple[str, float, float, f
     place = feature["geometry"].get("coordinates")
     number = isinstance(place, list) and all(type(v) in (int, float) and isfinite(v) for v in place)
     if not number or len(place) not in (2, 3) or abs(place[1]) > 90.0:
-        raise InvalidProblem(f"{str(place)[:80]} is no point", where, "write [longitude, latitude, height]")
+        raise InvalidProblem(f"{str(place)[:80]} is not a point", where, "write [longitude, latitude, height]")
     height = place[2] if len(place) == 3 else next((about[key] for key in _HEIGHTS if key in about), None)
     if height is None:
         return name, float(place[0]), float(place[1]), None

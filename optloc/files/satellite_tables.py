@@ -1,4 +1,4 @@
-"""Tables of satellites: pseudoranges with positions at transmission, files of receivers, orbits at given times."""
+"""Tables of satellites: pseudoranges with positions at transmission, GNSS receiver files, orbits at given times."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from optloc.files.table_problem import Converted, Section, TableProblem, no_sigm
 from optloc.files.words import distinct
 from optloc.files.writer import write_csv
 
-# Nothing is nearer to the centre of the Earth than its poles but what has another unit, metres.
+# A satellite is farther from the centre of the Earth than this radius, m; a smaller distance means a wrong unit.
 _SURFACE = 6.4e6
-# What a problem file says of satellites, and what is said of those that were turned.
-AT_RECEPTION = ("# Satellites are where they were when they sent, along the axes of the Earth at reception.",)
-_TURNED = "satellites are turned with the Earth during the flight of the signal; --turned takes them as they are"
+# Comment on satellites in a problem file, and the note on satellites that were rotated.
+AT_RECEPTION = ("# Satellite positions are at transmission, in the Earth axes at reception.",)
+_ROTATED_NOTE = "satellite positions are rotated with the Earth during the signal flight; --turned uses them unchanged"
 
 
 def pseudoranges(source: Path, roles: Roles, told: ColumnHints) -> TableProblem:
-    """Return pseudoranges as arrivals with a clock of each epoch, and the satellites as stations that move, in ECEF."""
+    """Return the problem of a pseudorange table: arrivals with a clock error per epoch, moving satellites in ECEF."""
     form = sort_named("arrivals")
     own = sigma_column(roles, form, told, [form])
     if told.sigma is None and own is None:
@@ -51,7 +51,7 @@ def pseudoranges(source: Path, roles: Roles, told: ColumnHints) -> TableProblem:
     if not told.turned:
         metres, ranges = place * UNITS["length"][length], Units("length").conversion(unit, "--unit").to_si(z)
         place = at_reception(source, epoch, metres, ranges) / UNITS["length"][length]
-        notes += (_TURNED,)
+        notes += (_ROTATED_NOTE,)
     columns = {"epoch": epoch, "a": satellite, "z": z}
     when = roles.find("time")
     if when is not None:
@@ -69,7 +69,7 @@ def pseudoranges(source: Path, roles: Roles, told: ColumnHints) -> TableProblem:
     read = [
         ("pseudoranges", f"{len(z)} readings in {unit} from {roles.column('toa')}, with a clock of each epoch"),
         ("epochs", f"{len(set(epoch.tolist()))} by column {roles.column(by)}"),
-        ("satellites", f"{len(set(satellite.tolist()))} at x, y, z in {length}, along ECEF at {when_}"),
+        ("satellites", f"{len(set(satellite.tolist()))} at x, y, z in {length}, in ECEF axes at {when_}"),
     ]
     read += [("sigma", f"of pseudoranges, from column {own}")] if "sigma" in columns else []
     read += [("not used", ", ".join(rest))] if rest else []
@@ -78,10 +78,10 @@ def pseudoranges(source: Path, roles: Roles, told: ColumnHints) -> TableProblem:
 
 
 def gnss(source: Path, told: ColumnHints) -> TableProblem:
-    """Return what a receiver of navigation satellites has seen as arrivals, like a table of pseudoranges."""
+    """Return the problem of a GNSS receiver file, in the same form as for a pseudorange table."""
     if told.columns or told.ignore:
         flag = "--column" if told.columns else "--ignore"
-        raise InvalidProblem(f"{source.name} has no columns with names", flag, "leave it out")
+        raise InvalidProblem(f"{source.name} has no column names", flag, "remove this option")
     found = received(source, told.navigation, told.sigma, system=told.system, mask=told.mask)
     columns = {"epoch": found.epoch, "time": found.time, "a": found.satellite, "z": np.round(found.z, 4)}
     columns["sigma"] = np.round(found.sigma, 3)
@@ -91,23 +91,25 @@ def gnss(source: Path, told: ColumnHints) -> TableProblem:
 
 
 def _check_once(roles: Roles, epoch: Array, satellite: Array) -> None:
-    """Refuse a satellite that an epoch has twice."""
+    """Raise InvalidProblem for a satellite that occurs twice in an epoch."""
     seen: dict[tuple[str, str], int] = {}
     for row, key in enumerate(zip(epoch.tolist(), satellite.tolist(), strict=True)):
         if key in seen:
             what = f"satellite {key[1]!r} occurs again at epoch {key[0]!r}, first in row {seen[key] + 1}"
-            raise InvalidProblem(what, roles.table.at(row), "leave one of them out")
+            raise InvalidProblem(what, roles.table.at(row), "remove one of them")
         seen[key] = row
 
 
 def _check_far(roles: Roles, place: np.ndarray) -> None:
-    """Raise InvalidProblem where a satellite is within the Earth: its unit or its columns are other ones."""
+    """Raise InvalidProblem for a satellite inside the Earth, which means a wrong unit or wrong columns."""
     near = np.flatnonzero(np.linalg.norm(place, axis=-1) < _SURFACE)
     if len(near):
         where = roles.table.where(roles.column("x"), int(near[0]))
         away = np.linalg.norm(place[near[0]]) / 1e3
         what = f"the satellite is {away:.4g} km from the centre of the Earth"
-        raise InvalidProblem(what, where, "name the columns with --column x=NAME and so on; a unit is seen from x_km")
+        raise InvalidProblem(
+            what, where, "state the columns with --column x=NAME and so on; a name such as x_km states the unit"
+        )
 
 
 # Orbits at the times of measurements.
@@ -116,13 +118,13 @@ def _check_far(roles: Roles, place: np.ndarray) -> None:
 def write_satellites(
     source: Path, out: Path, told: Mapping[str, str], times: Path | None, stations: Path | None
 ) -> Converted:
-    """Write where satellites are at the times of measurements, and with which velocity, as a table of stations."""
+    """Write positions and velocities of satellites at the times of measurements, as a table of stations."""
     if times is None:
-        advice = "name the table of the measurements with --times: its times, and its satellites if it has them"
-        raise InvalidProblem("nothing is known of when the satellites are wanted", "--times", advice)
+        advice = "give the table of the measurements with --times; it needs times, and may have satellites"
+        raise InvalidProblem("the times of the satellite positions are unknown", "--times", advice)
     if out.suffix.lower() != ".csv":
-        what = "satellites are stations that move: they become a CSV table"
-        raise InvalidProblem(what, str(out), "let the name behind --out end in .csv")
+        what = "satellites are moving stations, which are written as a CSV table"
+        raise InvalidProblem(what, str(out), "use the ending .csv after --out")
     own = {role: name for role, name in told.items() if stations is None or role not in PLACE}
     orbits, roles = read_orbits(source), Roles.of(read_table(times), own)
     check_column_hints(roles, ("time", "satellite"))
@@ -136,17 +138,17 @@ def write_satellites(
         rows = rows[np.unique(seconds[rows], return_index=True)[1]]
         parts.append((np.full(len(rows), name, dtype=object), rows, *orbits.at(name, seconds[rows])))
     rows = np.unique(seconds, return_index=True)[1]
-    for name, place in _resting(stations, told).items():
+    for name, place in _fixed_stations(stations, told).items():
         still = np.zeros((len(rows), 3))
         parts.append((np.full(len(rows), name, dtype=object), rows, place + still, still))
     names, rows, position, velocity = (np.concatenate(part) for part in zip(*parts, strict=True))
     columns = {"name": names, "time": written[rows]} | dict(zip("xyz", position.T, strict=True))
     write_csv(out, columns | dict(zip(("vx", "vy", "vz"), velocity.T, strict=True)))
-    return Converted((out,), None, ('positions are along ECEF: write kind = "ecef" in [frame]',))
+    return Converted((out,), None, ('positions are in ECEF: write kind = "ecef" in [frame]',))
 
 
-def _resting(path: Path | None, told: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """Return where stations on the ground are in ECEF, by name."""
+def _fixed_stations(path: Path | None, told: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Return the ECEF positions of fixed stations by name, m."""
     if path is None:
         return {}
     own = {role: name for role, name in told.items() if role in PLACE}
@@ -158,5 +160,7 @@ def _resting(path: Path | None, told: Mapping[str, str]) -> dict[str, np.ndarray
     elif "z" in held:
         found = scale * np.stack([held[axis] for axis in "xyz"], axis=-1)
     else:
-        raise InvalidProblem("stations beside satellites have x, y and z", path.name, "or latitude and longitude")
+        raise InvalidProblem(
+            "stations have no z, which satellites need", path.name, "give x, y and z, or latitude and longitude"
+        )
     return dict(zip(place.names, found, strict=True))

@@ -1,4 +1,7 @@
-"""What a problem file may say, as tables from which its JSON schema is derived."""
+"""Schema of problem files: tables and keys, from which the JSON schema is derived.
+
+The docstring of a key is its description in the JSON schema and in the manual.
+"""
 
 from __future__ import annotations
 
@@ -28,33 +31,33 @@ from optloc.base.units import (
 )
 from optloc.models import MODELS, Model, kind_named
 
-# Words that a file may get wrong, and amounts such as "30 ns".
+# Names and amounts such as "30 ns".
 
 
 def join(*places: str | None) -> str:
-    """Return one place out of several, from the file inwards."""
+    """Return several places as one text, from the file inwards, for messages."""
     return ", ".join(place for place in places if place)
 
 
 def kind_model(kind: str, where: str) -> Model:
-    """Return the model of a kind, by its name or an alias; raise InvalidProblem for an unknown one."""
+    """Return the model of a kind, by its name or an alias; raise InvalidProblem for an unknown kind."""
     return MODELS[kind_named(kind, where)]
 
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """What a number measures and what its units depend on.
+    """Quantity of a number, and the settings that its units depend on.
 
     Parameters
     ----------
     quantity : Quantity
-        It decides which units make sense.
+        Determines the permitted units.
     speed : float
         Propagation speed, metres per second.
     carrier : float, optional
         Carrier frequency, hertz.
     convention : AzimuthConvention
-        Of azimuths.
+        Convention of azimuths.
     """
 
     quantity: Quantity
@@ -64,15 +67,15 @@ class Units:
 
     @property
     def clockwise(self) -> bool:
-        """Return whether numbers grow clockwise, as those of a compass do."""
+        """Return whether numbers grow clockwise, as with a compass."""
         return self.convention == "north-clockwise"
 
     def name(self, unit: str | None) -> str:
-        """Return a unit; None is the SI unit."""
+        """Return the unit; None becomes the SI unit."""
         return SI_UNIT[self.quantity] if unit is None else unit
 
     def conversion(self, unit: str | None, where: str) -> Conversion:
-        """Return how a unit becomes SI; None is the SI unit."""
+        """Return the conversion of a unit to SI; None is the SI unit."""
         return conversion(
             self.name(unit),
             self.quantity,
@@ -83,38 +86,38 @@ class Units:
         )
 
     def amount(self, value: float | str, default: Conversion | None, where: str) -> tuple[float, Conversion]:
-        """Return the number of an amount and how its unit becomes SI.
+        """Return the number of an amount and the conversion of its unit to SI.
 
         Parameters
         ----------
         value : float or str
             A number in the default unit, or a number and a unit: ``"30 ns"``.
         default : Conversion, optional
-            Unit of a bare number; None: a bare number is refused.
+            Unit of a plain number; None rejects a plain number.
         where : str
-            Place to name.
+            Place for messages.
         """
         number, unit = split_amount(value, self.quantity, where)
         if unit:
             return number, self.conversion(unit, where)
         if default is None:
             example = example_of(number, str(value).strip(), self.quantity)
-            raise InvalidProblem(f"{value!r} has no unit", where, f"write it with its unit, such as {example}")
+            raise InvalidProblem(f"{value!r} has no unit", where, f"write it with a unit, such as {example}")
         return number, default
 
     def plain(self, value: float | str, default: str | None, where: str) -> float:
-        """Return an amount in SI units; `default` is the unit of a bare number, None refuses it."""
+        """Return an amount in SI units; `default` is the unit of a plain number, which None rejects."""
         number, unit = self.amount(value, None if default is None else self.conversion(default, where), where)
         return float(unit.to_si(number))
 
 
 Bound = Annotated[float, Field(allow_inf_nan=True)]
-"""One coordinate of a box; infinite where there is no bound."""
+"""One coordinate of a box; infinite without a bound."""
 
 Cell = str | int | float
 Row = dict[str, Cell]
 _Model = TypeVar("_Model", bound=BaseModel)
-# Complaints of pydantic that need words of their own; all others are quoted.
+# Sentences for errors of pydantic; other errors are quoted.
 _WHAT = {
     "missing": "the key {key!r} is missing",
     "extra_forbidden": "unknown key {key!r}",
@@ -123,9 +126,9 @@ _WHAT = {
 
 
 class _FileTable(BaseModel):
-    """A table of the file; keys that it does not know are refused."""
+    """A table of the file; unknown keys are rejected."""
 
-    # Strict and closed: a number in quotes or a misspelt key is refused, never guessed.
+    # Strict and closed: reject a number in quotes and a misspelt key.
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
@@ -143,31 +146,31 @@ class Origin(_FileTable):
 
 
 class FrameTable(_FileTable):
-    """The frame in which positions are computed and answered."""
+    """The frame of computations and results."""
 
     kind: Literal["cartesian", "ecef", "enu", "geodetic"] = "cartesian"
-    """Axes anywhere; Earth-centred Earth-fixed; east, north, up; or latitude, longitude, height (computed in ECEF)."""
+    """Local axes; Earth-centred Earth-fixed; east, north, up; or latitude, longitude, height (computed in ECEF)."""
     origin: Origin | None = None
-    """Origin of an ENU frame; by default the mean of stations that are given by latitude and longitude."""
+    """Origin of an ENU frame; by default the mean of stations with latitude and longitude."""
     dimension: Literal[2, 3] | None = None
-    """Dimension of the positions; by default 3 where there is a z or a height."""
+    """Dimension of the positions; by default 3 if there is a z or a height."""
 
 
 class DataTable(_FileTable):
-    """Where rows come from: a file, or the table itself."""
+    """Source of rows: a file, or rows in the table."""
 
     file: str | None = None
     """CSV or Parquet file, relative to the problem file."""
     rows: list[Row] | None = None
-    """The rows themselves, one inline table each."""
+    """Rows as inline tables."""
     columns: dict[str, str] = Field(default_factory=dict)
-    """What the file calls its columns: `{ a = "rx1", z = "tdoa_ns" }`."""
+    """Names of the columns in the file: `{ a = "rx1", z = "tdoa_ns" }`."""
     separator: Literal[",", ";", "\t", "|", ":", " "] = ","
-    """What separates the fields of a CSV file."""
+    """Separator of the fields of a CSV file."""
 
 
 class StationsTable(DataTable):
-    """The stations. Columns: name; x, y, z or lat_deg, lon_deg, height; optional ones are listed in the manual."""
+    """The stations. Columns: name; x, y, z or lat_deg, lon_deg, height; the manual lists optional columns."""
 
     unit: str = "m"
     """Unit of x, y, z, height and sigma."""
@@ -176,14 +179,14 @@ class StationsTable(DataTable):
     time_unit: str = "s"
     """Unit of the time column of moving stations."""
     axes: Literal["frame", "enu"] | None = None
-    """Axes that angles refer to: the frame's, or east, north, up at each station (default on Earth)."""
+    """Axes that angles refer to: the axes of the frame, or east, north, up at each station (default on Earth)."""
     sigma: Amount | None = None
-    """Standard deviation of each coordinate of the positions; None: surveyed exactly."""
+    """Standard deviation of each coordinate of the positions; None: exact positions."""
     velocity_sigma: Amount | None = None
-    """Standard deviation of each coordinate of the velocities; None: known exactly."""
+    """Standard deviation of each coordinate of the velocities; None: exact velocities."""
     span: Literal["epoch", "run", "noise"] = "epoch"
-    """Whether an error of position or velocity is an unknown of each epoch, one of the whole run, or noise drawn anew
-    at each epoch."""
+    """Span of an error of position or velocity: an unknown of each epoch, an unknown of the whole run, or independent
+    noise at each epoch."""
 
 
 class DeclinationTable(_FileTable):
@@ -195,7 +198,7 @@ class DeclinationTable(_FileTable):
     @field_validator("date", mode="before")
     @classmethod
     def _written(cls, value: Any) -> Any:
-        """Return a date of TOML as text."""
+        """Return a TOML date as text."""
         return value.isoformat() if isinstance(value, date) else value
 
 
@@ -204,43 +207,44 @@ def _kind_words() -> list[str]:
 
 
 class MeasurementsTable(DataTable):
-    """Measurements of one kind. Columns: a, b, z; optional ones are listed in the manual."""
+    """Measurements of one kind. Columns: a, b, z; the manual lists optional columns."""
 
     kind: str | None = Field(default=None, json_schema_extra=lambda schema: schema.update(enum=[*_kind_words(), None]))
-    """Measurement kind; None where the rows have a column `kind`."""
+    """Measurement kind; None if the rows have a column `kind`."""
     unit: str | dict[str, str] | None = None
-    """Unit of z, or one unit for each kind; SI by default."""
+    """Unit of z, or one unit for each kind; by default SI."""
     a: str | None = None
-    """First station of all rows, where there is no column a."""
+    """First station of all rows, if there is no column a."""
     b: str | None = None
-    """Second station of all rows, where there is no column b."""
+    """Second station of all rows, if there is no column b."""
     azimuth: AzimuthConvention | None = None
-    """Where azimuth zero is and which way it grows. Default: a compass (north-clockwise) for the kind `bearing`, and in
-    format 2 wherever there is an Earth; else east-counterclockwise."""
+    """Zero direction and sense of azimuths. Default: a compass (north-clockwise) for the kind `bearing`, and in format
+    2 for all frames on Earth; else east-counterclockwise."""
     declination: Amount | DeclinationTable | None = None
     """Magnetic declination, east positive, of bearings from magnetic north: a number in the unit of z or an amount such
-    as "4 deg"; or a date such as "2026-06-01", at which the World Magnetic Model gives that of each station."""
+    as "4 deg"; or a date such as "2026-06-01", for which the World Magnetic Model gives the value at each station."""
     positive: Literal["a-farther", "b-farther"] = "a-farther"
-    """Sign of differences (and sense of ratios): a against b, or b against a."""
+    """Sign of differences (and sense of ratios): a minus b, or b minus a."""
     excess: bool = False
-    """Whether a range_sum is given less the distance between its two stations."""
+    """Whether the distance between the two stations is subtracted from a range_sum."""
     carrier_hz: float | None = Field(default=None, gt=0.0)
     """Carrier frequency; needed by the unit Hz."""
     sigma: Amount | None = None
-    """Standard deviation of each row; "estimate": one for each kind, found from the data."""
+    """Standard deviation of each row; "estimate": one value for each kind, estimated from the data."""
     arrival_sigma: Amount | dict[str, Amount] | None = None
     """Standard deviation of the arrival at each station; rows of an epoch that share a station are then correlated."""
     covariance: list[list[float]] | None = None
     """Covariance of the rows of one epoch in their order, unit squared."""
     snr: Amount | dict[str, Amount] | None = None
-    """Signal-to-noise ratio of power within the band, one or of each station, "10 dB" or a ratio: with `bandwidth` and
-    `duration` the noise of time differences and gain ratios follows."""
+    """Signal-to-noise ratio of power within the band, one value or one for each station, "10 dB" or a ratio. With
+    `bandwidth` and `duration`, it determines the noise of time differences and gain ratios."""
     bandwidth: Amount | None = None
-    """Hertz, from zero up; of a signal about a carrier half its bandwidth, with twice the duration."""
+    """Bandwidth from zero frequency, hertz; for a signal around a carrier, give half its bandwidth and twice the
+    duration."""
     duration: Amount | None = None
-    """Seconds that are integrated for one measurement."""
+    """Integration time of one measurement, seconds."""
     correction: Amount | None = None
-    """Known amount by which every row exceeds the model; of azimuths the angle by which all turn clockwise."""
+    """Known offset of all rows from the model; for azimuths, a clockwise angle."""
     weight: float | None = Field(default=None, ge=0.0, le=1.0)
     """Weight of all rows: 1 as measured, 0 absent."""
     time_unit: str = "s"
@@ -248,15 +252,18 @@ class MeasurementsTable(DataTable):
 
 
 class TargetTable(DataTable):
-    """How targets move; the rows of a known one. Columns: x, y, z or lat_deg, lon_deg, height; time or epoch."""
+    """Motion of targets, and the rows of a known target.
+
+    Columns: x, y, z or lat_deg, lon_deg, height; time or epoch.
+    """
 
     motion: Literal["static", "free", "free_velocity", "constant_velocity", "constant_acceleration", "known"] | None = (
         None
     )
-    """Default: known with rows or a file, else static with one epoch, else a free position at every epoch, where the
-    target is at rest; free_velocity has a velocity of each epoch, too."""
+    """Default: known with rows or a file, else static for one epoch, else a free position at each epoch, without
+    velocity; free_velocity also has a free velocity at each epoch."""
     reference: float | None = None
-    """Time at which the state of a moving target is answered, seconds; the first epoch by default."""
+    """Time of the estimated state of a moving target, seconds; by default the first epoch."""
     unit: str = "m"
     """Unit of x, y, z and height of a known target."""
     speed_unit: str = "m/s"
@@ -266,44 +273,44 @@ class TargetTable(DataTable):
 
     @property
     def moves(self) -> str | None:
-        """Return the motion that is stated, if only by giving the places."""
+        """Return the stated motion; positions without a motion mean "known"."""
         given = self.file is not None or self.rows is not None
         return self.motion or ("known" if given else None)
 
 
 class ConstraintTable(_FileTable):
-    """What the answer must meet."""
+    """A constraint on the position, height or velocity of targets."""
 
     kind: Literal["box", "height", "above-ground", "polygon", "visible", "speed"]
-    """What is bounded; each kind has its own keys."""
+    """Kind of the constraint; each kind has different keys."""
     target: str | None = None
-    """Name of the target; all by default."""
+    """Name of the target; by default all targets."""
     exactly: Amount | list[Bound] | None = None
-    """Known height above the WGS 84 ellipsoid; or one number for each epoch, as reported."""
+    """Known height above the WGS 84 ellipsoid; or a reported height for each epoch."""
     within: Amount | None = None
-    """Half the width of a band about `exactly`."""
+    """Half width of a band around `exactly`."""
     along: bool | None = None
-    """Whether the height of a target that moves is held at every epoch (default), on a course that follows the
-    Earth, or at the reference time alone."""
+    """Whether the height of a moving target holds at each epoch (default), on a course that follows the Earth, or only
+    at the reference time."""
     min: Amount | list[Bound] | None = None
-    """Least height or speed; least coordinates of a box in the frame, -inf for none."""
+    """Least height or speed; least coordinates of a box in the frame, -inf for no bound."""
     max: Amount | list[Bound] | None = None
-    """Greatest height or speed; greatest coordinates of a box, inf for none."""
+    """Greatest height or speed; greatest coordinates of a box, inf for no bound."""
     unit: str | None = None
-    """Unit of bare numbers; metres or metres per second by default."""
+    """Unit of plain numbers; by default metres or metres per second."""
     corners: list[list[float]] | None = None
     """Corners [x, y] of a polygon in the plan, in order around it."""
     corners_deg: list[list[float]] | None = None
-    """The same as [latitude, longitude] in degrees, at the height of the origin of an ENU frame."""
+    """Corners [latitude, longitude] of a polygon in degrees, at the height of the origin of an ENU frame."""
     stations: str | list[str] | None = None
-    """Stations, for instance satellites, that stand above the target's horizon: "all" (default), or names."""
+    """Stations, for instance satellites, above the horizon of the target: "all" (default), or names."""
     elevation: Amount | None = None
-    """Least elevation of these stations, degrees; 0 by default."""
+    """Least elevation of these stations, degrees; by default 0."""
 
 
-# Depths of a table of speeds: each is a unit of work in every ray, and a profile of the sea has a few dozen.
+# Maximum number of depths in a table of speeds: each ray traces all of them, and a profile of the sea has a few dozen.
 _LAYERS = 1000
-# Biases, priors and constraints that a person writes down; each is a unit of work in every step of every fix.
+# Maximum number of biases, priors and constraints, which a person writes: each step of each fix evaluates all of them.
 _MANY = 100
 
 
@@ -311,112 +318,115 @@ class BiasTable(_FileTable):
     """A family of unknown systematic errors."""
 
     name: str = Field(min_length=1)
-    """Its name."""
+    """Name of the bias."""
     form: FormName = "offset"
-    """Added; times the measured quantity; times the seconds of the run; a turn of the station's axes; the seconds by
-    which the station is further along its course; or added, and another at each epoch: a random walk, as of a clock, or
-    a smooth function of time."""
+    """Form of the error: an offset; a scale of the measured quantity; a drift in time; a rotation of the axes of the
+    station; a delay of the station along its course, seconds; or an offset that changes with time: a random walk, such
+    as of a clock, or a smooth function of time."""
     per: Literal["station", "pair", "kind", "target"] = "station"
-    """Who has one of his own: each station (with the sign of its arrival), pair of stations, or target; or the kind."""
+    """Members with separate errors: each station (with the sign of its arrival), pair of stations, or target; or one
+    error for the kind."""
     kind: str | None = None
-    """Kind of the rows that are touched; needed where the file has several quantities, but not for a time."""
+    """Kind of the affected rows; required if the file has several quantities, but not for a time."""
     members: list[str] | dict[str, list[str]] | None = None
-    """Stations that have one; all that measure by default. Leave out the reference of a difference. Or groups of
-    stations that share one: `{ GPS = ["G01", "G07"] }`. Of pairs: names such as "A-B"; of targets: theirs."""
+    """Stations with an error; by default all that measure. Leave out the reference of a difference. Or groups of
+    stations that share an error: `{ GPS = ["G01", "G07"] }`. For pairs: names such as "A-B"; for targets: names of
+    targets."""
     mean: Amount | None = None
     """Prior mean."""
     sigma: Amount | None = None
-    """Prior standard deviation with its unit, such as "200 m"; without it the bias is unknown. Of a walk that of its
-    value at the first epoch."""
+    """Prior standard deviation with its unit, such as "200 m"; without it the bias is unknown. For a walk, the prior
+    applies to the value at the first epoch."""
     density: str | None = None
-    """Of a walk: spectral density of the white noise that it is the sum of, such as "0.04 m^2/s" or "4 ns^2/s"."""
+    """For a walk: spectral density of the white noise that it sums, such as "0.04 m^2/s" or "4 ns^2/s"."""
     rate_density: str | None = None
-    """Of a walk whose rate walks too: the density of that, such as "1e-6 m^2/s^3"."""
+    """For a walk with a walking rate: spectral density of the rate, such as "1e-6 m^2/s^3"."""
     allan: list[list[float]] | None = Field(default=None, max_length=_MANY)
-    """Of a walk of times or lengths, in place of densities: Allan deviations of the clock, each with its averaging time
-    in seconds, such as [[1.0, 1e-9], [100.0, 2e-10]]."""
+    """For a walk of times or lengths, instead of densities: pairs of averaging time in seconds and Allan deviation of
+    the clock, such as [[1.0, 1e-9], [100.0, 2e-10]]."""
     knots: int | list[float] | None = None
-    """Of a spline: the times in seconds between which it is a cubic polynomial, or how many evenly spaced ones."""
+    """For a spline: the times in seconds between which it is a cubic polynomial, or the number of evenly spaced
+    times."""
 
 
 class PriorTable(_FileTable):
     """Prior knowledge of an unknown."""
 
     name: str
-    """Unknown: position, velocity, acceleration, with `[0]` and so on behind it where there are several targets."""
+    """Unknown: position, velocity, acceleration; for several targets with an index, such as `position[0]`."""
     mean: list[float]
-    """Its mean, in the frame's coordinates."""
+    """Mean, in the coordinates of the frame."""
     sigma: list[float] | Amount
     """Standard deviation of each coordinate."""
     unit: str | None = None
-    """Unit of both; metres, metres per second, metres per second squared by default."""
+    """Unit of mean and sigma; by default metres, metres per second, metres per second squared."""
 
 
 class SoundTable(_FileTable):
-    """The medium through which sound comes."""
+    """The medium of sound waves."""
 
     medium: Literal["air", "fresh water", "sea water"]
-    """What it is."""
+    """Kind of the medium."""
     celsius: float
-    """Its temperature."""
+    """Temperature, degrees Celsius."""
     salinity: float | None = None
-    """Grams of salt in a kilogram of water; 0 in fresh water and 35 in sea water by default."""
+    """Grams of salt in a kilogram of water; by default 0 in fresh water and 35 in sea water."""
     depth: float = 0.0
     """Metres below the surface."""
 
 
 class SpeedTable(_FileTable):
-    """A speed that is not quite known."""
+    """A speed with a standard deviation."""
 
     value: Amount
     """The stated speed: metres per second, or text with a unit."""
     sigma: Amount
-    """Its standard deviation, likewise."""
+    """Standard deviation of the speed: metres per second, or text with a unit."""
 
 
 class MediumTable(_FileTable):
-    """What the waves come through where their speed is not one number: each row is then measured along its rays."""
+    """A medium without a single speed; rows are then measured along rays."""
 
     kind: Literal["layers", "atmosphere"]
-    """Speeds over depth below a level surface; or air as radio waves meet it."""
+    """Speeds over depth below a level surface; or air for radio waves."""
     depths: list[float] | None = Field(default=None, max_length=_LAYERS)
-    """Of layers: depths that grow; of the points between which speeds are straight lines, or of tops of layers."""
+    """For layers: increasing depths; of points between which the speed is linear, or of the tops of layers."""
     speeds: list[float] | None = Field(default=None, max_length=_LAYERS)
-    """Of layers: the speed at each depth."""
+    """For layers: the speed at each depth."""
     between: Literal["linear", "constant"] = "linear"
-    """Of layers: what holds between the depths."""
+    """For layers: speed between the depths, linear or constant."""
     surface: Amount = 0.0
-    """Of layers: third coordinate of depth zero."""
+    """For layers: third coordinate of depth zero."""
     unit: str = "m"
     """Unit of depths and surface."""
     speed_unit: str = "m/s"
     """Unit of speeds."""
     refractivity: float | None = None
-    """Of an atmosphere: (n - 1) 1e6 at height zero; 315 by default."""
+    """For an atmosphere: refractivity (n - 1) 1e6 at height zero; by default 315."""
     scale_height: float | None = None
-    """Of an atmosphere: metres over which it falls to 1 / e; 7350 by default."""
+    """For an atmosphere: height in metres over which the refractivity decreases to 1 / e; by default 7350."""
 
 
 class WindowTable(_FileTable):
-    """How rows are put together to epochs by their times."""
+    """Assignment of rows to epochs by their times."""
 
     window: str | None = None
-    """Length of an epoch, such as "0.1 s"; by default rows of exactly equal time belong together."""
+    """Length of an epoch, such as "0.1 s"; by default, rows of exactly equal time form an epoch."""
 
 
 class ProblemFile(_FileTable):
     """A problem file."""
 
     format: Literal[1, 2]
-    """Version of the format: in 2, azimuths on Earth are compass bearings where nothing else is said."""
+    """Version of the format: in 2, azimuths on Earth are compass bearings by default."""
     title: str | None = None
-    """What it is."""
+    """Title of the problem."""
     propagation_speed: Annotated[float, Field(gt=0.0)] | str | SoundTable | SpeedTable | None = None
-    """Metres per second, or text with a unit; or of sound: { medium = "air", celsius = 20.0 }. Light by default.
+    """Metres per second, or text with a unit; or for sound: { medium = "air", celsius = 20.0 }. By default light.
     A speed with a sigma is estimated with the target: { value = 343.0, sigma = 5.0 }.
-    Beside layers: the speed by which ranges in metres were made of times."""
+    With layers: the speed that converted times to ranges in metres."""
     medium: MediumTable | None = None
-    """Layers or air, where the speed is not one number."""
+    """Layers or air, if the speed is not one number."""
     frame: FrameTable = FrameTable()
     stations: StationsTable
     measurements: list[MeasurementsTable] = Field(min_length=1)
@@ -436,34 +446,34 @@ def schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **ProblemFile.model_json_schema()}
 
 
-# Read a TOML file and hold it against the schema; every complaint is one sentence with its place.
+# Read a TOML file and validate it against the schema; each error is one sentence with its place.
 
 
 def read_document(path: Path) -> ProblemFile:
-    """Return the contents of a problem file, or of standard input; raise InvalidProblem where it is none."""
+    """Return the contents of a problem file, or of standard input; raise InvalidProblem for an invalid file."""
     return document_of(read_text(path), name_of(path))
 
 
 def document_of(text: str, source: str) -> ProblemFile:
-    """Return the contents of the text of a problem file; `source` is the place to name."""
+    """Return the contents of the text of a problem file; `source` is the place for messages."""
     data = parse_toml(text, source, formats=(1, 2))
-    # these two a network alone has: `optloc.sites.calibration.network_file`
+    # only files of networks have these two keys: `optloc.sites.calibration.network_file`
     if isinstance(stations := data.get("stations"), dict) and {"dimension", "synchronised"} & set(stations):
-        raise InvalidProblem("the stations of this file are yet to be found", source, "use optloc calibrate")
+        raise InvalidProblem("the station positions of this file are unknown", source, "use optloc calibrate")
     return validate(data, source)
 
 
 def name_of(path: Path) -> str:
-    """Return what to call a document."""
+    """Return the name of a document for messages."""
     return "standard input" if path == STANDARD_INPUT else path.name
 
 
 def parse_toml(text: str, source: str, formats: tuple[int, ...] = (1,)) -> dict[str, Any]:
-    """Return TOML of one of some formats as data; `source` is the place to name."""
+    """Return TOML text as data, if its format is permitted; `source` is the place for messages."""
     if not text.strip():
         raise InvalidProblem("the file is empty", source, f"begin it with the line format = {max(formats)}")
     data = toml_of(text, source)
-    # true equals 1 in Python.
+    # true equals 1 in Python
     if data.get("format") not in formats or isinstance(data.get("format"), bool):
         given = f"format {data['format']!r} is unknown" if "format" in data else "the key 'format' is missing"
         raise InvalidProblem(given, source, f"begin the file with the line format = {max(formats)}")
@@ -471,21 +481,21 @@ def parse_toml(text: str, source: str, formats: tuple[int, ...] = (1,)) -> dict[
 
 
 def validate(data: dict[str, Any], source: str) -> ProblemFile:
-    """Return data as a problem file; `source` is the place to name."""
+    """Return data as a problem file; `source` is the place for messages."""
     return validated(ProblemFile, data, source)
 
 
 def validated(model: type[_Model], data: dict[str, Any], source: str) -> _Model:
-    """Return data as a table of a schema; raise InvalidProblem with the first complaint.
+    """Return data as a table of a schema; raise InvalidProblem with the first error.
 
     Parameters
     ----------
     model : type of pydantic model
         The schema.
     data : dict
-        What was written.
+        The data to check.
     source : str
-        Place to name.
+        Place for messages.
     """
     try:
         return model.model_validate(data)
@@ -494,8 +504,7 @@ def validated(model: type[_Model], data: dict[str, Any], source: str) -> _Model:
 
 
 def _sentence(error: ValidationError, source: str, data: dict[str, Any], model: type[BaseModel]) -> InvalidProblem:
-    # Alternatives of a union each complain. The table with the fewest complaints was meant, and its deepest complaint
-    # names the mistake.
+    # Each alternative of a union reports errors. Use the table with the fewest errors, and its deepest error.
     found = error.errors()
     counts = Counter(e["loc"][:2] for e in found if _is_alternative(e["loc"]))
     first = max(
@@ -515,7 +524,7 @@ def _sentence(error: ValidationError, source: str, data: dict[str, Any], model: 
     advice = None
     if first["type"] in {"extra_forbidden", "missing"}:
         known = _keys(path, model, first["loc"])
-        advice = nearest(key, known) if first["type"] == "extra_forbidden" else "add it"
+        advice = nearest(key, known) if first["type"] == "extra_forbidden" else "add the key"
     if first["type"] == "literal_error":
         known = [part.strip().strip("'") for part in str(first["ctx"]["expected"]).replace(" or ", ", ").split(",")]
         what, advice = f"{key} = {first['input']!r} is unknown", nearest(str(first["input"]), known)
@@ -523,19 +532,19 @@ def _sentence(error: ValidationError, source: str, data: dict[str, Any], model: 
 
 
 def _is_alternative(loc: tuple[int | str, ...]) -> bool:
-    """Return whether a complaint is about a key of one of several tables that the file may use in a place."""
+    """Return whether an error is about a key of one of several tables that a place allows."""
     return len(loc) > _IN_TABLE and str(loc[1]).endswith("Table")
 
 
-# Names before the key in the place of such a complaint: the key of the file, and the table.
+# Number of names before the key in the place of this error: the key of the file, and the table.
 _IN_TABLE = 2
 
 
 def _path(loc: tuple[int | str, ...], data: Any) -> tuple[list[int | str], str]:
-    """Return the path of the table and the key of a complaint, without the names of union members."""
+    """Return the path of the table and the key of an error, without the names of union members."""
     path: list[int | str] = []
     at: Any = data
-    # pydantic puts the names of a union's members between keys: what is not in the data is one of them.
+    # pydantic inserts the names of union members between keys: skip parts that are not in the data.
     for part in loc:
         if (isinstance(at, dict) and part in at) or (isinstance(at, list) and part in range(len(at))):
             at = at[part]  # type: ignore[index]  # just checked
@@ -543,14 +552,14 @@ def _path(loc: tuple[int | str, ...], data: Any) -> tuple[list[int | str], str]:
             continue
         path.append(part)
     *table, key = path or ["file"]
-    # The key of a complaint about an entry of a list is that of the list.
+    # An error in a list entry has the key of the list.
     while table and isinstance(key, int):
         key = table.pop()
     return table, str(key)
 
 
 def _spell(path: list[int | str]) -> list[str]:
-    """Return a path as a file spells it: ``[[measurements]] 2``."""
+    """Return a path in the notation of a file: ``[[measurements]] 2``."""
     names: list[str] = []
     for part in path:
         if isinstance(part, int):
@@ -561,7 +570,7 @@ def _spell(path: list[int | str]) -> list[str]:
 
 
 def _keys(path: list[int | str], model: Any, loc: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of the table at a path of a schema; a complaint names the table where a place allows several."""
+    """Return the keys of the table at a path of a schema; if the place allows several tables, `loc` names the table."""
     for part in path:
         if isinstance(part, str) and part in getattr(model, "model_fields", {}):
             found = _models_in(model.model_fields[part].annotation)

@@ -1,4 +1,4 @@
-"""The two shapes of a table of readings: long, one a row, and wide, a column for each receiver."""
+"""Long and wide tables of readings: one reading in each row, or a column for each receiver."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ from optloc.files.table_import import (
 from optloc.files.words import equal_rows, numbered
 from optloc.models import BEARING
 
-# Names of columns that are repeated of a list.
+# Largest number of column names in a message.
 _SHOWN = 4
 
 
-# A column for each receiver, or for each pair.
+# Wide tables: a column for each receiver, or for each pair.
 
 
 def read_wide(roles: Roles, told: ColumnHints, columns: Sequence[Named], place: ColumnPlaces) -> list[Readings]:
-    """Return the readings of a table that has a column for each receiver, one set for each sort."""
+    """Return the readings of a wide table, one set for each sort."""
     sorts: dict[str, list[Named]] = {}
     for one in columns:
         if one.sigma:
@@ -51,8 +51,8 @@ def read_wide(roles: Roles, told: ColumnHints, columns: Sequence[Named], place: 
         name = one.form or told.what or ("tdoa" if one.minus else None)
         if name is None:
             shown = ", ".join(repr(each.column) for each in columns[:_SHOWN])
-            advice = "say it with --as arrivals, --as range, --as tdoa or another kind"
-            raise InvalidProblem(f"columns such as {shown} do not tell what they hold", roles.table.source, advice)
+            advice = "state it with --as arrivals, --as range, --as tdoa or another kind"
+            raise InvalidProblem(f"columns such as {shown} do not identify their content", roles.table.source, advice)
         sorts.setdefault(name, []).append(one)
     errors = [one for one in columns if one.sigma]
     forms = {name: sort_named(name) for name in sorts}
@@ -92,7 +92,7 @@ def _wide_sort(
             deviations.append(sigma_of(table, own, form, first, held.row))
             errors_used.append(own)
     if not any(map(len, values)):
-        raise InvalidProblem("no cell holds a reading", table.source, "look at the columns of the receivers")
+        raise InvalidProblem("no cell has a reading", table.source, "check the columns of the receivers")
     pairs = form.stations > 1
     minus = all(one.minus or len(one.ends) == 1 for one in columns)
     number = np.repeat(np.arange(len(columns)), list(map(len, values)))
@@ -103,7 +103,7 @@ def _wide_sort(
     )
     if len(deviations) == len(columns):
         found = replace(found, sigma=np.concatenate(deviations), errors=tuple(dict.fromkeys(errors_used)))
-    return _settled(found, roles, told, place, empty, "a-farther" if minus else None)
+    return _checked(found, roles, told, place, empty, "a-farther" if minus else None)
 
 
 def _in_unit(values: Decimals, unit: str, wanted: str, form: Form) -> Decimals:
@@ -114,35 +114,21 @@ def _in_unit(values: Decimals, unit: str, wanted: str, form: Form) -> Decimals:
 
 
 def _is_error_of(error: Named, one: Named, form: Form) -> bool:
-    """Return whether a column holds the standard deviations of another column of the same receivers."""
+    """Return whether a column has the standard deviations of another column of the same receivers."""
     kinds = (None, one.form, form.kind)
     return error.ends == one.ends and error.form in kinds and _allows(form, error.column)
 
 
 def _allows(form: Form, column: str) -> bool:
-    """Return whether a column's name ends in a unit of a sort, or in none."""
+    """Return whether a column name ends in a unit of a sort, or in no unit."""
     unit = any_unit(column)
     return unit is None or unit in UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
 
 
 def sigma_column(roles: Roles, form: Form, told: ColumnHints, forms: Sequence[Form]) -> str | None:
-    """Return the column of standard deviations of a sort of readings, None where --sigma states them or none has them.
+    """Return the column of standard deviations of a sort of readings; None with --sigma, or without a column.
 
-    Parameters
-    ----------
-    roles : Roles
-        The table.
-    form : Form
-        The sort.
-    told : ColumnHints
-        What the user says of the table.
-    forms : sequence of Form
-        All sorts of the table.
-
-    Raises
-    ------
-    InvalidProblem
-        Where a column may belong to several sorts.
+    `forms` are all sorts of the table. Raise InvalidProblem if the column may belong to several sorts.
     """
     if stated_sigma(told, form.kind) is not None:
         return None
@@ -156,30 +142,30 @@ def sigma_column(roles: Roles, form: Form, told: ColumnHints, forms: Sequence[Fo
     others = [one for one in forms if _allows(one, column)]
     if (any_unit(column) is None and len({one.quantity for one in others}) > 1) or len(others) > 1:
         kinds = " or ".join(one.kind for one in others)
-        advice = f"say --column sigma_{others[0].kind}={column}, or give all of them with --sigma"
+        advice = f"use --column sigma_{others[0].kind}={column}, or state all of them with --sigma"
         raise InvalidProblem(f"the column {column!r} may be the error of {kinds}", roles.table.source, advice)
     return column
 
 
 def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Array) -> Array:
-    """Return the standard deviations of some rows in the unit of their values."""
+    """Return the standard deviations of the rows `pick`, in the unit of their values."""
     known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
     own = unit_of(column, known) or unit
     if {own, unit} & set(UNITS["time"]) and not {own, unit} <= set(UNITS["time"]) and form.quantity == "length":
-        advice = "give both in one unit, or say --sigma"
-        raise InvalidProblem(f"it is in {own}, its readings are in {unit}", table.where(column), advice)
+        advice = "give both in one unit, or use --sigma"
+        raise InvalidProblem(f"the column is in {own}, but the readings are in {unit}", table.where(column), advice)
     held = numbers(table, column)
     place = np.full(table.count, -1)
     place[held.row] = np.arange(len(held.row))
     lacking = pick[place[pick] < 0]
     if len(lacking):
-        advice = "give a number, or leave the row out"
+        advice = "give a number, or remove the row"
         raise InvalidProblem("the reading has no standard deviation", table.where(column, int(lacking[0])), advice)
     return np.asarray(held.values.floats()[place[pick]] * known[own] / known[unit])
 
 
 def _ends(one: Named, form: Form, told: ColumnHints, source: str) -> tuple[str, str | None]:
-    """Return the stations of a column of a wide table."""
+    """Return the stations of a column of a wide table; the second is None for one station."""
     if form.stations == 1 and len(one.ends) == 1:
         return one.ends[0], None
     if form.stations == 2 and len(one.ends) == 2:
@@ -187,16 +173,18 @@ def _ends(one: Named, form: Form, told: ColumnHints, source: str) -> tuple[str, 
     if form.stations == 2 and told.reference is not None:
         return one.ends[0], told.reference
     if form.stations == 2:
-        advice = "say the other with --reference STATION"
+        advice = "state the other with --reference STATION"
         raise InvalidProblem(f"{form.kind} needs two stations, {one.column!r} names one", source, advice)
-    raise InvalidProblem(f"{form.kind} has one station, {one.column!r} names two", source, "say what it is with --as")
+    raise InvalidProblem(
+        f"{form.kind} has one station, {one.column!r} names two", source, "state the content with --as"
+    )
 
 
-# One reading a row.
+# Long tables: one reading in each row.
 
 
 def read_inline(roles: Roles, told: ColumnHints) -> tuple[ColumnPlaces, Array]:
-    """Return the stations of a table that says in each row where its station was, and the name of each row's."""
+    """Return the stations of a table with station positions in each row, and the station name of each row (m,)."""
     count = roles.table.count
     role = next((role for role in ("station", "name") if roles.find(role)), None)
     names = np.array([str(i + 1) for i in range(count)], dtype=object) if role is None else roles.labels(role)
@@ -206,7 +194,7 @@ def read_inline(roles: Roles, told: ColumnHints) -> tuple[ColumnPlaces, Array]:
     heard, first = [], []
     for row, key in enumerate(zip(*(column.tolist() for column in every.columns.values()), strict=True)):
         if key not in spots:
-            # A station that is elsewhere in another row is another one: where it was matters, not what it is called.
+            # A station with another position in another row becomes a new station: positions matter, not names.
             seen[key[0]] = seen.get(key[0], 0) + 1
             spots[key] = key[0] if seen[key[0]] == 1 else f"{key[0]} ({seen[key[0]]})"
             first.append(row)
@@ -219,22 +207,9 @@ def read_inline(roles: Roles, told: ColumnHints) -> tuple[ColumnPlaces, Array]:
 def read_long(
     roles: Roles, form: Form, told: ColumnHints, place: ColumnPlaces, heard: Array | None, forms: Sequence[Form]
 ) -> Readings:
-    """Return the readings of one sort of a table that has one a row.
+    """Return the readings of one sort of a table with one reading in each row.
 
-    Parameters
-    ----------
-    roles : Roles
-        The table.
-    form : Form
-        The sort.
-    told : ColumnHints
-        What the user says of the table.
-    place : ColumnPlaces
-        The stations.
-    heard : object array (m,), optional
-        Stations of the rows, where the table has no column of them.
-    forms : sequence of Form
-        All sorts of the table.
+    `heard` (m,) has the stations of the rows if no column has them. `forms` are all sorts of the table.
     """
     table = roles.table
     if form.value == "sp" and roles.find("sp") is None:
@@ -245,14 +220,14 @@ def read_long(
     unit, note = ("s", "") if dated else unit_for(column, form, told, held.values, table.source)
     pick = held.row
     if not len(pick):
-        raise InvalidProblem("no cell holds a reading", table.where(column), "look at the column")
+        raise InvalidProblem("no cell has a reading", table.where(column), "check the column")
     a = roles.labels("station") if heard is None else heard
-    positive, b = ("a-farther", None) if form.stations == 1 else _others(roles, told)
+    positive, b = ("a-farther", None) if form.stations == 1 else _second_station(roles, told)
     found = _of_column(form, unit, held, column, a)
     found = replace(found, b=None if b is None else b[pick], notes=(note,) if note else ())
     if (own := sigma_column(roles, form, told, forms)) is not None:
         found = replace(found, sigma=sigma_of(table, own, form, unit, pick), errors=(own,))
-    return _settled(found, roles, told, place, table.count - len(pick), positive)
+    return _checked(found, roles, told, place, table.count - len(pick), positive)
 
 
 def _of_column(form: Form, unit: str, held: NumberColumn, column: str, a: Array) -> Readings:
@@ -260,20 +235,20 @@ def _of_column(form: Form, unit: str, held: NumberColumn, column: str, a: Array)
     return Readings(form, unit, held.values, held.row, (column,), np.zeros(len(held.row), dtype=int), a[held.row])
 
 
-def _others(roles: Roles, told: ColumnHints) -> tuple[str | None, Array]:
-    """Return the sign of differences, where it is known, and the second station of each row."""
+def _second_station(roles: Roles, told: ColumnHints) -> tuple[str | None, Array]:
+    """Return the sign of differences, None if unknown, and the second station of each row."""
     column = roles.find("reference")
     if told.reference is not None:
         return "a-farther", np.full(roles.table.count, told.reference, dtype=object)
     if column is None:
-        advice = "say it with --reference STATION, or name its column with --column reference=NAME"
+        advice = "state it with --reference STATION, or state its column with --column reference=NAME"
         raise InvalidProblem("no column looks like the second station", roles.table.source, advice)
     against = stem(column) in ("reference", "ref", "refstation", "b")
     return ("a-farther" if against else None), roles.labels("reference")
 
 
 def _picks(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> Readings:
-    """Return S minus P of a table with a column for each, or with a column of phases."""
+    """Return S minus P times of a table with a column for each wave, or with a column of phases."""
     table, zone = roles.table, told.zone
 
     def times(role: str) -> list[Decimal | None]:
@@ -297,7 +272,7 @@ def _picks(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> Readings:
         for row, key in enumerate(zip(event, station.tolist(), phases, strict=True)):
             if key in first:
                 what = f"station {key[1]!r} has a second {key[2]} pick, first in row {first[key] + 1}"
-                advice = "leave one out, or name the events with --column message=NAME"
+                advice = "remove one, or state the column of events with --column message=NAME"
                 raise InvalidProblem(what, table.at(row), advice)
             first[key] = row
         pairs = [
@@ -308,23 +283,26 @@ def _picks(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> Readings:
     both = [(row, s - p) for row, p, s in pairs if p is not None and s is not None]
     early = next((row for row, value in both if value <= 0), None)
     if early is not None:
-        raise InvalidProblem("the S wave is not behind the P wave", table.at(early), "correct the picks")
+        raise InvalidProblem("the S wave is not after the P wave", table.at(early), "correct the picks")
     if not both:
-        raise InvalidProblem("no station has both P and S", table.source, "name their columns with --column p=, s=")
+        raise InvalidProblem("no station has both P and S", table.source, "state their columns with --column p=, s=")
     held = NumberColumn(Decimals.of([value for _, value in both]), np.array([row for row, _ in both]))
     found = _of_column(sort_named("sp"), "s", held, roles.find("s") or roles.column("time"), station)
     lone = len({*station.tolist()}) - len({*found.a.tolist()})
     found = replace(found, notes=(f"{lone} stations without both P and S are left out",) if lone else ())
-    return _settled(found, roles, told, place, 0, "a-farther")
+    return _checked(found, roles, told, place, 0, "a-farther")
 
 
-# What all have in common: stations that are known, no gaps, no repeats, a sign and a convention.
+# Checks for both forms: known stations, no missing readings, no repeats, sign and convention.
 
 
-def _settled(
+def _checked(
     found: Readings, roles: Roles, told: ColumnHints, place: ColumnPlaces, empty: int, positive: str | None
 ) -> Readings:
-    """Return readings whose stations are known, of which none is missing or repeated, with sign and convention."""
+    """Return checked readings.
+
+    Stations are known, missing readings and repeats are removed, sign and convention are set.
+    """
     table, known = roles.table, set(place.names)
     for end in (found.a, found.b):
         for name in [] if end is None else numbered(end)[0]:
@@ -352,51 +330,51 @@ def _settled(
         found = without_repeats(found, epoch[found.row], told, table, label)
     signed = found.form.stations > 1 and found.form.kind != "range_sum"
     if signed and told.positive is None and positive is None:
-        advice = "say --positive a-farther if the first is farther then, or --positive b-farther"
-        what = "a difference of two stations may be positive where the first is farther, or the second"
+        advice = "use --positive a-farther if the first is farther, else --positive b-farther"
+        what = "the sign of differences is unknown: positive values may mean that the first or the second is farther"
         raise InvalidProblem(what, table.source, advice)
     found = replace(found, positive=told.positive or positive or "a-farther")
-    return _oriented(found, told, place, table.source) if found.form.kind == "azimuth" else found
+    return _with_convention(found, told, place, table.source) if found.form.kind == "azimuth" else found
 
 
-# Digits of an instant in seconds or nanoseconds of today, and metres of rounding that a fix would not show.
+# Significant digits of a recent time in seconds or nanoseconds; rounding, m, that has no effect on a fix.
 _INSTANT, _ROUNDED = 9, 1.0
 
 
 def _with_digits(found: Readings, table: Table) -> Readings:
-    """Return arrivals that have all their digits; raise InvalidProblem where a spreadsheet took them."""
+    """Return arrivals with all their digits; raise InvalidProblem if a spreadsheet rounded them."""
     if found.form.kind != "toa":
         return found
     for i in np.flatnonzero(found.values.written < 0).tolist():
         value = found.values[i]
         if len(value.as_tuple().digits) <= _INSTANT <= value.adjusted():
-            advice = "write it with all digits; a spreadsheet must take the column for text"
+            advice = "write it with all digits; in a spreadsheet, format the column as text"
             raise InvalidProblem(f"the arrival {value:E} has lost its digits", found.where(table, i), advice)
     floats = any(table.raw(name).dtype.kind == "f" for name in found.columns)
     factor = UNITS["length"][found.unit] * (SPEED_OF_LIGHT if found.unit in UNITS["time"] else 1.0)
     step = float(np.spacing(np.abs(found.values.floats()).max())) * factor
     if not floats or step < _ROUNDED:
         return found
-    note = f"arrivals are floating-point numbers, at this size rounded to {step:.3g} m: text or integers keep more"
+    note = f"arrivals are floating-point numbers, rounded to {step:.3g} m at this size; text or integers are more exact"
     return replace(found, notes=(*found.notes, note))
 
 
-def _oriented(found: Readings, told: ColumnHints, place: ColumnPlaces, source: str) -> Readings:
-    """Return azimuths with their convention: as told, as their name says, or, on Earth, that of a compass."""
+def _with_convention(found: Readings, told: ColumnHints, place: ColumnPlaces, source: str) -> Readings:
+    """Return azimuths with their convention: from the options, the column name or, on Earth, the compass."""
     named = any(word in stem(found.columns[0]) for word in (BEARING, "brg", "compass", "heading"))
     if found.heading is not None:
         return found
     if told.azimuth is not None or named:
         return replace(found, azimuth=told.azimuth or COMPASS)
     if place.frame == "cartesian":
-        advice = f"say --azimuth {COMPASS} of a compass, or --azimuth {CARTESIAN} from the x axis"
-        raise InvalidProblem("an azimuth may begin at north or at the x axis", source, advice)
-    note = f"azimuths are taken as those of a compass; --azimuth {CARTESIAN} says another"
+        advice = f"use --azimuth {COMPASS} for a compass, or --azimuth {CARTESIAN} from the x axis"
+        raise InvalidProblem("azimuths may count from north or from the x axis", source, advice)
+    note = f"azimuths are read as compass bearings; --azimuth {CARTESIAN} changes this"
     return replace(found, azimuth=COMPASS, notes=(*found.notes, note))
 
 
 def epochs_of(roles: Roles, told: ColumnHints, found: Sequence[Readings]) -> dict[str, Array]:
-    """Return the columns epoch, time and target (n,) of the rows of a table, those that there are."""
+    """Return the available columns epoch, time and target (n,) of the rows of a table."""
     table, taken = roles.table, {name for one in found for name in one.columns}
     out: dict[str, Array] = {}
     long = len(taken) == len(found)
@@ -421,8 +399,8 @@ def epochs_of(roles: Roles, told: ColumnHints, found: Sequence[Readings]) -> dic
     if time is not None:
         out["time"] = time
     elif when is not None and told.window is not None:
-        advice = "say it with --time-unit, such as --time-unit ns"
-        raise InvalidProblem(f"the unit of the times in column {when!r} is not known", table.source, advice)
+        advice = "state it with --time-unit, such as --time-unit ns"
+        raise InvalidProblem(f"the unit of the times in column {when!r} is unknown", table.source, advice)
     elif when is not None and message is None:
         out["epoch"] = roles.labels("time")
     if not long and not out.keys() & {"epoch", "time"}:
@@ -431,13 +409,13 @@ def epochs_of(roles: Roles, told: ColumnHints, found: Sequence[Readings]) -> dic
 
 
 def _no_times() -> InvalidProblem:
-    advice = "name the column of times with --column time=NAME, and its unit with --time-unit"
+    advice = "state the time column with --column time=NAME, and its unit with --time-unit"
     return InvalidProblem("a window needs a column of times", "--window", advice)
 
 
 def _clusters(found: Readings, window: str, count: int) -> Array:
-    """Return the message (n,) of each row of arrivals: of the same are those less than a window apart."""
-    # Arrivals in metres are times that the speed of light has multiplied.
+    """Return the message (n,) of each row of arrivals; arrivals less than a window apart belong to one message."""
+    # Arrivals in metres are times multiplied by the speed of light.
     seconds = Decimal(repr(UNITS["length"][found.unit]))
     seconds = seconds if found.unit in UNITS["time"] else seconds / Decimal(repr(SPEED_OF_LIGHT))
     factor = Decimal(repr(Units("time").plain(window, None, "--window"))) / seconds

@@ -20,17 +20,17 @@ from optloc.files.words import distinct
 
 _XYZ, _GEODETIC, _RATES = ("x", "y", "z"), ("lat_deg", "lon_deg", "height"), ("vx", "vy", "vz")
 _QUATERNION = ("qw", "qx", "qy", "qz")
-# Stems of columns of coordinates, by which a mapping is a table.
+# Column names of coordinates: a mapping with one of these keys is a table.
 _COLUMNS = {"x", *WORDS["lat_deg"].split(), "latdeg"}
-# Length of a quaternion beyond 1 that is more than the rounding of two or three written digits: another order of parts.
+# Larger deviations of the length of a quaternion from 1 are not rounding of two or three digits: the order is wrong.
 _UNIT = 1e-2
-# Difference of axes from the frame's that is rounding of a rotation: such stations need no axes of their own.
+# Difference from the axes of the frame that is rounding of a rotation: these stations need no separate axes.
 _SAME = 1e-15
 
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """Stations as the rows of their table say, before they are spread over epochs.
+    """Stations in the rows of their table, before they are assigned to epochs.
 
     Parameters
     ----------
@@ -45,11 +45,11 @@ class Survey:
     axes : array (n, d, d), optional
         Unit vectors in rows.
     sigma, velocity_sigma : array (n,), optional
-        Standard deviation of each coordinate, metres, and of the velocities, metres per second.
+        Standard deviations of each coordinate, metres, and of the velocities, metres per second.
     table : Table
         The rows.
     noun : str
-        What they are, for messages.
+        Noun for messages.
     """
 
     names: tuple[str, ...]
@@ -64,21 +64,14 @@ class Survey:
 
     @property
     def moving(self) -> bool:
-        """Return whether the table dates its rows."""
+        """Return whether the table has times or epochs."""
         return self.table.has("time") or self.table.has("epoch")
 
 
 def numbers_of(names: Sequence[str], stations: Sequence[str], where: str | Callable[[int], str]) -> Array:
-    """Return the number of each station (n,) by its name.
+    """Return the station number of each name (n,); raise InvalidProblem for an unknown name.
 
-    Parameters
-    ----------
-    names : sequence of n str
-        What a user wrote.
-    stations : sequence of s str
-        Stations that there are.
-    where : str, or function of int
-        Place of all names, or of each by its number.
+    `where` is the place of all names for messages, or a function that returns the place of a name by its index.
     """
     number = {name: i for i, name in enumerate(stations)}
     for i, name in enumerate(names):
@@ -90,18 +83,11 @@ def numbers_of(names: Sequence[str], stations: Sequence[str], where: str | Calla
 def station_table(
     given: Any, where: str, axes: Sequence[str] = ("x", "y", "z"), names: Mapping[str, str] | None = None
 ) -> Table:
-    """Return the table of stations that a caller has in Python.
+    """Return the table of stations from a Python argument.
 
-    Parameters
-    ----------
-    given : Stations, data frame, mapping of name to coordinates or to a row, mapping of columns, or array (s, d)
-        Where stations are; without names they are called S0, S1 and so on.
-    where : str
-        Argument to name.
-    axes : sequence of str
-        Columns of coordinates that are an array.
-    names : mapping of str to str, optional
-        What a table calls its columns.
+    `given` is a Stations object, data frame, mapping of name to coordinates or to a row, mapping of columns, or array
+    (s, d). Stations without names get the names S0, S1 and so on. `where` is the argument for messages. `axes` are the
+    columns of the coordinates of an array. `names` are the column names in the table.
     """
     names = names or {}
     if isinstance(given, Stations):
@@ -127,7 +113,7 @@ def station_table(
     except (TypeError, ValueError):
         place = np.zeros(0)
     if place.ndim != 2 or place.shape[1] not in (2, 3):
-        what = "these are no positions of 2 or 3 coordinates each"
+        what = "these are not positions with 2 or 3 coordinates"
         raise InvalidProblem(what, where, "give name: (x, y, z), or an array with a row for each station")
     labels = np.array([str(name) for name in given] if mapped else [f"S{i}" for i in range(len(place))], dtype=object)
     return of_frame({"name": labels} | dict(zip(axes, place.T, strict=False)), where, names)
@@ -140,11 +126,11 @@ def survey(section: StationsTable, table: Table, frame_table: FrameTable, where:
     found, first, index = distinct(labels)
     order = np.argsort(first)
     names = tuple(found[i] for i in order.tolist())
-    # Stations in the order of appearance, as messages and results list them.
+    # Keep the order of appearance, for messages and results.
     index = np.argsort(order)[index]
     if len(names) < table.count and not (table.has("time") or table.has("epoch")):
         row = int(np.setdiff1d(np.arange(table.count), first)[0])
-        advice = "rename one, or give moving stations a column 'time' or 'epoch'"
+        advice = "rename one station, or give moving stations a column 'time' or 'epoch'"
         raise InvalidProblem(f"station name {labels[row]!r} is used twice", table.where("name", row), advice)
     position, frame = _positions(table, frame_table, Units("length").conversion(section.unit, where).factor, where)
     d = position.shape[-1]
@@ -153,7 +139,7 @@ def survey(section: StationsTable, table: Table, frame_table: FrameTable, where:
     if rates:
         factor = Units("speed").conversion(section.speed_unit, where).factor
         velocity = factor * np.stack([table.numbers(key) for key in _RATES[:d]], axis=-1)
-        # Velocities beside latitude and longitude are east, north, up; the frame is ECEF.
+        # With latitude and longitude, velocities are east, north, up; the frame is ECEF.
         if frame.geodetic and frame_table.kind == "geodetic":
             velocity = np.einsum("nij,ni->nj", frame.enu_axes(position), velocity)
     axes = _axes(section, table, frame, position)
@@ -164,26 +150,26 @@ def survey(section: StationsTable, table: Table, frame_table: FrameTable, where:
 def _positions(table: Table, wanted: FrameTable, factor: float, where: str) -> tuple[Array, Frame]:
     plane, globe = table.has("x") or table.has("y"), table.has("lat_deg") or table.has("lon_deg")
     if plane and globe:
-        advice = "give x, y, z everywhere, or lat_deg, lon_deg, height"
+        advice = "give x, y, z in all rows, or lat_deg, lon_deg, height"
         raise InvalidProblem("the rows mix x, y with latitude and longitude", table.source, advice)
     if globe and wanted.kind == "cartesian":
         advice = 'write kind = "geodetic", "ecef" or "enu" in [frame]'
-        raise InvalidProblem("latitudes and longitudes have no place in a cartesian frame", table.source, advice)
+        raise InvalidProblem("latitudes and longitudes do not fit a cartesian frame", table.source, advice)
     if not globe:
         if wanted.kind == "geodetic":
             raise InvalidProblem(
-                "the frame is geodetic, but there are no columns lat_deg and lon_deg", table.source, "add them"
+                "the frame is geodetic, but there are no columns lat_deg and lon_deg", table.source, "add the columns"
             )
         if not plane:
             what = f"there are no coordinates among {', '.join(map(str, table.columns))}"
-            advice = "call them x, y, z, or lat_deg, lon_deg, height; optloc calibrate finds places that nobody knows"
+            advice = "name them x, y, z, or lat_deg, lon_deg, height; optloc calibrate estimates unknown positions"
             raise InvalidProblem(what, table.source, advice)
         d = wanted.dimension or (3 if table.has("z") else 2)
         return factor * np.stack([table.numbers(key) for key in _XYZ[:d]], axis=-1), _frame(wanted, where)
     lat, lon = (np.radians(table.numbers(key)) for key in _GEODETIC[:2])
     height = factor * table.numbers("height") if table.has("height") else np.zeros(table.count)
     ecef = ECEF.from_geodetic(lat, lon, height, where=table.source, first_row=1)
-    # An origin amid the stations keeps coordinates small, and the plane near the ground.
+    # An origin at the mean of the stations keeps coordinates small, and the plane near the ground.
     if wanted.kind == "enu" and wanted.origin is None:
         frame = Frame("enu", tuple(float(v) for v in ecef_to_geodetic(ecef.mean(0))))  # type: ignore[arg-type]
     else:
@@ -205,7 +191,7 @@ def _frame(wanted: FrameTable, where: str) -> Frame:
         return Frame.enu(lat_deg=place.lat_deg, lon_deg=place.lon_deg, height=place.height)
     if wanted.kind == "enu":
         advice = "write origin = { lat_deg = ..., lon_deg = ..., height = ... }"
-        raise InvalidProblem("an enu frame of stations in x, y, z needs its origin", join(where, "[frame]"), advice)
+        raise InvalidProblem("an enu frame of stations in x, y, z needs an origin", join(where, "[frame]"), advice)
     if place is not None:
         raise InvalidProblem(
             f"the frame {wanted.kind!r} has no origin", join(where, "[frame]"), 'only kind = "enu" has one'
@@ -214,11 +200,11 @@ def _frame(wanted: FrameTable, where: str) -> Frame:
 
 
 def _axes(section: StationsTable, table: Table, frame: Frame, position: Array) -> Array | None:
-    """Return the axes (n, d, d) of each row, None where they are the frame's."""
+    """Return the axes (n, d, d) of each row; None if they are the axes of the frame."""
     n, d = position.shape
     local = section.axes == "enu" or (section.axes is None and frame.geodetic)
     base = frame.enu_axes(position) if local else np.broadcast_to(np.eye(d), (n, d, d))
-    # Turned axes are the station's own relative to the frame's, or to east, north, up.
+    # A rotation is from the axes of the frame, or from east, north, up, to the axes of the station.
     turn = _turn(table, d)
     if turn is None:
         stated = frame.kind == "ecef" and section.axes is not None
@@ -227,18 +213,18 @@ def _axes(section: StationsTable, table: Table, frame: Frame, position: Array) -
 
 
 def _turn(table: Table, d: int) -> Array | None:
-    """Return the rotations (n, d, d) that columns of the table give, from the station's axes to the base axes."""
+    """Return the rotations (n, d, d) in the table, from the axes of the station to the base axes; None without any."""
     if not any(table.has(key) for key in ("yaw_deg", "heading_deg", *_QUATERNION)):
         return None
-    from scipy.spatial.transform import Rotation  # a fifth of a second, which most fixes can do without
+    from scipy.spatial.transform import Rotation  # a lazy import: it takes 0.2 s, and most fixes do not need it
 
-    # Yaw counts from x towards y, a heading from north towards east: the other way round.
+    # Yaw is positive from x towards y; a heading is positive from north towards east, so the sign changes.
     if table.has("yaw_deg") or table.has("heading_deg"):
         yaw = table.numbers("yaw_deg") if table.has("yaw_deg") else -table.numbers("heading_deg")
         return np.asarray(Rotation.from_euler("z", yaw[:, None], degrees=True).as_matrix()[:, :d, :d])
     if d == 2:
         raise InvalidProblem(
-            "a quaternion turns axes in space, but the stations have x and y only", table.source, "use yaw_deg"
+            "a quaternion rotates axes in space, but the stations have x and y only", table.source, "use yaw_deg"
         )
     parts = np.stack([table.numbers(key) for key in _QUATERNION], axis=-1)
     length = np.linalg.norm(parts, axis=-1)
@@ -246,12 +232,12 @@ def _turn(table: Table, d: int) -> Array | None:
     if len(bad):
         what = f"the quaternion has length {length[bad[0]]:.4g}, not 1"
         raise InvalidProblem(what, table.where("qw", int(bad[0])), "check the order w, x, y, z")
-    # scipy has the scalar part last, files have it first.
+    # scipy expects the scalar part last, files have it first.
     return np.asarray(Rotation.from_quat(parts[:, [1, 2, 3, 0]]).as_matrix())
 
 
 def _sigma(section: StationsTable, table: Table, where: str, key: str) -> Array | None:
-    """Return the standard deviations (n,) of positions or velocities, by the column or the key of that name."""
+    """Return the standard deviations (n,) of positions or velocities, from the column or the key with this name."""
     stated, place = getattr(section, key), join(where, "[stations]", f"key {key!r}")
     units, own = (Units("length"), section.unit) if key == "sigma" else (Units("speed"), section.speed_unit)
     unit = units.conversion(own, where)
@@ -265,23 +251,14 @@ def _sigma(section: StationsTable, table: Table, where: str, key: str) -> Array 
     bad = np.flatnonzero(sigma <= 0.0)
     if len(bad):
         place = table.where(key, int(bad[0])) if table.has(key) else place
-        raise InvalidProblem("a standard deviation is not positive", place, f"leave {key} out where nothing errs")
+        raise InvalidProblem("a standard deviation is not positive", place, f"remove {key} if there is no error")
     return sigma
 
 
 def over_epochs(found: Survey, section: StationsTable, epochs: Epochs, used: Sequence[Array]) -> Stations:
     """Return the stations at the epochs.
 
-    Parameters
-    ----------
-    found : Survey
-        Rows of the station table.
-    section : StationsTable
-        Its settings.
-    epochs : Epochs
-        Epochs of the measurements.
-    used : sequence of int array (u, 2)
-        Pairs (epoch, station) whose position is needed.
+    `used` has pairs (epoch, station) (u, 2) whose position is required, one array for each chunk of rows.
     """
     if found.moving:
         position, velocity, axes = stations_over_epochs(found, section, epochs, np.concatenate(used))
@@ -297,7 +274,7 @@ def over_epochs(found: Survey, section: StationsTable, epochs: Epochs, used: Seq
     return Stations(position, found.names, velocity, axes, covariance, section.span, of_rates)
 
 
-# Stations that move: their rows are matched to epochs by label, or interpolated in time.
+# Moving stations: rows are matched to epochs by label, or interpolated in time.
 
 
 def stations_over_epochs(
@@ -305,28 +282,28 @@ def stations_over_epochs(
 ) -> tuple[Array, Array | None, Array | None]:
     """Return position (k, s, d), velocity (k, s, d) and axes (k, s, d, d) of stations at the epochs.
 
-    A station that an epoch does not need may be anywhere there; it is put where it was first seen.
+    At an epoch without rows of a station, its position has no effect: the first known position is used.
     """
     low, high, share = _by_label(found, epochs) if found.table.has("epoch") else _by_time(found, section, epochs)
     missing = low[used[:, 0], used[:, 1]] < 0
     if missing.any():
         epoch, station = used[int(np.flatnonzero(missing)[0])]
         what = f"{found.noun} {found.names[station]!r} has no position at epoch {epochs.labels[epoch]!r}"
-        raise InvalidProblem(what, found.table.source, "add it, or leave out what it measured then")
+        raise InvalidProblem(what, found.table.source, "add the position, or remove the measurements of that epoch")
     first = _first(found)
-    # Wherever it is not needed a station stands where it was first seen: finite, and of no weight.
+    # Any finite position serves where it has no effect: use the first.
     low, high = np.where(low < 0, first, low), np.where(high < 0, first, high)
 
     def between(values: Array) -> Array:
         weight = share.reshape(*share.shape, *[1] * (values.ndim - 1))
         return np.asarray(np.where(weight == 0.0, values[low], (1.0 - weight) * values[low] + weight * values[high]))
 
-    # Positions are interpolated on a line; rotations are not, as nobody says how the station turned.
+    # Positions are interpolated linearly. Rotations are not interpolated, since the path of a rotation is unknown.
     if found.axes is not None and np.any((share > 0.0) & (low != high)) and _turning(found):
         raise InvalidProblem(
-            "the axes of stations turn between the times of their rows",
+            "the axes of stations rotate between the times of their rows",
             found.table.source,
-            "give rows at the epochs' times",
+            "give rows at the times of the epochs",
         )
     velocity = None if found.velocity is None else between(found.velocity)
     return between(found.position), velocity, None if found.axes is None else found.axes[low]
@@ -347,14 +324,14 @@ def _by_label(found: Survey, epochs: Epochs) -> tuple[Array, Array, Array]:
     number = {label: i for i, label in enumerate(known)}
     at = np.array([number.get(label, -1) for label in epochs.labels])
     check_budget("cells", max(len(known), epochs.count) * len(found.names), found.table.source)
-    # Row of each label and station; the last line, -1, is that of labels that the table lacks.
+    # Row of each label and station; the last line, -1, is for labels that are not in the table.
     grid = np.full((len(known) + 1, len(found.names)), -1)
     grid[place, found.index] = np.arange(len(labels))
     again = np.flatnonzero(grid[place, found.index] != np.arange(len(labels)))
     if len(again):
         row = int(again[0])
         what = f"{found.noun} {found.names[found.index[row]]!r} occurs twice at epoch {labels[row]!r}"
-        raise InvalidProblem(what, found.table.where("name", row), "leave one of them out")
+        raise InvalidProblem(what, found.table.where("name", row), "remove one of them")
     low = grid[at]
     return low, low, np.zeros(low.shape)
 
@@ -365,9 +342,9 @@ def _by_time(found: Survey, section: StationsTable, epochs: Epochs) -> tuple[Arr
     if not np.isfinite(epochs.times).all():
         advice = "give the measurements a column 'time', or the stations a column 'epoch'"
         raise InvalidProblem(
-            "the stations move in time, but the measurements are not dated", found.table.source, advice
+            "the stations move in time, but the measurements have no times", found.table.source, advice
         )
-    # Every station has a place at every epoch, used or not.
+    # Each station has a position at each epoch, even without rows.
     check_budget("cells", k * len(found.names), found.table.source)
     low = np.full((k, len(found.names)), -1)
     high, share = low.copy(), np.zeros(low.shape)
@@ -378,9 +355,9 @@ def _by_time(found: Survey, section: StationsTable, epochs: Epochs) -> tuple[Arr
         if len(again):
             row = int(rows[again[0] + 1])
             what = f"{found.noun} {found.names[station]!r} occurs twice at time {own[again[0]]:.10g} s"
-            raise InvalidProblem(what, found.table.where("name", row), "leave one of them out")
+            raise InvalidProblem(what, found.table.where("name", row), "remove one of them")
         inside = (epochs.times >= own[0]) & (epochs.times <= own[-1])
-        # Outside its rows a station is unknown, not extrapolated.
+        # Outside the times of its rows, the position of a station is unknown; do not extrapolate.
         before = np.searchsorted(own, epochs.times, side="right").clip(1, len(own)) - 1
         after = (before + 1).clip(max=len(own) - 1)
         gap = np.where(after > before, own[after] - own[before], 1.0)

@@ -1,4 +1,4 @@
-"""Readings of a foreign table: of which sort they are, in which unit, without gaps and repeats."""
+"""Readings of a measurement table: sort and unit of the readings, missing readings and repeats."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from optloc.models import MODELS, kind_named
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """A sort of reading that tables hold.
+    """A sort of reading in tables.
 
     Parameters
     ----------
     kind : str
-        Measurement kind that it becomes.
+        Measurement kind of the reading in a problem.
     value : str
         Role of its column.
     text : str
-        What readings are.
+        Description of the readings.
     """
 
     kind: str
@@ -43,16 +43,16 @@ class Form:
 
     @property
     def stations(self) -> int:
-        """Return how many stations a reading has."""
+        """Return the number of stations of a reading."""
         return MODELS[self.kind].stations
 
     @property
     def quantity(self) -> str:
-        """Return what its values measure."""
+        """Return the quantity of its values."""
         return MODELS[self.kind].quantity
 
 
-_OWN = {
+_SPECIAL_FORMS = {
     "arrivals": Form("toa", "toa", "arrival times"),
     "times": Form("toa", "time", "arrival times"),
     "sp": Form("range", "sp", "times from P to S of an earthquake, as ranges"),
@@ -60,80 +60,80 @@ _OWN = {
 
 
 def sort_named(name: str) -> Form:
-    """Return a sort of reading by its name: "arrivals", "times" (arrivals in the column of times), "sp" or a kind."""
-    return _OWN[name] if name in _OWN else Form(name, name, MODELS[name].summary)
+    """Return a sort of reading by name: "arrivals", "times" (arrivals in the time column), "sp" or a kind."""
+    return _SPECIAL_FORMS[name] if name in _SPECIAL_FORMS else Form(name, name, MODELS[name].summary)
 
 
-# Kinds that the name of a column suggests, in the order of the sections of a problem file.
-_SEEN = ("tdoa", "range", "range_sum", "azimuth", "elevation", "range_rate", "fdoa", "groa", "rss_difference")
-# What programs write in place of a reading that there is none of.
-_MARKS = tuple(map(Decimal, (0, -1, *(sign * (10**n - 1) for n in (2, 3, 4, 5, 6, 9) for sign in (1, -1)))))
-# Names that are an angle or a height without a unit.
+# Kinds that a column name can suggest, in the order of the sections of a problem file.
+_KINDS_BY_NAME = ("tdoa", "range", "range_sum", "azimuth", "elevation", "range_rate", "fdoa", "groa", "rss_difference")
+# Numbers that programs write for a missing reading.
+_MISSING_VALUES = tuple(map(Decimal, (0, -1, *(sign * (10**n - 1) for n in (2, 3, 4, 5, 6, 9) for sign in (1, -1)))))
+# Names that without a unit can mean an angle or a height.
 _ANGLE_OR_HEIGHT = ("elevation", "elev")
-# Letters of names such as d, r and el, which programs use for much else.
+# Names with at most this number of letters, such as d, r and el, have many other uses.
 _LETTERS = 2
-# Radians of a turn: what is beyond is in degrees.
+# A full turn in radians: larger angles are in degrees.
 _TURN = 6.2832
 COMPASS, CARTESIAN = "north-clockwise", "east-counterclockwise"
 COUNTER, BOW = "north-counterclockwise", "bow-clockwise"
 CONVENTIONS = (COMPASS, CARTESIAN, COUNTER, BOW)
-"""Conventions of azimuths in tables: those of a problem file, and from the bow of a vehicle, whose heading is added."""
+"""Conventions of azimuths in tables: as in a problem file, or relative to the bow of a vehicle."""
 
 
 @dataclass(frozen=True, slots=True)
 class ColumnHints:
-    """What is said of a table that it does not say itself; each is an option of the command line.
+    """Facts about a table that the table does not contain; each is an option of the command line.
 
     Parameters
     ----------
     stations : Path, optional
-        Where the stations are: CSV, Parquet, JSON or GeoJSON. Beside orbits: stations that stay.
+        File of station positions: CSV, Parquet, JSON or GeoJSON. With orbits: the fixed stations.
     sigma : str, optional
-        Standard deviation of each reading with its unit, such as "20 ns"; "estimate" finds it from many epochs; of
+        Standard deviation of each reading with its unit, such as "20 ns"; "estimate" finds it from many epochs; for
         several kinds "range=10 cm,azimuth=2 deg".
     what : str, optional
-        What the table holds: "arrivals", "pseudoranges", "stations", "sp" or a measurement kind; by default what its
-        columns suggest.
+        Content of the table: "arrivals", "pseudoranges", "stations", "sp" or a measurement kind; by default from the
+        column names.
     columns : mapping of str to str
-        Column of each role that is not found by its name; "set+msg" puts two columns together.
+        Column of each role whose name is not clear; "set+msg" joins two columns.
     ignore : tuple of str
-        Columns that are left out, such as measurements that are not wanted.
+        Columns to leave out, such as unwanted measurements.
     time_unit : str, optional
-        Unit of the column of times, where its name does not end in it.
+        Unit of the time column, if its name does not end in the unit.
     unit : str, optional
-        Unit of the values, where the column's name does not end in it.
+        Unit of the values, if the column name does not end in the unit.
     frame : "cartesian" or "ecef", optional
-        Frame of stations in x, y, z; cartesian by default.
+        Frame of stations with x, y, z; by default cartesian.
     times : Path, optional
-        Table of the measurements, whose times satellites are wanted at.
+        Table of measurements; satellite positions are computed at its times.
     missing : str, optional
-        NumberColumn that stand for no reading, such as "0,-1,9999"; "none": every number is a reading.
+        Numbers that mean no reading, such as "0,-1,9999"; "none": each number is a reading.
     average : bool
-        Whether several readings of the same become their mean; by default they are refused.
+        Whether repeated readings of one measurement are averaged; by default they are rejected.
     azimuth : str, optional
-        Convention of azimuths, as in a problem file, or "bow-clockwise"; with a column of headings that by default.
+        Convention of azimuths, as in a problem file, or "bow-clockwise", which is the default with a heading column.
     declination : str, optional
         Magnetic declination of bearings, east positive: "4 deg", or a date such as "2026-06-01".
     positive : str, optional
         Sign of differences, as in a problem file.
     reference : str, optional
-        Station against which differences of a single station each are.
+        Reference station of differences in columns of single stations.
     vp, vs : str, optional
         Speeds of the P and S waves, such as "6 km/s".
     window : str, optional
-        Length of time in which readings belong together, such as "0.1 s".
+        Time within which readings belong to one epoch, such as "0.1 s".
     still : bool
-        Whether the target stays, so that all readings belong together.
+        Whether the target does not move, so that all readings form one epoch.
     zone : str, optional
-        Time zone of dates that name none, such as "UTC" or "Europe/Rome".
+        Time zone of dates without a zone, such as "UTC" or "Europe/Rome".
     navigation : Path, optional
-        RINEX navigation file beside RINEX observations or a log of Android.
+        RINEX navigation file for RINEX observations or an Android log.
     system : str, optional
-        Letter of the system whose satellites are taken: "G", "E" or "J"; GPS.
+        Letter of the satellite system: "G", "E" or "J"; by default GPS.
     mask : str, optional
-        Elevation below which satellites are left out, such as "15 deg"; 10 degrees.
+        Lowest elevation of satellites, such as "15 deg"; by default 10 degrees.
     turned : bool
-        Whether the satellites of a table are along the axes of the Earth at reception; by default at transmission.
+        Whether satellite positions are in the Earth axes at reception; by default at transmission.
     """
 
     stations: Path | None = None
@@ -169,31 +169,31 @@ class Readings:
     Parameters
     ----------
     form : Form
-        The sort.
+        Sort of the readings.
     unit : str
-        Of the values.
+        Unit of the values.
     values : Decimals
         m numbers with all their digits.
     row : int array (m,)
-        Row of the table that each is from.
+        Row numbers in the table.
     headers : tuple of str
         Names of columns.
     column : int array (m,)
-        Which of these each is from.
+        Index of the column of each reading in `headers`.
     a, b : object array (m,)
-        Names of the stations; b of pairs only.
+        Names of the stations; b for pairs only.
     positive : str
         Sign of differences.
     azimuth : str, optional
         Convention of azimuths.
     heading : str, optional
-        Column of headings that are part of the values.
+        Column of headings that the values include.
     sigma : array (m,), optional
         Standard deviations in the same unit.
     errors : tuple of str
-        Columns that hold these.
+        Columns of these standard deviations.
     notes : tuple of str
-        What was assumed, and what was left out.
+        Assumptions, and readings that were left out.
     """
 
     form: Form
@@ -212,7 +212,7 @@ class Readings:
     notes: tuple[str, ...] = ()
 
     def take(self, pick: Array) -> Readings:
-        """Return some of the readings."""
+        """Return the selected readings."""
         return replace(
             self,
             values=self.values.take(pick),
@@ -224,35 +224,35 @@ class Readings:
         )
 
     def where(self, table: Table, item: int) -> str:
-        """Return the place of the cell of a reading."""
+        """Return the place of the cell of a reading, for messages."""
         return table.where(self.headers[int(self.column[item])], int(self.row[item]))
 
     @property
     def columns(self) -> list[str]:
-        """Return the columns that hold readings, in the order of the readings."""
+        """Return the columns with readings, in the order of the readings."""
         number, first = np.unique(self.column, return_index=True)
         return [self.headers[i] for i in number[np.argsort(first)].tolist()]
 
 
-# Which column holds readings of which stations.
+# Columns that are named after stations.
 
 
 @dataclass(frozen=True, slots=True)
 class Named:
-    """A column that names stations.
+    """A column that is named after one or two stations.
 
     Parameters
     ----------
     column : str
-        Its name.
+        Column name.
     form : str, optional
-        Sort of reading, None where the name does not say one.
+        Sort of reading; None if the name does not include one.
     ends : tuple of str
         The stations.
     minus : bool
-        Whether a minus is between the two stations.
+        Whether the name has a minus between the two stations.
     sigma : bool
-        Whether it holds standard deviations.
+        Whether the column has standard deviations.
     """
 
     column: str
@@ -263,7 +263,7 @@ class Named:
 
 
 def named_columns(columns: Sequence[str], stations: Sequence[str]) -> list[Named]:
-    """Return the columns of a wide table: those whose names hold one station or two, and no unknown word."""
+    """Return the columns of a wide table: their names have one or two stations and no unknown word."""
     known = sorted({tokens(name): name for name in stations if tokens(name)}.items(), key=lambda item: -len(item[0]))
     exact = {name.strip(): name for name in stations}
     found = []
@@ -279,12 +279,12 @@ def named_columns(columns: Sequence[str], stations: Sequence[str]) -> list[Named
     return found
 
 
-# Words of headers that say of a name that it is a station's.
+# Words in column names that go with a station name.
 _ENDS = frozenset("receiver rx sensor anchor node site station beacon minus at to from".split())
 
 
 def _stations_in(words: tuple[str, ...], known: Sequence[tuple[tuple[str, ...], str]]) -> tuple[list[str], list[str]]:
-    """Return the stations whose names are among words, in their order, and the words that are left."""
+    """Return the stations among the words, in their order, and the remaining words."""
     ends, rest, at = [], [], 0
     while at < len(words):
         hit = next(((key, name) for key, name in known if words[at : at + len(key)] == key), None)
@@ -298,38 +298,38 @@ def _stations_in(words: tuple[str, ...], known: Sequence[tuple[tuple[str, ...], 
 
 
 def _form_of(word: str, unit: str | None) -> str | None:
-    """Return the sort of reading that a word with a unit names, "" where there is none, and None for an unknown one."""
+    """Return the sort of reading for a word with a unit: "" for no word, None for an unknown word."""
     if not word:
         return ""
     role = role_of(word if unit is None else f"{word}_{unit}")
     if role == "height" and unit is None and word in _ANGLE_OR_HEIGHT:
-        return "elevation"  # a station has one height, and an angle in each row
+        return "elevation"  # a station has one height, but a different elevation angle in each row
     if role in ("toa", "time"):
         return "arrivals"
-    return role if role == "sp" or role in _SEEN else None
+    return role if role == "sp" or role in _KINDS_BY_NAME else None
 
 
 def stated_sigma(told: ColumnHints, kind: str) -> str | None:
-    """Return the standard deviation that the user states for a kind, None where --sigma does not name the kind."""
+    """Return the standard deviation that --sigma states for a kind, or None."""
     if told.sigma is None or "=" not in told.sigma:
         return told.sigma
     return sigmas_by_kind(told.sigma).get(kind)
 
 
 def sigmas_by_kind(text: str) -> dict[str, str]:
-    """Return the amounts of "range=6 m,azimuth=2 deg" by kind."""
+    """Return the amounts of a text such as "range=6 m,azimuth=2 deg" by kind."""
     parts = [part.partition("=") for part in text.split(",")]
     return {kind_named(word.strip(), "--sigma"): amount.strip() for word, _, amount in parts}
 
 
 def holds_names(table: Table, column: str, stations: Sequence[str]) -> bool:
-    """Return whether the cells of a column are names of stations: then it holds no readings."""
+    """Return whether all cells of a column are station names, so that it has no readings."""
     cells = {str(cell).strip() for cell in table.raw(column).tolist() if cell is not None and str(cell).strip()}
     return bool(cells) and cells <= {name.strip() for name in stations}
 
 
 def without_ignored_columns(table: Table, ignored: Sequence[str]) -> Table:
-    """Return a table without the columns that the user ignores; raise InvalidProblem for one that it does not have."""
+    """Return a table without the columns that the user ignores; raise InvalidProblem for an unknown column."""
     known = [*table.columns, *table.others]
     lacking = next((name for name in ignored if name not in known), None)
     if lacking is not None:
@@ -340,14 +340,17 @@ def without_ignored_columns(table: Table, ignored: Sequence[str]) -> Table:
 
 
 def sorts_of(roles: Roles, told: ColumnHints) -> list[str]:
-    """Return the sorts of readings of a table with one reading a row; none where its columns do not tell."""
+    """Return the sorts of readings of a table with one reading in each row.
+
+    Empty if the columns do not identify them.
+    """
     if told.what is not None:
         return ["times" if told.what == "arrivals" and roles.find("toa") is None else told.what]
     if all(roles.find(role) for role in ("station", "time", "phase")) or roles.find("sp"):
         return ["sp"]
     if roles.find("p") and roles.find("s") and roles.find("station"):
         return ["sp"]
-    fitting = [name for name in _SEEN if roles.find(name)]
+    fitting = [name for name in _KINDS_BY_NAME if roles.find(name)]
     fitting += ["arrivals"] if roles.find("toa") else []
     if fitting or not (roles.find("station") and roles.find("time")):
         return fitting
@@ -356,18 +359,18 @@ def sorts_of(roles: Roles, told: ColumnHints) -> list[str]:
 
 
 def _check_times_alone(roles: Roles) -> None:
-    """Raise InvalidProblem where a column beside the times may hold the readings: then the times are no arrivals."""
+    """Raise InvalidProblem if another column may have the readings, so that the times may not be arrivals."""
     taken = {part for name in roles.by_role.values() for part in name.split("+")}
     for column in [*roles.table.columns, *roles.table.others]:
         other = column not in taken and role_of(column) is None
         if other and (any_unit(column) is not None or _kind_within(column, None) is not None):
-            what = f"the readings may be in {column!r}, or be the times in {roles.find('time')!r}"
-            advice = f"say --column range={quoted(column)} or another kind, or --as arrivals for the times"
+            what = f"the readings may be in {column!r}, or may be the times in {roles.find('time')!r}"
+            advice = f"use --column range={quoted(column)} or another kind, or --as arrivals for the times"
             raise InvalidProblem(what, roles.table.source, advice)
 
 
 def _kind_within(column: str, unit: str | None) -> str | None:
-    """Return the kind that words of a column's name and a unit suggest, such as "range" of "dist_raw_m"; else None."""
+    """Return the kind that words in a column name and a unit suggest, such as "range" for "dist_raw_m"; else None."""
     words = [word for word in tokens(without_unit(column)) if not word.isdigit()]
     parts = ["_".join(words[i:j]) for i in range(len(words)) for j in range(len(words), i, -1)]
     named = [part if unit is None else f"{part}_{unit}" for part in parts if len(part) >= _LETTERS]
@@ -375,12 +378,10 @@ def _kind_within(column: str, unit: str | None) -> str | None:
 
 
 def as_angles(roles: Roles, told: ColumnHints) -> Roles:
-    """Return roles in which a column `elevation` without a unit is an angle or a height, as the options say.
+    """Return roles in which a column `elevation` without a unit is an angle or a height, as stated by the options.
 
-    Raises
-    ------
-    InvalidProblem
-        Where no option says which: an elevation may be the angle of a sight or the height of a station.
+    Raise InvalidProblem if no option decides: an elevation may be an angle above the horizon or the height of a
+    station.
     """
     column = roles.by_role.get("height")
     if column is None or "height" in roles.told or stem(column) not in _ANGLE_OR_HEIGHT or any_unit(column):
@@ -389,54 +390,49 @@ def as_angles(roles: Roles, told: ColumnHints) -> Roles:
     if told.what == "elevation" or told.unit in UNITS["angle"]:
         return replace(roles, by_role={"elevation": column, **rest})
     name = quoted(column)
-    advice = f"say --column elevation={name} with --unit deg, --column height={name}, or --ignore {name}"
+    advice = f"use --column elevation={name} with --unit deg, --column height={name}, or --ignore {name}"
     raise InvalidProblem(f"the column {column!r} may be an angle or a height", roles.table.source, advice)
 
 
 def quoted(name: str) -> str:
-    """Return a column's name as a shell takes it."""
+    """Return a column name with quotes for a shell, if needed."""
     return name if re.fullmatch(r"[\w.%+-]+", name) else repr(name)
 
 
 def unused_measurement(column: str, lengths: bool = False) -> str | None:
-    """Return what a column that is not used could measure, None where its name suggests no measurement.
+    """Return the possible measurement in an unused column, None if its name suggests no measurement.
 
-    Parameters
-    ----------
-    column : str
-        Its name.
-    lengths : bool
-        Whether only lengths and their rates can be measurements of the table.
+    With `lengths`, only lengths and their rates can be measurements of the table.
     """
     kind = sigma_kind(column)
     unit = any_unit(column)
     role = role_of(column) or (None if unit is None else _kind_within(column, unit))
     if kind is not None or role is None or (lengths and role in MODELS and MODELS[role].quantity == "angle"):
         return None
-    # One or two letters without a unit are too little to suspect a measurement.
+    # Names of one or two letters without a unit do not indicate a measurement.
     short = unit is None and len(stem(column)) <= _LETTERS
     if role in MODELS and not short:
         return MODELS[role].summary
     return MODELS["height"].summary if role in ("height", "depth") and not short else None
 
 
-# Units, gaps, repeats.
+# Units, missing readings, repeats.
 
 
 def unit_for(column: str, form: Form, told: ColumnHints, held: Decimals, where: str) -> tuple[str, str]:
-    """Return the unit of a column and a remark; raise InvalidProblem where neither its name nor --unit says it."""
+    """Return the unit of a column and a note; raise InvalidProblem if the unit is unknown."""
     known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
     own = unit_of(column, known)
     if told.unit is not None and told.unit in known:
         return told.unit, ""
     if told.unit is not None and (own is None or not any(told.unit in table for table in UNITS.values())):
-        raise InvalidProblem(f"{told.unit!r} is no unit of {form.text}", "--unit", nearest(told.unit, list(known)))
+        raise InvalidProblem(f"{told.unit!r} is not a unit of {form.text}", "--unit", nearest(told.unit, list(known)))
     if own is not None:
         return own, ""
     if form.quantity == "angle" and bool((np.abs(held.floats()) > _TURN).any()):
-        return "deg", f"{column!r} is in degrees: some of its values are beyond a turn in radians"
+        return "deg", f"{column!r} is in degrees, because some values exceed a full turn in radians"
     some = {"length": "ns, or --unit m", "angle": "deg, or --unit rad", "speed": "m/s"}.get(form.quantity, "1")
-    raise InvalidProblem(f"the unit of the column {column!r} is not known", where, f"say it with --unit {some}")
+    raise InvalidProblem(f"the unit of the column {column!r} is unknown", where, f"state it with --unit {some}")
 
 
 def in_unit(value: Decimal, unit: str, wanted: str, form: Form) -> Decimal:
@@ -446,13 +442,13 @@ def in_unit(value: Decimal, unit: str, wanted: str, form: Form) -> Decimal:
     if unit == wanted:
         return value
     if form.quantity == "length" and not times and {unit, wanted} & set(UNITS["time"]):
-        advice = "give the columns one unit, or convert them one by one"
+        advice = "use one unit in all columns, or convert them separately"
         raise InvalidProblem(f"some columns are in {unit}, others in {wanted}", "units", advice)
     return value * Decimal(repr(known[unit])) / Decimal(repr(known[wanted]))
 
 
 def marks_of(told: ColumnHints) -> frozenset[Decimal] | None:
-    """Return the numbers that stand for no reading; None where nothing is said of them."""
+    """Return the numbers that mean no reading; None without the option --missing."""
     if told.missing is None:
         return None
     if told.missing.strip().lower() == "none":
@@ -462,40 +458,29 @@ def marks_of(told: ColumnHints) -> frozenset[Decimal] | None:
         return frozenset(Decimal(word) for word in words if word.lower() not in NOTHING)
     except InvalidOperation:
         advice = "write numbers such as --missing 0,-1,9999, or --missing none"
-        raise InvalidProblem(f"{told.missing!r} is no list of numbers", "--missing", advice) from None
+        raise InvalidProblem(f"{told.missing!r} is not a list of numbers", "--missing", advice) from None
 
 
 def without_gaps(found: Readings, epoch: Array, told: ColumnHints, table: Table, empty: int) -> Readings:
-    """Return readings without those that a number marks as missing; one that may be such a mark is asked for.
+    """Return the readings without numbers that mean no reading; raise InvalidProblem for a number that may mean so.
 
-    Parameters
-    ----------
-    found : Readings
-        All numbers.
-    epoch : int array (m,)
-        Number of the epoch of each.
-    told : ColumnHints
-        What is known of such numbers.
-    table : Table
-        Where they are from.
-    empty : int
-        Cells that hold nothing, to be told.
+    `epoch` (m,) is the epoch number of each reading. `empty` is the number of empty cells, for a note.
     """
     marks = marks_of(told)
     if marks is None:
         marks = frozenset()
-        doubtful = _doubtful(found, epoch)
+        doubtful = _suspicious_number(found, epoch)
         if doubtful is not None:
             own = np.flatnonzero(found.values.units == found.values.number(doubtful))
             times = f"{len(own)} times, first here" if len(own) > 1 else "once"
-            advice = f"say --missing {doubtful}, or --missing none if it is a reading"
-            what = f"{doubtful} occurs {times}, and may be a reading or mean that there is none"
+            advice = f"use --missing {doubtful}, or --missing none if it is a reading"
+            what = f"{doubtful} occurs {times}, and may be a reading or mean no reading"
             raise InvalidProblem(what, found.where(table, int(own[0])), advice)
     gone = np.zeros(len(found.values), dtype=bool)
     for number in (found.values.number(mark) for mark in marks):
         gone |= False if number is None else found.values.units == number
     if gone.all():
-        raise InvalidProblem("no cell holds a reading", table.source, "look at --missing and the columns")
+        raise InvalidProblem("no cell has a reading", table.source, "check --missing and the columns")
     count = int(gone.sum())
     notes = [f"{_cells(count)} with {told.missing}: no reading"] if count else []
     notes += [f"{_cells(empty)} without a number: no reading"] if empty else []
@@ -506,18 +491,18 @@ def _cells(count: int) -> str:
     return "1 cell" if count == 1 else f"{count} cells"
 
 
-def _doubtful(found: Readings, epoch: Array) -> Decimal | None:
-    """Return a number that may mark what is missing, None where there is none.
+def _suspicious_number(found: Readings, epoch: Array) -> Decimal | None:
+    """Return a number that may mean a missing reading, or None.
 
-    Such a number is doubted where it is beyond all others or as frequent as none of them.
+    A typical number is suspicious if it is the smallest or the largest, or more frequent than all others.
     """
     values, counts = np.unique(found.values.units, return_counts=True)
-    for mark in _MARKS:
+    for mark in _MISSING_VALUES:
         number = found.values.number(mark)
         here = np.flatnonzero(values == number)
         if number is None or not len(here) or len(values) == 1:
             continue
-        if mark == 0 and found.form.kind == "toa" and _begins(found, epoch):
+        if mark == 0 and found.form.kind == "toa" and _is_relative_to_first(found, epoch):
             continue
         beyond = int(here[0]) in (0, len(values) - 1)
         count, others = counts[here[0]], np.delete(counts, here[0])
@@ -526,8 +511,8 @@ def _doubtful(found: Readings, epoch: Array) -> Decimal | None:
     return None
 
 
-def _begins(found: Readings, epoch: Array) -> bool:
-    """Return whether each epoch has one zero and nothing below: then arrivals are counted from the first."""
+def _is_relative_to_first(found: Readings, epoch: Array) -> bool:
+    """Return whether each epoch has one zero and no negative number: then arrivals are relative to the first."""
     units = found.values.units
     zeros = np.bincount(epoch[units == 0], minlength=int(epoch.max()) + 1)
     return bool((units >= 0).all() and (zeros[np.unique(epoch)] == 1).all())
@@ -536,20 +521,9 @@ def _begins(found: Readings, epoch: Array) -> bool:
 def without_repeats(
     found: Readings, epoch: Array, told: ColumnHints, table: Table, label: Callable[[int], str]
 ) -> Readings:
-    """Return readings of which none repeats another: their means where that is asked for, else they are refused.
+    """Return the readings with repeats averaged, if the user requests it; else raise InvalidProblem for a repeat.
 
-    Parameters
-    ----------
-    found : Readings
-        All of them.
-    epoch : int array (m,)
-        Number of the epoch and target of each.
-    told : ColumnHints
-        Whether means are wanted.
-    table : Table
-        Where they are from.
-    label : callable
-        Returns the label of the epoch of a row of the table.
+    `epoch` (m,) is the number of epoch and target of each reading. `label` returns the epoch label of a table row.
     """
     ends = [numbered(end)[1] for end in (found.a, found.b) if end is not None]
     first, group = first_rows(epoch, *ends)
@@ -565,22 +539,22 @@ def without_repeats(
         what = f"station {names} has a second reading of message {label(int(found.row[second]))!r}, "
         what += f"first in row {found.row[one] + 1}"
         if extra > 1:
-            what += f"; {extra} such repeats in all"
-        advice = "say --average for their means, or tell messages apart: --column message=ONE+TWO"
+            what += f"; {extra} repeats in total"
+        advice = "use --average for the means, or distinguish messages with --column message=ONE+TWO"
         raise InvalidProblem(what, table.at(int(found.row[second])), advice)
     values = found.values.tolist()
     for number in np.unique(group[again]).tolist():
         members = np.flatnonzero(group == number).tolist()
         values[members[0]] = _mean([values[i] for i in members], found)
     kept = replace(found, values=Decimals.of(values)).take(first)
-    note = f"{extra} repeated readings were averaged with the first of their message; sigma stays that of one"
+    note = f"{extra} repeated readings were averaged with the first of their message; sigma is not changed"
     return replace(kept, notes=(*found.notes, note))
 
 
 def _mean(values: Sequence[Decimal], found: Readings) -> Decimal:
     if found.form.quantity != "angle":
         return sum(values, Decimal(0)) / len(values)
-    # Of 359 and 1 degrees the mean is 0: directions are added, not numbers.
+    # The mean of 359 and 1 degrees is 0: average unit vectors, not angles.
     turn = [float(value) if found.unit == "rad" else radians(float(value)) for value in values]
     mean = atan2(sum(map(sin, turn)), sum(map(cos, turn)))
     return Decimal(repr(mean if found.unit == "rad" else degrees(mean) % 360.0))

@@ -1,4 +1,4 @@
-"""A foreign table as a problem: what optloc understood, and the problem file with CSV tables that says the same."""
+"""A measurement table as a problem: its interpretation, and the equivalent problem file with CSV tables."""
 
 from __future__ import annotations
 
@@ -23,13 +23,16 @@ from optloc.files.table import Table
 from optloc.files.words import Words
 from optloc.files.writer import write_csv
 
-# Letters of the name of a file that is not kept.
+# Largest number of characters in the name of a temporary file.
 _LETTERS = 40
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One table of measurements: its kind, columns (m,), unit, noise, what it is, and further lines of the file."""
+    """One table of measurements in a problem file.
+
+    It has kind, columns (m,), unit, sigma, description, and further lines.
+    """
 
     kind: str
     columns: Mapping[str, Any]
@@ -41,7 +44,7 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class TableProblem:
-    """What a table is understood to be, before anything is written.
+    """The interpretation of a measurement table, before anything is written.
 
     Parameters
     ----------
@@ -52,17 +55,17 @@ class TableProblem:
     places : ColumnPlaces
         The stations.
     about : tuple of (str, str)
-        What was understood: a word, and what it is.
+        Report for the user: keyword and text.
     notes : tuple of str
-        What was assumed or left out.
+        Assumptions, and data that were left out.
     lines : tuple of str
         Further lines of the problem file, before its tables.
     after : tuple of str
-        The same, behind them.
+        Further lines of the problem file, after its tables.
     height : str
-        What the constraint on the height says, where there is one.
+        Line of the constraint on the height, or empty.
     uses : mapping of str to str
-        Role of each column that is used.
+        Role of each used column.
     """
 
     source: Path
@@ -77,18 +80,18 @@ class TableProblem:
 
     @property
     def as_read(self) -> dict[str, Any]:
-        """Return how the table was read, as a JSON value."""
+        """Return the interpretation of the table as a JSON value."""
         pairs = [list(pair) for pair in self.about]
         return {"understood": pairs, "notes": list(self.notes), "columns": dict(self.uses)}
 
     def read(self, more: Mapping[str, ConstraintTable] | None = None) -> Loaded:
-        """Return the problem, with more constraints, as `optloc.files.read` does of the files that `write` writes."""
-        # As the table is called, as far as every system writes such a name.
+        """Return the problem with more constraints, equal to the problem that `read` returns for the written files."""
+        # Use the name of the table, limited to characters that are valid on all systems.
         out = Path(f"{re.sub(r'[^A-Za-z0-9_-]', '_', self.source.stem)[:_LETTERS]}.toml")
         names = [path.name for path in self.tables(out)]
-        # A height that is told takes the place of one that was assumed.
+        # A stated height replaces an assumed one.
         told = replace(self, height="") if "--height" in (more or {}) else self
-        # As in a file: characters of its name that are not Unicode are replaced.
+        # As in a file, replace characters that are not valid Unicode.
         text = told.text(names).encode("utf-8", "replace").decode("utf-8")
         file = document_of(text, out.name)
         sheets = (self.places.columns, *(section.columns for section in self.sections))
@@ -97,7 +100,7 @@ class TableProblem:
         return replace(loaded, source=self.source.name, table=self.as_read)
 
     def write(self, out: Path) -> tuple[Path, ...]:
-        """Write a problem file with its tables beside it, and return their paths."""
+        """Write a problem file and its tables, and return their paths."""
         tables = self.tables(out)
         with replace_together():
             for path, columns in zip(tables, (self.places.columns, *(s.columns for s in self.sections)), strict=True):
@@ -106,14 +109,14 @@ class TableProblem:
         return (out, *tables)
 
     def tables(self, out: Path) -> tuple[Path, ...]:
-        """Return the names of the tables beside a problem file: stations, then the rows of each kind."""
+        """Return the paths of the tables of a problem file: stations, then the rows of each kind."""
         many = len(self.sections) > 1
         names = ("stations", *(section.kind if many else "rows" for section in self.sections))
         return tuple(out.with_name(f"{out.stem}-{name}.csv") for name in names)
 
     def text(self, names: Sequence[str]) -> str:
         """Return the text of the problem file; `names` are the names of its tables."""
-        # JSON spells strings as TOML does, but for signs beyond 16 bits, which stay as they are.
+        # JSON and TOML strings agree, except for escapes of characters beyond 16 bits; do not escape them.
         quoted = partial(json.dumps, ensure_ascii=False)
         lines = [f"# Made from {quoted(self.source.name)} by optloc convert.", "format = 2"]
         lines += [f"title = {quoted(self.source.stem)}", *self.lines, "", "[frame]", f'kind = "{self.places.frame}"']
@@ -127,12 +130,15 @@ class TableProblem:
 
 
 def _written(column: Any) -> Any:
-    """Return a column as a file has it."""
+    """Return a column in the form for a file."""
     return column.texts() if isinstance(column, Decimals) else column
 
 
 def _table(name: str, columns: Mapping[str, Any]) -> Table:
-    """Return columns as the table of a file that has them; times may be labels, and become text as in a file."""
+    """Return columns as the table that a reader of the file would return.
+
+    Times become text, since they may be labels.
+    """
     import pyarrow as pa
 
     def read(key: str, column: Any) -> Array | Words:
@@ -148,7 +154,7 @@ def _table(name: str, columns: Mapping[str, Any]) -> Table:
 
 @dataclass(frozen=True, slots=True)
 class Converted:
-    """What was written, the problem that it is (None of stations alone), what was assumed, and how it was read."""
+    """The written files, the problem that they contain (None for stations alone), notes, and the interpretation."""
 
     written: tuple[Path, ...]
     loaded: Loaded | None
@@ -157,7 +163,7 @@ class Converted:
 
 
 def no_sigma(example: str, rows: str = "rows") -> InvalidProblem:
-    """Return the error of a table without standard deviations; `example` is one for --sigma."""
-    advice = f"say it with --sigma '{example}' (or metres); --sigma estimate finds it from many epochs"
-    what = "the rows are" if rows == "rows" else f"the readings of {rows} are"
-    return InvalidProblem(f"nothing is known of how accurate {what}", "--sigma", advice)
+    """Return the error for a table without standard deviations; `example` is a value for --sigma."""
+    advice = f"state it with --sigma '{example}' (or metres); --sigma estimate finds it from many epochs"
+    what = "the rows" if rows == "rows" else f"the readings of {rows}"
+    return InvalidProblem(f"the accuracy of {what} is unknown", "--sigma", advice)

@@ -1,4 +1,4 @@
-"""What a problem file says of its unknowns: motions, known targets, biases, priors, constraints."""
+"""Unknowns of a problem file: motions, known targets, biases, priors, constraints."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ from optloc.problem.clocks import clock_densities
 from optloc.problem.forms import FORMS, BiasForm, complete, form_of
 from optloc.problem.validation import bands_by_quantity, check_polygon
 
-# Derivatives of the position that a motion estimates.
+# Number of estimated derivatives of the position for each motion.
 _ORDERS = {"static": 0, "free": 0, "free_velocity": 1, "constant_velocity": 1, "constant_acceleration": 2}
 FREE = {"free", "free_velocity"}
-"""Motions whose state is one of each epoch."""
+"""Motions with a separate state at each epoch."""
 
-# What an unknown measures, and the unit of its bare numbers; units know no acceleration, so that is SI only.
+# Quantity of each unknown and the unit of plain numbers; acceleration has no other units than SI.
 _STATES: dict[str, tuple[Quantity, str]] = {
     "position": ("length", "m"),
     "velocity": ("speed", "m/s"),
     "acceleration": ("plain", "1"),
     "emission": ("length", "m"),
 }
-# Keys of each kind of constraint beside "kind" and "target".
+# Keys of each kind of constraint, in addition to "kind" and "target".
 _KEYS = {
     "box": ("min", "max", "unit"),
     "height": ("exactly", "within", "min", "max", "unit", "along"),
@@ -58,8 +58,8 @@ Constraint = Band | Polygon
 
 
 def motions_of(file: ProblemFile, epochs: Epochs, known: Mapping[str, Array], source: str) -> tuple[Motion, ...]:
-    """Return the motion of each target; `known` holds the states of those that are given."""
-    # Free targets with epochs of their own are one motion: which target an epoch belongs to is a label.
+    """Return the motion of each target; `known` has the states of known targets."""
+    # Free targets in separate epochs share one motion: the target of an epoch is a label.
     names = ("target",) if epochs.own else epochs.targets
     unknown = [name for name in file.targets if name not in epochs.targets]
     if unknown:
@@ -79,17 +79,17 @@ def _motion(table: TargetTable, count: int, known: Array | None) -> Motion:
 
 
 def needs_clock(motions: Sequence[Motion], biases: Sequence[BiasTable]) -> str | None:
-    """Return why the times of the epochs matter, or None."""
+    """Return the reason for which the times of the epochs matter, or None."""
     if any(motion.order > 0 and motion.span == "run" and motion.known is None for motion in motions):
         return "a moving target"
     return next((form.noun for bias in biases if (form := FORMS[bias.form]).changes), None)
 
 
-# Targets whose positions are given, for calibration: their tables are read like those of stations.
+# Targets with known positions, for calibration: their tables are read like tables of stations.
 
 
 def places_of(file: ProblemFile, folder: Path, source: str) -> dict[str | None, Table]:
-    """Return the tables of targets whose motion is known, by name; None is the table ``[target]``."""
+    """Return the tables of known targets by name; None is the table ``[target]``."""
     sections: list[tuple[str | None, TargetTable]] = [(None, file.target), *file.targets.items()]
     found = {}
     for name, section in sections:
@@ -97,15 +97,15 @@ def places_of(file: ProblemFile, folder: Path, source: str) -> dict[str | None, 
         if section.moves == "known":
             found[name] = table_of(section, folder, where)
         elif section.file is not None or section.rows is not None:
-            advice = 'write motion = "known", or leave the rows out'
-            raise InvalidProblem(f"the motion is {section.motion}, but its places are given", where, advice)
+            advice = 'write motion = "known", or remove the rows'
+            raise InvalidProblem(f"the motion is {section.motion}, but positions are given", where, advice)
     return found
 
 
 def known_of(
     file: ProblemFile, places: Mapping[str | None, Table], epochs: Epochs, frame: Frame, dimension: int
 ) -> dict[str, Array]:
-    """Return the states (k or 1, order + 1, d) of the known targets by name; arguments as `places_of` returns them."""
+    """Return the states (k or 1, order + 1, d) of known targets by name; `places` is from `places_of`."""
     states = {}
     for i, name in enumerate(epochs.targets):
         key = name if name in file.targets else None
@@ -121,9 +121,9 @@ def known_of(
 def _states(section: TargetTable, table: Table, name: str, epochs: Epochs, heard: Array, wanted: FrameTable) -> Array:
     dated = table.has("time") or table.has("epoch")
     if table.count > 1 and not dated:
-        raise InvalidProblem(f"target {name!r} has several places", table.source, "give a column 'time' or 'epoch'")
+        raise InvalidProblem(f"target {name!r} has several positions", table.source, "give a column 'time' or 'epoch'")
     own = {key: value for key, value in table.names.items() if key != "name"}
-    # A known target is read as a station of its name.
+    # Read a known target like a station with its name.
     named = Table(table.source, {**table.columns, "name": np.full(table.count, name, dtype=object)}, table.count, own)
     units = StationsTable(unit=section.unit, speed_unit=section.speed_unit, time_unit=section.time_unit)
     found = replace(survey(units, named, wanted, table.source)[0], noun="target")
@@ -135,8 +135,8 @@ def _states(section: TargetTable, table: Table, name: str, epochs: Epochs, heard
 
 
 def settle_frame(wanted: FrameTable, frame: Frame, dimension: int) -> FrameTable:
-    """Return the frame table with the origin and the dimension that the stations decided."""
-    # The frame as the stations settled it: a target must not choose an origin of its own.
+    """Return the frame table with the origin and the dimension of the stations."""
+    # A target must use the frame of the stations, not a separate origin.
     origin = None
     if frame.origin is not None:
         lat, lon = np.degrees(frame.origin[:2]).tolist()
@@ -156,35 +156,14 @@ def bias_of(
     written: Sequence[tuple[Array, Units, str]],
     source: str,
 ) -> tuple[Bias, tuple[str, float]]:
-    """Return a family of biases over the rows of a problem, and the unit that people read it in with its SI size.
+    """Return a family of biases over the rows of a problem, and its display unit with the size in SI units.
 
-    Parameters
-    ----------
-    table : BiasTable
-        What the file says.
-    rows : sequence of Rows
-        All rows.
-    stations : sequence of str
-        Their names.
-    epochs : Epochs
-        Names of the targets.
-    dimension : int
-        Of positions.
-    written : sequence of (int array (m,), Units, str)
-        Global numbers of rows, what their values measure and the unit that they are written in.
-    source : str
-        Place to name.
-
-    Returns
-    -------
-    Bias
-        The family.
-    (str, float)
-        Unit of the touched rows where they have one, per second for a drift; else empty.
+    `written` has the global row numbers (m,), the quantity and the unit of each set of values. The display unit is the
+    unit of the rows, per second for a drift; it is empty if the rows have several units.
     """
     where = join(source, f"[[biases]] {table.name!r}")
     if table.per == "target" and epochs.own:
-        what = "free targets are fixed apart, and so are their errors"
+        what = "free targets are fixed separately, so they share no bias"
         raise InvalidProblem(what, where, "give the targets a motion, or write one file for each")
     bias = family(
         rows,
@@ -198,36 +177,36 @@ def bias_of(
         where=where,
     )
     _check_sense(bias, rows, written, where)
-    # Priors and estimates are in the sense of the readings, which the coefficients of the bias hold.
+    # Priors and estimates have the sign of the readings; the coefficients of the bias include it.
     spelled = {
         (replace(units, convention="east-counterclockwise"), name)
         for numbers, units, name in written
         if np.isin(bias.row, numbers).any()
     }
-    # epochs without times are refused where the problem is made
-    bias = complete(bias, epochs.clock, where, **_change(table, [units for units, _ in spelled], where))
+    # the constructor of the problem rejects epochs without times
+    bias = complete(bias, epochs.clock, where, **_walk_parameters(table, [units for units, _ in spelled], where))
     form = form_of(bias)
     mean, sigma = _prior(table, form, [units for units, _ in spelled], form.shape(bias, dimension), where)
     return replace(bias, mean=mean, sigma=sigma), _unit_to_read(form, spelled, where)
 
 
 def _check_sense(bias: Bias, rows: Sequence[Rows], written: Sequence[tuple[Array, Units, str]], where: str) -> None:
-    """Refuse a bias of azimuths that are counted both ways, and a scale of those that are counted from north."""
+    """Raise InvalidProblem for a bias of azimuths with both senses, and for a scale of azimuths from north."""
     ends = np.cumsum([block.count for block in rows])
     touched = {int(i) for i in np.unique(np.searchsorted(ends, bias.row, side="right"))}
     senses = {rows[i].sense for i in touched if rows[i].kind == "azimuth"}
     if len(senses) > 1 and form_of(bias).of_readings:
-        what = "it touches azimuths that are counted clockwise and others that are counted anticlockwise"
-        advice = "count all of them one way, or name with members who is read which way"
+        what = "the bias affects clockwise and anticlockwise azimuths"
+        advice = "use one sense for all, or select stations of one sense with members"
         raise InvalidProblem(what, where, advice)
     north = any(units.convention != "east-counterclockwise" for n, units, _ in written if np.isin(bias.row, n).any())
     if form_of(bias).enters == "scales" and north:
-        what = "a scale of bearings would count from the x axis, not from north"
+        what = "a scale of bearings would refer to the x axis, not to north"
         raise InvalidProblem(what, where, 'use the form "offset", or azimuth = "east-counterclockwise"')
 
 
-def _change(table: BiasTable, rows: Sequence[Units], where: str) -> dict[str, Any]:
-    """Return what a table says of how its bias changes in time, SI units."""
+def _walk_parameters(table: BiasTable, rows: Sequence[Units], where: str) -> dict[str, Any]:
+    """Return the parameters of the change of a bias in time, SI units."""
     found: dict[str, Any] = {}
     for key, power in (("density", 1), ("rate_density", 3)):
         text = getattr(table, key)
@@ -239,29 +218,29 @@ def _change(table: BiasTable, rows: Sequence[Units], where: str) -> dict[str, An
         return found
     place = join(where, "key 'allan'")
     if found:
-        raise InvalidProblem("Allan deviations stand in place of densities", place, "give one of them")
+        raise InvalidProblem("Allan deviations and densities are both given", place, "give one of them")
     if rows[0].quantity != "length":
-        raise InvalidProblem("Allan deviations are of clocks, whose rows are times or lengths", place, "give a density")
+        raise InvalidProblem("Allan deviations need rows that are times or lengths", place, "give a density")
     if any(len(pair) != 2 for pair in table.allan):
-        raise InvalidProblem("an entry is not two numbers", place, "give [averaging time in s, Allan deviation] each")
+        raise InvalidProblem("an entry is not two numbers", place, "write [averaging time in s, Allan deviation]")
     tau, deviation = np.array(table.allan).reshape(-1, 2).T
     white, wander = clock_densities(tau, deviation, rows[0].speed)
     return {"density": white, **({"rate_density": wander} if wander > 0.0 else {})}
 
 
 def _density(text: str, power: int, units: Units, where: str) -> float:
-    """Return a spectral density such as "4 ns^2/s" in SI units; `power` is that of the seconds."""
+    """Return a spectral density such as "4 ns^2/s" in SI units; `power` is the power of the seconds."""
     end = "^2/s" if power == 1 else f"^2/s^{power}"
     number, _, unit = text.strip().partition(" ")
     if not unit.endswith(end):
         example = f'"{number} {units.name(None)}{end}"'
-        raise InvalidProblem(f"{text!r} is no density", where, f"write its unit, such as {example}")
+        raise InvalidProblem(f"{text!r} is not a density", where, f"write the unit, such as {example}")
     value, size = units.amount(f"{number} {unit.removesuffix(end)}", None, where)
     return float(value) * size.factor**2
 
 
 def _unit_to_read(form: BiasForm, spelled: Iterable[tuple[Units, str]], where: str) -> tuple[str, float]:
-    """Return the unit of an offset or drift of rows that are written in one unit, and its SI size; else empty."""
+    """Return the common unit of the rows of an offset or drift, and its SI size; else an empty text."""
     sizes = {(name, units.conversion(name, where)) for units, name in spelled}
     (name, size), *more = sizes
     if more or form.quantity is not None or size.logarithmic or size.factor == 1.0:
@@ -272,23 +251,23 @@ def _unit_to_read(form: BiasForm, spelled: Iterable[tuple[Units, str]], where: s
 def _prior(
     table: BiasTable, form: BiasForm, rows: Sequence[Units], shape: tuple[int, ...], where: str
 ) -> tuple[Array, Array | None]:
-    # All rows of a bias are of one quantity; carriers may differ from table to table.
+    # All rows of a bias have one quantity; carriers may differ between tables.
     carriers = {units.carrier for units in rows}
     units = replace(rows[0], quantity=form.quantity or rows[0].quantity)
 
     def si(value: float | str, key: str) -> tuple[float, Conversion]:
         place, text = join(where, f"key {key!r}"), value
         bare = "1" if units.quantity in {"plain", "ratio"} and not form.rate else None
-        # A drift has the unit of its rows per second, or per second squared of a drift of a rate.
+        # A drift has the unit of its rows per second, or per second squared for a drift of a rate.
         if form.rate:
             number, _, unit = str(value).strip().partition(" ")
             amount, slash, _ = unit.replace("^2", "/s").rpartition("/s")
             if not slash:
                 example = f'"{number} {units.name(None)}/s"'
-                raise InvalidProblem(f"{value!r} is no drift", place, f"write its unit, such as {example}")
+                raise InvalidProblem(f"{value!r} is not a drift", place, f"write the unit, such as {example}")
             text = f"{number} {amount}"
         if len(carriers) > 1 and str(text).endswith("Hz"):
-            raise InvalidProblem("its rows have several carriers", place, "give it in m/s")
+            raise InvalidProblem("the rows have several carriers", place, "give the value in m/s")
         return units.amount(text, None if bare is None else units.conversion(bare, place), place)
 
     centre, unit = (0.0, Conversion(1.0)) if table.mean is None else si(table.mean, "mean")
@@ -298,33 +277,35 @@ def _prior(
     size, unit = si(table.sigma, "sigma")
     if size <= 0.0:
         raise InvalidProblem(
-            "the standard deviation is not positive", join(where, "key 'sigma'"), "leave it out if unknown"
+            "the standard deviation is not positive", join(where, "key 'sigma'"), "remove it if unknown"
         )
-    # A frequency grows where a rate falls: the size is what a standard deviation has.
+    # A frequency increases when a range rate decreases, so the factor may be negative.
     return mean, np.full(shape, abs(float(unit.to_si(size))))
 
 
 def prior_of(table: PriorTable, dimension: int, source: str) -> Prior:
-    """Return prior knowledge of a state."""
+    """Return the prior of a state."""
     where = join(source, f"[[priors]] {table.name!r}")
     base = table.name.partition("[")[0]
     if base not in _STATES:
         raise InvalidProblem(
-            "there is no such unknown", where, f"{nearest(base, list(_STATES))}; those of biases stand with the bias"
+            "there is no such unknown", where, f"{nearest(base, list(_STATES))}; priors of biases belong to the bias"
         )
     quantity, default = _STATES[base]
     units, unit = Units(quantity), default if table.unit is None else table.unit
     size = 1 if base == "emission" else dimension
     if len(table.mean) != size:
-        raise InvalidProblem(f"the mean has {len(table.mean)} coordinates, not {size}", where, "give one each")
+        raise InvalidProblem(
+            f"the mean has {len(table.mean)} coordinates, not {size}", where, "give one number for each coordinate"
+        )
     spread = table.sigma if isinstance(table.sigma, list) else [units.plain(table.sigma, unit, where)] * size
     sigma = np.array(spread) * (units.conversion(unit, where).factor if isinstance(table.sigma, list) else 1.0)
     if len(sigma) != size or (sigma <= 0.0).any():
-        raise InvalidProblem(f"sigma is not {size} positive numbers", where, "give one each")
+        raise InvalidProblem(f"sigma is not {size} positive numbers", where, "give one number for each coordinate")
     return Prior(table.name, units.conversion(unit, where).factor * np.array(table.mean), np.diag(sigma**2))
 
 
-# Constraints of a problem file, and those that a command line adds to it.
+# Constraints of a problem file and of the command line.
 
 
 def constraints_of(
@@ -336,33 +317,17 @@ def constraints_of(
     times: Array,
     speed: float = SPEED_OF_LIGHT,
 ) -> tuple[tuple[Constraint, ...], tuple[Motion, ...]]:
-    """Return the constraints of tables, and the motions that can meet them.
+    """Return the constraints of tables, and motions that can satisfy them.
 
-    Those on one quantity of one target become one. Where heights are held along courses, all targets that move follow
-    the Earth.
-
-    Parameters
-    ----------
-    tables : mapping of str to ConstraintTable
-        Each behind its place.
-    stations : Stations
-        Stations in the frame.
-    frame : Frame
-        What coordinates mean.
-    motions : sequence of Motion
-        Of each target; a constraint without a target holds for all that are estimated.
-    names : sequence of str
-        Names of the targets.
-    times : array (k,)
-        Seconds of the epochs.
-    speed : float
-        Propagation speed, metres per second.
+    Constraints on one quantity of one target are joined. If a height holds along a course, all moving targets follow
+    the Earth. `tables` are by their place for messages; a table without a target applies to all estimated targets.
+    `times` (k,) are the seconds of the epochs, and `speed` is the propagation speed, m/s.
     """
     found: list[Constraint] = []
     motions = list(motions)
     for where, table in tables.items():
         _check_keys(table, where)
-        # A constraint without a target is one for each that is estimated, named after it.
+        # A constraint without a target becomes one constraint for each estimated target, with its name.
         for target in _targets(table, motions, names, where):
             suffix = f" of {names[target]}" if len(motions) > 1 else ""
             if table.kind in ("height", "above-ground"):
@@ -382,25 +347,25 @@ def _moves(motion: Motion) -> bool:
 def _level(
     table: ConstraintTable, motion: Motion, times: Array, where: str, c: float
 ) -> tuple[Motion, Sequence[Constraint]]:
-    """Return the constraint on a height, and the motion that can keep it."""
+    """Return the motion that can keep a height, and the constraint on the height."""
     if table.kind == "above-ground":
         low, high = 0.0, np.inf
     elif table.exactly is not None and (table.min is not None or table.max is not None):
         raise InvalidProblem("a height is either exact or in a band", where, "give exactly, or min and max")
     elif table.exactly is None:
         if table.within is not None:
-            raise InvalidProblem("'within' has nothing to be about", where, "give exactly, or min and max alone")
+            raise InvalidProblem("'within' needs 'exactly'", where, "give exactly, or min and max alone")
         low, high = _bounds(table, "length", where, c)
     else:
         within = _amount(table, "within", "length", where, c) or 0.0
         if within < 0.0:
-            raise InvalidProblem("the band has a negative width", join(where, "key 'within'"), "give its half width")
+            raise InvalidProblem("the band has a negative width", join(where, "key 'within'"), "give the half width")
         if isinstance(table.exactly, list):
             return _reported(table, motion, times, within, where, c)
         level = _amount(table, "exactly", "length", where, c)
         assert level is not None
         low, high = level - within, level + within
-    # bounds of a height that may curve are held at one time: between the ends of a course they need not hold
+    # bounds of a height that may curve hold at one time: inside them at both ends, the course may still leave them
     along = table.along if table.along is not None else motion.order < 2 or low == high
     over = replace(motion, over="ground") if along and _moves(motion) else motion
     return over, height(low, high, along=along)
@@ -409,16 +374,16 @@ def _level(
 def _reported(
     table: ConstraintTable, motion: Motion, times: Array, within: float, where: str, c: float
 ) -> tuple[Motion, Sequence[Constraint]]:
-    """Return motion and constraint of a height that is given for each epoch."""
+    """Return motion and constraint for heights that are stated for each epoch."""
     assert isinstance(table.exactly, list)
     place = join(where, "key 'exactly'")
     if motion.span == "run" and not motion.order:
-        raise InvalidProblem("a target that stays has one height", place, 'give one, such as "500 m"')
+        raise InvalidProblem("a static target has one height", place, 'give one height, such as "500 m"')
     if table.along is False:
-        raise InvalidProblem("heights of all epochs hold along the course", where, "leave out along = false")
+        raise InvalidProblem("heights of all epochs hold along the course", where, "remove along = false")
     if len(table.exactly) != len(times):
         what = f"{len(table.exactly)} heights for {len(times)} epochs"
-        raise InvalidProblem(what, place, "give one for each epoch, in the order of time")
+        raise InvalidProblem(what, place, "give one height for each epoch, in the order of time")
     levels = Units("length", c).conversion(table.unit, place).factor * np.array(table.exactly, dtype=float)
     if motion.span == "epoch":
         rise = np.stack([levels - levels[0], np.zeros_like(levels)], axis=-1)
@@ -430,18 +395,18 @@ def _check_keys(table: ConstraintTable, where: str) -> None:
     known = _KEYS[table.kind]
     foreign = sorted(table.model_fields_set - {"kind", "target", *known})
     if foreign:
-        advice = nearest(foreign[0], known) if known else "leave it out"
+        advice = nearest(foreign[0], known) if known else "remove it"
         raise InvalidProblem(f"{table.kind} has no key {foreign[0]!r}", where, advice)
     needed = [key for key in known if key not in {"unit", "stations", "elevation", "within", "along"}]
     if needed and not any(getattr(table, key) is not None for key in needed):
-        raise InvalidProblem(f"{table.kind} bounds nothing", where, f"give {' or '.join(needed)}")
+        raise InvalidProblem(f"{table.kind} has no bound", where, f"give {' or '.join(needed)}")
 
 
 def _targets(table: ConstraintTable, motions: Sequence[Motion], names: Sequence[str], where: str) -> list[int]:
     if table.target is None:
         free = [i for i, motion in enumerate(motions) if motion.known is None]
         if not free:
-            raise InvalidProblem("the motion of every target is known", where, "leave the constraint out")
+            raise InvalidProblem("the motion of each target is known", where, "remove the constraint")
         return free
     place = join(where, "key 'target'")
     if table.target not in names:
@@ -449,8 +414,8 @@ def _targets(table: ConstraintTable, motions: Sequence[Motion], names: Sequence[
             f"no row has the target {table.target!r}", place, nearest(table.target, sorted(set(names)))
         )
     if len(motions) == 1 and len(set(names)) > 1:
-        advice = "leave the key out, or write one file for each target"
-        raise InvalidProblem("free targets are fixed apart, and a constraint holds for all of them", place, advice)
+        advice = "remove the key, or write one file for each target"
+        raise InvalidProblem("free targets are fixed separately, and a constraint applies to all", place, advice)
     return [list(names).index(table.target) if len(motions) > 1 else 0]
 
 
@@ -461,7 +426,7 @@ def _make(table: ConstraintTable, stations: Stations, frame: Frame, where: str, 
     if table.kind == "speed":
         least, most = _bounds(table, "speed", where, c)
         return speed(most, lower=least)
-    return _region(table, frame, where, c) if table.kind == "polygon" else _sight(table, stations, frame, where)
+    return _region(table, frame, where, c) if table.kind == "polygon" else _visibility(table, stations, frame, where)
 
 
 def _bounds(table: ConstraintTable, quantity: Quantity, where: str, c: float) -> tuple[float, float]:
@@ -473,20 +438,24 @@ def _amount(table: ConstraintTable, key: str, quantity: Quantity, where: str, c:
     value: Amount | list[float] | None = getattr(table, key)
     place = join(where, f"key {key!r}")
     if isinstance(value, list):
-        raise InvalidProblem(f"{table.kind} has one bound, not a list", place, 'give one, such as "500 m"')
+        raise InvalidProblem(f"{table.kind} has one bound, not a list", place, 'give one bound, such as "500 m"')
     units = Units(quantity, c)
     return None if value is None else units.plain(value, units.name(table.unit), place)
 
 
 def _corner(table: ConstraintTable, key: str, dimension: int, where: str, c: float) -> Array:
-    """Return the least or greatest coordinates (d,) of a box; infinite where there is no bound."""
+    """Return the least or greatest coordinates (d,) of a box; infinite without a bound."""
     value = getattr(table, key)
     if value is None:
         return np.full(dimension, -np.inf if key == "min" else np.inf)
     place = join(where, f"key {key!r}")
     if not isinstance(value, list) or len(value) != dimension:
         count = f"{len(value)} coordinates" if isinstance(value, list) else "one number"
-        raise InvalidProblem(f"the box has {count}, not {dimension}", place, "give one each; inf or -inf is no bound")
+        raise InvalidProblem(
+            f"the box has {count}, not {dimension}",
+            place,
+            "give one number for each coordinate; inf or -inf means no bound",
+        )
     return Units("length", c).conversion(table.unit, place).factor * np.array(value)
 
 
@@ -499,32 +468,34 @@ def _region(table: ConstraintTable, frame: Frame, where: str, c: float) -> Seque
     assert given is not None
     bad = next((i for i, corner in enumerate(given) if len(corner) != 2), None)
     if bad is not None:
-        raise InvalidProblem(f"corner {bad + 1} has {len(given[bad])} coordinates", place, "give two")
+        raise InvalidProblem(f"corner {bad + 1} has {len(given[bad])} coordinates", place, "give two coordinates")
     corners = np.array(given, dtype=float).reshape(-1, 2)
     if table.corners_deg is None:
         corners = Units("length", c).conversion(table.unit, place).factor * corners
     elif frame.kind != "enu":
         advice = 'write kind = "enu" in [frame]'
-        raise InvalidProblem("corners in latitude and longitude need a plan", place, advice)
+        raise InvalidProblem("corners in latitude and longitude need an enu frame", place, advice)
     else:
         assert frame.origin is not None
         lat, lon = np.radians(corners).T
-        # At the height of the plan: a point above the ground has another x and y in it.
+        # Use the height of the origin: a point above the ground has other x and y in the plan.
         level = np.full(len(corners), frame.origin[2])
         corners = frame.from_geodetic(lat, lon, level, where=place, first_row=1)[:, :2]
     check_polygon(corners, place)
     return polygon(corners)
 
 
-def _sight(table: ConstraintTable, stations: Stations, frame: Frame, where: str) -> Sequence[Constraint]:
+def _visibility(table: ConstraintTable, stations: Stations, frame: Frame, where: str) -> Sequence[Constraint]:
     if not frame.geodetic or stations.dimension != 3:
         raise InvalidProblem("a horizon needs a geodetic frame", where, "use frame ecef or enu with 3-D stations")
     if stations.position.shape[-3] > 1:
-        raise InvalidProblem("the stations move, and so would their horizon", where, "give one file for each epoch")
+        raise InvalidProblem(
+            "the stations move, so their horizon is not constant", where, "give one file for each epoch"
+        )
     chosen = stations.names if table.stations is None or table.stations == "all" else table.stations
     place = join(where, "key 'stations'")
     if isinstance(chosen, str):
-        raise InvalidProblem(f"{chosen!r} is no list of stations", place, 'give "all" or a list of names')
+        raise InvalidProblem(f"{chosen!r} is not a list of stations", place, 'give "all" or a list of names')
     if not chosen:
         raise InvalidProblem("no station is named", place, nearest("", stations.names))
     index = numbers_of(chosen, stations.names, place)
@@ -537,8 +508,8 @@ def _sight(table: ConstraintTable, stations: Stations, frame: Frame, where: str)
 
 
 def _merge(constraints: Sequence[Constraint]) -> Iterator[Constraint]:
-    """Yield the intersection of the bands on each quantity, and every polygon once."""
-    # Two bands on one quantity may contradict each other: that is found by the problem's own check, not hidden here.
+    """Yield the intersection of the bands on each quantity, and each polygon once."""
+    # Keep two bands that contradict each other: the check of the problem reports them.
     for bands in bands_by_quantity(constraints):
         lower, upper = np.max([band.lower for band in bands], axis=0), np.min([band.upper for band in bands], axis=0)
         if np.isfinite(lower) or np.isfinite(upper) or lower > upper or np.isnan([lower, upper]).any():

@@ -1,4 +1,4 @@
-"""Columns of text as their different words and the number of each row's word: long tables repeat few words."""
+"""Columns of text as distinct words and word numbers of the rows, since long tables repeat few words."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from optloc.base.types import Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Words:
-    """A column (m,) of text; NumPy takes it for an array of objects.
+    """A column (m,) of text; NumPy converts it to an array of objects.
 
     Parameters
     ----------
     cells : object array (n,)
-        The different cells, in the order of their appearance.
+        The distinct cells, in the order of their appearance.
     index : int array (m,)
-        Which of them each row has.
+        Number of the cell of each row.
     """
 
     cells: Array
@@ -43,7 +43,7 @@ class Words:
         return (cells[i] for i in self.index)
 
     def __getitem__(self, pick: Any) -> Any:
-        """Return one cell, or some rows as words."""
+        """Return one cell, or the selected rows as words."""
         index = self.index[pick]
         return self.cells[index] if np.ndim(index) == 0 else Words(self.cells, index)
 
@@ -68,7 +68,7 @@ class Words:
 
 
 def numbered(column: Array | Words) -> tuple[list[Any], Array]:
-    """Return the different cells of a column in the order of their appearance, and which of them each row (m,) has."""
+    """Return the distinct cells of a column in the order of their appearance, and the cell number of each row (m,)."""
     import pyarrow as pa
 
     if isinstance(column, Words):
@@ -78,7 +78,7 @@ def numbered(column: Array | Words) -> tuple[list[Any], Array]:
         words = pa.array(column, pa.string()).dictionary_encode(null_encoding="encode")
         return words.dictionary.to_pylist(), words.indices.to_numpy()
     except (pa.ArrowException, UnicodeEncodeError, TypeError):
-        # The list is made once: a cell that is no number equals nothing but itself.
+        # Create the list once: two NaN cells are equal only if they are the same object.
         cells = column.tolist()
         number = {cell: i for i, cell in enumerate(dict.fromkeys(cells))}
         return list(number), np.array(list(map(number.__getitem__, cells)), dtype=np.int64)
@@ -98,7 +98,7 @@ def objects(cells: Sequence[Any]) -> Array:
 
 
 def equal_rows(columns: Sequence[Array | Words], count: int) -> tuple[Array, Array]:
-    """Return the first rows (n,) of all groups of equal rows, and the group of each row (m,)."""
+    """Return the first row (n,) of each group of equal rows, and the group of each row (m,)."""
     if not columns:
         return np.zeros(min(count, 1), dtype=np.int64), np.zeros(count, dtype=np.int64)
     return first_rows(*(c.index if isinstance(c, Words) else _numbers(c) for c in columns))
@@ -109,12 +109,9 @@ def _numbers(column: Array) -> Array:
 
 
 def distinct(labels: Array | Words) -> tuple[list[str], Array, Array]:
-    """Return what `np.unique` does of text: the names in order, the first row (n,) and the number (m,) of each.
+    """Return distinct labels as `np.unique` does: the sorted names, the first row (n,) and the number (m,) of each.
 
-    Parameters
-    ----------
-    labels : object array (m,) or Words
-        Text. As an array of fixed width a single long name would make it as large as all rows times its length.
+    A fixed-width array would need the length of the longest name for each row, so labels are objects or Words.
     """
     names, number = numbered(labels)
     order = sorted(range(len(names)), key=names.__getitem__)

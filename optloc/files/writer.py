@@ -1,4 +1,4 @@
-"""Write tables, and a problem file again with other measured values in the units and signs of its author."""
+"""Writing of CSV tables, and of a problem file with other measured values in its original units and signs."""
 
 from __future__ import annotations
 
@@ -20,31 +20,19 @@ from optloc.base.types import Array
 from optloc.files.reader import Draft, draft
 from optloc.files.table import Table, is_empty
 
-# Columns of measurements that are written again; the others are of no meaning to optloc.
+# Columns of measurements that are written again; optloc does not use other columns.
 _COLUMNS = ("kind", "epoch", "time", "target", "a", "b", "z", "sigma", "weight", "correction")
 
 
-# What makes a spreadsheet take a cell of text for a formula: OWASP, "CSV injection".
+# First characters that make a spreadsheet read a cell as a formula: OWASP, "CSV injection".
 _FORMULA = tuple("=+-@\t\r\n")
 
 
 def write_csv(path: Path, columns: Mapping[str, Any], *, for_people: bool = False) -> None:
-    """Write columns as CSV, NaN as an empty cell.
+    """Write columns as CSV, NaN as an empty cell; raise InvalidProblem if that fails.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    columns : mapping of str to array
-        By name.
-    for_people : bool
-        Whether people will open it in a spreadsheet: then text that would be a formula there is made harmless. What
-        optloc reads again is written as it is.
-
-    Raises
-    ------
-    InvalidProblem
-        Where it cannot be written.
+    With `for_people`, text that a spreadsheet would read as a formula gets an apostrophe. Without it, text is
+    unchanged, so that optloc can read the file again.
     """
     from pyarrow import csv
 
@@ -61,14 +49,17 @@ def _table(columns: Mapping[str, Any], for_people: bool) -> Any:
         try:
             return pa.array(values, from_pandas=True)
         except (pa.ArrowException, OverflowError):
-            # NumberColumn and words in one column, or numbers of many digits, go back as they came.
+            # Write columns of mixed type, or numbers with many digits, as text.
             return pa.array([None if is_empty(value) else str(value) for value in values])
 
     return pa.table({name: column(values) for name, values in cells.items()})
 
 
 def harmless(text: str) -> str:
-    """Return text of a cell with an apostrophe before it where a spreadsheet would compute it; numbers stay."""
+    """Return the text of a cell, with an apostrophe if a spreadsheet would read it as a formula.
+
+    Numbers are unchanged.
+    """
     if not text.startswith(_FORMULA):
         return text
     try:
@@ -79,14 +70,14 @@ def harmless(text: str) -> str:
 
 
 def harmless_column(values: Any) -> Any:
-    """Return a column of which the texts are harmless."""
+    """Return a column with harmless texts."""
     if isinstance(values, np.ndarray) and values.dtype.kind != "O":
         return values
     return [harmless(value) if isinstance(value, str) else value for value in values]
 
 
 class GrowingTable:
-    """A CSV file for people that grows row by row: each row is whole as soon as it is added, last at `when` seconds.
+    """A CSV file for people that grows row by row; each added row is complete on disk. `when` is the last addition, s.
 
     Parameters
     ----------
@@ -98,7 +89,7 @@ class GrowingTable:
         self.path, self.file, self.rows, self.when = path, GrowingFile(path), 0, -math.inf
 
     def add(self, columns: Mapping[str, Any]) -> None:
-        """Add rows, the same columns each time; raise InvalidProblem where that fails."""
+        """Append rows with the same columns each time; raise InvalidProblem if that fails."""
         from pyarrow import csv
 
         table, lines = _table(columns, for_people=True), BytesIO()
@@ -108,43 +99,26 @@ class GrowingTable:
 
 
 def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Path]:
-    """Write a problem file with other measured values.
+    """Write a problem file with other measured values and return the written files.
 
-    Parameters
-    ----------
-    source : Path
-        Problem file to begin with.
-    out : Path
-        Problem file to write; the rows go to CSV files beside it.
-    z : array (trials, m)
-        Measured values of all rows in SI units, in the order of the problem. Several trials become epochs.
-    note : str
-        Remark behind the title.
-
-    Returns
-    -------
-    list of Path
-        The files that were written.
-
-    Raises
-    ------
-    InvalidProblem
-        Where trials cannot become epochs, or a file cannot be written.
+    `source` is the problem file to start from. The rows go to CSV files in the folder of `out`. `z` (trials, m) has the
+    measured values of all rows in SI units, in the order of the problem; several trials become epochs. `note` is a
+    remark after the title. Raise InvalidProblem if trials cannot become epochs, or a file cannot be written.
     """
     made = draft(source, values=False)
     if len(z) > 1 and (made.loaded.problem.epochs > 1 or made.moving):
-        advice = "draw once for each file, with another seed"
+        advice = "simulate one file for each trial, with different seeds"
         raise InvalidProblem("several trials of a run of epochs do not fit one file", str(out), advice)
     if out.suffix.lower() != ".toml":
-        raise InvalidProblem("a simulation is written as a problem file", str(out), "let its name end in .toml")
-    # What the author left out stays out, and takes the same defaults again.
+        raise InvalidProblem("a simulation is written as a problem file", str(out), "use the ending .toml")
+    # Omit default values, so that they stay defaults.
     settings = made.file.model_dump(exclude_defaults=True)
     settings["title"] = " ".join(part for part in (made.loaded.title, f"({note})" if note else "") if part)
     kept = (settings["stations"], settings.get("target", {}), *settings.get("targets", {}).values())
     copies: dict[Path, Path] = {}
     for i, section in enumerate(kept):
         if "file" in section:
-            copies |= _keep(section, source.parent, out, "stations" if i == 0 else f"target-{i}")
+            copies |= _relocate(section, source.parent, out, "stations" if i == 0 else f"target-{i}")
     tables = [out.with_name(f"{out.stem}-{i + 1}.csv") for i in range(len(made.tables))]
     claim(out, *copies, *tables, inputs=[source])
     with replace_together():
@@ -161,20 +135,20 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
     return [out, *copies, *tables]
 
 
-def _keep(section: dict[str, Any], folder: Path, out: Path, role: str) -> dict[Path, Path]:
-    """Let a section name a table that is not written again; return the name of a copy and its original, if needed."""
+def _relocate(section: dict[str, Any], folder: Path, out: Path, role: str) -> dict[Path, Path]:
+    """Update the path of a table that is not written again; return its copy and its original if a copy is needed."""
     path = folder / section["file"]
     section["file"] = os.path.relpath(path, out.parent)
     if Path(os.path.realpath(path)).is_relative_to(os.path.realpath(out.parent)):
         return {}
-    # A problem file names nothing beyond its folder: what is elsewhere is copied beside it.
+    # A problem file must not refer outside its folder, so copy the table into the folder.
     copy = out.with_name(f"{out.stem}-{role}{path.suffix}")
     section["file"] = copy.name
     return {copy: path}
 
 
 def _rows(made: Draft, table: Table, z: Array) -> dict[str, Any]:
-    """Return one table: its known columns under their own names, the values of each trial below each other."""
+    """Return one table: its standard columns by their standard names, the values of all trials one below the other."""
     trials = len(z)
     values = np.full((trials, table.count), np.nan)
     for chunk, number in zip(made.chunks, made.numbers, strict=True):
@@ -182,18 +156,18 @@ def _rows(made: Draft, table: Table, z: Array) -> dict[str, Any]:
             values[:, chunk.row] = chunk.unit.from_si(z[:, number] - chunk.baseline)
     known = {key: table.raw(key) for key in _COLUMNS if key != "z" and table.has(key)}
     columns: dict[str, Any] = {key: np.tile(column, trials) for key, column in known.items()}
-    if trials > 1:  # each trial is an epoch, whose time would only say that all are one
+    if trials > 1:  # each trial is an epoch; equal times would join the trials
         columns["epoch"] = np.repeat(np.arange(trials), table.count)
         columns.pop("time", None)
     return columns | {"z": values.ravel()}
 
 
 def toml_text(settings: dict[str, Any], path: tuple[str, ...] = ()) -> str:
-    """Return TOML: numbers and lists first, then tables."""
+    """Return TOML text: numbers and lists first, then tables."""
     plain, tables = [], []
     for key, value in settings.items():
         name = (*path, key)
-        # Tables of the first level get a header; deeper ones are written inline, which TOML allows everywhere.
+        # Tables of the first level get a header; deeper tables are inline, which TOML allows everywhere.
         if isinstance(value, dict) and len(path) < 1:
             tables.append(f"\n[{'.'.join(map(_key, name))}]\n" + toml_text(value, name))
         elif isinstance(value, list) and value and isinstance(value[0], dict) and not path:
@@ -212,5 +186,5 @@ def _value(value: Any) -> str:
         return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items() if v is not None) + " }"
     if isinstance(value, list):
         return "[" + ", ".join(_value(item) for item in value) + "]"
-    # repr keeps every digit; JSON spells strings, booleans and whole numbers as TOML does.
+    # repr keeps all digits; JSON strings, booleans and integers are valid TOML.
     return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)

@@ -1,1 +1,1 @@
-"""A stream of events: lines of rows or arrivals in, fixes and proofs out, for as long as it runs."""
+"""Live service: a stream of events with lines of rows or arrivals as input, and fixes and proofs as output."""

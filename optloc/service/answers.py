@@ -1,4 +1,4 @@
-"""What a stream answers: records of fixes and proofs, and the same in other formats."""
+"""Answers of a stream: records of fixes, proofs and tracks, and their conversion to other formats."""
 
 from __future__ import annotations
 
@@ -16,34 +16,22 @@ from optloc.tracking import Entry
 
 Record = dict[str, Any]
 
-# Shared by all threads: it keeps nothing of what it writes.
+# All threads share this encoder: it has no state.
 _JSON = json.JSONEncoder(allow_nan=False, separators=(",", ":"))
 _LABELS = {int(status): status.label for status in Status}
 _FEET = 0.3048
 
 UNNAMED = "target"
-"""What the target of events that name none is called in tracks, as in files."""
+"""Name of the target of events without a target in tracks, as in files."""
 
-# Seconds after which a target is no longer on the list: what maps of aircraft take.
-_GONE = 60.0
+# Seconds after which a target is removed from the list; maps of aircraft use this limit.
+_MAX_AGE = 60.0
 
 
 def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Record]:
-    """Return what is answered of each event of a batch (n,).
+    """Return the answers to the events of a batch (n,): metres in the frame of the site, degrees; None for no number.
 
-    Parameters
-    ----------
-    fix : Fix
-        Their fixes.
-    events : sequence of n Event
-        Whose they are.
-    phase : str, optional
-        Which answer of several it is.
-
-    Returns
-    -------
-    list of dict
-        Metres in the frame of the site, degrees; None where there is no number.
+    `phase` is the phase of the answer, None for a single answer.
     """
     position, covariance = fix.position, fix.covariance()
     known = np.asarray(np.isfinite(position).all(-1))
@@ -72,14 +60,14 @@ def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Re
             record["reason"] = fix.reason[i]
         if wild[i].any():
             record["undetermined"] = ["xyz"[axis] for axis in np.flatnonzero(wild[i])]
-        _mark(record, event)
+        _add_exceptions(record, event)
     return made
 
 
 def unsolved(event: Event, phase: str = "fix", **why: Any) -> Record:
-    """Return what is answered of an event that has no place; `why` is its status, or an error."""
+    """Return the answer to an event without a position; `why` is its status, or an error."""
     record = {"event": event.name, "phase": phase, **why, "position": None}
-    _mark(record, event)
+    _add_exceptions(record, event)
     return record
 
 
@@ -91,7 +79,7 @@ def _known(values: Array, known: Array) -> list[Any]:
 
 
 def _alternatives(fix: Fix) -> dict[int, list[Record]]:
-    """Return the other positions of those events of a batch that have some."""
+    """Return the other positions of the events of a batch, by event number."""
     gap = fix.alternatives.gap
     if not gap.shape[-1]:
         return {}
@@ -103,8 +91,8 @@ def _alternatives(fix: Fix) -> dict[int, list[Record]]:
     return out
 
 
-def _mark(record: Record, event: Event) -> None:
-    """Add what is not as usual about an event."""
+def _add_exceptions(record: Record, event: Event) -> None:
+    """Add the unusual properties of an event: closing reason, revision, conflict, target."""
     if event.closed != "whole":
         record["closed"] = event.closed
     if event.revision > 1:
@@ -116,16 +104,10 @@ def _mark(record: Record, event: Event) -> None:
 
 
 def proof_records(fix: Fix, events: Sequence[Event], before: Sequence[Record | None]) -> list[Record]:
-    """Return what the second phase says of each event: the proof alone, or a better fix with it.
+    """Return the answers of the second phase: the proof alone, or a better fix with its proof.
 
-    Parameters
-    ----------
-    fix : Fix
-        Fixes (n,) of the whole method.
-    events : sequence of n Event
-        Whose they are.
-    before : sequence of n dict or None
-        What the first phase said; None where nothing was said, so that all is.
+    `fix` has the fixes (n,) of the whole method. `before` has the answers of the first phase; after None, the answer
+    includes the fix.
     """
     records = fix_records(fix, events, None)
     out = []
@@ -136,7 +118,7 @@ def proof_records(fix: Fix, events: Sequence[Event], before: Sequence[Record | N
             proof["why"] = reason
         if old is None:
             out.append(new | proof)
-        elif _same(new, old):
+        elif _is_same_fix(new, old):
             changed = {key: new[key] for key in ("alternatives", "revision", "reason", "target") if new.get(key)}
             out.append({"event": new["event"], "phase": "proof", "status": new["status"], **proof, **changed})
         else:
@@ -145,12 +127,12 @@ def proof_records(fix: Fix, events: Sequence[Event], before: Sequence[Record | N
     return out
 
 
-# Costs and coordinates that differ by less are rounding, as shares: the whole method refines to eleven digits.
+# Relative difference of costs and coordinates that is rounding: the whole method refines to eleven digits.
 _ROUNDING = 1e-9
 
 
-def _same(new: Record, old: Record) -> bool:
-    """Return whether the whole method has left the fix of the first phase as it was."""
+def _is_same_fix(new: Record, old: Record) -> bool:
+    """Return whether the whole method gives the same fix as the first phase."""
     if new["position"] is None or old["position"] is None:
         return bool(new["position"] == old["position"])
     size = 1.0 + max(map(abs, old["position"]))
@@ -159,23 +141,10 @@ def _same(new: Record, old: Record) -> bool:
 
 
 def track_record(event: Event, time: float, entry: Entry, problem: Problem) -> Record:
-    """Return what is answered of an event of a track.
+    """Return the answer to an event of a track: metres and seconds in the frame of the site.
 
-    Parameters
-    ----------
-    event : Event
-        Whose.
-    time : float
-        Seconds, as the event says.
-    entry : Entry
-        What became of it.
-    problem : Problem
-        Gives dimension and frame.
-
-    Returns
-    -------
-    dict
-        Metres and seconds in the frame of the site; `cov` is that of position, velocity and acceleration.
+    `time` is the time of the event, s. `entry` is the result of the scan. `problem` has the dimension and the frame.
+    The value `cov` is the covariance of position, velocity and acceleration.
     """
     d, mean = problem.dimension, entry.updated.mean
     known = bool(np.isfinite(mean).all())
@@ -190,12 +159,12 @@ def track_record(event: Event, time: float, entry: Entry, problem: Problem) -> R
     record |= {"nis": nis if np.isfinite(nis) else None, "rows": int(entry.updated.count), "rejected": entry.rejected}
     if entry.reason:
         record["reason"] = entry.reason
-    _mark(record, event)
+    _add_exceptions(record, event)
     return record
 
 
 def unproven(event: Event, why: str, before: Record | None) -> Record:
-    """Return what is said of an event whose proof was not finished: "deadline" or "skipped: load"."""
+    """Return the answer to an event whose proof was not finished; `why` is "deadline" or "skipped: load"."""
     proof = {"proof": "unknown", "margin": 0.0, "boxes": 0, "why": why}
     proof |= {"target": event.target} if event.target else {}
     if before is not None:
@@ -204,14 +173,14 @@ def unproven(event: Event, why: str, before: Record | None) -> Record:
 
 
 def join(first: Record | None, then: Record) -> Record:
-    """Return the answers of both phases of an event as one."""
-    left_out = ("phase", "reason")  # why the first one was not sure is told no longer
+    """Return the answers of both phases of an event as one record."""
+    left_out = ("phase", "reason")  # the second phase replaces the reason of the first
     kept = {} if first is None else {key: value for key, value in first.items() if key not in left_out}
     return kept | {key: value for key, value in then.items() if key != "phase"}
 
 
 def to_line(record: Record) -> bytes:
-    """Return a record as one line of strict JSON; what is not finite is null."""
+    """Return a record as one line of strict JSON; numbers that are not finite become null."""
     try:
         return _JSON.encode(record).encode() + b"\n"
     except ValueError:
@@ -230,7 +199,7 @@ def _finite(value: Any) -> Any:
 
 
 def to_feature(record: Record) -> Record:
-    """Return a record as a GeoJSON feature (RFC 7946); its geometry is null where it has no place on Earth."""
+    """Return a record as a GeoJSON feature (RFC 7946); the geometry is null without a position on Earth."""
     place = None
     if record.get("lat_deg") is not None:
         place = {"type": "Point", "coordinates": [record["lon_deg"], record["lat_deg"], record["height"]]}
@@ -257,11 +226,16 @@ def to_aircraft(record: Record, seen: float = 0.0) -> Record:
 
 
 def to_mark(record: Record, frame: Frame) -> Mark:
-    """Return a fix or the state of a track as formats take it."""
+    """Return a fix or the state of a track in the form that the export formats need."""
     position, d = np.array(record["position"], dtype=float), len(record["position"])
     spread = np.full((d, d), np.nan) if record.get("cov") is None else np.array(record["cov"], dtype=float)[:d, :d]
     others = [
-        Other(x := np.array(each["position"], dtype=float), earth_points(frame, x[None])[0], each["gap"], _doubt(each))
+        Other(
+            x := np.array(each["position"], dtype=float),
+            earth_points(frame, x[None])[0],
+            each["gap"],
+            _probability(each),
+        )
         for each in record.get("alternatives", ())
     ]
     name = record.get("target") or record["event"]
@@ -279,13 +253,13 @@ def to_mark(record: Record, frame: Frame) -> Mark:
     )
 
 
-def _doubt(each: Record) -> float:
+def _probability(each: Record) -> float:
     """Return the probability of an alternative, as `optloc.problem.fix.Alternatives` does."""
-    return float(1.0 / (1.0 + np.exp(min(each["gap"] / 2.0, 700.0))))  # beyond, exp overflows
+    return float(1.0 / (1.0 + np.exp(min(each["gap"] / 2.0, 700.0))))  # exp overflows beyond 700
 
 
 def _of_file(each: Callable[[Mark], str]) -> Callable[[Record, Frame], bytes | None]:
-    """Return what writes a record in a format of files; None of one without a place on Earth."""
+    """Return a function that writes a record in a file format; its result is None without a position on Earth."""
 
     def line(record: Record, frame: Frame) -> bytes | None:
         if record.get("lat_deg") is None:
@@ -302,19 +276,16 @@ FORMATS: Mapping[str, Callable[[Record, Frame], bytes | None]] = {
     "aircraft": lambda record, _: to_line(to_aircraft(record)) if record.get("lat_deg") is not None else None,
     **{name: _of_file(one.each) for name, one in FILE_FORMATS.items() if one.each is not None},
 }
-"""What lines of the output are, by name: a function of a record and the frame of its site."""
+"""Output formats by name: functions of a record and the frame of its site that return a line."""
 
 OF_RECORDS = ("ndjson", "geojson")
-"""Formats in which notes, errors and health have lines, too; beside others they are told to people."""
+"""Formats with lines for notes, errors and health; with other formats these go to standard error."""
 
 
 class Latest:
-    """The latest fix of each target, or event where it names none: what maps ask for.
+    """The latest fix of each target, or of each event without a target, for maps.
 
-    Parameters
-    ----------
-    most : int
-        Targets that are kept.
+    `most` is the largest number of targets.
     """
 
     def __init__(self, most: int = 1024) -> None:
@@ -322,7 +293,7 @@ class Latest:
         self._held: dict[str, tuple[float, Record]] = {}
 
     def __call__(self, record: Record) -> None:
-        """Keep a record, if it has a place or says more of one that is kept."""
+        """Store a record if it has a position, or adds to a stored record."""
         if "event" not in record or "note" in record:
             return
         name = record.get("target") or record["event"]
@@ -332,7 +303,7 @@ class Latest:
             return
         if record.get("position") is None:
             return
-        # One call of a built-in each: whoever reads in another thread sees the old or the new.
+        # Each step is one call of a built-in: a reader in another thread gets the old or the new record.
         self._held.pop(name, None)
         self._held[name] = (time(), join(None, record))
         self._total += 1
@@ -341,13 +312,13 @@ class Latest:
 
     def _present(self) -> list[tuple[float, Record]]:
         now = time()
-        return [(now - when, record) for when, record in list(self._held.values()) if now - when < _GONE]
+        return [(now - when, record) for when, record in list(self._held.values()) if now - when < _MAX_AGE]
 
     def features(self) -> Record:
-        """Return them as a GeoJSON feature collection."""
+        """Return the latest fixes as a GeoJSON feature collection."""
         return {"type": "FeatureCollection", "features": [to_feature(record) for _, record in self._present()]}
 
     def aircraft(self) -> Record:
-        """Return them as readsb's ``aircraft.json``."""
+        """Return the latest fixes as readsb's ``aircraft.json``."""
         found = [to_aircraft(record, age) for age, record in self._present() if record.get("lat_deg") is not None]
         return {"now": round(time(), 1), "messages": self._total, "aircraft": found}

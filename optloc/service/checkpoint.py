@@ -1,4 +1,4 @@
-"""Checkpoints of a stream: its open events, the ids of those that were answered, and its counts, as one JSON object."""
+"""Checkpoints of a stream: open events, ids of answered events, and counts, as one JSON object."""
 
 from __future__ import annotations
 
@@ -13,25 +13,20 @@ from optloc.service.metrics import COUNTS
 from optloc.service.site import Site
 
 _FORMAT = "optloc live 1"
-# Bytes of a checkpoint: as many as the largest state has, 4096 open events of 64 kB and 65 536 ids.
+# Bytes of a checkpoint with the largest state: 4096 open events of 64 kB and 65 536 ids.
 _BUDGET = Budget(text=1 << 29)
-# Of a count: a million a second for 30 000 years, far below what a float rounds.
-_MOST = 1 << 60
-# Characters that are repeated of what is refused.
+# Largest count: a million a second for 30 000 years, which is exact as a float.
+_MAX_COUNT = 1 << 60
+# Largest number of characters of an invalid value in a message.
 _SHOWN = 40
 _NAMES: dict[type, str] = {list: "list", dict: "object", str: "text", int: "whole number", bool: "true or false"}
 T = TypeVar("T")
 
 
 def state_of(events: Events, unwritten: dict[str, Event]) -> Record:
-    """Return what a stream must know to go on where it was.
+    """Return the state that a stream needs to continue.
 
-    Parameters
-    ----------
-    events : Events
-        Of the stream.
-    unwritten : dict of str to Event
-        Closed events whose answers may not have been written: they count as open.
+    `unwritten` has closed events whose answers may not be written yet: they count as open.
     """
     site = events.site
 
@@ -53,26 +48,15 @@ def state_of(events: Events, unwritten: dict[str, Event]) -> Record:
 
 
 def restore(path: Path, events: Events, now: float) -> None:
-    """Take over what a checkpoint holds: all of it, or nothing.
+    """Restore a checkpoint into the events of a stream that has read no line: all of the checkpoint, or nothing.
 
-    Parameters
-    ----------
-    path : Path
-        The checkpoint.
-    events : Events
-        A stream's, before its first line.
-    now : float
-        By the clock of the stream.
-
-    Raises
-    ------
-    InvalidProblem
-        Where it is none, is damaged, or names what the site has not.
+    `now` is the time of the clock of the stream, s. Raise InvalidProblem for a file that is not a checkpoint, is
+    damaged, or has names that the site does not have.
     """
-    with access(anew=True, budget=_BUDGET):  # it is written again, which a file that was read must not be
+    with access(anew=True, budget=_BUDGET):  # forget the input: it is written again later
         found = json_of(read_text(path), path.name)
     if not isinstance(found, dict) or found.get("format") != _FORMAT:
-        raise InvalidProblem("this is no checkpoint of a stream", str(path), "name another file, or remove it")
+        raise InvalidProblem("this is not a checkpoint of a stream", str(path), "use another file, or remove it")
     where = str(path)
     try:
         closed = [name_under("closed", name) for name in _typed(found.get("closed"), list, "closed")]
@@ -85,7 +69,7 @@ def restore(path: Path, events: Events, now: float) -> None:
             opened[event.name] = event
     except InvalidProblem as error:
         if error.where in ("kind", "a", "b", "station"):
-            raise InvalidProblem(error.what, where, "it belongs to another site; name another file") from None
+            raise InvalidProblem(error.what, where, "the checkpoint is of another site; use another file") from None
         raise InvalidProblem(f"this checkpoint is damaged ({error.where}: {error.what})", where, "remove it") from None
     for name in closed:
         events.remember(name, None)
@@ -94,7 +78,7 @@ def restore(path: Path, events: Events, now: float) -> None:
 
 
 def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
-    """Return an open event of another name than those taken; raise InvalidProblem, whose place is a key, for none."""
+    """Return an open event whose name is not in `taken`; raise InvalidProblem with a key as its place."""
     each = _typed(found, dict, "open")
     entries = [_parts(entry, 5, "rows") for entry in _typed(each.get("rows"), list, "rows")]
     given = [
@@ -106,14 +90,14 @@ def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
     rows, sigmas, times = rows_and_arrivals(given, heard, site)
     refused = _typed(each.get("refused", ""), str, "refused")
     if not rows and not times and not refused:
-        raise InvalidProblem("an event has no rows", "rows", "remove it")
+        raise InvalidProblem("an event has no rows", "rows", "remove the event")
     name, target = name_under("event", each.get("event")), _typed(each.get("target"), str, "target")
     if name in taken:
-        raise InvalidProblem(f"the event {name!r} is there twice", "event", "remove it")
+        raise InvalidProblem(f"the event {name!r} occurs twice", "event", "remove one")
     event = Event(name, rows, times, now, now, sigmas, target and name_under("target", target))
     event.revision = _count(each.get("revision"), "revision")
     event.conflict = _typed(each.get("conflict"), bool, "conflict")
-    # checkpoints from before there were tracks have neither
+    # checkpoints of versions without tracks have neither key
     event.when = None if each.get("when") is None else picoseconds(each["when"], "time_ps")
     event.track = _typed(each.get("track", False), bool, "track")
     event.refused = refused
@@ -121,9 +105,9 @@ def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
 
 
 def _typed(found: Any, kind: type[T], where: str) -> T:
-    """Return a value of a type; raise InvalidProblem for another one. True is no number."""
+    """Return a value of the type `kind`; raise InvalidProblem for another type. True is not a number."""
     if type(found) is not kind:
-        raise InvalidProblem(f"{str(found)[:_SHOWN]!r} is no {_NAMES[kind]}", where, "remove it")
+        raise InvalidProblem(f"{str(found)[:_SHOWN]!r} is not of the type {_NAMES[kind]}", where, "remove it")
     return found
 
 
@@ -135,17 +119,17 @@ def _parts(found: Any, count: int, where: str) -> list[Any]:
 
 
 def _count(found: Any, where: str) -> int:
-    """Return a number of things that were counted."""
+    """Return a valid count."""
     number = _typed(found, int, where)
-    if not 0 <= number <= _MOST:
-        raise InvalidProblem(f"{str(number)[:_SHOWN]} is no count", where, "remove it")
+    if not 0 <= number <= _MAX_COUNT:
+        raise InvalidProblem(f"{str(number)[:_SHOWN]} is not a count", where, "remove it")
     return number
 
 
 def _counts(found: Any) -> dict[str, int]:
-    """Return what was counted, by the names of `optloc.service.metrics.COUNTS`."""
+    """Return the counts, by the names of `optloc.service.metrics.COUNTS`."""
     counts = _typed(found, dict, "counts")
     unknown = counts.keys() - COUNTS.keys()
     if unknown:
-        raise InvalidProblem(f"nothing is counted as {min(unknown)[:_SHOWN]!r}", "counts", "remove it")
+        raise InvalidProblem(f"there is no count {min(unknown)[:_SHOWN]!r}", "counts", "remove it")
     return {name: _count(number, "counts") for name, number in counts.items()}

@@ -1,4 +1,4 @@
-"""`optloc live` and `optloc serve`: fixes from a stream, until it ends or is told to."""
+"""The commands ``optloc live`` and ``optloc serve``: fixes from a stream, until the stream or a signal ends."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from optloc.service.sources import Adapter
     from optloc.service.stream import Stream
 
-# The stream itself is imported inside the commands, so that --help answers at once.
+# Import the stream inside the commands, so that --help prints without delay.
 
-# Seconds after which a thread that runs Python gives way: the first phase is not to wait 5 ms for the second.
+# Thread switch interval, s: the first phase must not wait 5 ms for the second.
 _SWITCH = 5e-4
 
 Replay = Annotated[
@@ -38,47 +38,69 @@ Replay = Annotated[
     typer.Option("--replay", metavar="FILE", help="Read a recording, or the epochs of a problem file (.toml)."),
 ]
 Speed = Annotated[
-    float | None, typer.Option(metavar="N", help="How many times as fast as it was recorded; as fast as it goes.")
+    float | None,
+    typer.Option(metavar="N", help="Replay speed relative to the recording; by default as fast as possible."),
 ]
-Wait = Annotated[str, typer.Option(metavar="TIME", help="How long after its first row an event closes.")]
-Late = Annotated[str, typer.Option(metavar="drop|revise", help="Whether late rows make a new answer.")]
+Wait = Annotated[str, typer.Option(metavar="TIME", help="Time from the first row of an event to its closing.")]
+Late = Annotated[str, typer.Option(metavar="drop|revise", help="Ignore late rows, or answer again.")]
 Phases = Annotated[
-    str, typer.Option(metavar="two|one|fix", help="A fix at once and its proof later, both in one, or no proof.")
+    str,
+    typer.Option(metavar="two|one|fix", help="Answers: a fix at once and its proof later, both in one, or no proof."),
 ]
 Deadline = Annotated[
-    str | None, typer.Option(metavar="TIME", help="When a proof is given up; 1 s, never where a file is read.")
+    str | None,
+    typer.Option(metavar="TIME", help="Time limit of a proof; by default 1 s, or none for input from a file."),
 ]
 Shed = Annotated[
     bool | None,
-    typer.Option("--shed/--no-shed", help="Skip proofs under load, or let rows wait; rows of a file wait."),
+    typer.Option("--shed/--no-shed", help="Skip proofs under load, or let rows wait; by default, rows of a file wait."),
 ]
 Part = Annotated[
-    str, typer.Option("--partition", metavar="K/N", help="Answer the events of the Kth of N processes only.")
+    str, typer.Option("--partition", metavar="K/N", help="Answer only the share of events of process K of N.")
 ]
-Format = Annotated[str, typer.Option("--format", metavar="NAME", help="ndjson, geojson, aircraft, cot or nmea.")]
-State = Annotated[Path | None, typer.Option("--state", metavar="FILE", help="Keep a checkpoint, and go on from it.")]
-Every = Annotated[str, typer.Option("--every", metavar="TIME", help="How often the checkpoint is written.")]
-Record = Annotated[Path | None, typer.Option("--record", metavar="FILE", help="Keep the lines that are read.")]
+Format = Annotated[
+    str, typer.Option("--format", metavar="NAME", help="Output format: ndjson, geojson, aircraft, cot or nmea.")
+]
+State = Annotated[
+    Path | None, typer.Option("--state", metavar="FILE", help="Write checkpoints to this file, and continue from it.")
+]
+Every = Annotated[str, typer.Option("--every", metavar="TIME", help="Time between checkpoints.")]
+Record = Annotated[Path | None, typer.Option("--record", metavar="FILE", help="Record the input lines.")]
 
 Http = Annotated[
-    str | None, typer.Option("--http", metavar="[HOST:]PORT", help="Take requests, too; this machine alone by default.")
+    str | None,
+    typer.Option(
+        "--http", metavar="[HOST:]PORT", help="Accept HTTP requests as well; by default from this machine only."
+    ),
 ]
 Mqtt = Annotated[
-    str | None, typer.Option("--mqtt", metavar="URL", help="Read a topic of a broker: mqtt://host:1883/topic.")
+    str | None, typer.Option("--mqtt", metavar="URL", help="Read a topic of an MQTT broker: mqtt://host:1883/topic.")
 ]
 Zmq = Annotated[
     str | None,
-    typer.Option("--zmq", metavar="URL", help="Read a socket: tcp://host:5555, or pull+tcp://127.0.0.1:5555."),
+    typer.Option("--zmq", metavar="URL", help="Read a ZeroMQ socket: tcp://host:5555, or pull+tcp://127.0.0.1:5555."),
 ]
 Adapt = Annotated[
-    str | None, typer.Option("--adapter", metavar="chirpstack|mode-s", help="Lines are in the format of others.")
+    str | None,
+    typer.Option("--adapter", metavar="chirpstack|mode-s", help="Format of the input lines from other systems."),
 ]
 
-Model = Annotated[str, typer.Option("--model", metavar="NAME", help="Of tracks: as of [bold]optloc track[/bold].")]
-Filter = Annotated[str, typer.Option("--filter", metavar="NAME", help="Of tracks, likewise.")]
-Noise = Annotated[float | None, typer.Option("--noise", metavar="SD", help="Of tracks, likewise.")]
-Gap = Annotated[float | None, typer.Option("--gap", metavar="SECONDS", help="Of tracks, likewise.")]
-Track = Annotated[bool, typer.Option("--track", help="Answer the states of targets' tracks in the place of fixes.")]
+Model = Annotated[
+    str, typer.Option("--model", metavar="NAME", help="Motion model of tracks; see [bold]optloc track[/bold].")
+]
+Filter = Annotated[
+    str, typer.Option("--filter", metavar="NAME", help="Filter of tracks; see [bold]optloc track[/bold].")
+]
+Noise = Annotated[
+    float | None, typer.Option("--noise", metavar="SD", help="Process noise of tracks; see [bold]optloc track[/bold].")
+]
+Gap = Annotated[
+    float | None,
+    typer.Option(
+        "--gap", metavar="SECONDS", help="Longest time without rows of tracks; see [bold]optloc track[/bold]."
+    ),
+]
+Track = Annotated[bool, typer.Option("--track", help="Answer with states of tracks instead of fixes.")]
 
 EXAMPLES = example(
     "feed | optloc live site.toml > fixes.ndjson",
@@ -112,16 +134,16 @@ def live(
     filter_: Filter = "iekf",
     noise: Noise = None,
     gap: Gap = None,
-    check: Annotated[bool, typer.Option("--check", help="Say what the stream would take, and end.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Print the input format of the stream, and end.")] = False,
     outside: Outside = False,
     budget: Budget = None,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Fix events as they come: lines of JSON in, fixes and their proofs out.
+    """Fix events as they arrive: JSON lines are the input, fixes and proofs the output.
 
-    The rows of FILE are the template of an event. Signals: TERM answers what is there and ends, HUP reads FILE anew.
+    The rows of FILE are the template of an event. Signals: TERM answers all waiting events and ends, HUP reloads FILE.
     """
     if check:
         raise typer.Exit(run_check(file, method))
@@ -145,7 +167,7 @@ SERVED = example(
 def serve(
     file: ProblemPath,
     http: Annotated[
-        str, typer.Option("--http", metavar="[HOST:]PORT", help="Where; this machine alone by default.")
+        str, typer.Option("--http", metavar="[HOST:]PORT", help="Address of the server; by default this machine only.")
     ] = "8200",
     method: Method = "auto",
     wait: Wait = "50 ms",
@@ -169,9 +191,9 @@ def serve(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Fix events that come by HTTP: /fix, /track, /ws, /health, /metrics, a map at /, fixes as GeoJSON and aircraft.
+    """Fix events from HTTP requests: /fix, /track, /ws, /health, /metrics, a map at /, fixes as GeoJSON and aircraft.
 
-    Nothing is read from standard input, and nothing written to standard output.
+    The command does not use standard input and standard output.
     """
     settings = _settings(wait, late, "two", deadline, part, "ndjson") | {"state": state, "record": record}
     settings |= _tracking(model, filter_, noise, gap, track=track)
@@ -183,7 +205,7 @@ def serve(
 
 
 def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str, form: str) -> dict[str, Any]:
-    """Return what options say as arguments of `optloc.service.stream.Settings`."""
+    """Return the values of options as arguments of `optloc.service.stream.Settings`."""
     from optloc.service.answers import FORMATS
     from optloc.service.engine import PHASES
 
@@ -198,7 +220,7 @@ def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str
 
 
 def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, track: bool) -> dict[str, Any]:
-    """Return how tracks are made, as arguments of `optloc.service.stream.Settings`."""
+    """Return the tracking options as arguments of `optloc.service.stream.Settings`."""
     if (model, name, noise, gap) == ("cv", "iekf", None, None):
         return {"track": track}
     from optloc.cli import TrackOptions, dynamics_of, rules
@@ -211,26 +233,13 @@ def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, 
 
 @dataclass(frozen=True, slots=True)
 class ServiceOptions:
-    """What the options of the command say.
+    """Options of the commands `live` and `serve`.
 
-    Parameters
-    ----------
-    settings : Settings
-        How the stream answers; whether it sheds proofs under load is seen from its source.
-    method : str
-        How events are solved.
-    recording : Path, optional
-        What is read instead of standard input.
-    speed : float
-        How many times as fast as it was recorded.
-    shed : bool, optional
-        Whether proofs are skipped under load; by default where rows come by themselves.
-    quiet : bool
-        Whether health is left unsaid.
-    http, mqtt, zmq, adapter : str, optional
-        As the options.
-    stdin, stdout : bool
-        Whether lines come from standard input where there is no recording, and answers go to standard output.
+    settings: arguments of the stream settings; the source decides on shedding. method: method of the fixes. recording:
+    file to read instead of standard input. speed: replay speed relative to the recording. shed: whether proofs are
+    skipped under load; None means yes, unless the source can wait. quiet: whether health is not printed. http, mqtt,
+    zmq, adapter: as the options. stdin: whether lines come from standard input without a recording. stdout: whether
+    answers go to standard output.
     """
 
     settings: dict[str, Any]
@@ -248,18 +257,18 @@ class ServiceOptions:
 
 
 def run_live(file: Path, asked: ServiceOptions) -> int:
-    """Run a stream until its source ends or a signal comes, and return the exit code."""
+    """Run a stream until its source ends or a signal arrives, and return the exit code."""
     from optloc.service.recording import read_recording
     from optloc.service.site import read_site
     from optloc.service.sources import adapter_of
     from optloc.service.stream import Settings, Stream
 
     if not asked.speed > 0.0:
-        raise InvalidProblem(f"the speed is {asked.speed:g}", "--speed", "give a positive number")
+        raise InvalidProblem(f"the speed is {asked.speed:g}, not positive", "--speed", "give a positive number")
     site = read_site(file, asked.method)
     adapter = None if asked.adapter is None else adapter_of(asked.adapter, site.stations)
     recording = None if asked.recording is None else read_recording(asked.recording)
-    # what stands in a file has waited already: nothing is lost by waiting once more
+    # lines of a file can wait, so no proof needs to be skipped
     waits = recording is not None or (asked.stdin and _is_file(sys.stdin))
     shed = not waits if asked.shed is None else asked.shed
     given = asked.settings | ({"deadline": inf} if not shed and asked.settings.get("deadline") is None else {})
@@ -269,10 +278,10 @@ def run_live(file: Path, asked: ServiceOptions) -> int:
     write = _write(sys.stdout.buffer) if asked.stdout else _silent
     with _threads(), ExitStack() as stops:
         stream = Stream(site, settings, write, say, again=file, replayed=recording is not None)
-        stops.callback(stream.close)  # where a source cannot be opened
+        stops.callback(stream.close)  # also if a source cannot be opened
         if settings.track and stream.untracked:
-            raise InvalidProblem(stream.untracked, "--track", "leave it out")
-        interrupted = stops.enter_context(_obeying(stream))  # before anything is read
+            raise InvalidProblem(stream.untracked, "--track", "remove this option")
+        interrupted = stops.enter_context(_signal_handlers(stream))  # before the first line is read
         places = _open(asked, stream, adapter, stops)
         say(f"ready: {site.title!r}, {len(site.rows)} rows of {len(site.stations)} stations{places}")
         _read(asked, stream, adapter, recording)
@@ -282,7 +291,7 @@ def run_live(file: Path, asked: ServiceOptions) -> int:
 
 
 def _open(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, stops: ExitStack) -> str:
-    """Open the sources that are none of files, and return what is said of them."""
+    """Open the HTTP, MQTT and ZeroMQ sources, and return a text on them for the ready message."""
     from optloc.service import serve as requests
     from optloc.service.sources import mqtt, zeromq
 
@@ -290,7 +299,7 @@ def _open(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, stops:
     if asked.http is not None:
         host, _, port = asked.http.rpartition(":")
         if not port.isdecimal():
-            raise InvalidProblem(f"{asked.http!r} is no port", "--http", "write 8200, or 0.0.0.0:8200")
+            raise InvalidProblem(f"{asked.http!r} is not a port", "--http", "write 8200, or 0.0.0.0:8200")
         host = host.strip("[]") or requests.HOST
         number, stop = requests.serve(stream, host, int(port))
         stops.callback(stop)
@@ -302,7 +311,7 @@ def _open(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, stops:
 
 
 def _read(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None) -> None:
-    """Read a recording or standard input in a thread of its own, if that is wanted."""
+    """Read a recording or standard input in a separate thread, if requested."""
     from optloc.service.recording import replay
     from optloc.service.stream import read_lines
 
@@ -315,7 +324,7 @@ def _read(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, record
 
 
 def run_check(file: Path, method: str) -> int:
-    """Say what a stream of a site takes and answers."""
+    """Print the input lines that a stream of a site accepts."""
     from optloc.service.site import read_site
 
     site = read_site(file, method)
@@ -325,7 +334,7 @@ def run_check(file: Path, method: str) -> int:
 
 
 def told(site: Site) -> Iterator[str]:
-    """Yield what a stream of a site takes, with a line of each sort that would be answered."""
+    """Yield a description of the input of a stream, with an example line of each form."""
     yield f"{site.title}: {len(site.rows)} rows of {len(site.stations)} stations, solved by {site.method}"
     yield "whole events: " + json.dumps({"event": "1", "z": [0.0] * len(site.rows)})
     row = site.rows[0]
@@ -345,8 +354,8 @@ def told(site: Site) -> Iterator[str]:
 
 
 def wait(stream: Stream, interrupted: Event) -> int:
-    """Return the exit code of a stream when it has ended."""
-    # with a timeout: on Windows a wait without one hears no signals
+    """Wait for the end of a stream and return its exit code."""
+    # on Windows, a wait without a timeout blocks signals
     while not stream.ended.wait(1.0):
         pass
     if stream.error is not None:
@@ -355,14 +364,14 @@ def wait(stream: Stream, interrupted: Event) -> int:
 
 
 @contextmanager
-def _obeying(stream: Stream) -> Iterator[Event]:
-    """Let signals end a stream, or have it read its site anew; what is yielded is set by Ctrl-C."""
+def _signal_handlers(stream: Stream) -> Iterator[Event]:
+    """Let signals end a stream or reload its site; Ctrl-C sets the event that is yielded."""
     interrupted = Event()
 
     def stop(number: int, _: Any) -> None:
         if number == signal.SIGINT:
             interrupted.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # a second Ctrl-C does not wait
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a second Ctrl-C interrupts at once
         stream.close()
 
     with _signals({"SIGTERM": stop, "SIGINT": stop, "SIGHUP": lambda *_: stream.reload()}):
@@ -371,7 +380,7 @@ def _obeying(stream: Stream) -> Iterator[Event]:
 
 @contextmanager
 def _signals(wanted: dict[str, Callable[[int, Any], None]]) -> Iterator[None]:
-    """Handle signals, those that the system has, as long as the block lasts."""
+    """Handle the available signals within the block."""
     if current_thread() is not main_thread():
         yield
         return
@@ -383,14 +392,14 @@ def _signals(wanted: dict[str, Callable[[int, Any], None]]) -> Iterator[None]:
             signal.signal(getattr(signal, name), how)
 
 
-# One processor does: batches of a stream are small. And who has no machine code yet is answered by plain Python while a
-# process in the background makes it, where that may be.
+# One processor suffices: batches of a stream are small. Without machine code, plain Python answers while a background
+# process compiles, if permitted.
 _ENVIRONMENT = {"OPTLOC_THREADS": "1", "OPTLOC_COMPILE": "child"}
 
 
 @contextmanager
 def _threads() -> Iterator[None]:
-    """Let threads give way quickly, and the environment be that of a stream where it says nothing else."""
+    """Set a short thread switch interval, and the environment of a stream unless variables are already set."""
     old, own = sys.getswitchinterval(), {name: _ENVIRONMENT[name] for name in _ENVIRONMENT.keys() - os.environ.keys()}
     sys.setswitchinterval(_SWITCH)
     os.environ.update(own)
@@ -403,7 +412,7 @@ def _threads() -> Iterator[None]:
 
 
 def _begin(source: Callable[[], None], stream: Stream) -> None:
-    """Read a source in a thread of its own, and let the stream end behind it."""
+    """Read a source in a separate thread, and close the stream at its end."""
 
     def run() -> None:
         try:
@@ -423,9 +432,9 @@ def _write(file: Any) -> Callable[[bytes], None]:
 
 
 def _reader(file: Any) -> tuple[Callable[[int], bytes], Callable[[], bool]]:
-    """Return what reads as soon as there is something, without a lock that the end of the process would wait for.
+    """Return a function that reads available bytes, and a function that returns whether bytes are available.
 
-    And what says whether there is something.
+    The read takes no lock, since the end of the process would wait for the lock.
     """
     try:
         number = file.fileno()
@@ -436,7 +445,7 @@ def _reader(file: Any) -> tuple[Callable[[int], bytes], Callable[[], bool]]:
         try:
             return bool(select.select([number], [], [], 0.0)[0])
         except (OSError, ValueError):
-            return False  # Windows says so of sockets only
+            return False  # on Windows, select works for sockets only
 
     return lambda count: os.read(number, count), pending
 
@@ -454,14 +463,14 @@ def _is_file(file: Any) -> bool:
     try:
         return stat.S_ISREG(os.fstat(file.fileno()).st_mode)
     except (OSError, AttributeError, ValueError):
-        return True  # what has no number, as in tests, is in memory
+        return True  # a stream without a file number is in memory, as in tests
 
 
 def part_of(text: str) -> tuple[int, int]:
-    """Return which of how many processes this is, from "2/4"; raise InvalidProblem where that is not said."""
+    """Return the part (from 0) and the number of processes of a text such as "2/4"; raise InvalidProblem for others."""
     number, _, count = text.partition("/")
     if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
-        raise InvalidProblem(f"{text!r} is no part", "--partition", "write 1/4 for the first of four processes")
+        raise InvalidProblem(f"{text!r} is not a part", "--partition", "write 1/4 for the first of four processes")
     return int(number) - 1, int(count)
 
 
@@ -476,7 +485,7 @@ def seconds_of(text: str, where: str) -> float:
 
 
 def one_of(word: str, known: tuple[str, ...], where: str) -> str:
-    """Return a word that is known; raise InvalidProblem naming the option."""
+    """Return a word if it is in `known`; raise InvalidProblem with the option otherwise."""
     if word not in known:
         raise InvalidProblem(f"{word!r} is unknown", where, nearest(word, known))
     return word

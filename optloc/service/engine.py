@@ -1,4 +1,7 @@
-"""Fixes at once and proofs under a deadline: micro-batches of events, solved by problems that are prepared."""
+"""Engine of a stream: fixes at once, and proofs under a deadline, in small batches of events.
+
+Each set of rows has a prepared problem. The calling thread computes fixes; a second thread computes proofs.
+"""
 
 from __future__ import annotations
 
@@ -22,20 +25,20 @@ from optloc.service.tracks import Following, Scan, Tracks
 LOG = logging.getLogger("optloc.service")
 
 BATCH = 64
-"""Events that are solved at once, at most: alone while few come, all that wait under load."""
+"""Largest number of events that are solved together: single events at low rates, all waiting events under load."""
 
 PENDING = 256
-"""Proofs that may wait; what comes beyond is answered without one, or waits, as the stream wants it."""
+"""Largest number of waiting proofs; further events are answered without a proof, or wait, by the settings."""
 
 PHASES = ("two", "one", "fix")
-"""Answers of an event: a fix at once and its proof later, both in one when the proof is there, or no proof at all."""
+"""Answers of an event: a fix at once and its proof later, both in one answer after the proof, or no proof."""
 
 Emit = Callable[[Event, Record, bool], None]
-"""Takes an event, what is answered, and whether that is its last answer."""
+"""Receives an event, its answer, and whether it is the last answer."""
 
 
 class EventGroup(NamedTuple):
-    """Events of a batch that have the same rows: one prepared problem, and their measurements (n, m)."""
+    """Events of a batch with the same rows: their prepared problem, and their measurements (n, m)."""
 
     ready: Ready
     events: list[Event]
@@ -44,22 +47,10 @@ class EventGroup(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Pending:
-    """A proof that is still to be made.
+    """A proof that is not finished.
 
-    Parameters
-    ----------
-    event : Event
-        Whose.
-    ready : Ready
-        Its problem.
-    z : array (m,)
-        Its measurements.
-    before : dict or None
-        What the first phase has answered.
-    until : float
-        When it is no longer waited for, by the clock of the stream.
-    done : bool
-        Whether the event has its last answer.
+    event: its event. ready: prepared problem. z: measurements (m,). before: answer of the first phase, or None. until:
+    deadline by the clock of the stream, s. done: whether the event has its last answer.
     """
 
     event: Event
@@ -71,26 +62,26 @@ class Pending:
 
 
 class Engine:
-    """Solves events: the first phase in the thread that calls, the second in one of its own.
+    """Solver of events: the first phase runs in the calling thread, the second phase in a separate thread.
 
     Parameters
     ----------
     site : Site
-        Whose events.
+        Site of the events.
     metrics : Metrics
-        Where is counted.
+        Counters.
     emit : callable
-        Takes the answers, from both threads.
+        Receives the answers, from both threads.
     clock : callable
-        Seconds that never go back.
+        Monotonic clock, s.
     phases : "two", "one" or "fix"
-        As `PHASES`.
+        As in `PHASES`.
     deadline : float
-        Seconds after its event closed at which a proof is given up; infinity for none.
+        Seconds from the closing of an event to the end of its proof; infinity for no deadline.
     shed : bool
-        Whether events are answered without a proof where too many wait; the stream waits for them otherwise.
+        Whether events are answered without a proof if too many wait; otherwise the stream waits.
     following : Following, optional
-        How tracks are made of the events that are to be answered by them.
+        Settings of tracks.
     """
 
     def __init__(
@@ -108,7 +99,7 @@ class Engine:
         self.site, self._metrics, self._emit, self._clock = site, metrics, emit, clock
         self._phases, self._deadline, self._shed = phases, deadline, shed
         self._waiting: deque[Pending] = deque()
-        # those that wait and those that are being proven, in the order of their deadlines
+        # waiting and running proofs, in the order of their deadlines
         self._open: deque[Pending] = deque()
         self._changed, self._ends = Condition(), False
         self._thread = Thread(target=self._prove, name="optloc proofs", daemon=True)
@@ -121,12 +112,12 @@ class Engine:
 
     @property
     def next_due(self) -> float:
-        """Return when the next proof is to be given up; infinity where none is open."""
+        """Return the earliest deadline of a proof; infinity without open proofs."""
         with self._changed:
             return self._open[0].until if self._open else inf
 
     def settle(self, events: Iterable[Event]) -> None:
-        """Answer events that have closed, and let their proofs be made; or hand them to their tracks."""
+        """Answer closed events and queue their proofs, or pass the events to their tracks."""
         closed = []
         for event in events:
             if event.refused:
@@ -136,7 +127,7 @@ class Engine:
         followed = [event for event in closed if event.track]
         if followed:
             scans = [Scan(e, group.ready.fast.problem, z) for group in self._groups(followed) for e, z in _pairs(group)]
-            # groups are by rows, tracks go by time
+            # groups are by rows, but tracks need the order of time
             place = {id(event): i for i, event in enumerate(followed)}
             self.tracks.take(sorted(scans, key=lambda scan: place[id(scan.event)]))
             closed = [event for event in closed if not event.track]
@@ -170,7 +161,7 @@ class Engine:
         self._give_up(late, "deadline")
 
     def stop(self) -> None:
-        """Finish the tracks that wait, and the proofs within their deadlines, and end."""
+        """Finish the waiting tracks and the proofs within their deadlines, and end."""
         self.tracks.stop()
         with self._changed:
             self._ends = True
@@ -180,12 +171,12 @@ class Engine:
             self.expire()
             with self._changed:
                 if all(item.done for item in self._open):
-                    return  # what is still being proven is given up already
+                    return  # running proofs are already given up
 
     # Batches.
 
     def _groups(self, events: Iterable[Event]) -> list[EventGroup]:
-        """Return events by their rows; those whose rows make no problem are answered at once."""
+        """Return events grouped by rows; answer events whose rows give no problem at once."""
         found: dict[tuple[tuple[int, ...], tuple[SiteRow, ...]], list[Event]] = {}
         everything = tuple(range(len(self.site.rows)))
         names: dict[tuple[Any, ...], tuple[SiteRow, ...]] = {everything: self.site.rows}
@@ -217,7 +208,7 @@ class Engine:
             for event in events:
                 self._answer(event, unsolved(event, status=Status.TOO_FEW_ROWS.label), last=True)
             return []
-        # differences of integers: a float of seconds since 1970 would resolve no more than 70 m
+        # differences of integers: a float of seconds since 1970 only resolves 70 m
         arrivals = np.array([_since_first(event, heard) for event in events], dtype=float).reshape(len(events), -1)
         values = np.array([list(event.rows.values()) for event in events], dtype=float).reshape(len(events), -1)
         return [EventGroup(ready, events, ready.si(arrivals, values))]
@@ -226,12 +217,12 @@ class Engine:
         """Return the answers of the first phase."""
         try:
             return fix_records(group.ready.fast(group.z), group.events, phase)
-        except Exception as error:  # noqa: BLE001  # a stream goes on, whatever one event brings to light
+        except Exception as error:  # noqa: BLE001  # an error of one event must not end the stream
             return self._failed(group, error)
 
     def _failed(self, group: EventGroup, error: Exception) -> list[Record]:
         if not isinstance(error, InvalidProblem):
-            LOG.error("events from %s on failed", group.events[0].name, exc_info=error)
+            LOG.error("events failed, from %s on", group.events[0].name, exc_info=error)
         why = str(error) if isinstance(error, InvalidProblem) else f"{type(error).__name__}: {error}"
         self._metrics.add("unsolvable", len(group.events))
         return [unsolved(event, error=why) for event in group.events]
@@ -248,7 +239,7 @@ class Engine:
     def _followed(self, event: Event, record: Record) -> None:
         self._emit(event, record, True)
 
-    # Proofs, in a thread of their own.
+    # Proofs, in a separate thread.
 
     def _offer(self, items: Sequence[Pending]) -> None:
         left: Sequence[Pending] = ()
@@ -283,7 +274,7 @@ class Engine:
                 self._conclude(group, {item.event.name: item for item in taken})
 
     def _conclude(self, group: EventGroup, items: dict[str, Pending]) -> None:
-        """Prove the fixes of some events, and answer those that are still waited for."""
+        """Prove the fixes of events, and answer the events that are still open."""
         whose = [items[event.name] for event in group.events]
         try:
             fix = group.ready.full(group.z)
@@ -304,7 +295,7 @@ class Engine:
 
 
 def _order(key: int | SiteRow) -> tuple[int, tuple[str, ...]]:
-    """Return the place of a row among those of an event: as in the template, what is not listed behind."""
+    """Return the sort key of a row: in the order of the template, then rows that are not in the template."""
     return (key, ()) if isinstance(key, int) else (1 << 30, key[2:5])
 
 
@@ -319,7 +310,7 @@ def _pairs(group: EventGroup) -> list[tuple[Event, Array]]:
 
 
 def _grouped(items: Sequence[Pending]) -> list[EventGroup]:
-    """Return proofs by their problems."""
+    """Return proofs grouped by prepared problem."""
     found: dict[int, list[Pending]] = {}
     for item in items:
         found.setdefault(id(item.ready), []).append(item)

@@ -1,4 +1,4 @@
-"""From lines to events: what a line may say, when an event closes, and what becomes of rows that come late or twice."""
+"""Lines and events of a stream: parsing of lines, closing of events, and rows that are late or repeated."""
 
 from __future__ import annotations
 
@@ -15,44 +15,44 @@ from optloc.problem import LARGEST, InvalidProblem, nearest, no_station
 from optloc.service.metrics import Metrics
 from optloc.service.site import Site, SiteRow, UnknownName
 
-# One line.
+# Parsing of a line.
 
 LINE = 1 << 16
-"""Bytes that a line may have: more than a thousand rows."""
+"""Largest size of a line, bytes: more than a thousand rows."""
 
 COMMANDS = ("flush", "health")
-# Characters of an id or a name, and rows of an event: far more than any network has.
+# Largest number of characters of an id or a name, and of rows of an event: far more than any network has.
 _NAME, _ROWS = 256, 4096
 _KEYS = {
     *("command", "event", "z", "rows", "arrivals", "station", "kind", "a", "b", "sigma", "more", "target", "received"),
     *("time", "time_ns", "time_ps"),
 }
 _ROW_KEYS = {"kind", "a", "b", "z", "sigma"}
-# Digits behind the point of a picosecond, by the key that a time stands under.
+# Decimals that give picoseconds, by the key of a time.
 _DIGITS = {"time": 12, "time_ns": 3, "time_ps": 0}
 _DECIMAL = re.compile(r"([+-]?)(\d{1,25})(?:\.(\d{1,40}))?")
-# Picoseconds of thirty thousand years: no clock of any epoch shows more.
+# Picoseconds of 30 000 years: no clock has a later time.
 _LATEST = 10**24
 
 Key = int | SiteRow
-"""A row of an event: its number in the template, or what the template does not list."""
+"""A row of an event: its number in the template, or a row that is not in the template."""
 
 
 def _refuse(word: str) -> Any:
-    raise ValueError(f"{word} is no number")
+    raise ValueError(f"{word} is not a number")
 
 
-# What JSON has no word for is refused by the reader of numbers itself.
+# Reject NaN and infinity, which are not JSON, during parsing.
 _JSON = json.JSONDecoder(parse_constant=_refuse)
 
 
 class Message(NamedTuple):
-    """What a line says.
+    """The content of a line.
 
     Parameters
     ----------
     event : str
-        Whose rows these are; empty for a command.
+        Event of the rows; empty for a command.
     rows : dict of Key to float
         Values in the units of the site.
     times : dict of int to int
@@ -60,13 +60,13 @@ class Message(NamedTuple):
     whole : bool
         Whether the event ends with this line.
     sigmas : dict of Key to float, optional
-        Standard deviations that the rows bring along.
+        Standard deviations of rows.
     target : str
-        Name of the target, handed on.
+        Name of the target, for the answer.
     command : str
-        What is to be done instead.
+        Command instead of rows.
     when : int, optional
-        Time of the event, picoseconds; its first arrival counts where it says none.
+        Time of the event, picoseconds; None: use the first arrival.
     """
 
     event: str
@@ -80,37 +80,30 @@ class Message(NamedTuple):
 
 
 def parse(line: bytes, site: Site) -> Message:
-    """Return what a line says.
-
-    Parameters
-    ----------
-    line : bytes
-        One JSON object.
-    site : Site
-        What rows and stations it may name.
+    """Return the content of a line with one JSON object.
 
     Raises
     ------
     InvalidProblem
-        Where it says nothing of the kind; the sentence names the key. `UnknownName` says whose event it is.
+        For an invalid line; the message names the key. `UnknownName` has the event of the line.
     """
     if len(line) > LINE:
-        raise InvalidProblem(f"the line has {len(line)} bytes, {LINE} at most", None, "send fewer rows a line")
+        raise InvalidProblem(f"the line has {len(line)} bytes, more than {LINE}", None, "send fewer rows in a line")
     try:
         found = _JSON.decode(line.decode())
     except RecursionError:
-        raise InvalidProblem("the line is nested too deep", None, "send one flat object a line") from None
+        raise InvalidProblem("the line is nested too deeply", None, "send one flat object in each line") from None
     except ValueError as error:
         what = "it is not UTF-8" if isinstance(error, UnicodeDecodeError) else str(error).partition(":")[0].lower()
-        raise InvalidProblem(f"this is not JSON: {what}", None, "send one object a line") from None
+        raise InvalidProblem(f"this is not JSON: {what}", None, "send one object in each line") from None
     if type(found) is not dict:
-        raise InvalidProblem("this is no JSON object", None, 'send {"event": "1", "z": [...]}')
+        raise InvalidProblem("this is not a JSON object", None, 'send {"event": "1", "z": [...]}')
     z = found.get("z")
     if len(found) == 2 and type(z) is list:
-        return Message(_event(found), _values(z, site), {}, whole=True)  # what comes ten thousand times a second
+        return Message(_event(found), _values(z, site), {}, whole=True)  # the most frequent form of values
     station, time = found.get("station"), found.get("time_ns")
     if len(found) == 3 and type(time) is int and abs(time) < _LATEST // 1000 and type(station) is str:
-        number = site.number.get(station, -1)  # what comes even more often
+        number = site.number.get(station, -1)  # the most frequent form of arrivals
         if number >= 0 and site.arriving:
             return Message(_event(found), {}, {number: 1000 * time}, whole=False)
     return _general(found, site)
@@ -124,9 +117,7 @@ def _general(found: dict[str, Any], site: Site) -> Message:
     if "command" in found:
         command = found["command"]
         if command not in COMMANDS:
-            raise InvalidProblem(
-                f"unknown command {str(command)[:40]!r}", "command", f"known are {', '.join(COMMANDS)}"
-            )
+            raise InvalidProblem(f"unknown command {str(command)[:40]!r}", "command", f"use {' or '.join(COMMANDS)}")
         return Message("", {}, {}, whole=False, command=command)
     event = _event(found)
     target = _text(found["target"], "target") if "target" in found else ""
@@ -137,7 +128,7 @@ def _general(found: dict[str, Any], site: Site) -> Message:
         raise InvalidProblem(what, None, "give one of z, rows, arrivals, station, kind")
     more = found.get("more", ways[0] in ("station", "kind"))
     if type(more) is not bool:
-        raise InvalidProblem("it is neither true nor false", "more", "say true where more rows are to come")
+        raise InvalidProblem("the value is neither true nor false", "more", "send true if more rows will come")
     try:
         rows, sigmas, times = _named(found, ways, site)
     except UnknownName as error:
@@ -149,7 +140,7 @@ def _general(found: dict[str, Any], site: Site) -> Message:
 def _named(
     found: dict[str, Any], ways: list[str], site: Site
 ) -> tuple[dict[Key, float], dict[Key, float], dict[int, int]]:
-    """Return the values, the standard deviations and the arrivals of a line, by the names that it gives."""
+    """Return the values, the standard deviations and the arrivals of a line, by row or station."""
     rows, sigmas, times = dict[Key, float](), dict[Key, float](), dict[int, int]()
     if "rows" in ways:
         for entry in _list(found["rows"], "rows"):
@@ -168,26 +159,26 @@ def _named(
 
 def _event(found: Mapping[str, Any]) -> str:
     if "event" not in found:
-        raise InvalidProblem("the line has no event", None, 'give every line an id: "event": "1"')
+        raise InvalidProblem("the line has no event", None, 'give each line an id: "event": "1"')
     name = found["event"]
     return str(name) if type(name) is int and abs(name) < _LATEST else _text(name, "event")
 
 
 def _text(given: Any, key: str) -> str:
     if type(given) is not str or not given or len(given) > _NAME or has_controls(given):
-        raise InvalidProblem(f"{str(given)[:40]!r} is no name", key, f"give 1 to {_NAME} printable characters")
+        raise InvalidProblem(f"{str(given)[:40]!r} is not a name", key, f"give 1 to {_NAME} printable characters")
     return given
 
 
 def _when(found: Mapping[str, Any], ways: list[str]) -> int | None:
-    """Return the time of an event in picoseconds, None where the line says none or it is that of its arrival."""
+    """Return the time of an event in picoseconds; None if the line has no time, or only the time of its arrival."""
     given = [key for key in _DIGITS if key in found]
     if ways == ["station"] or not given:
         return None
     if len(given) > 1:
         raise InvalidProblem(f"the line has {' and '.join(given)}", given[0], "give one of them")
     value = found[given[0]]
-    if type(value) is float:  # of a track a quarter of a microsecond is enough, of an arrival it is not
+    if type(value) is float:  # for a track, a float is precise enough (0.25 us); for an arrival it is not
         value = round(_number(value, given[0]) * 10.0 ** _DIGITS[given[0]])
         if abs(value) >= _LATEST:
             raise _beyond_clocks(found[given[0]], given[0])
@@ -197,13 +188,15 @@ def _when(found: Mapping[str, Any], ways: list[str]) -> int | None:
 
 def _list(given: Any, key: str) -> list[Any]:
     if type(given) is not list or not 0 < len(given) <= _ROWS:
-        raise InvalidProblem(f"it is no list of 1 to {_ROWS} entries", key, "give a list")
+        raise InvalidProblem(f"the value is not a list of 1 to {_ROWS} entries", key, "give a list")
     return given
 
 
 def _object(given: Any, keys: set[str], where: str) -> dict[str, Any]:
     if type(given) is not dict:
-        raise InvalidProblem("an entry is no object", where, f"give objects of {', '.join(sorted(keys))}")
+        raise InvalidProblem(
+            "an entry is not an object", where, f"give objects with the keys {', '.join(sorted(keys))}"
+        )
     unknown = given.keys() - keys
     if unknown:
         name = min(unknown)
@@ -212,18 +205,18 @@ def _object(given: Any, keys: set[str], where: str) -> dict[str, Any]:
 
 
 def _number(given: Any, where: str) -> float:
-    # true is a whole number in Python, and one of 400 digits is no float
+    # in Python, true is an integer, and an integer of 400 digits is not a float
     if type(given) is float or (type(given) is int and abs(given) <= LARGEST):
         value = float(given)
         if abs(value) <= LARGEST:
             return value
-    raise InvalidProblem(f"{str(given)[:40]} is no number up to {LARGEST:g}", where, "give a number")
+    raise InvalidProblem(f"{str(given)[:40]} is not a number up to {LARGEST:g}", where, "give a number")
 
 
 def _values(given: list[Any], site: Site) -> dict[Key, float]:
     if len(given) != len(site.rows):
-        what = f"there are {len(given)} values, and the site has {len(site.rows)} rows"
-        raise InvalidProblem(what, "z", "give them in the order of the file, null for what is missing")
+        what = f"there are {len(given)} values, but the site has {len(site.rows)} rows"
+        raise InvalidProblem(what, "z", "give values in the order of the file, null for missing values")
     return {i: _number(value, "z") for i, value in enumerate(given) if value is not None}
 
 
@@ -247,7 +240,7 @@ def _row(found: Mapping[str, Any], site: Site, rows: dict[Key, float], sigmas: d
 def _arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) -> None:
     station = found.get("station")
     if not site.arriving:
-        what = "the site has neither toa nor tdoa rows, so that it cannot take arrivals"
+        what = "the site has neither toa nor tdoa rows, so it cannot use arrivals"
         raise InvalidProblem(what, "station", "send values: kind, a, b, z")
     if type(station) is not str or station not in site.number:
         raise no_station(str(station)[:40], "station", site.number, UnknownName)
@@ -256,13 +249,13 @@ def _arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) -> Non
         raise InvalidProblem("an arrival needs one time", "station", "give time_ns, time_ps or time")
     value, number = picoseconds(found[given[0]], given[0]), site.number[station]
     if times.setdefault(number, value) != value:
-        raise InvalidProblem(f"station {station!r} has two arrivals", "arrivals", "send one")
+        raise InvalidProblem(f"station {station!r} has two arrivals", "arrivals", "send one arrival")
 
 
 def rows_and_arrivals(
     rows: Sequence[Mapping[str, Any]], arrivals: Sequence[Mapping[str, Any]], site: Site
 ) -> tuple[dict[Key, float], dict[Key, float], dict[int, int]]:
-    """Return values, standard deviations and arrivals of the entries that a line may have; errors as of `parse`."""
+    """Return values, standard deviations and arrivals of the entries of a line; errors as in `parse`."""
     values, sigmas, times = dict[Key, float](), dict[Key, float](), dict[int, int]()
     for entry in rows:
         _row(entry, site, values, sigmas)
@@ -272,24 +265,15 @@ def rows_and_arrivals(
 
 
 def name_under(key: str, given: Any) -> str:
-    """Return the name that is given under a key; raise InvalidProblem where it is none."""
+    """Return the name under a key; raise InvalidProblem for an invalid name."""
     return _text(given, key)
 
 
 def picoseconds(given: Any, key: str) -> int:
-    """Return a time as picoseconds: a whole number, or a decimal number in quotes, of the unit that its key says.
+    """Return a time as picoseconds, from an integer, or from a decimal number in quotes.
 
-    Parameters
-    ----------
-    given : int or str
-        The time; digits below a picosecond (0.3 mm) are cut.
-    key : "time", "time_ns" or "time_ps"
-        Seconds, nanoseconds or picoseconds.
-
-    Raises
-    ------
-    InvalidProblem
-        For all else; a float of seconds since 1970 resolves 70 m.
+    `given` is the time in the unit of `key`: "time" (seconds), "time_ns" or "time_ps". Digits below a picosecond (0.3
+    mm) are cut. Raise InvalidProblem for other values, since a float of seconds since 1970 only resolves 70 m.
     """
     digits = _DIGITS[key]
     if type(given) is int and abs(given) < _LATEST:
@@ -300,63 +284,63 @@ def picoseconds(given: Any, key: str) -> int:
         value = -value if sign == "-" else value
     else:
         advice = "send a whole number as time_ns or time_ps, or a decimal number in quotes"
-        raise InvalidProblem(f"{str(given)[:40]} is no exact time", key, advice)
+        raise InvalidProblem(f"{str(given)[:40]} is not an exact time", key, advice)
     if abs(value) >= _LATEST:
         raise _beyond_clocks(given, key)
     return value
 
 
 def _beyond_clocks(given: Any, key: str) -> InvalidProblem:
-    return InvalidProblem(f"the time {str(given)[:40]} is beyond all clocks", key, "check its unit")
+    return InvalidProblem(f"the time {str(given)[:40]} is out of range", key, "check its unit")
 
 
 # Events: open until they are whole, then answered, then remembered.
 
 MOST_OPEN = 4096
-"""Events that may be open at a time; the oldest closes before another opens."""
+"""Largest number of open events; beyond, the oldest event closes early."""
 
 REMEMBERED = 65_536
-"""Closed events whose rows are still known: at a thousand events a second, a minute."""
+"""Number of closed events whose rows are stored: a minute at a thousand events a second."""
 
 
 class Reply(Protocol):
-    """Who gets the answers of an event besides the output."""
+    """Receiver of the answers of an event, in addition to the output."""
 
     def expect(self) -> None:
-        """Note that there will be answers."""
+        """Register one more event to be answered."""
 
     def answer(self, record: dict[str, Any], last: bool) -> None:
-        """Take one."""
+        """Take an answer; `last` marks the last answer of an event."""
 
 
 @dataclass(slots=True)
 class Event:
-    """Rows that belong together.
+    """Rows that form one event.
 
     Parameters
     ----------
     name : str
-        Its id.
+        Id of the event.
     rows, times, sigmas, target
-        As of `Message`.
+        As in `Message`.
     first : float
-        When its first row was read, by the time that events wait.
+        Time of its first row, by the time for which events wait, s.
     stamp : float
-        When it could be answered, by the clock: its last row was read, or its time was over.
+        Time at which it could be answered, by the clock, s: its last row was read, or its wait was over.
     closed : str
-        Why it closed: "whole", "wait", "flush" or "early".
+        Closing reason: "whole", "wait", "flush" or "early".
     revision : int
-        1, and one more for each answer that late rows have changed.
+        1, and one more for each answer with late rows.
     conflict : bool
-        Whether a row came with two values.
+        Whether a row had two values.
     when : int, optional
-        As of `Message`.
+        As in `Message`.
     track : bool
-        Whether it is answered by the state of its track, in the place of a fix.
+        Whether the answer is the state of a track instead of a fix.
     reply : Reply, optional
-        Who waits for its answers.
+        Receiver of the answers.
     refused : str
-        Why it is not solved: a line of it names a station or a kind that the site does not have.
+        Error if a line has a station or a kind that the site does not have; the event is then not solved.
     """
 
     name: str
@@ -382,19 +366,19 @@ class Events:
     Parameters
     ----------
     site : Site
-        What an event consists of.
+        Rows and stations of an event.
     metrics : Metrics
-        Where is counted.
+        Counters.
     note : callable
-        Gets a record of every row that came late or with another value after its event was answered.
+        Receives a record of each row that is late, or changes its value, after its event was answered.
     wait : float
-        Seconds after its first row at which an event closes.
+        Seconds from the first row of an event to its closing.
     revise : bool
-        Whether late rows make a new answer.
+        Whether late rows give a new answer.
     part : (int, int)
-        Which of how many processes this is: others answer events whose ids fall to them.
+        Number of this process and number of processes: each answers a share of the events.
     most : int
-        Events that may be open.
+        Largest number of open events.
     """
 
     site: Site
@@ -405,27 +389,20 @@ class Events:
     part: tuple[int, int] = (0, 1)
     most: int = MOST_OPEN
     open: dict[str, Event] = field(default_factory=dict)
-    # None: known from a checkpoint by its id alone
+    # None: an id from a checkpoint, without rows
     closed: dict[str, Event | None] = field(default_factory=dict)
     ready: deque[Event] = field(default_factory=deque)
-    # names of the closed ones in their order: a dictionary whose oldest entries have gone is slow to find its first
+    # names of closed events in order: the first key of a dictionary is slow to find after many deletions
     _order: deque[str] = field(default_factory=deque)
 
     def take(
         self, message: Message, now: float, when: float, reply: Reply | None = None, *, track: bool = False
     ) -> None:
-        """Put what a line says to its event, which may close.
+        """Add the content of a line to its event, which may close.
 
-        Parameters
-        ----------
-        message : Message
-            What the line says.
-        now, when : float
-            When it was read, by the clock, and by the time that events wait.
-        reply : Reply, optional
-            Gets the answers if nobody else waits for them.
-        track : bool
-            Whether the event, if it is a new one, is answered by its track.
+        `now` and `when` are the time of reading by the clock, and by the time for which events wait, s. `reply`
+        receives the answers unless the event already has a receiver. With `track`, a new event is answered by its
+        track.
         """
         counts = self.metrics.counts
         size = len(message.rows) + len(message.times)
@@ -453,17 +430,11 @@ class Events:
             self._close(event, "whole", now)
 
     def refuse(self, error: UnknownName, now: float, when: float, *, track: bool = False) -> None:
-        """Refuse the event of a line that names an unknown station or kind, where other lines belong to it as well.
+        """Reject the event of a line with an unknown station or kind, if other lines also belong to the event.
 
-        The event is answered by the sentence of the error when it closes: without the rows of this line it would be
-        another event. A line that is a whole event is refused by itself, and may be sent again.
-
-        Parameters
-        ----------
-        error : UnknownName
-            What is wrong with the line.
-        now, when, track
-            As of `take`.
+        When the event closes, its answer is the error: without the rows of this line it would be a different event. If
+        the line is a whole event, only the line is rejected, and may be sent again. `now`, `when` and `track` are as in
+        `take`.
         """
         if self.part[1] > 1 and share_of(error.event, self.part[1]) != self.part[0]:
             return
@@ -485,7 +456,7 @@ class Events:
             self._close(self.open.pop(oldest), "early", now)
 
     def due(self, when: float, now: float) -> None:
-        """Close what has waited long enough; times as of `take`."""
+        """Close the events that have waited long enough; times as in `take`."""
         while self.open:
             event = next(iter(self.open.values()))
             if when < event.first + self.wait:
@@ -496,7 +467,7 @@ class Events:
 
     @property
     def next_due(self) -> float:
-        """Return when the next event closes by time; infinity where none is open."""
+        """Return the time at which the next event closes; infinity without open events."""
         return next(iter(self.open.values())).first + self.wait if self.open else float("inf")
 
     def flush(self, now: float) -> None:
@@ -506,12 +477,12 @@ class Events:
         self.open.clear()
 
     def closing(self) -> Iterator[Event]:
-        """Yield the events that have closed since, and forget them."""
+        """Yield the events that have closed since the last call."""
         while self.ready:
             yield self.ready.popleft()
 
     def _join(self, event: Event, message: Message) -> None:
-        """Put rows to an event; the first value of a row stays."""
+        """Add rows to an event; the first value of a row is kept."""
         counts = self.metrics.counts
         known: list[tuple[dict[Any, Any], dict[Any, Any]]] = [
             (event.rows, message.rows),
@@ -532,7 +503,7 @@ class Events:
         event.when = message.when if event.when is None else event.when
 
     def _is_whole(self, event: Event) -> bool:
-        """Return whether all rows and stations of the site are there."""
+        """Return whether all rows and stations of the site are present."""
         site = self.site
         if event.times:
             if len(event.times) < len(site.hearing):
@@ -552,14 +523,14 @@ class Events:
         self.ready.append(event)
 
     def remember(self, name: str, event: Event | None) -> None:
-        """Note that an event is answered, and forget the oldest one where there are too many."""
+        """Register an answered event, and forget the oldest event if there are too many."""
         self.closed[name] = event
         self._order.append(name)
         if len(self._order) > REMEMBERED:
             self.closed.pop(self._order.popleft(), None)
 
     def _after(self, message: Message, now: float) -> None:
-        """Tell what came after its event was answered."""
+        """Handle rows that arrive after the answer of their event: count them, send notes, or answer again."""
         event, counts = self.closed[message.event], self.metrics.counts
         if event is None:
             counts["repeated"] += len(message.rows) + len(message.times)
@@ -588,5 +559,5 @@ class Events:
 
 
 def share_of(event: str, count: int) -> int:
-    """Return which of `count` processes answers an event: the same in every process and on every machine."""
+    """Return the number of the process that answers an event; it is the same on all machines."""
     return crc32(event.encode("utf-8", "surrogatepass")) % count

@@ -1,4 +1,4 @@
-"""Commands of the service: `optloc live` and `optloc serve`."""
+"""Extension of the command line by the commands ``optloc live`` and ``optloc serve``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a stream counts, and how long its answers take: health as one record, and as text for Prometheus."""
+"""Counters and latencies of a stream: health as a JSON record, and as text for Prometheus."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ import numpy as np
 
 from optloc.problem import Array
 
-# Latencies that are kept, of each phase: percentiles of the last seconds under load, of the last minute at 64 a second.
+# Number of stored latencies per phase: the last seconds under load, the last minute at 64 answers a second.
 _LATENCIES = 4096
 
 PHASES = ("fix", "proof", "track")
-"""Answers whose latency is told."""
+"""Answers whose latency is measured."""
 
 COUNTS = {
     "lines": "lines read",
     "rows": "rows and arrivals read",
     "events": "events closed and answered",
     "malformed": "lines that could not be read",
-    "late": "rows that came after their event was answered",
-    "repeated": "rows that were there already, with the same value",
-    "conflicts": "rows that were there already, with another value",
-    "revisions": "answers given again with late rows",
-    "incomplete": "events closed by time with rows missing",
+    "late": "rows received after the answer of their event",
+    "repeated": "rows received again with the same value",
+    "conflicts": "rows received again with another value",
+    "revisions": "new answers with late rows",
+    "incomplete": "events closed by time with missing rows",
     "early": "events closed before their time because too many were open",
     "elsewhere": "rows of events that other processes answer",
-    "dropped": "messages of a broker that were dropped because the input was full",
-    "refused": "requests that were refused because the input was full",
-    "unsolvable": "events whose rows make no problem, or name what the site does not have",
-    "tracked": "events that were taken into a track",
-    "unordered": "events that came after a later one of their track, and were refused",
-    "forgotten": "tracks that were forgotten: silent for too long, too many, or failed",
+    "dropped": "messages of a broker dropped because the input queue was full",
+    "refused": "requests refused because the input queue was full",
+    "unsolvable": "events whose rows give no problem, or have names that the site does not have",
+    "tracked": "events used in a track",
+    "unordered": "events refused because a later event of their track came first",
+    "forgotten": "tracks removed: no events for too long, too many tracks, or failed",
 }
-"""What is counted, and what it means."""
+"""Names of the counts, and their meanings."""
 
 
 class Metrics:
-    """Counters of one stream; safe in threads."""
+    """Counters of one stream; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -54,12 +54,12 @@ class Metrics:
         self.gauges: dict[str, Callable[[], int]] = {}
 
     def add(self, name: str, count: int = 1) -> None:
-        """Count something."""
+        """Add to a count."""
         with self._lock:
             self.counts[name] += count
 
     def took(self, phase: str, seconds: Sequence[float]) -> None:
-        """Keep how long answers of a phase, one of `PHASES`, took from the last row of their events, seconds."""
+        """Store the latencies of answers of a phase, one of `PHASES`: seconds from the last row of their events."""
         taken = np.asarray(seconds, dtype=float)
         with self._lock:
             place = (self._answers[phase] + np.arange(len(taken))) % _LATENCIES
@@ -67,7 +67,7 @@ class Metrics:
             self._answers[phase] += len(taken)
 
     def concluded(self, status: str, proof: str | None) -> None:
-        """Count an event by its status, and by its proof where it has one."""
+        """Count an event by its status, and by its proof if it has one."""
         with self._lock:
             self.statuses[status] += 1
             if proof is not None:
@@ -79,26 +79,21 @@ class Metrics:
             self.tracks[status] += 1
 
     def hear(self, stations: Iterable[str], now: float) -> None:
-        """Note when stations were heard last, by the clock of the stream."""
+        """Store the time of the last row of stations, by the clock of the stream."""
         for name in stations:
             self.heard[name] = now
 
     def percentiles(self, phase: str) -> Array:
-        """Return the median and the 99th percentile of the latest latencies of a phase, seconds; NaN before any."""
+        """Return the median and the 99th percentile of the latest latencies of a phase, seconds; NaN without any."""
         with self._lock:
             count = min(self._answers[phase], _LATENCIES)
             values = self._latency[phase][:count].copy()
         return np.quantile(values, [0.5, 0.99]) if count else np.full(2, np.nan)
 
     def health(self, now: float, about: Mapping[str, Any]) -> dict[str, Any]:
-        """Return all of it as a record.
+        """Return all counts and latencies as a record.
 
-        Parameters
-        ----------
-        now : float
-            By the clock of the stream.
-        about : mapping
-            What stands in front.
+        `now` is the time of the clock of the stream, s. The entries of `about` come first.
         """
         with self._lock:
             out: dict[str, Any] = {
@@ -116,7 +111,7 @@ class Metrics:
         return out
 
     def text(self, now: float) -> str:
-        """Return all of it in the text format of Prometheus (version 0.0.4)."""
+        """Return all counts and latencies in the text format of Prometheus (version 0.0.4)."""
         found = self.health(now, {})
         lines = []
         for name, meaning in COUNTS.items():
@@ -130,10 +125,10 @@ class Metrics:
             label = "proof" if key == "proofs" else "status"
             lines += [f"# HELP optloc_{name} {meaning}", f"# TYPE optloc_{name} counter"]
             lines += [f'optloc_{name}{{{label}="{_label(word)}"}} {n}' for word, n in sorted(found[key].items())]
-        lines += ["# HELP optloc_queue_depth what waits", "# TYPE optloc_queue_depth gauge"]
+        lines += ["# HELP optloc_queue_depth waiting entries", "# TYPE optloc_queue_depth gauge"]
         lines += [f'optloc_queue_depth{{queue="{name}"}} {depth}' for name, depth in found["queues"].items()]
         lines += [
-            "# HELP optloc_latency_seconds from the last row to the answer",
+            "# HELP optloc_latency_seconds time from the last row to the answer",
             "# TYPE optloc_latency_seconds gauge",
         ]
         for phase in PHASES:
@@ -142,7 +137,7 @@ class Metrics:
             for word, value in zip(("0.5", "0.99"), self.percentiles(phase), strict=True):
                 lines.append(f'optloc_latency_seconds{{phase="{phase}",quantile="{word}"}} {value:.6g}')
         lines += [
-            "# HELP optloc_silence_seconds since the last row of a station",
+            "# HELP optloc_silence_seconds time since the last row of a station",
             "# TYPE optloc_silence_seconds gauge",
         ]
         lines += [
@@ -157,5 +152,5 @@ def _ms(seconds: float) -> float:
 
 
 def _label(text: str) -> str:
-    """Return text as the value of a label."""
+    """Return text as a label value, with escapes."""
     return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")

@@ -1,4 +1,4 @@
-"""Bounded queues between the threads of a stream: lines that wait to be read, answers that wait to be written."""
+"""Bounded queues between the threads of a stream: input lines and output lines."""
 
 from __future__ import annotations
 
@@ -11,18 +11,13 @@ from optloc.service.answers import Record, join
 from optloc.service.engine import BATCH
 
 WAITING = 4096
-"""Lines that may wait to be read, and answers that may wait to be written."""
+"""Largest number of waiting input lines, and of waiting output lines."""
 
 
 class Ticket:
-    """Whoever waits for the answers to some lines, such as a request.
+    """Collector of the answers to the lines of one client, such as a request.
 
-    Parameters
-    ----------
-    lines : int
-        How many lines it sends.
-    done : callable
-        Called once, from any thread, with the answers in the order in which they were complete.
+    `lines` is the number of lines. `done` is called once, from any thread, with the answers in the order of completion.
     """
 
     def __init__(self, lines: int, done: Callable[[list[Record]], None]) -> None:
@@ -30,12 +25,12 @@ class Ticket:
         self._open, self._records = 0, dict[int | str, Record]()
 
     def expect(self) -> None:
-        """Note that an event of these lines is to be answered."""
+        """Register one more event of these lines to be answered."""
         with self._lock:
             self._open += 1
 
     def handled(self, refused: Record | None = None) -> None:
-        """Note that a line was read, and what is wrong with it if anything is."""
+        """Register a line as read; `refused` is its error, if any."""
         with self._lock:
             self._lines -= 1
             if refused is not None:
@@ -45,7 +40,7 @@ class Ticket:
             self._finish()
 
     def answer(self, record: Record, last: bool) -> None:
-        """Take an answer; both phases of an event become one record."""
+        """Take an answer; both phases of an event are joined to one record."""
         with self._lock:
             name = record["event"]
             self._records[name] = join(self._records.get(name), record)
@@ -59,24 +54,24 @@ class Ticket:
 
 
 class QueuedLine(NamedTuple):
-    """A line as it was read.
+    """An input line.
 
     Parameters
     ----------
     data : bytes
-        What it holds.
+        Content.
     number : int
-        Its place in its source.
+        Line number in its source.
     source : str
-        What complaints call that.
+        Name of the source for messages.
     stamp : float
-        When it was read, by the clock of the stream.
+        Time of reading, by the clock of the stream, s.
     when : float
-        The same by the time that events wait, see `optloc.service.stream.read_lines`.
+        Time of reading, by the time for which events wait, s; see `optloc.service.stream.read_lines`.
     ticket : Ticket, optional
-        Who waits for what it brings.
+        Receiver of the answers.
     track : bool, optional
-        Whether its event is answered by its track; None: as the stream does it.
+        Whether its event is answered by its track; None: as set for the stream.
     """
 
     data: bytes
@@ -89,13 +84,7 @@ class QueuedLine(NamedTuple):
 
 
 class Inbox:
-    """Lines that wait to be read, from all sources; bounded.
-
-    Parameters
-    ----------
-    most : int
-        Lines that may wait.
-    """
+    """Bounded queue of input lines from all sources; `most` is the largest number of lines."""
 
     def __init__(self, most: int = WAITING) -> None:
         self._most, self._lines, self._changed = most, deque[QueuedLine](), Condition()
@@ -105,7 +94,7 @@ class Inbox:
         return len(self._lines)
 
     def put(self, lines: Sequence[QueuedLine]) -> None:
-        """Take lines; the caller waits while there are too many. None are taken any more once the stream ends."""
+        """Add lines; the caller waits while the queue is full. After the end of the stream, lines are dropped."""
         with self._changed:
             for first in range(0, len(lines), BATCH):
                 self._changed.wait_for(lambda: len(self._lines) < self._most or self.closed)
@@ -115,7 +104,7 @@ class Inbox:
                 self._changed.notify_all()
 
     def offer(self, lines: Sequence[QueuedLine]) -> bool:
-        """Take lines if there is room for all of them, and return whether there was."""
+        """Add lines if there is room for all, and return whether they were added."""
         with self._changed:
             if self.closed or len(self._lines) + len(lines) > self._most:
                 return False
@@ -124,7 +113,7 @@ class Inbox:
             return True
 
     def push(self, line: QueuedLine) -> int:
-        """Take a line in any case, and return how many of the oldest were dropped for it."""
+        """Add a line, and return the number of oldest lines that were dropped to make room."""
         with self._changed:
             dropped = 0
             while len(self._lines) >= self._most:
@@ -135,7 +124,7 @@ class Inbox:
             return dropped
 
     def take(self, most: int, seconds: float) -> list[QueuedLine] | None:
-        """Return the next lines, none where none comes within some seconds; None where none will come."""
+        """Return the next lines; empty if none arrives within `seconds`, None after the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._lines or self.closed or self._woken, max(seconds, 0.0))
             self._woken = False
@@ -146,27 +135,22 @@ class Inbox:
             return taken
 
     def close(self) -> None:
-        """Take no more lines: what is there is still answered."""
+        """Accept no more lines; waiting lines are still answered."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
 
     def wake(self) -> None:
-        """Let the reader look round."""
+        """Wake the reader before its timeout."""
         with self._changed:
             self._woken = True
             self._changed.notify_all()
 
 
 class Outbox:
-    """Answers that wait to be written, by a thread of its own; bounded.
+    """Bounded queue of output lines, with a thread that writes them.
 
-    Parameters
-    ----------
-    write : callable
-        Writes bytes; an OSError ends the stream.
-    gone : callable
-        Called where writing fails.
+    `write` writes bytes; an OSError ends the stream. `gone` is called if writing fails.
     """
 
     def __init__(self, write: Callable[[bytes], None], gone: Callable[[], None], most: int = WAITING) -> None:
@@ -181,14 +165,14 @@ class Outbox:
         return len(self._lines)
 
     def put(self, line: bytes, whole: str | None = None) -> None:
-        """Take a line, and the event that is answered with it; the caller waits while there are too many."""
+        """Add a line, and the name of the event that it completes; the caller waits while the queue is full."""
         with self._changed:
             self._changed.wait_for(lambda: len(self._lines) < self._most or self.failed)
             self._lines.append((line, whole))
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Write what is there, and end."""
+        """Write all waiting lines, and end."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()

@@ -1,4 +1,4 @@
-"""Recordings: lines with the seconds at which they were read, or the epochs of a problem file, again at any speed."""
+"""Recordings: lines with their times of reading, or the epochs of a problem file, replayed at any speed."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from optloc.models import MODELS
 from optloc.service.queues import QueuedLine
 from optloc.service.stream import Stream
 
-# Lines that are handed on at once where nobody waits for the clock.
+# Lines per batch if the replay does not wait for the clock.
 _MANY = 64
 
 
 class Recorded(NamedTuple):
-    """A line, and the seconds at which it was read; NaN: right behind the one before."""
+    """A line and its time of reading, s; NaN: directly after the previous line."""
 
     received: float
     data: bytes
@@ -29,16 +29,8 @@ class Recorded(NamedTuple):
 def read_recording(path: Path) -> list[Recorded]:
     """Return the lines of a recording.
 
-    Parameters
-    ----------
-    path : Path
-        Lines of JSON, with the key ``received`` where ``--record`` wrote them; or a problem file (.toml), of which each
-        epoch is an event.
-
-    Raises
-    ------
-    InvalidProblem
-        Where it cannot be read.
+    A recording has JSON lines, with the key ``received`` if ``--record`` wrote them. In a problem file (.toml), each
+    epoch is an event. Raise InvalidProblem if the file cannot be read.
     """
     if path.suffix.lower() == ".toml":
         return list(_epochs(draft(path, values=True)))
@@ -52,7 +44,7 @@ def _received(line: bytes) -> float:
         found = json.loads(line)
         return float(found.get("received", np.nan))
     except (ValueError, TypeError, AttributeError, RecursionError, OverflowError):
-        return np.nan  # the stream says what is wrong with it
+        return np.nan  # the stream reports the error
 
 
 def _epochs(made: Draft) -> Iterator[Recorded]:
@@ -78,24 +70,16 @@ def _epochs(made: Draft) -> Iterator[Recorded]:
 
 
 def _turned(kind: str) -> bool:
-    """Return whether a row sets one station against another, so that a file may turn its sign."""
+    """Return whether a row is a difference or ratio of two stations, so that a file may reverse its sign."""
     model = MODELS[kind]
     return model.stations > 1 and not (model.ranges is not None and sum(model.ranges) > 1)
 
 
 def replay(recording: Sequence[Recorded], stream: Stream, speed: float, source: str) -> None:
-    """Hand the lines of a recording to a stream, and close it behind them.
+    """Pass the lines of a recording to a stream, and close the stream at the end.
 
-    Parameters
-    ----------
-    recording : sequence of Recorded
-        The lines.
-    stream : Stream
-        Who gets them.
-    speed : float
-        How many times as fast as they were read; infinity: as fast as they are answered.
-    source : str
-        What complaints call them.
+    `speed` is the replay speed relative to the recording; infinity: as fast as the stream answers. `source` is the name
+    of the recording for messages.
     """
     began, first, when, never = stream.clock(), np.nan, 0.0, Event()
     waiting: list[QueuedLine] = []

@@ -1,4 +1,4 @@
-"""A stream over HTTP: events in requests and over a websocket, health, metrics, the latest fixes, a map of them."""
+"""A stream over HTTP: events in requests and over a websocket, health, metrics, the latest fixes and their map."""
 
 from __future__ import annotations
 
@@ -19,45 +19,27 @@ from optloc.service.site import Site
 from optloc.service.stream import Stream
 
 HOST, PORT = "127.0.0.1", 8200
-"""Where requests are taken unless somebody says otherwise: on this machine alone."""
+"""Default address of the server: requests of this machine only."""
 
-# Bytes of a request: a thousand events of a large network.
+# Largest size of a request, bytes: a thousand events of a large network.
 _BODY = 1 << 20
-# Seconds after which a request is answered without its fix: its events wait for rows of others.
+# Seconds after which a request is answered without its fix, since its events wait for rows of other clients.
 _PATIENCE = 30.0
-# Requests and websockets at a time, and records that wait for a websocket.
+# Largest number of requests and websockets at a time, and of records that wait for a websocket.
 _CONNECTIONS, _QUEUE = 256, 1024
-# What a browser on this machine may call it: another name in a request is a page of a stranger that had its own name
-# point here.
+# Permitted host names of local requests. Another name may come from a web page of a stranger whose domain name resolves
+# to this machine (DNS rebinding).
 _NAMES = ("localhost", "127.0.0.1", "::1", "[::1]")
 
 
 def serve(stream: Stream, host: str = HOST, port: int = PORT) -> tuple[int, Callable[[], None]]:
-    """Take requests in a thread of their own.
+    """Serve requests in a separate thread, and return the port and a function that stops the server.
 
-    Parameters
-    ----------
-    stream : Stream
-        Who answers.
-    host : str
-        Name or address of the interface; other machines reach it unless it is this machine's own.
-    port : int
-        0 takes one that is free.
-
-    Returns
-    -------
-    port : int
-        Where it listens.
-    stop : callable
-        Ends it.
-
-    Raises
-    ------
-    InvalidProblem
-        Where nobody can listen there, or a library is missing.
+    `host` is the name or address of the interface; other machines can reach it unless it is a local address. `port` 0
+    selects a free port. Raise InvalidProblem if the address is not available, or a library is missing.
     """
     try:
-        import starlette  # noqa: F401  # what the application needs
+        import starlette  # noqa: F401  # the application needs it
         import uvicorn
     except ImportError:
         raise InvalidProblem(
@@ -66,7 +48,7 @@ def serve(stream: Stream, host: str = HOST, port: int = PORT) -> tuple[int, Call
     try:
         found = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except (OSError, OverflowError) as error:
-        what = f"nobody can listen at {host}:{port} ({getattr(error, 'strerror', None) or error})"
+        what = f"the address {host}:{port} is not available ({getattr(error, 'strerror', None) or error})"
         raise InvalidProblem(what, "--http", "choose another port") from None
     config = uvicorn.Config(
         application(stream, local=host in _NAMES),
@@ -91,15 +73,7 @@ def serve(stream: Stream, host: str = HOST, port: int = PORT) -> tuple[int, Call
 
 
 def application(stream: Stream, *, local: bool = True) -> Any:
-    """Return the ASGI application of a stream.
-
-    Parameters
-    ----------
-    stream : Stream
-        Who answers.
-    local : bool
-        Whether requests must name this machine.
-    """
+    """Return the ASGI application of a stream; with `local`, requests must name this machine."""
     from starlette.applications import Starlette
     from starlette.middleware import Middleware
     from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -130,7 +104,7 @@ def application(stream: Stream, *, local: bool = True) -> Any:
 
     routes = [
         Route("/", page),
-        *_questions(stream),
+        *_line_routes(stream),
         Route("/health", health),
         Route("/metrics", metrics),
         Route("/fixes.geojson", fixes),
@@ -141,8 +115,8 @@ def application(stream: Stream, *, local: bool = True) -> Any:
     return Starlette(routes=routes, middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=names)])
 
 
-def _questions(stream: Stream) -> list[Any]:
-    """Return the routes that take lines and tell tracks."""
+def _line_routes(stream: Stream) -> list[Any]:
+    """Return the routes that accept lines and return tracks."""
     from starlette.responses import JSONResponse, Response
     from starlette.routing import Route
 
@@ -150,8 +124,8 @@ def _questions(stream: Stream) -> list[Any]:
         return JSONResponse({"error": why}, code, headers)
 
     async def answer(request: Any, *, track: bool) -> Any:
-        if not _is_own(request):
-            return refused(403, "a page of another site asks")
+        if not _is_same_origin(request):
+            return refused(403, "requests from pages of other sites are refused")
         body = await _body(request)
         if body is None:
             return refused(413, f"the request has more than {_BODY} bytes")
@@ -159,9 +133,13 @@ def _questions(stream: Stream) -> list[Any]:
         lines = [body.replace(b"\n", b" ")] if single else [each for each in body.split(b"\n") if each.strip()]
         if not 0 < len(lines) <= WAITING:
             return refused(400, f"send 1 to {WAITING} lines")
-        records = await _answered(stream, lines, track=track)
+        records = await _answers_to(stream, lines, track=track)
         if isinstance(records, int):
-            said = {429: "too much waits", 503: "the stream ends", 504: "no answer yet: it will be in the stream"}
+            said = {
+                429: "the input queue is full",
+                503: "the stream ends",
+                504: "no answer yet; it will be in the stream",
+            }
             return refused(records, said[records], **{"Retry-After": "1"})
         if single:
             return Response(to_line(records[0]), 400 if "error" in records[0] else 200, media_type="application/json")
@@ -190,7 +168,7 @@ def _questions(stream: Stream) -> list[Any]:
 
 
 def page_of(site: Site) -> str:
-    """Return the page of a site's map; raise InvalidProblem where it has no place on Earth."""
+    """Return the page with the map of a site; raise InvalidProblem for a site that is not on Earth."""
     from optloc.show import live_page
 
     ready = site.ready((), site.rows)
@@ -198,14 +176,14 @@ def page_of(site: Site) -> str:
     return live_page(ready.fast.problem, site.title)
 
 
-def _is_own(request: Any) -> bool:
+def _is_same_origin(request: Any) -> bool:
     """Return whether a request comes from a program, or from a page of this server."""
     origin = request.headers.get("origin")
     return origin is None or urlsplit(origin).netloc == request.headers.get("host")
 
 
 async def _body(request: Any) -> bytes | None:
-    """Return what a request holds; None where that is too much."""
+    """Return the body of a request; None if it is too large."""
     parts, size = [], 0
     async for part in request.stream():
         size += len(part)
@@ -215,8 +193,8 @@ async def _body(request: Any) -> bytes | None:
     return b"".join(parts)
 
 
-async def _answered(stream: Stream, lines: list[bytes], *, track: bool) -> list[Record] | int:
-    """Return the answers to lines, or the code of why there are none."""
+async def _answers_to(stream: Stream, lines: list[bytes], *, track: bool) -> list[Record] | int:
+    """Return the answers to lines, or an HTTP status code if there are none."""
     loop = asyncio.get_running_loop()
     future: asyncio.Future[list[Record]] = loop.create_future()
 
@@ -242,11 +220,11 @@ async def _answered(stream: Stream, lines: list[bytes], *, track: bool) -> list[
 
 
 async def _listen(stream: Stream, socket: Any) -> None:
-    """Send all records to a websocket, and take lines from it."""
+    """Send all records to a websocket, and accept lines from it."""
     from starlette.websockets import WebSocketDisconnect
 
-    if not _is_own(socket):
-        await socket.close(1008, "a page of another site asks")
+    if not _is_same_origin(socket):
+        await socket.close(1008, "requests from pages of other sites are refused")
         return
     await socket.accept()
     loop, queue = asyncio.get_running_loop(), asyncio.Queue[Record | None](_QUEUE)
@@ -255,7 +233,7 @@ async def _listen(stream: Stream, socket: Any) -> None:
         with suppress(asyncio.QueueFull):
             queue.put_nowait(record)
             return
-        while not queue.empty():  # who reads too slowly is told so, and begins anew
+        while not queue.empty():  # a slow reader gets a close code, and must connect again
             queue.get_nowait()
         queue.put_nowait(None)
 
@@ -266,7 +244,7 @@ async def _listen(stream: Stream, socket: Any) -> None:
     async def send() -> None:
         while (record := await queue.get()) is not None:
             await socket.send_text(to_line(record).decode())
-        await socket.close(1013, "read faster")
+        await socket.close(1013, "the client reads too slowly")
 
     stream.listeners = (*stream.listeners, hear)
     sending = asyncio.create_task(send())
@@ -277,9 +255,11 @@ async def _listen(stream: Stream, socket: Any) -> None:
             number += 1
             if not stream.inbox.offer(stream.lines([text.encode()], "websocket", number)):
                 stream.metrics.add("refused")
-                await socket.send_text(json.dumps({"error": "too much waits; send it again", "line": number}))
+                await socket.send_text(
+                    json.dumps({"error": "the input queue is full; send the line again", "line": number})
+                )
     except (WebSocketDisconnect, RuntimeError, KeyError):
-        pass  # it has gone, or sends what is no text
+        pass  # the client has disconnected, or sends data that is not text
     finally:
         stream.listeners = tuple(each for each in stream.listeners if each is not hear)
         sending.cancel()

@@ -1,7 +1,7 @@
-"""The site of a stream: what its file says of every event, and problems that are prepared for the rows that are there.
+"""The site of a stream: the template of events from a problem file, and prepared problems for sets of rows.
 
-A site is an ordinary problem file. Its rows are the template of an event: their kinds, stations and noise count, their
-values do not. An event is solved as the file would be that holds its rows alone, by the same reader.
+A site is an ordinary problem file. Its rows are the template of an event: kinds, stations and noise matter, values do
+not. An event is solved like a file with only its rows, by the same reader.
 """
 
 from __future__ import annotations
@@ -32,21 +32,22 @@ from optloc.problem import Array, Conversion, Frame, InvalidProblem, nearest, no
 from optloc.solvers import Prepared, prepare
 
 FAST = "gtrs+lsr"
-"""The method of the first phase: no proof, some ten microseconds a fix."""
+"""The method of the first phase: no proof, about ten microseconds for each fix."""
 
-# Prepared problems that are kept, each some 100 kB: a network of ten has more sets of receivers, but few of them often.
+# Number of stored prepared problems, about 100 kB each: a network of ten has more sets of receivers, but few are
+# frequent.
 _KEPT = 64
-# Settings that a row may bring along in a table of the site, beside its stations.
+# Columns of a row in a table of the site, in addition to its stations.
 _OWN = ("sigma", "weight", "correction")
 
 
 class UnknownName(InvalidProblem):
-    """A line names a station or a kind that the site does not have.
+    """A line has a station or a kind that the site does not have.
 
     Attributes
     ----------
     event : str
-        The event of the line, "" where it is not known.
+        The event of the line; "" if unknown.
     whole : bool
         Whether the event consists of this line alone.
     """
@@ -56,20 +57,11 @@ class UnknownName(InvalidProblem):
 
 
 class SiteRow(NamedTuple):
-    """A row as an event names it.
+    """A row of an event.
 
-    Parameters
-    ----------
-    section : int
-        Table ``[[measurements]]`` whose settings it has.
-    at : int
-        Row of that table, -1 where it is not listed there.
-    kind : str
-        Its kind.
-    a, b : str
-        Its stations; empty where it has none.
-    sigma : float or None
-        Standard deviation that the event states, in the unit of the file.
+    section: number of the table ``[[measurements]]`` with its settings. at: row number in that table, -1 for a row that
+    is not listed. kind: measurement kind. a, b: stations, empty for none. sigma: standard deviation that the event
+    states, in the unit of the file.
     """
 
     section: int
@@ -81,24 +73,24 @@ class SiteRow(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return what people call it: kind and stations."""
+        """Return a name for messages: kind and stations."""
         return " ".join(part for part in (self.kind, "-".join(filter(None, (self.a, self.b)))) if part)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ready:
-    """A problem of one set of rows, prepared.
+    """A prepared problem for one set of rows.
 
     Parameters
     ----------
     fast, full : Prepared
-        For the first phase, and for the method of the stream.
+        Solvers of the first phase, and of the method of the stream.
     count : int
-        Rows of the problem; those without a value have no weight.
+        Number of rows of the problem; rows without a value have no weight.
     row, first, second : int array (l,)
-        Rows that arrivals make, and which two arrivals each compares; `second` is -1 for a time of arrival.
+        Rows that come from arrivals, and the two arrivals of each; `second` is -1 for a time of arrival.
     stated : tuple of (int array, int array, Conversion, array)
-        Of each kind of the rows that come as values: their columns, rows of the problem, unit, and what is added.
+        For each kind of rows with values: their columns, rows of the problem, unit, and the amount to add, SI.
     scale : float
         Metres in a picosecond.
     """
@@ -113,14 +105,10 @@ class Ready:
     scale: float
 
     def si(self, arrivals: Array, values: Array) -> Array:
-        """Return the measurements (n, m) of the problem.
+        """Return the measurements (n, m) of the problem, SI.
 
-        Parameters
-        ----------
-        arrivals : array (n, h)
-            Picoseconds since the first arrival of the event.
-        values : array (n, v)
-            Values of the other rows in their units.
+        `arrivals` (n, h) are in picoseconds since the first arrival of the event. `values` (n, v) are the other rows in
+        their units.
         """
         z = np.zeros((len(values), self.count))
         less = np.where(self.second >= 0, arrivals[:, self.second], 0.0) if len(self.row) else 0.0
@@ -130,45 +118,45 @@ class Ready:
         return z
 
 
-# Keyed by the site itself, too: one that is read anew has problems of its own.
+# The key includes the site, so a reloaded site has separate problems.
 _READY = Cache["Ready | None"](_KEPT)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Site:
-    """What the file of a stream says.
+    """Content of the problem file of a stream.
 
     Parameters
     ----------
     source : str
-        Its name.
+        Name of the file.
     title : str
-        What it says it is.
+        Title of the file.
     method : str
-        How events are solved; see `optloc.solve`.
+        Method of the fixes; see `optloc.solve`.
     file : ProblemFile
-        Its settings.
+        Settings.
     station_table : Table
-        Its stations as they were read.
+        Stations as read.
     tables : tuple of Table
         Rows of each ``[[measurements]]``.
     places : mapping of str to Table
-        Of known targets.
+        Positions of known targets.
     rows : tuple of SiteRow
-        The template of an event, in the order of the file.
+        Template of an event, in the order of the file.
     stations : tuple of str
         Names of the stations.
     position : array (s, d)
-        Their positions, metres in the frame.
+        Positions of the stations, metres in the frame.
     frame : Frame
-        Of positions.
+        Frame of the positions.
     speed : float
-        Of the signals, metres per second.
+        Propagation speed, metres per second.
     arriving, others : tuple of int
-        Rows of the template that arrivals make, those of the first table of times of arrival or of their differences;
-        and all others.
+        Rows of the template that come from arrivals, which are the rows of the first table of `toa` or `tdoa`; and all
+        other rows.
     hearing : tuple of int
-        Stations whose arrivals the template knows.
+        Stations with arrivals in the template.
     index : dict of (kind, a, b) to int
         Number of each row of the template.
     number : dict of str to int
@@ -194,14 +182,16 @@ class Site:
     number: dict[str, int]
 
     def find(self, kind: str, a: str, b: str) -> int | SiteRow:
-        """Return the row that an event names by kind and stations: its number in the template, or what is not listed.
+        """Return the row of an event by kind and stations.
+
+        The result is its number in the template, or a row that is not in the template.
 
         Raises
         ------
         UnknownName
-            For a kind that the site has not, or a station that it does not know.
+            For a kind or a station that the site does not have.
         InvalidProblem
-            Where there is a station too many or too few.
+            For a missing or superfluous station.
         """
         known = self.index.get((kind, a, b))
         if known is not None:
@@ -213,7 +203,7 @@ class Site:
         count = MODELS[kind].stations
         for key, name, needed in (("a", a, count > 0), ("b", b, count > 1)):
             if bool(name) != needed:
-                what = "the station is missing" if needed else "there is a station too many"
+                what = "the station is missing" if needed else "there is a superfluous station"
                 raise InvalidProblem(what, key, f"{kind} rows name {count} of them")
             if needed and name not in self.number:
                 raise no_station(name[:40], key, self.stations, UnknownName)
@@ -222,35 +212,26 @@ class Site:
         return SiteRow(alike[0].section, -1, kind, a, b)
 
     def row(self, key: int | SiteRow) -> SiteRow:
-        """Return a row by what an event calls it."""
+        """Return a row by its key in an event."""
         return self.rows[key] if isinstance(key, int) else key
 
     def name_of(self, key: int | SiteRow) -> str:
-        """Return what people call a row."""
+        """Return the name of a row for messages."""
         return self.row(key).name
 
     def ready(self, heard: tuple[int, ...], rows: tuple[SiteRow, ...]) -> Ready | None:
-        """Return the problem of some arrivals and rows, prepared; None where they make no row.
+        """Return the prepared problem for arrivals and rows; None if they give no row.
 
-        Parameters
-        ----------
-        heard : tuple of int
-            Stations that have an arrival, ascending.
-        rows : tuple of SiteRow
-            Rows that come as values.
-
-        Raises
-        ------
-        InvalidProblem
-            Where the file does not say enough of one of them, such as its noise.
+        `heard` are the stations with an arrival, ascending. `rows` are the rows with values. Raise InvalidProblem if
+        the file lacks data for a row, such as its noise.
         """
         return _READY.find((self, heard, rows), lambda: self._prepare(heard, rows))
 
     def between(self, heard: tuple[int, ...]) -> tuple[SiteRow, ...]:
-        """Return the rows that arrivals at some stations make.
+        """Return the rows that arrivals at the stations `heard` give.
 
-        Those of the template whose stations are there; where they do not link all of them, a difference to the first
-        takes in each group that is left.
+        These are the rows of the template whose stations have arrivals. If they do not connect all stations, a
+        difference to the first station connects each further group.
         """
         if not heard:
             return ()
@@ -282,7 +263,7 @@ class Site:
             column = np.array([order[section][row] for row in chunk.row.tolist()])
             made = np.flatnonzero((column >= 0) & (column < len(timed))).tolist()
             links += [(number[i], place[int(chunk.a[i])], place.get(int(chunk.b[i]), -1)) for i in made]
-            # rows that are there for a covariance alone keep any value: their weight is zero
+            # rows that are only present for a covariance may keep any value: their weight is zero
             given = column >= len(timed)
             added = np.where(chunk.weight > 0.0, chunk.baseline, 0.0)[given]
             stated.append((column[given] - len(timed), number[given], chunk.unit, added))
@@ -292,16 +273,16 @@ class Site:
         return Ready(fast, full, problem.count, row, first, second, tuple(stated), self.speed * 1e-12)
 
     def _draft(self, rows: tuple[SiteRow, ...]) -> tuple[Draft, list[list[int]]]:
-        """Return the problem of some rows, and which of them each row of its tables is, -1 for none."""
+        """Return the problem of rows, and for each row of its tables the index in `rows`, -1 for none."""
         sections, tables, order = [], [], []
         for i, (section, table) in enumerate(zip(self.file.measurements, self.tables, strict=True)):
             of_all = section.covariance is not None or self.file.covariance is not None
             listed = {row.at: k for k, row in enumerate(rows) if row.section == i and row.at >= 0}
             others = [k for k, row in enumerate(rows) if row.section == i and row.at < 0]
             if of_all and others:
-                what = f"the covariance of the site does not know {rows[others[0]].name}"
-                raise InvalidProblem(what, self.source, "send rows of the site only")
-            # one matrix for all rows of an epoch: what is absent keeps its place, with weight 0
+                what = f"the covariance of the site does not include {rows[others[0]].name}"
+                raise InvalidProblem(what, self.source, "send only rows of the site")
+            # one matrix for all rows of an epoch: absent rows keep their place, with weight 0
             own = [row for row in self.rows if row.section == i] if of_all else []
             chosen = own or [*(rows[k] for k in sorted(listed.values())), *(rows[k] for k in others)]
             if not chosen:
@@ -316,7 +297,7 @@ class Site:
 
 
 def _table(table: Table, kinds: bool, rows: Sequence[SiteRow], present: Sequence[bool]) -> Table:
-    """Return the rows of an event as a table like that of the site."""
+    """Return the rows of an event as a table with the form of a table of the site."""
     columns: dict[str, Array] = {}
     if kinds:
         columns["kind"] = np.array([row.kind for row in rows], dtype=object)
@@ -328,20 +309,20 @@ def _table(table: Table, kinds: bool, rows: Sequence[SiteRow], present: Sequence
         stated = key == "sigma" and any(row.sigma is not None for row in rows)
         if given is None and not stated and (key != "weight" or all(present)):
             continue
-        columns[key] = np.array([_own(given, key, row, table.source) for row in rows])
+        columns[key] = np.array([_row_setting(given, key, row, table.source) for row in rows])
     if not all(present):
         columns["weight"] = np.where(present, columns["weight"], 0.0)
     return Table(table.source, columns, len(rows))
 
 
-def _own(given: Array | None, key: str, row: SiteRow, source: str) -> float:
+def _row_setting(given: Array | None, key: str, row: SiteRow, source: str) -> float:
     """Return the standard deviation, weight or correction of a row."""
     if key == "sigma" and row.sigma is not None:
         return row.sigma
     if given is not None and row.at >= 0:
         return float(given[row.at])
     if key == "sigma":
-        raise InvalidProblem(f"nothing is said of the noise of {row.name}", source, "send its sigma")
+        raise InvalidProblem(f"the noise of {row.name} is unknown", source, "send its sigma")
     return 1.0 if key == "weight" else 0.0
 
 
@@ -351,15 +332,15 @@ def read_site(path: Path, method: str = "auto") -> Site:
     Parameters
     ----------
     path : Path
-        The file; its rows are the template of an event, values need not be there.
+        The file; its rows are the template of an event and need no values.
     method : str
-        How events are solved.
+        Method of the fixes.
 
     Raises
     ------
     InvalidProblem
-        Where the file is none, or says what a stream of single events cannot have: stations or targets that move,
-        noise to be estimated, decibels.
+        For an invalid file, and for properties that single events cannot have: moving stations or targets, estimated
+        noise, decibels.
     """
     file, source = read_document(path), name_of(path)
     station_table = table_of(file.stations, path.parent, join(source, "[stations]"))
@@ -382,27 +363,30 @@ def read_site(path: Path, method: str = "auto") -> Site:
         tuple(i for i in range(len(rows)) if i not in arriving), tuple(sorted(hearing)),
         {row[2:5]: i for i, row in enumerate(rows)}, number,
     )  # fmt: skip
-    # what one event cannot be fixed by, such as a bias without a prior, is the verdict's; what cannot be read is told
+    # report errors of the reader now; an event that cannot be fixed, as with a bias without a prior, gets a status
+    # later
     site.ready((), rows)
     return site
 
 
 def _check(draft: Draft, source: str) -> None:
-    """Refuse what single events cannot have."""
+    """Raise InvalidProblem for properties that single events cannot have."""
     if draft.moving or len(draft.loaded.problem.stations.position) > 1:
-        raise InvalidProblem("the stations move", join(source, "[stations]"), "a stream needs stations that stay")
+        raise InvalidProblem(
+            "the stations move", join(source, "[stations]"), "use fixed stations; a stream cannot have moving stations"
+        )
     motion = {table.moves for table in (draft.file.target, *draft.file.targets.values())} - {None, "static"}
     if motion - FREE:
         what = f"the motion {min(map(str, motion - FREE))} needs several epochs"
-        raise InvalidProblem(what, join(source, "[target]"), "leave it out: events are fixed one by one")
+        raise InvalidProblem(what, join(source, "[target]"), "remove it; each event is fixed separately")
     for chunk in draft.chunks:
         if chunk.unit.logarithmic:
             where = join(chunk.table.source, "key 'unit'")
-            raise InvalidProblem("a stream takes no decibels of ratios", where, "send ratios, in the unit '1'")
+            raise InvalidProblem("a stream cannot use ratios in decibels", where, "send ratios, in the unit '1'")
 
 
 def _template(draft: Draft, source: str) -> tuple[SiteRow, ...]:
-    """Return what different rows there are, in the order of the file."""
+    """Return the distinct rows, in the order of the file."""
     found: dict[tuple[int, str, str, str], SiteRow] = {}
     for i, (section, table) in enumerate(zip(draft.file.measurements, draft.tables, strict=True)):
         kinds = [section.kind] * table.count if section.kind is not None else table.labels("kind").tolist()
@@ -414,7 +398,8 @@ def _template(draft: Draft, source: str) -> tuple[SiteRow, ...]:
             count = MODELS[kind].stations
             key = (i, kind, a if count > 0 else "", b if count > 1 else "")
             if key in found and draft.loaded.problem.epochs == 1:
-                what = f"{found[key].name} stands twice"
-                raise InvalidProblem(what, join(source, f"[[measurements]] {i + 1}"), "a stream tells rows by these")
+                what = f"the row {found[key].name} occurs twice"
+                place = join(source, f"[[measurements]] {i + 1}")
+                raise InvalidProblem(what, place, "remove one: kind and stations must identify a row")
             found.setdefault(key, SiteRow(i, at, *key[1:]))
     return tuple(found.values())

@@ -1,4 +1,4 @@
-"""Where lines come from besides pipes and requests: brokers of messages, and the formats of gateways and receivers."""
+"""Further sources of lines: MQTT and ZeroMQ, and adapters for the formats of gateways and receivers."""
 
 from __future__ import annotations
 
@@ -18,21 +18,17 @@ from optloc.service.stream import Stream
 LOG = logging.getLogger("optloc.service")
 
 Adapter = Callable[[bytes], bytes]
-"""Turns a line of another format into one of a stream; what it does not understand stays, and is refused."""
+"""Converts a line of another format to a line of a stream; it returns other lines unchanged, for an error message."""
 
-# Formats of others.
+# Formats of other systems.
 
 
 class ChirpStack:
-    """Uplinks of ChirpStack (version 4, JSON) whose gateways have fine timestamps.
+    """Adapter for uplinks of ChirpStack (version 4, JSON) from gateways with fine timestamps.
 
-    The event is the deduplication id, the target the device. Gateways of other networks hear a device, too: those that
-    the site does not have are left out, and each is named once in a warning.
-
-    Parameters
-    ----------
-    stations : collection of str
-        Names of the stations: the gateways' ids.
+    The event is the deduplication id, the target is the device. Gateways of other networks may receive a device as
+    well: gateways that the site does not have are left out, with one warning for each. `stations` are the ids of the
+    gateways of the site.
     """
 
     def __init__(self, stations: Collection[str]) -> None:
@@ -58,29 +54,27 @@ class ChirpStack:
         return json.dumps(event).encode()
 
     def _warn(self, foreign: set[str]) -> None:
-        """Name gateways that the site does not have, each once."""
+        """Log a warning for each gateway that the site does not have, once."""
         for name in sorted(foreign - self._foreign) if len(self._foreign) < _MESSAGES else ():
             self._foreign.add(name)
-            LOG.warning("gateway %r is no station of the site: its arrivals are left out", name[:40])
+            LOG.warning("gateway %r is not a station of the site: its arrivals are left out", name[:40])
 
 
-# Nanoseconds within which receivers of one network hear the same transmission, and messages that are remembered: equal
-# bits are sent again after tenths of a second.
+# Largest time between receptions of one transmission, ns, and number of remembered messages. Equal bits are repeated
+# after tenths of a second.
 _TOGETHER, _MESSAGES = 5_000_000, 4096
-# A day in nanoseconds: clocks of these receivers begin anew at midnight.
+# A day in nanoseconds: the clocks of these receivers restart at midnight.
 _DAY = 86_400 * 10**9
 
 
 class ModeS:
-    """Messages of mlat-client, ``{"mlat": {"t": ..., "m": "8d..."}}``, each with the name of its `receiver`.
+    """Adapter for messages of mlat-client, with the name of the `receiver` added.
 
-    The receivers' clocks must be synchronised: `t` counts nanoseconds since midnight, as of GPS receivers
-    (``radarcape_gps``). Equal messages within 5 ms are one event; those that carry an address have it as the target.
+    A message is ``{"mlat": {"t": ..., "m": "8d..."}}``.
 
-    Parameters
-    ----------
-    stations : collection of str
-        Names of the stations: the receivers.
+    The clocks of the receivers must be synchronised: `t` is in nanoseconds since midnight, as with GPS receivers
+    (``radarcape_gps``). Equal messages within 5 ms are one event. An address in the message becomes the target.
+    `stations` are the names of the receivers.
     """
 
     def __init__(self, stations: Collection[str]) -> None:
@@ -103,14 +97,14 @@ class ModeS:
         self._seen[bits] = first, number
         if len(self._seen) > _MESSAGES:
             del self._seen[next(iter(self._seen))]
-        # counted from the first receiver's midnight: an event does not end there
+        # relative to the midnight of the first receiver, so that midnight does not split an event
         event = {"event": f"{bits}-{number}", "station": station, "time_ns": first + apart}
         address = _address(bits)
         return json.dumps(event | ({"target": address} if address else {})).encode()
 
 
 def _address(bits: str) -> str:
-    """Return the address that a Mode S message carries in the clear: formats 11, 17 and 18."""
+    """Return the address in a Mode S message of format 11, 17 or 18; empty for other formats."""
     try:
         kind = int(bits[:2], 16) >> 3
     except ValueError:
@@ -119,7 +113,7 @@ def _address(bits: str) -> str:
 
 
 def _object(line: bytes) -> dict[str, Any] | None:
-    if len(line) > 4 * LINE:  # an uplink has much that is left out
+    if len(line) > 4 * LINE:  # an uplink has many parts that are not used
         return None
     try:
         found = json.loads(line)
@@ -129,11 +123,11 @@ def _object(line: bytes) -> dict[str, Any] | None:
 
 
 ADAPTERS: Mapping[str, Callable[[Collection[str]], Adapter]] = {"chirpstack": ChirpStack, "mode-s": ModeS}
-"""Formats of others by name."""
+"""Adapters by name."""
 
 
 def adapter_of(name: str, stations: Collection[str]) -> Adapter:
-    """Return what turns lines of a format into those of a stream; raise InvalidProblem for an unknown one."""
+    """Return the adapter for a format by name; raise InvalidProblem for an unknown format."""
     if name not in ADAPTERS:
         raise InvalidProblem(f"there is no format {name!r}", "--adapter", nearest(name, ADAPTERS))
     return ADAPTERS[name](stations)
@@ -143,27 +137,12 @@ def adapter_of(name: str, stations: Collection[str]) -> Adapter:
 
 
 def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callable[[], None]:
-    """Take the messages of a topic of an MQTT broker; where too many wait, the oldest are dropped and counted.
+    """Read the messages of a topic of an MQTT broker, and return a function that stops it.
 
-    Parameters
-    ----------
-    stream : Stream
-        Who answers.
-    address : str
-        ``mqtt://user@host:1883/topic``, or ``mqtts`` with TLS; the topic may have wildcards. The password is in the
-        variable OPTLOC_MQTT_PASSWORD.
-    adapter : callable, optional
-        Turns what comes into lines.
-
-    Returns
-    -------
-    callable
-        Ends it.
-
-    Raises
-    ------
-    InvalidProblem
-        For an address that is none, a broker that cannot be reached, or a missing library.
+    If too many messages wait, the oldest are dropped and counted. `address` is ``mqtt://user@host:1883/topic``, or
+    ``mqtts`` with TLS; the topic may have wildcards. The variable OPTLOC_MQTT_PASSWORD has the password. `adapter`
+    converts messages to lines. Raise InvalidProblem for an invalid address, an unreachable broker, or a missing
+    library.
     """
     try:
         from paho.mqtt import client as paho
@@ -173,8 +152,8 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callab
     parts = urlsplit(address)
     topic = unquote(parts.path[1:] + (f"#{parts.fragment}" if "#" in address else ""))
     if parts.scheme not in ("mqtt", "mqtts") or not parts.hostname or not topic:
-        raise InvalidProblem(f"{address!r} is no address of a topic", "--mqtt", "write mqtt://host:1883/topic")
-    # Version 2 of its callbacks: the other one goes in its next release.
+        raise InvalidProblem(f"{address!r} is not an address of a topic", "--mqtt", "write mqtt://host:1883/topic")
+    # Version 2 of the callbacks: version 1 will be removed in the next release.
     client = paho.Client(CallbackAPIVersion.VERSION2)
     if parts.scheme == "mqtts":
         client.tls_set()
@@ -186,7 +165,7 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callab
         if reason.is_failure:
             LOG.warning("%s: the broker refuses (%s)", parts.hostname, reason)
         else:
-            client.subscribe(topic, qos=1)  # again after every reconnection
+            client.subscribe(topic, qos=1)  # again after each reconnection
 
     def heard(_: Any, __: Any, message: Any) -> None:
         nonlocal number
@@ -207,7 +186,7 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callab
 
 
 def _push(stream: Stream, payload: bytes, source: str, number: int, adapter: Adapter | None) -> int:
-    """Hand the lines of a message to a stream in any case, and return the number of the last one."""
+    """Pass the lines of a message to a stream without waiting, and return the number of the last line."""
     for data in payload.split(b"\n"):
         if not data.strip():
             continue
@@ -220,27 +199,11 @@ def _push(stream: Stream, payload: bytes, source: str, number: int, adapter: Ada
 
 
 def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> Callable[[], None]:
-    """Take the messages of a ZeroMQ socket.
+    """Read the messages of a ZeroMQ socket, and return a function that stops it.
 
-    Parameters
-    ----------
-    stream : Stream
-        Who answers.
-    address : str
-        ``tcp://host:5555`` subscribes to a publisher, of whose messages the oldest are dropped where too many wait;
-        ``pull+tcp://127.0.0.1:5555`` listens, and lets those wait who push.
-    adapter : callable, optional
-        Turns what comes into lines.
-
-    Returns
-    -------
-    callable
-        Ends it.
-
-    Raises
-    ------
-    InvalidProblem
-        For an address that is none, or a missing library.
+    ``tcp://host:5555`` subscribes to a publisher; if too many messages wait, the oldest are dropped.
+    ``pull+tcp://127.0.0.1:5555`` listens; if too many messages wait, the senders wait. `adapter` converts messages to
+    lines. Raise InvalidProblem for an invalid address, or a missing library.
     """
     try:
         import zmq
@@ -249,7 +212,7 @@ def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> Call
     pulls = address.startswith("pull+")
     context: Any = zmq.Context()
     socket = context.socket(zmq.PULL if pulls else zmq.SUB)
-    # Nothing of a stranger's size is kept: a message may hold as many lines as a request.
+    # Limit the size of a message from the network to the size of a request.
     socket.setsockopt(zmq.MAXMSGSIZE, 16 * LINE)
     socket.setsockopt(zmq.RCVHWM, WAITING)
     socket.setsockopt(zmq.LINGER, 0)
@@ -277,7 +240,7 @@ def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> Call
                 number += len(lines)
             else:
                 number = _push(stream, payload, "zmq", number, adapter)
-        # a socket belongs to its thread
+        # a socket must be closed in its thread
         context.destroy(0)
 
     thread = Thread(target=run, name="optloc zmq", daemon=True)

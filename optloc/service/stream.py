@@ -1,4 +1,4 @@
-"""A stream: lines from anywhere through one bounded queue, one thread that answers, one that writes."""
+"""A stream: lines from all sources go through one bounded queue; one thread answers, one thread writes."""
 
 from __future__ import annotations
 
@@ -27,49 +27,49 @@ from optloc.service.tracks import Following, Tracks
 
 LOG = logging.getLogger("optloc.service")
 
-# Lines that are looked at before the clock is: a timer is late by what they take, some milliseconds.
+# Lines between two looks at the clock: a timer is late by their time, some milliseconds.
 _LINES = 256
-# Seconds after which it is looked again whether a reader has read what is there for it.
+# Seconds between checks of whether a reader has read its available input.
 _PAUSE = 1e-3
-# Share of the time that does not count for events while lines wait to be read: rows of an event that were written one
-# after the other are near each other however slowly they are read, and events without all rows still close.
-_STILL = 0.98
-# Bytes of a recording that are gathered before they are written.
+# Share of the time that does not count for waiting events while lines wait to be read. Rows of an event that were
+# written together then stay together at any reading speed, and events with missing rows still close.
+_UNCOUNTED = 0.98
+# Bytes of a recording that are collected before writing.
 _GATHERED = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How a stream answers.
+    """Settings of a stream.
 
     Parameters
     ----------
     wait : float
-        Seconds after its first row at which an event closes.
+        Seconds from the first row of an event to its closing.
     revise : bool
-        Whether late rows make a new answer.
+        Whether late rows give a new answer.
     phases : "two", "one" or "fix"
-        As `optloc.service.engine.PHASES`.
+        As in `optloc.service.engine.PHASES`.
     deadline : float
         Seconds after which a proof is given up.
     shed : bool
-        Whether proofs are skipped under load; rows wait otherwise.
+        Whether proofs are skipped under load; otherwise rows wait.
     part : (int, int)
-        Which of how many processes this is.
+        Number of this process, and number of processes.
     format : str
         A key of `optloc.service.answers.FORMATS`.
     state : Path, optional
-        Checkpoint, read at the start where it is there.
+        Checkpoint; restored at the start if it exists.
     record : Path, optional
-        Where the lines go that are read, with the seconds at which they were.
+        File for the lines with their times of reading.
     every : float
         Seconds between checkpoints.
     health : float
         Seconds between lines of health.
     track : bool
-        Whether events are answered by the states of their tracks, in the place of fixes.
+        Whether events are answered by states of tracks instead of fixes.
     following : Following, optional
-        How tracks are made.
+        Settings of tracks.
     """
 
     wait: float = 0.05
@@ -88,24 +88,24 @@ class Settings:
 
 
 class Stream:
-    """Reads lines, answers events, writes answers, until it is closed.
+    """A service that reads lines, answers events and writes answers until it is closed.
 
     Parameters
     ----------
     site : Site
-        What events consist of.
+        Template of events.
     settings : Settings
-        How they are answered.
+        Settings of the answers.
     write : callable
         Writes bytes to the output.
     say : callable
-        Writes a line for people, such as health.
+        Prints a line for people, such as health.
     clock : callable
-        Seconds that never go back.
+        Monotonic clock, s.
     again : Path, optional
-        The file of the site, where it may be read anew.
+        File of the site, for reloading.
     replayed : bool
-        Whether its lines say themselves when they were read: events then close by that, whatever the speed.
+        Whether lines have recorded times of reading: events then close by these times, at any replay speed.
     """
 
     def __init__(
@@ -122,9 +122,9 @@ class Stream:
         self.site, self._settings, self._say, self.clock, self._again = site, settings, say, clock, again
         self._replayed = replayed
         self.metrics, self.latest, self.inbox = Metrics(), Latest(), Inbox()
-        # replaced, never changed: threads go through it
+        # replaced, never modified, because threads iterate over it
         self.listeners: tuple[Callable[[Record], None], ...] = ()
-        # of a source that is a file: seconds that count for nothing, and whether it has more to read
+        # for a source that is a file: seconds that do not count for waiting, and whether it has more to read
         self.held = 0.0
         self.pending: Callable[[], bool] = bool
         self._outbox = Outbox(write, self.inbox.close)
@@ -132,7 +132,7 @@ class Stream:
         self._engine = self._new_engine(site)
         self._events = Events(site, self.metrics, self._emit, settings.wait, settings.revise, settings.part)
         self._unwritten: dict[str, of_events.Event] = {}
-        # first of all files: a checkpoint that is refused leaves no other one behind
+        # before other files are created, since a rejected checkpoint must leave none behind
         if settings.state is not None and settings.state.exists():
             restore(settings.state, self._events, self._time())
         self._record = None if settings.record is None else GrowingFile(settings.record)
@@ -162,7 +162,7 @@ class Stream:
             following=s.following,
         )
 
-    # What others ask for.
+    # Interface for sources and commands.
 
     def lines(
         self,
@@ -173,41 +173,41 @@ class Stream:
         *,
         track: bool | None = None,
     ) -> list[QueuedLine]:
-        """Return what was read just now as lines, numbered from `first`; `track` as of `QueuedLine`."""
+        """Return data that was just read as lines, numbered from `first`; `track` is as in `QueuedLine`."""
         now, when = self.clock(), self._time()
         return [QueuedLine(each, first + i, source, now, when, ticket, track) for i, each in enumerate(data)]
 
     @property
     def tracks(self) -> Tracks:
-        """Return the tracks of the events that are answered by them."""
+        """Return the tracks of the stream."""
         return self._engine.tracks
 
     @property
     def untracked(self) -> str:
-        """Return why events of this stream make no tracks; empty where they do."""
+        """Return the reason for which this stream cannot make tracks; empty if it can."""
         if self._settings.part[1] > 1:
-            return "this process answers a part of the events, and a track needs all those of its target"
+            return "this process answers a part of the events, but a track needs all events of its target"
         return self.tracks.why
 
     def _time(self) -> float:
         return self.clock() - self.held
 
     def close(self) -> None:
-        """Read no more lines, answer those that are there, and end."""
+        """Read no more lines, answer the waiting lines, and end."""
         self.inbox.close()
 
     def reload(self) -> None:
-        """Read the file of the site anew, if it can be read; open events are answered by the old one."""
+        """Reload the file of the site, if it is valid; open events are answered by the old site."""
         self._reload = True
         self.inbox.wake()
 
     @property
     def failed(self) -> bool:
-        """Whether the reader of the output has gone."""
+        """Whether the reader of the output has closed it."""
         return self._outbox.failed
 
     def health(self) -> Record:
-        """Return what is counted."""
+        """Return counts, latencies and settings."""
         about = {"site": self.site.title, "machine_code": enabled(), "phases": self._settings.phases}
         return self.metrics.health(self.clock(), about)
 
@@ -216,7 +216,7 @@ class Stream:
     def _run(self) -> None:
         try:
             self._loop()
-        except Exception as error:  # noqa: BLE001  # raised where the stream is waited for
+        except Exception as error:  # noqa: BLE001  # raised in the thread that waits for the stream
             self.error = error
         finally:
             self.inbox.close()
@@ -237,22 +237,22 @@ class Stream:
                     self._events.due(line.when, self.clock())
                 self._read(line)
                 if len(self._events.ready) >= BATCH:
-                    self._settle()
-            # while lines wait it is as late as the last one says: what belongs to an event may be among them
+                    self._answer_closed()
+            # while lines wait, use the time of the last line: rows of an open event may be among the waiting lines
             if not (self._replayed or pending or len(self.inbox)):
                 self._events.due(self._time(), self.clock())
-            self._tend()
+            self._do_timed_work()
         if not self._outbox.failed:
             self._finish()
 
-    def _tend(self) -> None:
-        """Do what is due by time."""
+    def _do_timed_work(self) -> None:
+        """Do all timed work."""
         now = self.clock()
-        self._settle()
+        self._answer_closed()
         self._engine.expire()
         if self._reload:
             self._reload = False
-            self._renew()
+            self._reload_site()
         if now >= self._next_health:
             self._next_health = now + self._settings.health
             self._say(json.dumps({"health": self.health()}))
@@ -262,9 +262,9 @@ class Stream:
             self._checkpoint()
 
     def _finish(self) -> None:
-        """Answer all that is there, and keep the last state."""
+        """Answer all waiting events, and store the last state."""
         self._events.flush(self.clock())
-        self._settle()
+        self._answer_closed()
         self._engine.stop()
         self._outbox.close()
         self._checkpoint()
@@ -279,16 +279,16 @@ class Stream:
             track = self._settings.track if line.track is None else line.track
             try:
                 message = parse(data, self.site)
-                self._keep(data, line.stamp)
+                self._record_line(data, line.stamp)
                 if message.command:
-                    refused = self._obey(message.command)
+                    refused = self._run_command(message.command)
                 else:
                     self._events.take(message, line.stamp, line.when, ticket, track=track)
-            except Exception as error:  # a stream goes on, whatever one line brings to light
+            except Exception as error:  # an error of one line must not end the stream
                 if not isinstance(error, InvalidProblem):
                     LOG.exception("line %d of %s failed", line.number, line.source)
                 if isinstance(error, UnknownName):
-                    self._keep(data, line.stamp)
+                    self._record_line(data, line.stamp)
                     self._events.refuse(error, line.stamp, line.when, track=track)
                 counts["malformed"] += 1
                 refused = {"error": str(error), "line": line.number, "source": line.source}
@@ -297,7 +297,7 @@ class Stream:
         if ticket is not None:
             ticket.handled(refused)
 
-    def _obey(self, command: str) -> Record:
+    def _run_command(self, command: str) -> Record:
         if command == "flush":
             self._events.flush(self.clock())
             return {"flushed": True}
@@ -305,7 +305,7 @@ class Stream:
         self._emit(record)
         return record
 
-    def _settle(self) -> None:
+    def _answer_closed(self) -> None:
         closed = list(self._events.closing())
         for event in closed:
             self._unwritten[event.name] = event
@@ -320,10 +320,10 @@ class Stream:
         if event.reply is not None:
             event.reply.answer(record, last)
             if last:
-                event.reply = None  # it is remembered for long, and who asked has gone
+                event.reply = None  # the event is remembered for long, but the client has its last answer
 
     def _emit(self, record: Record) -> None:
-        """Write a record that is no answer: a note, an error, health."""
+        """Write a record that is not an answer: a note, an error, health."""
         self._tell(record)
         if self._settings.format in OF_RECORDS:
             self._outbox.put(self._format(record, self.site.frame) or b"")
@@ -337,8 +337,8 @@ class Stream:
 
     # Files.
 
-    def _renew(self) -> None:
-        """Take the file of the site as it is now, once the events of the old one are answered."""
+    def _reload_site(self) -> None:
+        """Reload the file of the site after the events of the old site are answered."""
         if self._again is None:
             return
         try:
@@ -346,15 +346,15 @@ class Stream:
                 site = read_site(self._again, self.site.method)
             warm_up(site, self._settings.phases)
         except InvalidProblem as error:
-            self._say(f"The site stays as it was: {error}")
+            self._say(f"The site is not changed: {error}")
             return
         self._events.flush(self.clock())
-        self._settle()
+        self._answer_closed()
         self._engine.stop()
         self.site = self._events.site = site
         self._engine = self._new_engine(site)
-        self._events.closed = dict.fromkeys(self._events.closed)  # their rows were others
-        self._say(f"The site is {site.title!r} now, with {len(site.rows)} rows of {len(site.stations)} stations.")
+        self._events.closed = dict.fromkeys(self._events.closed)  # their rows belong to the old site
+        self._say(f"The site is now {site.title!r}, with {len(site.rows)} rows of {len(site.stations)} stations.")
 
     def _checkpoint(self) -> None:
         for _ in range(len(self._outbox.written)):
@@ -363,10 +363,10 @@ class Stream:
             try:
                 write_text(self._settings.state, to_line(state_of(self._events, self._unwritten)).decode())
             except InvalidProblem as error:
-                self._say(f"There is no checkpoint: {error}")  # a full disk ends no stream
+                self._say(f"No checkpoint is written: {error}")  # a full disk must not end the stream
 
-    def _keep(self, data: bytes, stamp: float) -> None:
-        """Record a line with the seconds at which it was read; it holds one JSON object."""
+    def _record_line(self, data: bytes, stamp: float) -> None:
+        """Record a line, which has one JSON object, with its time of reading."""
         if self._record is not None:
             self._recorded += b'{"received":%.6f,' % stamp + data[1:] + b"\n"
             if len(self._recorded) > _GATHERED:
@@ -383,21 +383,16 @@ class Stream:
 
 
 def warm_up(site: Site, phases: str) -> None:
-    """Solve a made-up event, so that the first real one finds machine code loaded.
+    """Solve a simulated event, so that machine code is loaded before the first real event.
 
-    Parameters
-    ----------
-    site : Site
-        Whose template is taken.
-    phases : "two", "one" or "fix"
-        Which answers will be wanted.
+    `phases` are the phases of the answers: "two", "one" or "fix".
     """
     ready = site.ready((), site.rows)
     assert ready is not None  # a site has rows
     problem = ready.fast.problem
     x = np.zeros(problem.layout.size)
     slot, _ = problem.layout.find("position")
-    # beside the middle, where no two stations are alike
+    # away from the centre, where the geometry may be symmetric
     x[slot.start : slot.start + slot.size] = site.position.mean(0) + 0.1 * np.ptp(site.position, axis=0)
     with np.errstate(all="ignore"):
         z = simulate(problem, x, 0, BATCH).z
@@ -417,20 +412,20 @@ def read_lines(
     adapter: Callable[[bytes], bytes] | None = None,
     pending: Callable[[], bool] = bool,
 ) -> None:
-    """Read lines until the end and hand them to a stream; what it has no room for is not read.
+    """Read lines until the end and pass them to a stream; while the queue is full, nothing is read.
 
     Parameters
     ----------
     read : callable
-        Returns at most so many bytes, as soon as some are there; none at the end.
+        Returns at most the given number of bytes, as soon as any are available; empty at the end.
     stream : Stream
-        Who gets them.
+        Receives the lines.
     source : str
-        What its complaints call them.
+        Name of the source for messages.
     adapter : callable, optional
-        Turns what comes into lines of a stream.
+        Converts input lines to lines of a stream.
     pending : callable
-        Whether something is there to be read: the time between two reads then hardly counts for events that wait.
+        Returns whether input is available: then the time between two reads hardly counts for waiting events.
     """
     rest, number, last = b"", 0, stream.clock()
     stream.pending = pending
@@ -439,11 +434,11 @@ def read_lines(
         if not (piece := read(LINE)):
             break
         now = stream.clock()
-        stream.held += _STILL * (now - last) if waited else 0.0
+        stream.held += _UNCOUNTED * (now - last) if waited else 0.0
         last = now
         *whole, rest = (rest + piece).split(b"\n")
         if len(rest) > 2 * LINE:
-            rest = rest[: LINE + 1]  # of a line that is refused its beginning is enough, however long it becomes
+            rest = rest[: LINE + 1]  # the beginning suffices to reject a line that is too long
         lines = whole if adapter is None else [adapter(data) for data in whole]
         stream.inbox.put(stream.lines(lines, source, number + 1))
         number += len(whole)

@@ -1,4 +1,4 @@
-"""Tracks of the targets of a stream: the state of each after each of its events."""
+"""Tracks of the targets of a stream: the state of each target after each of its events."""
 
 from __future__ import annotations
 
@@ -20,26 +20,27 @@ from optloc.tracking import Dynamics, Entry, Follower, Rules, Update, alone, pol
 
 LOG = logging.getLogger("optloc.service")
 
-# Events that may wait for their track; beyond, the stream waits, as every scan counts.
+# Largest number of events that wait for their track; then the stream waits, since no scan may be lost.
 _WAITING = 256
 
 
 @dataclass(frozen=True, slots=True)
 class Following:
-    """How the tracks of a stream are made, and how many of them are kept.
+    """Settings of the tracks of a stream, and their largest number.
 
     Parameters
     ----------
     dynamics : Dynamics
-        Model of motion; by default constant velocity driven by 1 m/s^2, as of ``optloc track``.
+        Motion model; by default constant velocity with a process noise of 1 m/s^2, as in ``optloc track``.
     update : callable or str
         A filter, or its name in `optloc.tracking.UPDATES`.
     rules : Rules
-        When rows are left out and tracks begin anew.
+        Rules for the gate, and for the start and end of tracks.
     most : int
-        Tracks that are kept; the one that was silent longest makes room. More than the aircraft of a busy sky.
+        Largest number of tracks, more than the aircraft of a busy sky; beyond, the track without events for longest is
+        removed.
     age : float
-        Seconds of silence after which one is forgotten; `Rules.gap` or its covariance has ended it before.
+        Seconds without events after which a track is removed; `Rules.gap` or the covariance has ended it before.
     """
 
     dynamics: Dynamics = field(default_factory=lambda: polynomial(1, 1.0))
@@ -50,7 +51,7 @@ class Following:
 
 
 class Scan(NamedTuple):
-    """An event as a tracker takes it: its problem, and its measurements (m,)."""
+    """An event in the form for a tracker: its problem, and its measurements (m,)."""
 
     event: Event
     problem: Problem
@@ -58,8 +59,11 @@ class Scan(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Kept:
-    """A track, the time of its first event in picoseconds, when it was heard by the clock, and what it said last."""
+class _StoredTrack:
+    """A stored track.
+
+    origin: time of its first event, picoseconds. heard: time of its last event by the clock, s. last: last answer.
+    """
 
     follower: Follower
     origin: int
@@ -68,20 +72,20 @@ class _Kept:
 
 
 class Tracks:
-    """The tracks of a stream, made in a thread of their own so that no fix waits for a start.
+    """The tracks of a stream, computed in a separate thread, so that no fix waits for the start of a track.
 
     Parameters
     ----------
     problem : Problem
-        Of a whole event of the site.
+        Problem of a whole event of the site.
     how : Following
-        How they are made.
+        Settings.
     metrics : Metrics
-        Where is counted.
+        Counters.
     emit : callable
-        Takes an event and its answer.
+        Receives an event and its answer.
     clock : callable
-        Seconds that never go back.
+        Monotonic clock, s.
     """
 
     def __init__(
@@ -93,8 +97,8 @@ class Tracks:
         clock: Callable[[], float],
     ) -> None:
         self._how, self._metrics, self._emit, self._clock = how, metrics, emit, clock
-        # in the order in which they were heard last
-        self._kept: dict[str, _Kept] = {}
+        # in the order of their last events
+        self._kept: dict[str, _StoredTrack] = {}
         self._waiting, self._ends = deque[Scan](), False
         self._changed = Condition()
         self._thread: Thread | None = None
@@ -103,11 +107,11 @@ class Tracks:
 
     @cached_property
     def why(self) -> str:
-        """Return why events of the site make no tracks; empty where they do."""
-        return _why_not(self._problem, self._how)
+        """Return the reason for which events of the site make no tracks; empty if they do."""
+        return _reason_without_tracks(self._problem, self._how)
 
     def take(self, scans: Sequence[Scan]) -> None:
-        """Take events in the order in which they closed; the caller waits while there are too many."""
+        """Add events in the order in which they closed; the caller waits while the queue is full."""
         with self._changed:
             if self._thread is None:
                 self._thread = Thread(target=self._run, name="optloc tracks", daemon=True)
@@ -118,7 +122,7 @@ class Tracks:
                 self._changed.notify_all()
 
     def stop(self) -> None:
-        """Answer what is there, and end."""
+        """Answer the waiting events, and end."""
         with self._changed:
             self._ends = True
             self._changed.notify_all()
@@ -126,7 +130,7 @@ class Tracks:
             self._thread.join()
 
     def records(self) -> list[Record]:
-        """Return the last answer of each track that is kept, with the seconds since (`age`), the latest first."""
+        """Return the last answer of each stored track, with the seconds since then (`age`), the latest first."""
         with self._changed:
             now = self._clock()
             self._forget(now)
@@ -142,8 +146,8 @@ class Tracks:
                 scan = self._waiting.popleft()
                 self._changed.notify_all()
             try:
-                record = self._follow(*scan)
-            except Exception as error:  # noqa: BLE001  # a stream goes on, whatever one event brings to light
+                record = self._track_event(*scan)
+            except Exception as error:  # noqa: BLE001  # an error of one event must not end the stream
                 record = self._failed(scan.event, error)
             self._metrics.took("track", [self._clock() - scan.event.stamp])
             self._emit(scan.event, record)
@@ -153,28 +157,30 @@ class Tracks:
             self._metrics.add("unsolvable")
             return unsolved(event, phase="track", error=str(error))
         LOG.error("event %s failed in its track", event.name, exc_info=error)
-        # what is left of it may be half of a step
+        # remove the track, since its state may be half updated
         with self._changed:
             self._kept.pop(event.target or UNNAMED, None)
         self._metrics.add("unsolvable")
         self._metrics.add("forgotten")
-        return unsolved(event, phase="track", error=f"{type(error).__name__}: {error}; the track begins anew")
+        return unsolved(event, phase="track", error=f"{type(error).__name__}: {error}; a new track starts")
 
-    def _follow(self, event: Event, problem: Problem, z: Array) -> Record:
-        """Return what an event says of its target."""
+    def _track_event(self, event: Event, problem: Problem, z: Array) -> Record:
+        """Return the answer to an event from the track of its target."""
         if self.why:
-            raise InvalidProblem(self.why, None, "ask for fixes")
+            raise InvalidProblem(self.why, None, "request fixes instead of tracks")
         when = event.when if event.when is not None else min(event.times.values(), default=None)
         if when is None:
             raise InvalidProblem("a track needs the time of the event", "time", "add time, time_ns or time_ps")
         name = event.target or UNNAMED
         kept = self._kept.get(name)
-        track = kept or _Kept(Follower(self._how.dynamics, self._how.update, self._how.rules), when)
-        # whole picoseconds first: only their difference becomes a float
+        track = kept or _StoredTrack(Follower(self._how.dynamics, self._how.update, self._how.rules), when)
+        # subtract integers of picoseconds first, since a float would lose digits
         time = (when - track.origin) * 1e-12
         if track.follower.last >= time:
             self._metrics.add("unordered")
-            what = f"the event is {track.follower.last - time:.6g} s before the last one of {name}, or at the same time"
+            what = (
+                f"the event is {track.follower.last - time:.6g} s before the last event of {name}, or at the same time"
+            )
             error = InvalidProblem(what, "time", "send the events of a target in the order of their times")
             return unsolved(event, phase="track", error=str(error))
         entries = track.follower.take(scan_of(problem, z, time))
@@ -191,7 +197,7 @@ class Tracks:
         return record
 
     def _forget(self, now: float) -> None:
-        """Forget tracks that were silent for too long, or are too many."""
+        """Remove tracks without recent events, and tracks beyond the largest number."""
         while self._kept:
             name = next(iter(self._kept))
             if len(self._kept) <= self._how.most and now - self._kept[name].heard <= self._how.age:
@@ -201,7 +207,7 @@ class Tracks:
 
 
 def scan_of(problem: Problem, z: Array, time: float) -> Problem:
-    """Return measurements (m,) of a problem as one scan of a run of one target, at a time in seconds."""
+    """Return measurements (m,) of a problem as one scan of a run with one target, at a time in seconds."""
     rows = np.ones(problem.count, dtype=bool)
     return alone(problem.with_rows(z=z), rows, np.array([time]))
 
@@ -213,12 +219,12 @@ def _told(event: Event, when: int, entry: Entry | None, follower: Follower, prob
     return unsolved(event, phase="track", target=event.target or UNNAMED, time=when * 1e-12, **said)
 
 
-def _why_not(problem: Problem, how: Following) -> str:
-    """Return why events of a site make no tracks; empty where they do."""
+def _reason_without_tracks(problem: Problem, how: Following) -> str:
+    """Return the reason for which events of a site make no tracks; empty if they do."""
     if problem.priors:
-        return f"the file has a prior of {problem.priors[0].name!r}, which a track does not take"
+        return f"the file has a prior of {problem.priors[0].name!r}; a track cannot use priors"
     if len(problem.motions) > 1 or problem.motions[0].known is not None:
-        return "the file tells of several targets, or of one whose place is known"
+        return "the file has several targets, or a known target"
     try:
         with np.errstate(all="ignore"):
             Follower(how.dynamics, how.update, how.rules).take(scan_of(problem, np.zeros(problem.count), 0.0))

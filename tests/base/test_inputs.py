@@ -85,20 +85,20 @@ HOSTILE = {
     "long name": (lambda f: named(f, "x" * 5000 + ".csv"), r"cannot be opened \(File name too long\)"),
     "a zero in a name": (lambda f: named(f, "t\\u0000.csv"), "control characters"),
     "columns": (lambda f: table(f, b",".join(b"c%d" % i for i in range(10**6)) + b"\n1\n"), "1000000 columns, 1000 at"),
-    "a long header": (lambda f: table(f, b"a,b,z" + b"x" * 10**7 + b"\nB,A,1\n"), "no CSV table"),
+    "a long header": (lambda f: table(f, b"a,b,z" + b"x" * 10**7 + b"\nB,A,1\n"), "not a CSV table"),
     "rows": (lambda f: table(f, b"a,b,z\n" + b"B,A,1\n" * 10**7), "more rows than 4000000"),
     "digits in a cell": (lambda f: table(f, b"a,b,z\nB,A," + b"9" * 10**6 + b"\n"), "is not a finite number"),
     "zeros": (lambda f: table(f, b"a,b,z\nB,A\0,1\n"), "control characters"),
     "not UTF-8": (lambda f: table(f, b"a,b,z\nB,A,1\nB,\xff,2\n"), "t.csv, line 3: the text is not UTF-8"),
-    "quotes": (lambda f: table(f, b'a,b,z\nB,"A,1\n'), "no CSV table|no station"),
+    "quotes": (lambda f: table(f, b'a,b,z\nB,"A,1\n'), "not a CSV table|no station"),
     "parquet rows": (lambda f: packed(f, ("z", np.zeros(10**7)), compression="zstd"), "10000000 rows, 4000000 at"),
     "parquet nothings": (lambda f: packed(f, ("z", pa.nulls(10**7))), "10000000 rows, 4000000 at"),
     "parquet word": (
         lambda f: packed(f, ("a", ["x" * (1 << 20)] * 300), ("z", np.zeros(300)), compression="zstd"),
         "there is no station 'xxx",  # once in its dictionary, it is no burden
     ),
-    "parquet lists": (lambda f: packed(f, *row(z=[[1.0]])), "column 'z': it holds list<"),
-    "parquet truth": (lambda f: packed(f, *row(z=[True])), "column 'z': it holds bool"),
+    "parquet lists": (lambda f: packed(f, *row(z=[[1.0]])), "column 'z': the column has the type list<"),
+    "parquet truth": (lambda f: packed(f, *row(z=[True])), "column 'z': the column has the type bool"),
     "parquet dates": (lambda f: packed(f, *row(z=pa.array([1], pa.timestamp("ns")))), "datetime64.*not numbers"),
     "parquet bytes": (lambda f: packed(f, *row(a=invalid_text())), "not UTF-8"),
     "digits": (lambda f: document(f, "format = " + "9" * 10**6), "too many digits"),
@@ -228,7 +228,7 @@ def test_standard_input_is_a_problem_file(tmp_path, monkeypatch):
 
 def test_a_table_named_like_standard_input_is_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InvalidProblem, match="no known type"):
+    with pytest.raises(InvalidProblem, match="an unknown type"):
         read(named(Path(), "-"))
 
 

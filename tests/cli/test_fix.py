@@ -31,13 +31,15 @@ def test_sentences_on_the_noise_say_what_uses_them():
     assert tell_level(None) == ()
     assert tell_level(level(suspect=True)) == ("the noise is twice as large: --rescale-noise uses it",)
     assert tell_level(level(suspect=True), used=True) == ("the noise is twice as large: this is used",)
-    assert tell_level(level(), used=True) == ("the noise is used as stated: no common factor explains more",)
+    assert tell_level(level(), used=True) == (
+        "the noise is used as stated: no common factor explains the residuals better",
+    )
 
 
 def test_late_rows_outweigh_the_noise():
     late = SimpleNamespace(sentence="a tenth of the rows is late", alike=False)
     assert tell_level(level(suspect=True), late=late) == (
-        "a tenth of the rows is late: --late-from-data fixes with that",
+        "a tenth of the rows is late: --late-from-data fixes with this loss",
     )
 
 

@@ -14,7 +14,7 @@ from optloc.files import read
 def test_columns_are_named_by_role():
     assert columns_of(["station=receiver", "toa=t=1"]) == {"station": "receiver", "toa": "t=1"}
     assert columns_of(None) == {}
-    with pytest.raises(InvalidProblem, match="'station=' names no column"):
+    with pytest.raises(InvalidProblem, match="'station=' does not name a column"):
         columns_of(["station="])
 
 

@@ -23,7 +23,7 @@ def test_coordinates_are_finite_numbers_unless_they_are_bounds():
     assert coordinates("1,-2.5,3e2", "--at") == [1.0, -2.5, 300.0]
     assert coordinates("0,-inf", "--box", bounds=True) == [0.0, -inf]
     for text in ("1,x", "1,,2", "inf", "nan", ""):
-        with pytest.raises(InvalidProblem, match="no list of numbers"):
+        with pytest.raises(InvalidProblem, match="not a list of numbers"):
             coordinates(text, "--at")
 
 

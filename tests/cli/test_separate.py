@@ -13,7 +13,7 @@ def test_a_number_of_emitters_is_at_most_that_of_rows():
     assert _count("auto", 5) is None
     assert _count("5", 5) == 5
     for text in ("6", "-1", "two", "1.0", "9" * 20, "\u0663"):
-        with pytest.raises(InvalidProblem, match="no number of emitters"):
+        with pytest.raises(InvalidProblem, match="not a number of emitters"):
             _count(text, 5)
 
 
@@ -22,7 +22,7 @@ def test_a_region_is_two_corners():
     assert _region(problem, None) is None
     lower, upper = _region(problem, "0,1:2,3")
     assert (lower.tolist(), upper.tolist()) == ([0.0, 1.0], [2.0, 3.0])
-    for text, words in (("0,1", "no region"), ("0,1,2:3,4,5", "3 coordinates do not fit 2")):
+    for text, words in (("0,1", "not a region"), ("0,1,2:3,4,5", "3 coordinates do not fit 2")):
         with pytest.raises(InvalidProblem, match=words):
             _region(problem, text)
 

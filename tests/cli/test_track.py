@@ -31,7 +31,7 @@ def test_a_start_needs_a_number_for_each_part_of_the_state():
     assert state.mean.tolist() == [1.0, 2.0, 3.0, 4.0]
     assert np.diagonal(state.cov).tolist() == [100.0, 100.0, 25.0, 25.0]
     assert _start(run, dynamics, TrackOptions()) is None
-    for start, sigma, words in (("1,2", "1,1", "2 numbers for a state of 4"), ("1,2,3,4", "1", "no standard")):
+    for start, sigma, words in (("1,2", "1,1", "2 numbers for a state of 4"), ("1,2,3,4", "1", "not standard")):
         with pytest.raises(InvalidProblem, match=words):
             _start(run, dynamics, TrackOptions(start=start, sigma=sigma))
     with pytest.raises(InvalidProblem, match="give both or neither"):

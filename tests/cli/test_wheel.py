@@ -23,7 +23,7 @@ def test_a_folder_that_cannot_be_made_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(wheel, "find_spec", lambda name: True)
     monkeypatch.setattr(wheel, "names_in", lambda package: [])
     (tmp_path / "file").touch()
-    with pytest.raises(InvalidProblem, match="cannot be made") as refused:
+    with pytest.raises(InvalidProblem, match="cannot be created") as refused:
         wheel.pack(tmp_path, tmp_path / "file" / "out")
     assert refused.value.where == str(tmp_path / "file" / "out")
 

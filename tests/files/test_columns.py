@@ -198,7 +198,7 @@ def test_an_angle_is_no_height(head, extra, tmp_path):
 def test_an_elevation_without_a_unit_is_asked_for(tmp_path):
     text = "anchor,azimuth_deg,elevation\nN1,45,30\nN2,50,20\n"
     told = {"sigma": "1 deg", "azimuth": "north-clockwise"}
-    with pytest.raises(InvalidProblem, match=r"'elevation' may be an angle or a height; say --column elevation=elev"):
+    with pytest.raises(InvalidProblem, match=r"'elevation' may be an angle or a height; use --column elevation=elev"):
         read(tmp_path, text, **told)
     assert [one.kind for one in read(tmp_path, text, unit="deg", **told).sections] == ["azimuth", "elevation"]
     chosen = read(tmp_path, text, columns={"elevation": "elevation"}, **told).sections
@@ -211,8 +211,8 @@ def test_an_elevation_without_a_unit_is_asked_for(tmp_path):
     [
         ({"toa": "nothing"}, "there is no column 'nothing' for the toa"),
         ({"toa": "when_s"}, None),
-        ({"range": "angle_deg"}, r"'angle_deg' is in deg, which is no unit of the role range"),
-        ({"time": "far_m"}, r"'far_m' is in m, which is no unit of the role time"),
+        ({"range": "angle_deg"}, r"'angle_deg' is in deg, which is not a unit of the role range"),
+        ({"time": "far_m"}, r"'far_m' is in m, which is not a unit of the role time"),
         ({"toa": "when_s", "time": "when_s"}, r"'when_s' is given two roles, toa and time"),
         ({"toa": "when_s", "arrivals": "far_m"}, r"the role toa is given to two columns, 'when_s' and 'far_m'"),
         ({"toa": "when_s", "reference": "anchor2"}, r"the role reference of the column 'anchor2' is not used"),
@@ -269,7 +269,9 @@ def test_a_role_of_places_that_is_named_is_used_or_refused(tmp_path):
 def test_a_measurement_is_not_left_out_without_a_message(column, tmp_path):
     text = rows(f"anchor,range_m,{column}", "{n},{r:.9f},30.5")
     told = {"what": "range"}
-    with pytest.raises(InvalidProblem, match=rf"'{column}': it may hold a measurement .* --ignore {column} leaves"):
+    with pytest.raises(
+        InvalidProblem, match=rf"'{column}': the column may have a measurement .* --ignore {column} leaves"
+    ):
         read(tmp_path, text, **told)
     made = read(tmp_path, text, ignore=(column,), **told)
     assert column not in made.uses
@@ -289,7 +291,9 @@ def test_other_columns_are_named_in_one_line(columns, tmp_path):
 @pytest.mark.parametrize("column", ["dist_corr_m", "far [cm]", "range_raw", "twr2", "angle_deg", "level_dB"])
 def test_times_are_no_arrivals_beside_a_column_that_may_hold_the_readings(column, tmp_path):
     text = rows(f"time_s,anchor,{column}", "{t}e-9,{n},{r:.9f}")
-    with pytest.raises(InvalidProblem, match=r"the readings may be in '.*', or be the times in 'time_s'; say --column"):
+    with pytest.raises(
+        InvalidProblem, match=r"the readings may be in '.*', or may be the times in 'time_s'; use --column"
+    ):
         read(tmp_path, text)
     assert fixed(read(tmp_path, rows("time_s,anchor,squawk", "{t}e-9,{n},7000"))) < 1e-5
 
@@ -302,7 +306,9 @@ def test_what_is_ignored_must_be_there(tmp_path):
 def test_a_wide_table_leaves_no_kind_out(tmp_path):
     head = "t_s," + ",".join(f"dist_{n}_m,toa_{n}_ns" for n in FAR)
     text = head + "\n0," + ",".join(f"{r},{r / C}" for r in FAR.values()) + "\n"
-    with pytest.raises(InvalidProblem, match=r"column 'toa_N1_ns': it may hold a measurement \(arrival times\)"):
+    with pytest.raises(
+        InvalidProblem, match=r"column 'toa_N1_ns': the column may have a measurement \(arrival times\)"
+    ):
         read(tmp_path, text, what="range")
     gone = tuple(f"toa_{n}_ns" for n in FAR)
     assert fixed(read(tmp_path, text, what="range", ignore=gone)) < 1e-6
@@ -333,7 +339,7 @@ def test_errors_of_all_kinds_are_read(head, line, kinds, tmp_path):
     from optloc.problem import noise
 
     if kinds is None:  # two plain columns of errors: the first one has no unit of an angle
-        with pytest.raises(InvalidProblem, match="nothing is known of how accurate the readings of azimuth are"):
+        with pytest.raises(InvalidProblem, match="the accuracy of the readings of azimuth is"):
             read(tmp_path, rows(head, line), sigma=None)
         return
     problem = read(tmp_path, rows(head, line), sigma=None).read().problem
@@ -347,7 +353,7 @@ def test_errors_of_all_kinds_are_read(head, line, kinds, tmp_path):
 def test_errors_without_a_unit_are_asked_for_beside_several_kinds(tmp_path):
     text = rows("anchor,range_m,bearing_deg,sigma", "{n},{r},3,2")
     with pytest.raises(
-        InvalidProblem, match=r"'sigma' may be the error of range or azimuth; say --column sigma_range=sig"
+        InvalidProblem, match=r"'sigma' may be the error of range or azimuth; use --column sigma_range=sig"
     ):
         read(tmp_path, text, sigma=None)
     chosen = {"columns": {"sigma_range": "sigma"}, "sigma": "bearing=1 deg"}
@@ -393,7 +399,7 @@ def test_a_window_needs_the_unit_of_the_times_not_their_name(name, unit, told, t
     assert read(tmp_path, text, window="3 s", **told).read().problem.epochs == 1
     if "time_unit" in told:
         with pytest.raises(
-            InvalidProblem, match=r"unit of the times in column '.*' is not known; say it with --time-unit"
+            InvalidProblem, match=r"unit of the times in column '.*' is unknown; state it with --time-unit"
         ):
             read(tmp_path, text, window="0.06 s", **{key: value for key, value in told.items() if key != "time_unit"})
 
@@ -411,14 +417,14 @@ def test_a_window_puts_arrivals_together_by_their_gaps(head, size, tmp_path):
 @pytest.mark.parametrize("epochs", [1, 3])
 def test_a_window_without_times_is_refused_before_repeats_are(epochs, tmp_path):
     text = "stamp_ms,anchor,range_m\n" + "".join(f"{k},{n},{r}\n" for k in range(epochs) for n, r in FAR.items())
-    with pytest.raises(InvalidProblem, match="a window needs a column of times; name the column"):
+    with pytest.raises(InvalidProblem, match="a window needs a column of times; state the time column"):
         read(tmp_path, text, window="0.2 s")
 
 
 @pytest.mark.parametrize(
     ("told", "words"),
     [
-        ({"time_unit": "m"}, "'m' is no unit of time"),
+        ({"time_unit": "m"}, "'m' is not a unit of time"),
         ({"time_unit": "s"}, r"the column 't_ms' ends in ms, not in s"),
         ({"window": "soon"}, "soon"),
     ],
@@ -444,7 +450,7 @@ def test_wrong_units_of_times_are_refused(told, words, tmp_path):
 def test_the_sign_is_told_as_it_is(head, sign, further, tmp_path):
     lines = "".join(f"{n},N1,{further(r, FAR['N1']):.9f}\n" for n, r in FAR.items() if n != "N1")
     made = read(tmp_path, f"{head}\n{lines}", sigma="0.1 dB" if "dB" in head else "1 cm")
-    assert dict(made.about)["sign"] == f"positive where the {sign} is farther"
+    assert dict(made.about)["sign"] == f"positive if the {sign} is farther"
     problem = made.read().problem
     where = problem.stations.position.reshape(-1, 3)
     one = problem.rows[0]
@@ -452,7 +458,7 @@ def test_the_sign_is_told_as_it_is(head, sign, further, tmp_path):
     z = further(r[one.a], r[one.b])
     np.testing.assert_allclose(_plain(one), z, atol=1e-6)
     turned = read(tmp_path, f"{head}\n{lines}", sigma="0.1 dB" if "dB" in head else "1 cm", positive="b-farther")
-    assert dict(turned.about)["sign"] == f"positive where the {'first' if sign == 'second' else 'second'} is farther"
+    assert dict(turned.about)["sign"] == f"positive if the {'first' if sign == 'second' else 'second'} is farther"
 
 
 def _plain(one):
@@ -512,10 +518,10 @@ def test_stations_of_a_document_may_have_lists_of_coordinates(tmp_path):
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        ([{"anchor": ["N1", "N2"], "range_m": [1.0]}], r"row 1: its lists have different lengths: anchor has 2"),
+        ([{"anchor": ["N1", "N2"], "range_m": [1.0]}], r"row 1: the lists have different lengths: anchor has 2"),
         ([{"a_b": 1, "a": {"b": 2}}], r"row 1: the value 'a_b' is given twice"),
         ([{"anchor": "N1", "range_m": [[1, 2]]}], r"finite number"),
-        ({"readings": []}, r"no list of records|do not tell"),
+        ({"readings": []}, r"no list of records|do not identify"),
     ],
 )
 def test_lists_that_say_nothing_are_refused(data, words, tmp_path):

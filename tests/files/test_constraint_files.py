@@ -113,7 +113,7 @@ BAD = {
     "unknown key": ('kind = "height"\nminimum = 3', ["'minimum'", "did you mean 'min'"]),
     "key of another kind": ('kind = "height"\nmin = 1\ncorners = [[0, 0]]', ["height has no key 'corners'"]),
     "key of none": ('kind = "above-ground"\nmin = 1', ["above-ground has no key 'min'"]),
-    "nothing": ('kind = "height"', ["bounds nothing", "exactly or min or max"]),
+    "nothing": ('kind = "height"', ["has no bound", "exactly or min or max"]),
     "exact and a band": ('kind = "height"\nexactly = 1\nmin = 0', ["exact or in a band"]),
     "unknown unit": ('kind = "height"\nmin = "3 mm/h"', ["[[constraints]] 1", "'mm/h'"]),
     "unit of another quantity": ('kind = "height"\nmin = "3 deg"', ["'deg'", "length"]),
@@ -134,19 +134,19 @@ BAD = {
     "latitude": ('kind = "polygon"\ncorners_deg = [[97, 0], [9, 0], [9, 9]]', ["'corners_deg'", "latitude 97"]),
     "corners twice": ('kind = "polygon"\ncorners = [[0, 0]]\ncorners_deg = [[0, 0]]', ["twice"]),
     "unknown station": ('kind = "visible"\nstations = ["Q"]', ["'stations'", "no station 'Q'"]),
-    "no list": ('kind = "visible"\nstations = "A"', ["'A' is no list"]),
+    "not a list": ('kind = "visible"\nstations = "A"', ["'A' is not a list"]),
     "beyond the zenith": ('kind = "visible"\nelevation = 95', ["outside -90 to 90"]),
     "unknown target": ('kind = "above-ground"\ntarget = "drone"', ["no row has the target 'drone'"]),
     "speed at rest": ('kind = "speed"\nmax = 3', ["'speed'", "moves"]),
     "known target": ('kind = "above-ground"\n[target]\nrows = [{ x = 0.0, y = 0.0, z = 0.0 }]', ["is known"]),
     "places of a free target": ('kind = "above-ground"\n[target]\nmotion = "free"\nrows = [{ x = 0 }]', ["are given"]),
     "known without places": ('kind = "above-ground"\n[target]\nmotion = "known"', ["[target]", "given once"]),
-    "several places": ('kind = "above-ground"\n[target]\nrows = [{ x = 0 }, { x = 1 }]', ["several places"]),
+    "several positions": ('kind = "above-ground"\n[target]\nrows = [{ x = 0 }, { x = 1 }]', ["several positions"]),
 }  # fmt: skip
 IN_PLANE = {
     "height without the Earth": ('kind = "height"\nmin = 1', ["height", "geodetic frame"]),
     "horizon without the Earth": ('kind = "visible"', ["geodetic frame"]),
-    "degrees without the Earth": ('kind = "polygon"\ncorners_deg = [[0, 0], [9, 0], [9, 9]]', ["need a plan"]),
+    "degrees without the Earth": ('kind = "polygon"\ncorners_deg = [[0, 0], [9, 0], [9, 9]]', ["need an enu frame"]),
 }
 TABLE = {name: (demand(text), words) for name, (text, words) in BAD.items()}
 TABLE |= {name: (demand(text, PLANE), words) for name, (text, words) in IN_PLANE.items()}
@@ -200,8 +200,8 @@ def test_what_lies_below_the_ground_is_no_alternative(tmp_path):
         (["--height", "5 deg"], "'deg'"),
         (["--height", "-5", "--above-ground"], "at least 0 m and at most -5 m"),
         (["--box", "0,0"], "--box: '0,0' has one corner"),
-        (["--box", "0,0:1,x"], "no list"),
-        (["--box", "0,0,nan:1,1,1"], "no list"),
+        (["--box", "0,0:1,x"], "not a list"),
+        (["--box", "0,0,nan:1,1,1"], "not a list"),
         (["--box", "0,0:1,1"], "2 coordinates, not 3"),
     ],
 )

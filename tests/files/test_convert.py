@@ -75,7 +75,7 @@ def test_arrival_times_keep_all_their_digits(suffix, tmp_path):
 def test_other_names_and_separators_are_told(tmp_path):
     source = arrivals(tmp_path, message="Pulse", station="RX", time="when [s]", separator=";")
     out = tmp_path / "site.toml"
-    with pytest.raises(InvalidProblem, match=r"arrivals\.csv: the columns Pulse, RX, when \[s\] do not tell"):
+    with pytest.raises(InvalidProblem, match=r"arrivals\.csv: the columns Pulse, RX, when \[s\] do not identify"):
         convert(source, out, stations=geojson(tmp_path), sigma="10 ns")
     convert(source, out, stations=geojson(tmp_path), sigma="10 ns", columns={"time": "when [s]"})
     assert fixed(out)[1].max() < 0.05
@@ -86,7 +86,7 @@ def test_several_columns_make_a_message(tmp_path):
     table = pd.read_csv(source, dtype=str)
     table.assign(message="7", set=table["message"]).to_csv(source, index=False)
     out = tmp_path / "site.toml"
-    with pytest.raises(InvalidProblem, match=r"row 6: .*'A' has a second .* '7', first in row 1; 5 such .*ONE\+TWO"):
+    with pytest.raises(InvalidProblem, match=r"row 6: .*'A' has a second .* '7', first in row 1; 5 repeats .*ONE\+TWO"):
         convert(source, out, stations=geojson(tmp_path), sigma="10 ns")
     found = convert(source, out, stations=geojson(tmp_path), sigma="10 ns", columns={"message": "set+message"})
     assert found.loaded.epochs == ("1-7", "2-7")
@@ -116,7 +116,7 @@ def test_stations_alone_are_a_table(tmp_path):
 
 def test_a_column_without_a_unit_is_asked_for_it(tmp_path):
     source, sites, out = arrivals(tmp_path, time="time"), geojson(tmp_path), tmp_path / "s.toml"
-    with pytest.raises(InvalidProblem, match="the unit of the column 'time' is not known; say it with --unit ns"):
+    with pytest.raises(InvalidProblem, match="the unit of the column 'time' is unknown; state it with --unit ns"):
         convert(source, out, stations=sites, sigma="10 ns")
     assert not convert(source, out, stations=sites, sigma="10 ns", unit="s").notes
 
@@ -143,8 +143,8 @@ def test_a_bad_cell_is_named(change, words, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"sigma": None}, r"nothing is known of how accurate the rows are; say it with --sigma"),
-        ({"stations": None}, "nothing is known of where the stations are"),
+        ({"sigma": None}, r"the accuracy of the rows is unknown; state it with --sigma"),
+        ({"stations": None}, "the station positions are unknown"),
         ({"columns": {"staton": "x"}}, "there is no role 'staton'; did you mean 'station'"),
         ({"columns": {"station": "statoin"}}, "no column 'statoin' for the station; did you mean 'station'"),
         ({"what": "arivals"}, "did you mean 'arrivals'"),
@@ -171,7 +171,7 @@ def test_bad_options_are_sentences(options, words, tmp_path):
         ('{"features": [{"geometry": {"type": "Point", "coordinates": [1, 2]}}]}', "feature 1: the point has no name"),
         (
             '{"features": [{"id": "A", "geometry": {"type": "Point", "coordinates": [1, 97]}}]}',
-            r"feature 1: \[1, 97\] is no point; write \[longitude, latitude, height\]",
+            r"feature 1: \[1, 97\] is not a point; write \[longitude, latitude, height\]",
         ),
     ],
 )

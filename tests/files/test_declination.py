@@ -14,7 +14,7 @@ def test_a_date_is_told_from_an_angle():
     assert date_of("2026-06-01", "here") == date(2026, 6, 1)
     assert date_of("4 deg", "here") is None
     assert date_of(0.1, "here") is None
-    with pytest.raises(InvalidProblem, match="no date"):
+    with pytest.raises(InvalidProblem, match="not a date"):
         date_of("2026-13-01", "here")
 
 

@@ -76,7 +76,7 @@ def test_a_stated_convention_leaves_the_heading_out(tmp_path):
     told = RUN.invoke(app, ["convert", str(path), "--sigma", "1 deg", "--azimuth", "north-clockwise", "--still"])
     assert "not used  heading_deg" in told.stdout
     told = RUN.invoke(app, ["convert", str(path), "--sigma", "1 deg", "--still"])
-    assert "its heading was added, column 'heading_deg'; --azimuth north-clockwise takes them" in told.stdout
+    assert "the heading in column 'heading_deg' is added; --azimuth north-clockwise reads them" in told.stdout
     assert "bearings from the bow, plus heading_deg" in told.stdout
 
 
@@ -95,7 +95,9 @@ def test_other_angles_do_not_change_true_bearings(tmp_path):
 
 def test_a_declination_is_added_to_magnetic_headings(tmp_path):
     path = drive(tmp_path, "heading_mag_deg", shift=5.5)
-    with pytest.raises(InvalidProblem, match=r"'heading_mag_deg' are magnetic, of unknown declination; give it with"):
+    with pytest.raises(
+        InvalidProblem, match=r"'heading_mag_deg' are magnetic, and the declination is unknown; give it with"
+    ):
         fixed(path)
     assert off(fixed(path, declination="5.5 deg")) < 0.1
     out = tmp_path / "drive.toml"
@@ -121,7 +123,7 @@ def test_commands_take_the_declination(tmp_path):
     ("replaced", "by", "words"),
     [
         ("200.0,", ",", r"row 4, column 'heading_deg': the bearing has no heading"),
-        ("200.0,", "511,", r"row 4, column 'heading_deg': the heading 511 deg is more than a turn"),
+        ("200.0,", "511,", r"row 4, column 'heading_deg': the heading 511 deg is more than a full turn"),
         ("heading_deg", "heading_m", r"no column looks like the heading"),
     ],
 )
@@ -135,7 +137,7 @@ def test_headings_that_are_none_are_refused(replaced, by, words, tmp_path):
 def test_small_headings_without_a_unit_are_asked_for(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("lat,lon,heading,bearing_deg\n59.9,10.7,1.0,30\n59.8,10.75,2.0,20\n")
-    with pytest.raises(InvalidProblem, match=r"the unit of the column 'heading' is not known; call it heading_deg"):
+    with pytest.raises(InvalidProblem, match=r"the unit of the column 'heading' is unknown; rename it to heading_deg"):
         fixed(path)
     found = interpret_table(path, ColumnHints(sigma="1 deg", still=True, unit="deg")).sections[0]
     assert found.columns["z"].texts() == ["31.0", "22.0"]
@@ -160,7 +162,7 @@ def test_stations_of_a_table_may_have_headings(tmp_path):
     sites.write_text("\n".join(rows) + "\n")
     made = interpret_table(path, ColumnHints(sigma="1 deg", stations=sites))
     assert off(solve(made.read().problem)) < 0.1
-    assert "bearings are taken from the headings of the stations" in made.notes[0]
+    assert "bearings are relative to the headings of the stations" in made.notes[0]
     sites.write_text("\n".join(rows).replace(",65.0", ",") + "\n")
     with pytest.raises(InvalidProblem, match="station 'S2' has no heading"):
         interpret_table(path, ColumnHints(sigma="1 deg", stations=sites))

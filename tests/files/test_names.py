@@ -66,7 +66,7 @@ def test_an_unknown_name_is_refused_in_every_form(form, wrong, hint):
 @pytest.mark.parametrize("extra", ["time", "note", "temperature_C", ("A1", "A2")])
 def test_a_column_that_is_none_of_a_station_is_refused_with_advice_to_drop_it(extra):
     frame = pd.DataFrame([RANGES]).assign(x=[1.0]).rename(columns={"x": extra})
-    with pytest.raises(InvalidProblem, match="drop a column that holds no ranges"):
+    with pytest.raises(InvalidProblem, match="drop columns without ranges"):
         locate(ANCHORS, ranges=frame, sigma=0.05)
     assert locate(ANCHORS, ranges=frame.drop(columns=[extra]), sigma=0.05).dof == 3
 

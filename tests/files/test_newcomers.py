@@ -155,7 +155,7 @@ def test_a_file_of_bearings_says_how_they_are_counted(tmp_path, caplog, version,
     assert loaded.problem.rows[0].kind == "azimuth"
     assert loaded.azimuths.startswith("the compass" if compass else "the axes")
     assert ("east-counterclockwise" if compass else "north-clockwise") in loaded.azimuths
-    assert ("no convention is named" in caplog.text) == (not compass)
+    assert ("no convention is stated" in caplog.text) == (not compass)
     if compass:
         assert metres(optloc.solve(loaded.problem)) < 0.1
 
@@ -250,7 +250,7 @@ def test_kinds_together_and_sound():
 WRONG = {
     "nothing measured": ({"stations": ANCHORS, "sigma": 1.0}, "give one of toa"),
     "no stations": ({"ranges": [1.0], "sigma": 1.0}, "latlon="),
-    "no sigma": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4]}, "how accurate the ranges are"),
+    "no sigma": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4]}, "the accuracy of the ranges is unknown"),
     "no coordinates": (
         {"stations": pd.DataFrame({"east": [0.0, 1.0], "north": [0.0, 1.0]}), "ranges": [1.0, 1.0], "sigma": 1.0},
         "no coordinates among",
@@ -267,11 +267,14 @@ WRONG = {
     "x and y for degrees": ({"latlon": {"x": [0.0, 1.0], "y": [0.0, 1.0]}, "toa": [0, 0], "sigma": 1.0}, "lat and lon"),
     "words": ({"stations": ANCHORS, "ranges": {"A": "near"}, "sigma": 1.0}, "not numbers"),
     "height": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "height": 2.0}, "plane"),
-    "a height that is none": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "height": {}}, "no height"),
+    "a height that is none": (
+        {"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "height": {}},
+        "not a height",
+    ),
     "a speed that is none": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "speed": "fast"}, "speed"),
     "a unit that is none": (
         {"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "unit": [1]},
-        "list is no name",
+        "list is not text",
     ),
     "a method that is none": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "method": {}}, "dict is no"),
 }

@@ -170,18 +170,20 @@ def test_places_of_a_low_satellite_need_small_steps(tle, tmp_path):
     times = seconds(0.0, 31.0, 100.0)
     found = satellites(sp3(tle, tmp_path / "fine.sp3", 60, hours=2), times, ["L01"])
     assert np.abs(found.position - satellites(tle, times, ["LEO 1"]).position).max() < 0.02
-    with pytest.raises(InvalidProblem, match=r"coarse\.sp3, satellite L01: its places are 900 s apart.*smaller steps"):
+    with pytest.raises(
+        InvalidProblem, match=r"coarse\.sp3, satellite L01: the positions are 900 s apart.*smaller steps"
+    ):
         satellites(sp3(tle, tmp_path / "coarse.sp3", 900), times, ["L01"])
 
 
 def test_gaps_and_ends_of_an_sp3_file_are_not_bridged(tle, tmp_path):
     path = sp3(tle, tmp_path / "igs.sp3", 900)
-    with pytest.raises(InvalidProblem, match="before its first or after its last place; use the file of that day"):
+    with pytest.raises(InvalidProblem, match="before the first or after the last position; use the file of that day"):
         satellites(path, seconds(40000.0))
     lines = path.read_text().splitlines()
     hole = next(i for i, text in enumerate(lines) if text.startswith("*  2004  4  6 10")) + 2
     path.write_text("\n".join([*lines[:hole], re.sub(r"[1-9]", "0", lines[hole][:46]), *lines[hole + 1 :]]))
-    with pytest.raises(InvalidProblem, match=r"places are missing around 2004-04-06T\d\d"):
+    with pytest.raises(InvalidProblem, match=r"positions are missing around 2004-04-06T\d\d"):
         satellites(path, seconds(8000.0), ["G07"])
 
 
@@ -189,39 +191,45 @@ def test_gaps_and_ends_of_an_sp3_file_are_not_bridged(tle, tmp_path):
 
 ONE, TWO = LEO.splitlines()[1:]
 BROKEN = {
-    "nothing": ("", "the file holds no orbits"),
-    "words": ("these are\nno elements\n", "the file holds no orbits"),
+    "nothing": ("", "the file has no orbits"),
+    "words": ("these are\nno elements\n", "the file has no orbits"),
     "check digit": (LEO.replace("100.0000", "101.0000"), r"b\.tle, line 2: the check digit at the end of a line"),
-    "letters": (f"A\n{ONE}\n{line(TWO.replace('86.3900', 'xx.3900'))}", r"b\.tle, line 2: these are no elements"),
-    "cut": (f"A\n{ONE[:40]}\n{TWO}", r"b\.tle, line 2: these are no elements"),
-    "two satellites": (f"A\n{ONE}\n{GNSS.splitlines()[2]}", r"b\.tle, line 2: these are no elements"),
-    "a line is missing": (f"A\n{ONE}\nB\n", r"b\.tle, line 2: a first line of elements has no second one"),
-    "the first is missing": (f"A\n{TWO}\n", r"b\.tle, line 2: a second line of elements has no first one"),
-    "no motion": (elements(motion=0.0), r"b\.tle, line 2: these are no elements|cannot be followed"),
-    "in the ground": (elements(motion=18.5), r"b\.tle, line 2: .*(no elements|cannot be followed)"),
+    "letters": (
+        f"A\n{ONE}\n{line(TWO.replace('86.3900', 'xx.3900'))}",
+        r"b\.tle, line 2: these are not valid elements",
+    ),
+    "cut": (f"A\n{ONE[:40]}\n{TWO}", r"b\.tle, line 2: these are not valid elements"),
+    "two satellites": (f"A\n{ONE}\n{GNSS.splitlines()[2]}", r"b\.tle, line 2: these are not valid elements"),
+    "a line is missing": (f"A\n{ONE}\nB\n", r"b\.tle, line 2: a first line of elements has no second line"),
+    "the first is missing": (f"A\n{TWO}\n", r"b\.tle, line 2: a second line of elements has no first line"),
+    "no motion": (elements(motion=0.0), r"b\.tle, line 2: these are not valid elements|cannot be computed"),
+    "in the ground": (elements(motion=18.5), r"b\.tle, line 2: .*(not valid elements|cannot be computed)"),
     "other years": (elements(epoch="05097.00000000"), "are 36[456] days from 2004-04-06"),
     "bell": (LEO.replace("LEO 1", "LE\x07"), "control characters"),
-    "xml": ("<?xml version='1.0'?><ndm/>", "elements in XML are not read; save them as JSON"),
+    "xml": ("<?xml version='1.0'?><ndm/>", "elements in XML are not supported; save them as JSON"),
     "half a json": ('{"OBJECT_NAME": "A"', "line 1: this is not JSON"),
-    "a list of numbers": ("[1, 2]", "message 1: this is no orbit mean-elements message"),
+    "a list of numbers": ("[1, 2]", "message 1: this is not an orbit mean-elements message"),
     "a message without a number": ("[{}]", "message 1: the element NORAD_CAT_ID is missing"),
     "a message without motion": (
         json.dumps({"NORAD_CAT_ID": 3, "EPOCH": "2004-04-06T00:00:00"}),
         "element .* is missing",
     ),
-    "a message of words": (json.dumps(omm(INCLINATION="steep")), "message 1: these are no elements"),
-    "nested": (json.dumps(omm(INCLINATION=[1.0])), "message 1: these are no elements"),
-    "another frame": (json.dumps(omm(REF_FRAME="ICRF")), "REF_FRAME is 'ICRF'; elements are read where it is TEME"),
-    "not an instant": (json.dumps(omm(EPOCH="yesterday")), "message 1: these are no elements"),
-    "an old format": ("#x\n", r"line 1: this is no SP3 file of version a to d"),
-    "sp3 without places": ("#d\n*  2004 4 6 0 0 0.0\nEOF", "the file holds no places"),
+    "a message of words": (json.dumps(omm(INCLINATION="steep")), "message 1: these are not valid elements"),
+    "nested": (json.dumps(omm(INCLINATION=[1.0])), "message 1: these are not valid elements"),
+    "another frame": (
+        json.dumps(omm(REF_FRAME="ICRF")),
+        "REF_FRAME is 'ICRF'; only elements with REF_FRAME = TEME are supported",
+    ),
+    "not an instant": (json.dumps(omm(EPOCH="yesterday")), "message 1: these are not valid elements"),
+    "an old format": ("#x\n", r"line 1: this is not an SP3 file of version a to d"),
+    "sp3 without places": ("#d\n*  2004 4 6 0 0 0.0\nEOF", "the file has no positions"),
     "sp3 with words": (
         "#d\n*  2004 4 6 0 0 0.0\nPG01" + 3 * "        a lot " + "\n",
         "line 3: 'a lot' is not a number",
     ),
-    "sp3 without a date": ("#d\n*  2004 13 6 0 0 0.0\n", "line 2: this is no date"),
-    "sp3 at minute -5": ("#d\n*  2004 4 6 0 -5 0.0\n", "line 2: this is no date"),
-    "sp3 with few": ("#d\n*  2004 4 6 0 0 0.0\nPG01" + 3 * "  12345.000000" + "\n", "there are 1 places"),
+    "sp3 without a date": ("#d\n*  2004 13 6 0 0 0.0\n", "line 2: this is not a date"),
+    "sp3 at minute -5": ("#d\n*  2004 4 6 0 -5 0.0\n", "line 2: this is not a date"),
+    "sp3 with few": ("#d\n*  2004 4 6 0 0 0.0\nPG01" + 3 * "  12345.000000" + "\n", "there are 1 positions"),
     "sp3 backwards": (2 * ("#d\n*  2004 4 6 0 0 0.0\nPG01" + 3 * "  12345.000000" + "\n"), "do not increase"),
 }
 
@@ -299,12 +307,12 @@ def test_convert_writes_satellites_at_the_times_of_a_table(tle, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"times": None}, "nothing is known of when the satellites are wanted; name the table"),
-        ({"out": "p.toml"}, "satellites are stations that move: they become a CSV table"),
+        ({"times": None}, "the times of the satellite positions are unknown; give the table"),
+        ({"out": "p.toml"}, "satellites are moving stations, which are written as a CSV table"),
         ({"columns": {"satellite": "b"}}, "there is no column 'b' for the satellite"),
         ({"columns": {"satellite": "z"}}, "there is no satellite '1'"),
         ({"columns": {"time": "z"}}, "days from 1970-01-01"),
-        ({"stations": "flat.csv"}, "stations beside satellites have x, y and z"),
+        ({"stations": "flat.csv"}, "stations have no z, which satellites need"),
     ],
 )
 def test_convert_of_satellites_says_what_it_lacks(options, words, tle, tmp_path):

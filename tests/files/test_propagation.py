@@ -38,7 +38,7 @@ def test_layers_are_read_in_the_units_of_their_table():
         ({"propagation_speed": "-3 m/s"}, "not positive"),
         ({"propagation_speed": {"medium": "air", "celsius": 20.0, "salinity": 35.0}}, "no salinity"),
         ({"medium": {"kind": "layers", "depths": [0.0]}}, "needs speeds"),
-        ({"medium": {"kind": "atmosphere"}, "propagation_speed": 3e8}, "its own speed"),
+        ({"medium": {"kind": "atmosphere"}, "propagation_speed": 3e8}, "determines the speed"),
     ],
 )
 def test_contradicting_speeds_are_refused(given, words):

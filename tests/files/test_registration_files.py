@@ -203,12 +203,12 @@ SHIPPED = {
     ),
     "epoch with two times": (
         {"rows": lambda t: t.assign(epoch=np.where(t["time"] == 300, "3", t["time"].astype(str)))},
-        ["registration.toml", "epoch '3'", "3 s", "300 s", "epoch '6' lies between"],
+        ["registration.toml", "epoch '3'", "3 s", "300 s", "epoch '6' is between"],
     ),
     "prior without unit": ({"change": lambda text: text + "sigma = 200.0\n"}, ["'clock'", "no unit", '"200.0 m"']),
     "drift without unit": (
         {"change": lambda text: text + 'form = "drift"\nsigma = 0.2\n'},
-        ["'clock'", "no drift", '"0.2 m/s"'],
+        ["'clock'", "not a drift", '"0.2 m/s"'],
     ),
     "drift in metres": (
         {"change": lambda text: text + 'form = "drift"\nsigma = "0.2 m"\n'},

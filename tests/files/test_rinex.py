@@ -57,7 +57,7 @@ def test_version_2_says_the_same(tmp_path):
 
 
 def test_the_reader_names_what_a_file_lacks():
-    with pytest.raises(InvalidProblem, match="holds no ephemerides"):
+    with pytest.raises(InvalidProblem, match="has no ephemerides"):
         read_navigation(OBSERVED)
     known = read_navigation(BROADCAST)
     assert known.ionosphere.tolist()[0] == pytest.approx(1.118e-8)

@@ -92,17 +92,15 @@ def test_the_command_says_what_it_turned(tmp_path):
     path, out = table(tmp_path, at), tmp_path / "gnss.toml"
     told = RUN.invoke(app, ["convert", str(path), "--sigma", "1 m", "--out", str(out)])
     assert told.exit_code == 0, told.output
-    assert "Satellites are turned with the Earth during the flight of the signal; --turned takes them as they are." in (
+    assert "Satellite positions are rotated with the Earth during the signal flight; --turned uses them unchanged." in (
         " ".join(told.stdout.split())
     )
-    assert "along ECEF at transmission" in told.stdout
-    assert (
-        "# Satellites are where they were when they sent, along the axes of the Earth at reception." in out.read_text()
-    )
+    assert "in ECEF axes at transmission" in told.stdout
+    assert "# Satellite positions are at transmission, in the Earth axes at reception." in out.read_text()
     assert miss(load(out), at) < 1e-3
     there = table(tmp_path, at, sent=False, name="there.csv")
     told = RUN.invoke(app, ["convert", str(there), "--sigma", "1 m", "--turned"])
-    assert "along ECEF at reception" in told.stdout
+    assert "in ECEF axes at reception" in told.stdout
     assert "are turned with" not in told.stdout
 
 
@@ -131,7 +129,7 @@ def test_three_satellites_and_a_height(tmp_path):
 def test_too_few_satellites_are_not_turned(tmp_path):
     at = receiver(48.2, 16.4)
     path = table(tmp_path, at, count=2)
-    with pytest.raises(InvalidProblem, match=r"gnss.csv: no epoch has 3 satellites.*cannot be turned.*say --turned"):
+    with pytest.raises(InvalidProblem, match=r"gnss.csv: no epoch has 3 satellites.*cannot be rotated.*use --turned"):
         interpret_table(path, ColumnHints(sigma="1 m"))
     assert interpret_table(path, ColumnHints(sigma="1 m", turned=True)).read().problem.count == 2
 
@@ -174,5 +172,5 @@ def test_satellites_twice_or_within_the_earth_are_refused(change, words, tmp_pat
 
 
 def test_orbits_are_wanted_at_times(tmp_path):
-    with pytest.raises(InvalidProblem, match="when the satellites are wanted"):
+    with pytest.raises(InvalidProblem, match="times of the satellite positions are unknown"):
         write_satellites(tmp_path / "a.tle", tmp_path / "a.csv", {}, None, None)

@@ -56,8 +56,8 @@ def test_a_moving_station_is_interpolated_and_never_extrapolated():
     [
         ([{"name": "A", "x": 0.0, "y": 0.0}] * 2, None, "used twice"),
         ([{"name": "A", "x": 0.0, "lat_deg": 0.0, "lon_deg": 0.0}], None, "mix"),
-        ([{"name": "A", "lat_deg": 0.0, "lon_deg": 0.0}], None, "no place in a cartesian frame"),
-        ([{"name": "A", "x": 0.0, "y": 0.0}], FrameTable(kind="enu"), "needs its origin"),
+        ([{"name": "A", "lat_deg": 0.0, "lon_deg": 0.0}], None, "do not fit a cartesian frame"),
+        ([{"name": "A", "x": 0.0, "y": 0.0}], FrameTable(kind="enu"), "needs an origin"),
         ([{"name": "A", "x": 0.0, "y": 0.0, "sigma": 0.0}], None, "not positive"),
     ],
 )

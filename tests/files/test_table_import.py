@@ -43,7 +43,7 @@ def test_marks_of_missing_values_are_numbers_or_none():
     assert marks_of(ColumnHints()) is None
     assert marks_of(ColumnHints(missing="none")) == frozenset()
     assert marks_of(ColumnHints(missing="-1, 9999")) == {Decimal(-1), Decimal(9999)}
-    with pytest.raises(InvalidProblem, match="no list of numbers"):
+    with pytest.raises(InvalidProblem, match="not a list of numbers"):
         marks_of(ColumnHints(missing="zero"))
 
 

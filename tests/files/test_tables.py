@@ -84,7 +84,7 @@ def test_five_hundred_aircraft_messages_from_a_wide_table(tmp_path):
     source, out = table(tmp_path, header + "\n".join(rows)), tmp_path / "fixes.csv"
     words = ["fix", source, "--stations", rx(tmp_path), "--sigma", "5 ns"]
     asked = run(*words, code=2)
-    assert "do not tell what they hold; say it with --as arrivals" in asked.stderr
+    assert "do not identify their content; state it with --as arrivals" in asked.stderr
     told = run(*words, "--as", "arrivals", "--out", out, "--allow", "curved,ambiguous,unproven")
     assert "10 cells without a number: no reading" in told.stdout
     assert "not used  squawk" in told.stdout
@@ -127,7 +127,7 @@ def picks(folder, form):
 def test_an_earthquake_with_picks_of_p_and_s(form, tmp_path):
     source, stations = picks(tmp_path, form)
     words = ["fix", source, "--stations", stations, "--sigma", "0.02 s"]
-    assert "say both, such as --vp '6 km/s' --vs '3.5 km/s'" in run(*words, code=2).stderr
+    assert "state both, such as --vp '6 km/s' --vs '3.5 km/s'" in run(*words, code=2).stderr
     told = run(*words, "--vp", "6 km/s", "--vs", "3.46 km/s", "--json")
     fix = json.loads(told.stdout)["fixes"][0]
     assert fix["status"] == "ok"  # the mirror image is above ground
@@ -235,7 +235,7 @@ def test_differences_have_a_sign_that_is_known(header, row, told, tmp_path):
     found |= {names[b]: -z for a, b, z in zip(rows.a, rows.b, rows.z, strict=True) if names[a] == "A2"}
     assert found == pytest.approx({n: d[n] * 1e-9 * SPEED_OF_LIGHT for n in chosen}, abs=1e-6)
     if "positive" in told:
-        with pytest.raises(InvalidProblem, match="say --positive a-farther"):
+        with pytest.raises(InvalidProblem, match="use --positive a-farther"):
             table_problem(tmp_path, "\n".join([header, *lines]), sigma="1 ns")
 
 
@@ -253,9 +253,9 @@ def test_dates_and_numbers_of_an_instant_are_the_same_arrivals(tmp_path):
     np.testing.assert_allclose(z[0], [7919e-12 * i * SPEED_OF_LIGHT for i in range(6)], rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(z[1], z[0])
     np.testing.assert_array_equal(z[2], z[0])
-    with pytest.raises(InvalidProblem, match=r"'toa_s': the dates name no time zone; say --zone UTC"):
+    with pytest.raises(InvalidProblem, match=r"'toa_s': the dates have no time zone; use --zone UTC"):
         table_problem(tmp_path, "msg,rx,toa_s\n" + bare, **told)
-    with pytest.raises(InvalidProblem, match=r"row 1, .* names no time zone, but others do"):
+    with pytest.raises(InvalidProblem, match=r"row 1, .* has no time zone, but others have one"):
         table_problem(tmp_path, "msg,rx,toa_s\n" + dates.replace("+02:00", "", 1), **told)
     with pytest.raises(InvalidProblem, match="no time zone 'Mars'"):
         table_problem(tmp_path, "msg,rx,toa_s\n" + bare, **told, zone="Mars")
@@ -294,7 +294,7 @@ def test_words_for_nothing_are_no_readings(word, tmp_path):
 
 def test_repeats_are_refused_with_their_count_or_averaged(tmp_path):
     text = "frame,anchor,range_m\n1,A1,3.0\n1,A2,4.0\n1,A1,3.2\n1,A1,3.4\n"
-    with pytest.raises(InvalidProblem, match=r"row 3: station 'A1' has a second .* in row 1; 2 such repeats in all"):
+    with pytest.raises(InvalidProblem, match=r"row 3: station 'A1' has a second .* in row 1; 2 repeats in total"):
         table_problem(tmp_path, text)
     found = table_problem(tmp_path, text, average=True)
     np.testing.assert_allclose(found.read().problem.rows[0].z, [3.2, 4.0])
@@ -314,21 +314,21 @@ def test_repeats_are_refused_with_their_count_or_averaged(tmp_path):
         (
             "anchor,range\nA1,3\nA2,4\n",
             {},
-            r"unit of the column 'range' is not known; say it with --unit ns, or --unit m",
+            r"unit of the column 'range' is unknown; state it with --unit ns, or --unit m",
         ),
-        ("anchor,bearing\nA1,3\nA2,1.5\n", {"sigma": "1 deg"}, r"say it with --unit deg, or --unit rad"),
-        ("anchor,azimuth_deg\nA1,3\nA2,4\n", {"sigma": "1 deg"}, r"say --azimuth north-clockwise of a compass"),
-        ("A1,A2\n3,4\n", {}, r"columns such as 'A1', 'A2' do not tell what they hold"),
+        ("anchor,bearing\nA1,3\nA2,1.5\n", {"sigma": "1 deg"}, r"state it with --unit deg, or --unit rad"),
+        ("anchor,azimuth_deg\nA1,3\nA2,4\n", {"sigma": "1 deg"}, r"use --azimuth north-clockwise for a compass"),
+        ("A1,A2\n3,4\n", {}, r"columns such as 'A1', 'A2' do not identify their content"),
         ("anchor,range_m,bearing_deg\nA1,3,4\nA2,4,5\n", {}, r"write --sigma 'range=1 m,azimuth=1 deg'"),
-        ("anchor,range_m,bearing_deg\nA1,3,4\n", {"sigma": "range=1 m"}, r"nothing is said of azimuth"),
+        ("anchor,range_m,bearing_deg\nA1,3,4\n", {"sigma": "range=1 m"}, r"azimuth has no sigma"),
         ("anchor,range_m\nA1,3\nQ,4\n", {}, r"row 2, column 'anchor': there is no station 'Q' in anchors\.csv"),
         ("epoch,range_m\n1,3\n", {}, "no column looks like the station"),
-        ("anchor,range_m\nA1,3\n", {"stations": None}, "nothing is known of where the stations are"),
-        ("anchor,range_m\nA1,3\n", {"sigma": None}, "nothing is known of how accurate"),
+        ("anchor,range_m\nA1,3\n", {"stations": None}, "the station positions are unknown"),
+        ("anchor,range_m\nA1,3\n", {"sigma": None}, "the accuracy of"),
         ("anchor,range_m\nA1,3\n", {"what": "rnge"}, "there is no input 'rnge'; did you mean 'range'"),
         ("anchor,range_m\nA1,3\n", {"window": "1 s"}, "a window needs a column of times"),
         ("t_s,anchor,range_m\n1,A1,3\n,A2,3\n", {}, "row 2, column 't_s': the cell is empty"),
-        ("station,P_s,S_s\nA1,2,1\n", {"vp": "2 m/s", "vs": "1 m/s"}, "row 1: the S wave is not behind the P wave"),
+        ("station,P_s,S_s\nA1,2,1\n", {"vp": "2 m/s", "vs": "1 m/s"}, "row 1: the S wave is not after the P wave"),
     ],
 )
 def test_what_is_ambiguous_is_one_sentence(text, told, words, tmp_path):
@@ -339,7 +339,7 @@ def test_what_is_ambiguous_is_one_sentence(text, told, words, tmp_path):
 def test_angles_beyond_a_turn_are_degrees(tmp_path):
     found = table_problem(tmp_path, "anchor,bearing\nA1,30\nA2,1.5\n", sigma="1 deg")
     assert found.sections[0].unit == "deg"
-    assert "beyond a turn in radians" in found.notes[0]
+    assert "exceed a full turn in radians" in found.notes[0]
 
 
 def test_several_kinds_in_one_table(tmp_path):
@@ -355,7 +355,7 @@ def test_several_kinds_in_one_table(tmp_path):
 def test_readings_within_a_window_or_of_a_target_that_stays(tmp_path):
     rows = "".join(f"{0.01 * i:.2f},{n},{d:.6f}\n" for i, (n, d) in enumerate(ranges().items()))
     text = "t_s,anchor,range_m\n" + rows + rows.replace("0.0", "1.0")
-    assert "--window '0.1 s' those of 0.1 s" in table_problem(tmp_path, text).notes[0]
+    assert "--window '0.1 s' to join readings within 0.1 s" in table_problem(tmp_path, text).notes[0]
     assert table_problem(tmp_path, text, window="0.2 s").read().problem.epochs == 2
     assert table_problem(tmp_path, text, still=True).read().problem.epochs == 1
     heard = "rx,toa_us\nLake,5\nMill,7\nTower,9\nLake,900005\nMill,900011\n"
@@ -395,7 +395,7 @@ def test_a_kraken_log_has_the_heading_added(tmp_path):
     found = interpret_table(table(tmp_path, " \n".join(rows), "k.csv"), ColumnHints(sigma="1 deg", still=True))
     assert [float(z) for z in found.sections[0].columns["z"]] == [180.0, 80.0]
     assert found.sections[0].lines == ('azimuth = "north-clockwise"',)
-    assert "its heading was added" in found.notes[0]
+    assert "is added" in found.notes[0]
 
 
 @pytest.mark.parametrize(
@@ -407,7 +407,7 @@ def test_a_kraken_log_has_the_heading_added(tmp_path):
             "     3.04           OBSERVATION DATA    M                   RINEX VERSION / TYPE\n",
             "--navigation",
         ),
-        ("aircraft.json", '{"now": 1, "aircraft": [{"hex": "3c0000"}]}', "positions of aircraft, no measurements"),
+        ("aircraft.json", '{"now": 1, "aircraft": [{"hex": "3c0000"}]}', "positions of aircraft, not measurements"),
     ],
 )
 def test_what_holds_no_measurements_is_said(name, text, words, tmp_path):
@@ -471,7 +471,7 @@ def test_broken_records_are_one_sentence(text, tmp_path):
 
 def test_options_of_tables_are_not_for_problem_files(tmp_path):
     told = run("fix", table(tmp_path, "format = 1\n", "site.toml"), "--unit", "ns", code=2)
-    assert told.stderr.startswith("--unit: it is for a table; site.toml is a problem file")
+    assert told.stderr.startswith("--unit: this option is for a table; site.toml is a problem file")
 
 
 def test_without_out_a_table_is_only_looked_at(tmp_path):
@@ -548,4 +548,4 @@ def test_a_table_is_checked_tracked_and_fixed_by_the_same_options(tmp_path):
     assert [scan["x"] for scan in again] == [scan["x"] for scan in scans]
     for command in ("check", "track"):
         assert "--stations" in run(command, source, code=2).stderr
-        assert "it is for a table" in run(command, "demo", "--sigma", "3 m", code=2).stderr
+        assert "this option is for a table" in run(command, "demo", "--sigma", "3 m", code=2).stderr

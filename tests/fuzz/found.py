@@ -90,16 +90,16 @@ FOUND = {
     "large in another unit": (
         FIX,
         problem('"range"\n', '"range"\nunit = "km"\n', GOOD.replace("2800.0", "1e29")),
-        ["p.toml", "row 1, column 'z'", "beyond 1e+30"],
+        ["p.toml", "row 1, column 'z'", "exceeds 1e+30"],
     ),
     "number of 400 digits": (FIX, problem("2800.0", "9" * 400), ["p.toml", "beyond 1e+30", "99999..."]),
     "amount of 1e308": (FIX, problem("sigma = 3.0", 'sigma = "1e308 km"'), ["'sigma'", "beyond 1e+30"]),
     "sigma of 1e-50": (FIX, problem("sigma = 3.0", "sigma = 1e-50"), ["p.toml", "deviations below 1e-30"]),
-    "decibels of 1e9": (FIX, {"p.toml": f"format = 1\n{STATIONS}{GAINS}"}, ["row 2, column 'z'", "beyond 1e+30"]),
+    "decibels of 1e9": (FIX, {"p.toml": f"format = 1\n{STATIONS}{GAINS}"}, ["row 2, column 'z'", "exceeds 1e+30"]),
     "cell of 1e308": (
         FIX,
         table("r.csv", "a,z\nA,1.0\nB,1e308\n"),
-        ["r.csv, row 2, column 'z'", "1e308 is beyond 1e+30"],
+        ["r.csv, row 2, column 'z'", "1e308 is larger than 1e+30"],
     ),
     "names that are no numbers": (
         FIX,
@@ -109,7 +109,7 @@ FOUND = {
     "header with a break": (
         FIX,
         table("r.csv", 'a,"z\rx,y\n'),
-        ["r.csv, header", "this is no CSV table: "],
+        ["r.csv, header", "this is not a CSV table: "],
     ),
     "the plane beside a place on Earth": (FIX, problem("[stations]", f"{ENU}[stations]"), None),
     "numbers and words in one column": (
@@ -133,15 +133,15 @@ FOUND = {
     "a bound of emission times alone": (
         ["crlb", "p.toml"],
         problem('"range"', '"toa"', f"{GOOD}{KNOWN}"),
-        ["p.toml", "nothing is unknown but"],
+        ["p.toml", "no unknown is shared"],
     ),
     "an empty unit": (FIX, problem("sigma", 'unit = ""\nsigma'), ["unknown unit ''"]),
-    "a bound of nothing": (["crlb", "p.toml"], problem(text=f"{GOOD}{KNOWN}"), ["nothing is unknown"]),
-    "a track of what is known": (["track", "p.toml"], problem(text=f"{GOOD}{KNOWN}"), ["every target is known"]),
+    "a bound of nothing": (["crlb", "p.toml"], problem(text=f"{GOOD}{KNOWN}"), ["no unknown is shared"]),
+    "a track of what is known": (["track", "p.toml"], problem(text=f"{GOOD}{KNOWN}"), ["each target is known"]),
     "a date among numbers": (
         FIX,
         {"p.toml": GOOD.replace("{ a", "{ time = 3.0, a").replace("3.0, a", '"2024-05-01", a', 1)},
-        ["row 2, column 'time'", "3.0 is no date"],
+        ["row 2, column 'time'", "3.0 is not a date"],
     ),
     "a carrier of 1e-310 Hz": (
         FIX,

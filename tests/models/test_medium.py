@@ -294,7 +294,7 @@ def test_a_file_says_what_its_waves_come_through(tmp_path):
         ('kind = "layers"\ndepths = [0, 100]\nspeeds = [1500, 1400]', "", "station 'B' is at depth 120 m"),
         ('kind = "layers"\ndepths = [0, 100]\nspeeds = [1500, 1400]\nrefractivity = 3.0', "", "has no 'refractivity'"),
         ('kind = "atmosphere"', "", "frame on Earth"),
-        ('kind = "atmosphere"', "propagation_speed = 3e8", "leave propagation_speed out"),
+        ('kind = "atmosphere"', "propagation_speed = 3e8", "remove propagation_speed"),
         ('kind = "mud"', "", "unknown"),
         (LAYERED.replace("km", "fathoms"), "", "fathoms"),
     ],

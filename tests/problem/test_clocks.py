@@ -318,8 +318,8 @@ def test_a_file_says_how_clocks_walk(tmp_path):
 @pytest.mark.parametrize(
     ("lines", "words"),
     [
-        ('form = "walk"\ndensity = "0.9 ns/s"\n', "is no density"),
-        ('form = "walk"\ndensity = "1 m^2/s"\nallan = [[1.0, 1e-9]]\n', "in place of densities"),
+        ('form = "walk"\ndensity = "0.9 ns/s"\n', "is not a density"),
+        ('form = "walk"\ndensity = "1 m^2/s"\nallan = [[1.0, 1e-9]]\n', "and densities are both given"),
         ('form = "walk"\nallan = [[1.0]]\n', "not two numbers"),
         ('form = "walk"\n', "needs a spectral density"),
         ('form = "spline"\nknots = [0.0, 60.0]\n', "beyond the knots"),

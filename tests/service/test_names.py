@@ -125,5 +125,5 @@ def test_a_gateway_of_another_network_is_named_once(site, caplog):
         sent = json.loads(adapter(json.dumps({"deduplicationId": str(number), "rxInfo": heard}).encode()))
         assert [each["station"] for each in sent["arrivals"]] == ["A"]
     assert [record.getMessage() for record in caplog.records] == [
-        "gateway 'roaming' is no station of the site: its arrivals are left out"
+        "gateway 'roaming' is not a station of the site: its arrivals are left out"
     ]

@@ -42,7 +42,7 @@ def test_arrivals_and_values_become_metres(site):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('{ a = "C" }', '{ a = "B" }', "tdoa B-A stands twice"),
+        ('{ a = "C" }', '{ a = "B" }', "tdoa B-A occurs twice"),
         ("[[measurements]]", '[target]\nmotion = "constant_velocity"\n\n[[measurements]]', "needs several epochs"),
     ],
 )

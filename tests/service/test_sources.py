@@ -88,7 +88,7 @@ def test_messages_of_a_broker_are_lines(stream):
 @pytest.mark.parametrize("address", ["mqtt://host", "http://host/topic", "mqtt:///topic", "nonsense"])
 def test_addresses_that_are_no_topic(stream, address):
     pytest.importorskip("paho.mqtt.client")
-    with pytest.raises(InvalidProblem, match="is no address of a topic"):
+    with pytest.raises(InvalidProblem, match="is not an address of a topic"):
         mqtt(stream, address)
 
 
@@ -149,7 +149,7 @@ def test_uplinks_of_chirpstack_are_events(site):
     assert (record["event"], record["target"], record["dof"]) == ("3ac7e3c4", "0101010101010101", 2)
     uplink["rxInfo"] = heard[-1:]
     (record,) = answers(site, [adapter(json.dumps(uplink).encode())], phases="fix")[0]
-    assert "arrivals: it is no list of 1 to 4096 entries" in record["error"]
+    assert "arrivals: the value is not a list of 1 to 4096 entries" in record["error"]
     assert adapter(b"nonsense") == b"nonsense"
 
 
@@ -176,8 +176,8 @@ def test_unknown_formats_and_addresses_are_one_sentence(tmp_path):
     site_in(tmp_path)
     for words, said in (
         (["--adapter", "chirpstak"], "did you mean 'chirpstack'?"),
-        (["--http", "port"], "'port' is no port"),
-        (["--mqtt", "x"], "is no address of a topic"),
+        (["--http", "port"], "'port' is not a port"),
+        (["--mqtt", "x"], "is not an address of a topic"),
     ):
         result = CliRunner().invoke(app, ["live", str(tmp_path / "site.toml"), *words])
         assert (result.exit_code, len(result.output.splitlines())) == (2, 1), result.output

@@ -241,7 +241,7 @@ def test_a_bad_line_is_one_line_with_its_number(site):
     records, health = answers(site, [b"{}", b"", b"x" * 200_000, line(command="health"), b"[" * 70_000, b"nonsense"])
     said = [record for record in records if "error" in record]
     assert [(record["line"], record["source"]) for record in said] == [(n, "test") for n in (1, 3, 5, 6)]
-    assert "bytes, 65536 at most" in said[1]["error"]
+    assert "bytes, more than 65536" in said[1]["error"]
     assert health["malformed"] == 4
     (told,) = [record["health"] for record in records if "health" in record]
     assert (told["malformed"], told["lines"]) == (2, 3)
@@ -372,9 +372,9 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path):
     path = tmp_path / "other.json"
     other = {"event": "1", "rows": [["range", "A", "", 1.0, None]], "times": []}
     for found, said in (
-        ({"format": 1}, "this is no checkpoint"),
+        ({"format": 1}, "this is not a checkpoint"),
         ({"format": "optloc live 1", "closed": 1}, "this checkpoint is damaged"),
-        ({"format": "optloc live 1", "closed": [], "counts": {}, "open": [other]}, "it belongs to another site"),
+        ({"format": "optloc live 1", "closed": [], "counts": {}, "open": [other]}, "the checkpoint is of another site"),
     ):
         text = json.dumps(found)
         path.write_text(text)
@@ -582,10 +582,10 @@ def test_a_site_is_read_anew_if_it_can_be(tmp_path):
         return said[-1]
 
     stream.inbox.put(stream.lines([line(event="1", station="A", time_ns=1)], "test"))
-    assert again("format = 3").startswith("The site stays as it was: site.toml: format 3 is unknown")
+    assert again("format = 3").startswith("The site is not changed: site.toml: format 3 is unknown")
     assert stream.site is site
     assert again(SITE.replace("Six receivers", "Others").replace(', { a = "F" }', "")).startswith(
-        "The site is 'Others'"
+        "The site is now 'Others'"
     )
     stream.inbox.put(stream.lines([line(event="2", z=[1.0] * 4)], "test"))
     stream.close()
@@ -635,7 +635,7 @@ def test_a_reader_that_goes_ends_it(tmp_path):
         (["--wait", "soon"], "soon"),
         (["--wait", "-1 s"], "is negative"),
         (["--phases", "three"], "--phases: 'three' is unknown"),
-        (["--partition", "3/2"], "--partition: '3/2' is no part"),
+        (["--partition", "3/2"], "--partition: '3/2' is not a part"),
         (["--format", "xml"], "--format: 'xml' is unknown"),
         (["--track", "--partition", "1/2"], "--track: this process answers a part of the events"),
         (["--track", "--model", "fast"], "--model: unknown model 'fast'"),

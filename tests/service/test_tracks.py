@@ -41,7 +41,7 @@ def test_a_target_that_stays_is_followed_and_events_must_come_in_order(site, pro
     assert followed["status"] == "ok"
     (wanted,) = solve(problem.with_rows(z=z), FAST).flat().position
     assert np.linalg.norm(np.subtract(followed["position"], wanted)) < 1.0
-    assert "1.5 s before the last one of t" in out[4]["error"]
+    assert "1.5 s before the last event of t" in out[4]["error"]
     assert "needs the time of the event" in out[5]["error"]
 
 

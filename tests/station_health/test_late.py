@@ -116,14 +116,14 @@ def told(*arguments):
 @pytest.mark.slow
 def test_files_say_so(tmp_path):
     path = written(tmp_path, late(1, 0.2, 10.0, epochs=20)[0])
-    assert "--late-from-data fixes with that" in told("check", path)
+    assert "--late-from-data fixes with this loss" in told("check", path)
     found = json.loads(told("fix", path, "--late-from-data", "--json"))
     assert found["late_signals"]["share"] == pytest.approx(0.2, abs=0.08)
     assert found["late_signals"]["used"]
     assert {"late_rows", "on_late_rows"} <= found["fixes"][0].keys()
     assert found["stages"][0]["name"] == found["late_signals"]["method"]
     clean = written(tmp_path, late(1, 0.0, 10.0, epochs=5)[0])
-    assert "no rows are seen to be late" in told("fix", clean, "--late-from-data").lower()
+    assert "no late rows are found" in told("fix", clean, "--late-from-data").lower()
 
 
 def test_rows_late_alike_are_an_offset(tmp_path):
