@@ -35,12 +35,12 @@ HEADER = [
     "unique",
     "`ok`",
     "others",
-    "`ok`, cheaper unfound",
-    "not `ok`, cheaper unfound",
+    "`ok`, cheaper position missed",
+    "not `ok`, cheaper position missed",
     "boxes, median",
     "boxes, 99 %",
     "ms a fix (processor)",
-    "besides",
+    "also",
 ]
 
 
