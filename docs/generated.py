@@ -313,7 +313,7 @@ def effects() -> dict[str, tuple[str, Any, Any]]:
     table: dict[str, tuple[str, Callable[[Any], Any]]] = {
         "light time, from the ground up (Sagnac)": ("not modelled", lambda t: scene.light(t, up=True) - scene.range(t)),
         "light time, from the satellite down": ("not modelled", lambda t: scene.light(t, up=False) - scene.range(t)),
-        "light time from the satellite down, with times earlier by the light time of mid-pass": (
+        "the same, with times earlier by the light time at mid-pass": (
             "remaining error",
             lambda t: scene.light(t, up=False) - scene.range(t, -late),
         ),
@@ -331,13 +331,13 @@ def effects() -> dict[str, tuple[str, Any, Any]]:
     line = place - scene.emitter
     carried = _TURN * np.einsum("ni,ni->n", line, np.stack([-place[:, 1], place[:, 0], 0.0 * t], -1))
     turn = (
-        "modelled: included in velocities in ECEF",
+        "modelled: velocities in ECEF contain it",
         np.full(len(t), np.nan),
         carried / np.linalg.norm(line, axis=-1),
     )
     # Speed slows the clock of the satellite, and height speeds it up.
     clock = (speed**2 / 2.0 + _GM / scene.radius - _GM / np.linalg.norm(scene.emitter)) / _C
-    constant = ("part of the unknown frequency", np.full(len(t), np.nan), np.full(len(t), clock))
+    constant = ("absorbed by the unknown frequency", np.full(len(t), np.nan), np.full(len(t), clock))
     return {"Earth's rotation in the velocities": turn} | found | {"v²/2c² and gravity (clocks)": constant}
 
 
