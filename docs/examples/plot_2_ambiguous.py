@@ -2,8 +2,8 @@
 Two positions that fit
 ======================
 
-Three receivers in the plane give two differences. Two positions explain them exactly. The fix lists both, each with its
-additional cost.
+Three receivers in the plane give two differences. Two positions explain them exactly. The fix lists both, each with
+its additional cost.
 """
 
 from importlib.resources import files

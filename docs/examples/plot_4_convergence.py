@@ -2,8 +2,8 @@
 End points of iterations from a guess
 =====================================
 
-Every position of the map is a start. The plain Taylor iteration of Foy (1976) reaches the best fit from few starts. Damped
-least squares reaches it from more starts. The fix without a start is proven to be the best.
+Every position of the map is a start. The plain Taylor iteration of Foy (1976) reaches the best fit from few starts.
+Damped least squares reaches it from more starts. The fix without a start is proven to be the best.
 """
 
 from importlib.resources import files

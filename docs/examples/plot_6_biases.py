@@ -2,7 +2,8 @@
 Clock errors estimated in a run
 ===============================
 
-Four clocks are estimated together with the position of the emitter. The bands are 95 % intervals. Dotted lines are the true errors.
+Four clocks are estimated together with the position of the emitter. The bands are 95 % intervals. Dotted lines are
+the true errors.
 """
 
 from importlib.resources import files

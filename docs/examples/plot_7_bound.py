@@ -2,8 +2,8 @@
 Map of the Cramér-Rao bound
 ===========================
 
-The Cramér-Rao bound over the position of the target is the best possible accuracy of a fix there. It uses the noise and the
-stations of the file.
+The Cramér-Rao bound over the position of the target is the best possible accuracy of a fix there. It uses the noise
+and the stations of the file.
 """
 
 from importlib.resources import files

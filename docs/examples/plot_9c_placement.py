@@ -2,8 +2,8 @@
 Station placement
 =================
 
-Eight of forty masts are chosen. Fixes at twelve places are as accurate as possible, even if one mast fails. The picture below the
-maps compares the best set with the bound for all sets during the search.
+Eight of forty masts are chosen. Fixes at twelve places are as accurate as possible, even if one mast fails. The
+picture below the maps compares the best set with the bound for all sets during the search.
 """
 
 import numpy as np
