@@ -1,4 +1,4 @@
-"""What pages say that only the code or the measured tables know: filled in while the documentation is built."""
+"""Parts of pages that come from the code or from measured tables: filled in while the documentation is built."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ PLACE = re.compile(r"^<!-- generated: (\w+)(?: (.+?))? -->$", re.MULTILINE)
 
 
 def filled(text: str) -> str:
-    """Return a page with every ``<!-- generated: NAME ARGUMENTS -->`` followed by what it stands for."""
+    """Return a page with the generated text after each ``<!-- generated: NAME ARGUMENTS -->``."""
     return PLACE.sub(lambda found: GENERATED[found[1]](*(found[2] or "").split(maxsplit=1)), text)
 
 
 def rows(file: str, pattern: str = "") -> str:
-    """Return the lines of a measured table whose first cell matches a pattern, and what was measured when."""
+    """Return the lines of a measured table whose first cell matches a pattern, with the date and the conditions."""
     lines = (DOCS / "measured" / f"{file}.md").read_text(encoding="utf-8").splitlines()
     about = next(line for line in lines if line.startswith("optloc "))
     table = [line for line in lines if line.startswith("|")]
@@ -32,22 +32,22 @@ def rows(file: str, pattern: str = "") -> str:
 
 
 def formulation(name: str) -> str:
-    """Return what the catalogue says of a formulation."""
+    """Return the entry of a formulation in the catalogue."""
     from optloc.solvers import FORMULATIONS
 
     parts = [key for key in FORMULATIONS if key.split(":")[0] == name]
     lines = []
     for key in parts:
         line, head = FORMULATIONS[key], f"`{key.partition(': ')[2]}` " if len(parts) > 1 else ""
-        lines += [f"- {head}serves {line.kinds}.", f"- {head}answer: {line.tight}.", f"- {head}time: {line.cost}."]
+        lines += [f"- {head}rows: {line.kinds}.", f"- {head}solution: {line.tight}.", f"- {head}time: {line.cost}."]
     return "\n".join(lines)
 
 
 def costs() -> str:
-    """Return the formulations as a table: what each serves, how good its answer is, what it takes, its words."""
+    """Return the formulations as a table: rows, quality of the solution, time and words."""
     from optloc.solvers import FORMULATIONS
 
-    head = ["| formulation | rows | its answer | time | words of a method |", "|---|---|---|---|---|"]
+    head = ["| formulation | rows | solution | time | words of a method |", "|---|---|---|---|---|"]
     lines = []
     for name, line in FORMULATIONS.items():
         words = " ".join(f"`{word}`" for word in (*line.starts, *line.words)) or "for studies only"
@@ -56,26 +56,26 @@ def costs() -> str:
 
 
 def budgets() -> str:
-    """Return how much a file may hold as a table."""
+    """Return the limits of a file as a table."""
     from dataclasses import asdict
 
     from optloc.files import Budget
 
     what = {
-        "bytes": "bytes of a table: as it is stored, and as Parquet declares itself unpacked",
+        "bytes": "bytes of a table: as stored, and the unpacked size that Parquet declares",
         "text": "bytes of a document: TOML, JSON, GeoJSON",
         "rows": "rows of a table",
         "columns": "columns of a table",
-        "cells": "cells of a table; places of moving stations, one for each epoch",
-        "nesting": "tables and lists within each other in a document",
-        "unknowns": "unknowns of a problem that its epochs share",
+        "cells": "cells of a table; positions of moving stations, one for each epoch",
+        "nesting": "nested tables and lists in a document",
+        "unknowns": "shared unknowns of all epochs of a problem",
     }
     lines = [f"| `{name}` | {what[name]} | {most} |" for name, most in asdict(Budget()).items()]
     return "\n".join(["| name | what | at most |", "|---|---|---|", *lines])
 
 
 def words() -> str:
-    """Return the words that a method is made of as a table."""
+    """Return the words of methods as a table."""
     from optloc.solvers import SOLVERS
 
     lines = [f"| `{name}` | {entry.role} | {entry.summary} |" for name, entry in SOLVERS.items()]
@@ -83,7 +83,7 @@ def words() -> str:
 
 
 def formats() -> str:
-    """Return the formats as a table: what of the uncertainty each carries, and what of a fix that is not ok."""
+    """Return the formats as a table: the uncertainty in each, and its content for a fix that is not ok."""
     from optloc.show.formats import FORMATS
 
     head = [
@@ -112,7 +112,7 @@ def kinds() -> str:
 
 
 def columns() -> str:
-    """Return the roles of columns of foreign tables: their names, the units that fit, and what they hold."""
+    """Return the roles of columns in tables of other programs: names, allowed units and content."""
     from optloc.files.columns import roles
 
     lines = []
@@ -120,13 +120,13 @@ def columns() -> str:
         names = " ".join(f"`{word}`" for word in role.names)
         if role.with_unit:
             names += f"{'; ' if names else ''}with a unit: " + " ".join(f"`{word}`" for word in role.with_unit)
-        units = " ".join(f"`{unit}`" for unit in role.units) if name != "sigma" else "those of the readings"
+        units = " ".join(f"`{unit}`" for unit in role.units) if name != "sigma" else "units of the measurements"
         lines.append(f"| `{name}` | {names} | {units or '-'} | {role.text} |")
-    return "\n".join(["| role | names | units | what the column holds |", "|---|---|---|---|", *lines])
+    return "\n".join(["| role | names | units | content |", "|---|---|---|---|", *lines])
 
 
 def layers() -> str:
-    """Return the layers of the house as a drawing: every folder on its floor, with what its docstring says."""
+    """Return the layers as a drawing: every folder in its layer, with the first line of its docstring."""
     source = ast.parse((DOCS.parent / "tests" / "test_layers.py").read_text(encoding="utf-8"))
     assigned = {ast.unparse(node.targets[0]): node.value for node in source.body if isinstance(node, ast.Assign)}
     floors = [
@@ -137,7 +137,7 @@ def layers() -> str:
     width, height, gap = 760, 46, 6
     total = len(floors) * (height + gap) + gap
     parts = [f'<svg viewBox="0 0 {width} {total}" role="img" aria-label="The layers of optloc" class="layers">']
-    floors[0].append("formulations")  # beside the lowest floor
+    floors[0].append("formulations")  # next to the lowest layer
     for floor, rooms in enumerate(floors):
         y, wide = total - (floor + 1) * (height + gap), (width - gap * (len(rooms) + 1)) / len(rooms)
         for i, room in enumerate(rooms):
@@ -159,7 +159,7 @@ def _about(room: str) -> str:
 
 
 def _short(text: str, most: int) -> str:
-    """Return as many whole words as fit into so many letters."""
+    """Return the first words of a text, at most a number of letters."""
     if len(text) <= most:
         return text
     return text[: most - 1].rsplit(" ", 1)[0].rstrip(",;:.") + " …"
@@ -216,14 +216,14 @@ def _marked(text: str) -> str:
     return re.sub(r"(?<![`\w-])(--[a-z][a-z-]*)", r"`\1`", text)
 
 
-# What moves Doppler rows of a pass, and what of it is modelled: sizes from a pass that is typical.
+# Effects on the Doppler rows of a pass, and their models in optloc: sizes from a typical pass.
 
 # m/s; rad/s; m3/s2 (WGS 84); Hz, the L band of Iridium; TECU and metres at the zenith: a day at middle latitudes.
 _C, _TURN, _GM, _CARRIER, _TECU, _AIR = 299792458.0, 7.2921151467e-5, 3.986004418e14, 1.6e9, 30.0, 2.4
 
 
 class Pass:
-    """Four minutes of a satellite 780 km high that comes up to 45 degrees over an emitter: two bodies."""
+    """Four minutes of a satellite 780 km high that rises to 45 degrees above an emitter, as a two-body orbit."""
 
     def __init__(self) -> None:
         from optloc.base.frames import ECEF
@@ -237,21 +237,21 @@ class Pass:
         self.speed = float(np.sqrt(_GM / self.radius))
 
     def satellite(self, times: Any) -> Any:
-        """Return where it is in axes that do not turn, those of the Earth at time zero."""
+        """Return the position of the satellite in inertial axes, equal to the axes of the Earth at time zero."""
         angle = np.asarray(times)[..., None] * self.speed / self.radius
         return self.radius * (np.cos(angle) * self.up + np.sin(angle) * self.ahead)
 
     def ground(self, times: Any) -> Any:
-        """Return where the emitter is in these axes."""
+        """Return the position of the emitter in the inertial axes."""
         return turned(np.broadcast_to(self.emitter, (*np.shape(times), 3)), _TURN * np.asarray(times))
 
     def range(self, times: Any, shift: float = 0.0) -> Any:
-        """Return what optloc computes: the distance at one instant, the satellite `shift` seconds ahead."""
+        """Return the range as optloc computes it: at one instant, with the satellite `shift` seconds ahead."""
         place = turned(self.satellite(times + shift), -_TURN * (times + shift))
         return np.linalg.norm(place - self.emitter, axis=-1)
 
     def light(self, times: Any, *, up: bool) -> Any:
-        """Return the way of the light that arrives at times, from the ground to the satellite or down."""
+        """Return the path length of light that arrives at the given times, up to the satellite or down."""
         way = np.zeros_like(times)
         for _ in range(5):  # each step is 1e5 times closer
             then = times - way / _C
@@ -267,11 +267,11 @@ class Pass:
         )
 
     def rate(self, excess: Callable[[Any], Any]) -> Any:
-        """Return the rate of what a path is longer by."""
+        """Return the rate of an excess path."""
         return (excess(self.times + 0.5) - excess(self.times - 0.5)) / 1.0
 
     def moves(self, rate: Any, *, known: bool) -> float:
-        """Return by how much an error of the rates moves a fix at known height, metres; the frequency known or not."""
+        """Return the shift of a fix at known height by an error of the rates, metres; frequency known or not."""
 
         def model(place: Any) -> Any:
             away = turned(self.satellite(self.times), -_TURN * self.times)
@@ -292,7 +292,7 @@ def turned(place: Any, angle: Any) -> Any:
 
 
 def effects() -> dict[str, tuple[str, Any, Any]]:
-    """Return what moves the rows of a pass: what optloc does about it, error of the range and of its rate (n,)."""
+    """Return the effects on the rows of a pass: treatment in optloc, error of the range and of its rate (n,)."""
     scene = Pass()
     t, speed = scene.times, scene.speed
     late = float(scene.range(np.zeros(1))[0] / _C)
@@ -330,18 +330,22 @@ def effects() -> dict[str, tuple[str, Any, Any]]:
     place = turned(scene.satellite(t), -_TURN * t)
     line = place - scene.emitter
     carried = _TURN * np.einsum("ni,ni->n", line, np.stack([-place[:, 1], place[:, 0], 0.0 * t], -1))
-    turn = ("modelled: velocities in ECEF contain it", np.full(len(t), np.nan), carried / np.linalg.norm(line, axis=-1))
-    # Speed makes the satellite's clock slow, height makes it fast.
+    turn = (
+        "modelled: velocities in ECEF contain it",
+        np.full(len(t), np.nan),
+        carried / np.linalg.norm(line, axis=-1),
+    )
+    # Speed slows the clock of the satellite, and height speeds it up.
     clock = (speed**2 / 2.0 + _GM / scene.radius - _GM / np.linalg.norm(scene.emitter)) / _C
     constant = ("absorbed by the unknown frequency", np.full(len(t), np.nan), np.full(len(t), clock))
     return {"Earth's rotation in the velocities": turn} | found | {"v²/2c² and gravity (clocks)": constant}
 
 
 def doppler() -> str:
-    """Return the effects as a table: their sizes, and what a fix is moved by."""
+    """Return the effects as a table: their sizes, and the shift of a fix."""
     scene, head = (
         Pass(),
-        "| effect | range, m | rate, m/s | at 1.6 GHz, Hz | moves the fix by, m | frequency known, m | in optloc |",
+        "| effect | range, m | rate, m/s | at 1.6 GHz, Hz | shift of the fix, m | frequency known, m | in optloc |",
     )
     lines = [head, "|---|---|---|---|---|---|---|"]
     for name, (what, length, rate) in effects().items():
@@ -353,7 +357,7 @@ def doppler() -> str:
 
 
 def _brief(size: float) -> str:
-    """Return two digits of a size; less than a tenth of a millimetre is nothing."""
+    """Return two digits of a size; less than a tenth of a millimetre is zero."""
     return "0" if size < 1e-4 else f"{float(f'{size:.2g}'):g}"
 
 

@@ -2,7 +2,8 @@
 A fix and its ellipse
 =====================
 
-Six receivers hear one pulse. The fix needs no first guess; the ellipse holds the target with a probability of 95 %.
+Six receivers receive one pulse. The fix needs no first guess. The ellipse contains the target with a probability of
+95 %.
 """
 
 from importlib.resources import files

@@ -1,9 +1,9 @@
 """
-Two places that fit
-===================
+Two positions that fit
+======================
 
-Three receivers in the plane give two differences, which two places explain exactly. Both are listed, each with the
-cost by which it is worse.
+Three receivers in the plane give two differences. Two positions explain them exactly. The fix lists both, each with
+its additional cost.
 """
 
 from importlib.resources import files

@@ -1,9 +1,9 @@
 """
-The cost over the place of the target
-=====================================
+The cost over the position of the target
+========================================
 
-The cost has a narrow valley with two minima, which is why an iteration from a guess may end at either. Around the fix
-the line that holds 95 % by the cost is bent; the ellipse is what remains of it when the model is linearised.
+The cost has a narrow valley with two minima. So an iteration from a guess may end at either minimum. Around the fix
+the 95 % contour of the cost is curved. The ellipse is the contour of the linearised model.
 """
 
 from importlib.resources import files

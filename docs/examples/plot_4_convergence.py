@@ -1,9 +1,9 @@
 """
-Where iterations from a guess end
-=================================
+End points of iterations from a guess
+=====================================
 
-Every place of the map is a start. The plain Taylor iteration of Foy (1976) reaches the best fit from few of them,
-damped least squares from more; the fix without a start is proven to be the best.
+Every position of the map is a start. The plain Taylor iteration of Foy (1976) reaches the best fit from few starts.
+Damped least squares reaches it from more starts. The fix without a start is proven to be the best.
 """
 
 from importlib.resources import files

@@ -2,7 +2,7 @@
 Residuals by station
 ====================
 
-Thirty fixes of a drive past five beacons: what every range and bearing says against the fix it took part in.
+Thirty fixes of a drive past five beacons, with the residual of every range and bearing at its fix.
 """
 
 from importlib.resources import files

@@ -1,8 +1,9 @@
 """
-Clock errors that a run reveals
+Clock errors estimated in a run
 ===============================
 
-Four clocks are estimated together with the place of the emitter. Bands are 95 %; dotted are the true errors.
+Four clocks are estimated together with the position of the emitter. The bands are 95 % intervals. Dotted lines are
+the true errors.
 """
 
 from importlib.resources import files

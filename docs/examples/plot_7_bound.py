@@ -1,9 +1,9 @@
 """
-Where a fix would be accurate
-=============================
+Map of the Cramér-Rao bound
+===========================
 
-The Cramer-Rao bound over the place of the target: how accurate a fix can be there, with the noise and the stations that
-the file states.
+The Cramér-Rao bound over the position of the target is the best possible accuracy of a fix there. It uses the noise
+and the stations of the file.
 """
 
 from importlib.resources import files

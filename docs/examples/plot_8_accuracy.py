@@ -2,8 +2,8 @@
 Errors against the bound
 ========================
 
-Two hundred draws at each noise. Differences against one receiver share its noise. A fix that knows it reaches the
-Cramer-Rao bound; one that takes the rows for independent does not.
+Two hundred simulations at each noise. Differences against one receiver share the noise of this receiver. A fix with
+the correct covariance reaches the Cramér-Rao bound. A fix that assumes independent rows does not.
 """
 
 import numpy as np

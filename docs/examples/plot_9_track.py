@@ -1,8 +1,8 @@
 """
-A track from nothing
-====================
+A track without a first state
+=============================
 
-The drive past five beacons again, now as a track: its start is a fix of the first scans.
+The drive past five beacons again, now as a track. Its start is a fix of the first scans.
 """
 
 from importlib.resources import files

@@ -2,8 +2,8 @@
 A pass of a satellite
 =====================
 
-Frequencies of one emitter in one pass: each row alone would leave the target anywhere on its isodoppler curve. The
-curves cross at the fix, and once more at the mirror place on the other side of the track.
+The rows are frequencies of one emitter in one pass. Each row alone fits everywhere on its isodoppler curve. The
+curves cross at the fix, and again at the mirror image on the other side of the track.
 """
 
 from importlib.resources import files

@@ -1,9 +1,9 @@
 """
-Where to put stations
-=====================
+Station placement
+=================
 
-Eight of forty masts, so that fixes at twelve places are as good as possible even if one of them fails. Below the maps:
-the best set against what no set can be better than, while it was searched.
+Eight of forty masts are chosen. Fixes at twelve places are as accurate as possible, even if one mast fails. The
+picture below the maps compares the best set with the bound for all sets during the search.
 """
 
 import numpy as np

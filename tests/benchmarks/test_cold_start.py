@@ -45,9 +45,9 @@ def test_write_the_table(tmp_path):
     at_hand = spent(tmp_path / "made", *FIRST)
     batch = spent(tmp_path / "made", "-c", BATCH)
     figures = {
-        "`optloc fix demo`, machine code at hand": at_hand,
-        "a program that proves 10 000 fixes, machine code at hand": batch,
-        "`optloc fix demo`, nothing at hand": first,
+        "`optloc fix demo`, with stored machine code": at_hand,
+        "a program that proves 10 000 fixes, with stored machine code": batch,
+        "`optloc fix demo`, without stored machine code": first,
         "`optloc compile`, from nothing": made,
     }
     rows = [[name, *(f"{seconds:.1f}" for seconds in times)] for name, times in figures.items()]

@@ -76,7 +76,7 @@ def test_write_the_growth_table():
         what = f"{MILLION:,} fixes of one call, {method}, two threads, {100 * inside:.0f} % inside: {seconds:.2f} s, "
         what += f"{megabytes:.0f} MB, {100 * proven:.1f} % proven global"
         rows.append([what, f"{1e6 * seconds / MILLION:.3g}", f"{seconds / MILLION / product():.2g}"])
-    facts = f"TDOA, {SIGMA:g} m, emitters inside; one thread unless said; quietest of the rounds; {machine()}"
+    facts = f"TDOA, {SIGMA:g} m, emitters inside; one thread unless stated; quietest of the rounds; {machine()}"
     assert write("growth", ["where", "us a fix", "in products of order 200"], rows, facts).is_file()
     with (FOLDER / "growth.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

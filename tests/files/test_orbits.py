@@ -369,7 +369,7 @@ def test_the_effects_of_the_page_have_the_sizes_of_their_formulas():
     assert (clock < speed**2 / 2.0 / c).all()
     assert scene.moves(clock, known=False) < 1e-6
     # along the track the fix goes with the satellite, by as much less as the ground is lower
-    along = effects["place of the satellite along its track, 1 km"]
+    along = effects["position of the satellite along its track, 1 km"]
     assert abs(scene.moves(along[2], known=False) - 1e3 * 6367.0 / 7158.0) < 20.0
     table = generated.doppler().splitlines()
     assert len(table) == 2 + len(effects)

@@ -150,7 +150,7 @@ GROSS, NEAR = 100, 3.0
 GROSS_HEADER = (
     "network",
     "counted",
-    "rows left out as from the truth",
+    "same rows left out as from the truth",
     "distances as good as from the truth",
     "wrong though ok",
     "unproven, curved, misfit",

@@ -57,7 +57,7 @@ REGULAR = {
 
 @pytest.fixture(scope="module")
 def nees_book():
-    header = ["case", "ok", "share", "NEES / d", "99 % band", "in the 95 % ellipsoid", "in that of 99.9 %"]
+    header = ["case", "ok", "share", "NEES / d", "99 % band", "in the 95 % ellipsoid", "in the 99.9 % ellipsoid"]
     with ledger("nees", header, NAMES, f"seed {SEED}, {FULL} trials a case") as made:
         yield made
 

@@ -35,12 +35,12 @@ HEADER = [
     "unique",
     "`ok`",
     "others",
-    "`ok`, cheaper unfound",
-    "not `ok`, cheaper unfound",
+    "`ok`, cheaper position missed",
+    "not `ok`, cheaper position missed",
     "boxes, median",
     "boxes, 99 %",
     "ms a fix (processor)",
-    "besides",
+    "also",
 ]
 
 
@@ -225,24 +225,24 @@ def _from_anywhere(besides: Counter, scenes: Scenes, fix: Fix, best: np.ndarray)
 
 
 def _said_of_descents(besides: Counter) -> str:
-    return f"{besides['arrived']} of {besides['descents']} descents from random places end at the best one"
+    return f"{besides['arrived']} of {besides['descents']} descents from random positions end at the best minimum"
 
 
 def _said_of_sides(besides: Counter) -> str:
     n = max(besides["judged"], 1)
     stated, exact = (f"{besides[key] / n:.4f}" for key in ("stated", "exact"))
     scores = f"Brier score of the stated side {stated}, of the exact posterior {exact}"
-    either = f"truth or mirror place the answer: {besides['either']}"
-    return f"{either}; the other listed where its gap is below 25: {besides['listed']} of {besides['near']}; {scores}"
+    either = f"the fix is the truth or its mirror image: {besides['either']}"
+    return f"{either}; the other is listed if its gap is below 25: {besides['listed']} of {besides['near']}; {scores}"
 
 
 def _said_of_bound(besides: Counter) -> str:
     ratio, held = np.sqrt(besides["squared"] / besides["judged"]), besides["covered"] / max(besides["sure"], 1)
-    return f"RMSE {ratio:.3f} of the bound; the 95 % ellipses of `ok` hold {100.0 * held:.1f} % of truths"
+    return f"RMSE {ratio:.3f} of the bound; the 95 % ellipses of `ok` contain {100.0 * held:.1f} % of truths"
 
 
 def _said_of_methods(besides: Counter) -> str:
-    return f"{besides['ok']} `ok` by {len(METHODS)} other methods, {besides['wrong']} of them beaten"
+    return f"{besides['ok']} `ok` by {len(METHODS)} other methods, a cheaper position known for {besides['wrong']}"
 
 
 HYBRIDS = [name for name in FAMILIES if "bearing" in name]

@@ -75,17 +75,17 @@ LOUD = [
 CELLS = list(dict.fromkeys([*WRONG, *RIGHT, *TRIED, Cell("toa", 3, 8, 2, 100), *GRID, *LOUD]))
 PROMISED = {*WRONG, *RIGHT, *TRIED, Cell("toa", 3, 8, 2, 100)}
 HEADER = [
-    "rows, stations, liars",
+    "rows, stations, wrong stations",
     "trials",
     "ok",
     "ok, wrong",
     "of these named",
     "listed with the truth",
-    "listed without",
+    "listed without the truth",
     "unproven",
     "contradictory",
     "others",
-    "expected unseen",
+    "expected undetected",
     "median error of ok, m",
     "cauchy, the same trials",
     "good rows from the truth",
@@ -94,7 +94,7 @@ HEADER = [
 
 @pytest.fixture(scope="module")
 def book():
-    facts = f"{FULL} trials a case, {MANY} where something is promised, each fixed by itself (`test_liars.py`)"
+    facts = f"{FULL} trials a case, {MANY} for promised cases, each problem fixed separately (`test_liars.py`)"
     with ledger("robust", HEADER, [cell.name for cell in CELLS], facts) as made:
         yield made
 

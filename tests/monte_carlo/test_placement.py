@@ -72,7 +72,7 @@ CASES = {case.name: case for case in (*SMALL, *LARGE)}
 HEADER = (
     "sites and places, criterion",
     "searches",
-    "gap asked, %",
+    "target gap, %",
     "CPU s allowed",
     "closed in time",
     "median s",
@@ -81,7 +81,7 @@ HEADER = (
     "same as enumeration",
     "bound above the best set",
     "random sets",
-    "of them below the bound",
+    "random sets below the bound",
 )
 
 

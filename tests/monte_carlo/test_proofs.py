@@ -17,11 +17,11 @@ HEADER = [
     "unique",
     "region",
     "ambiguous",
-    "no answer",
+    "no fix",
     "replaced",
     "boxes, median",
     "boxes, 99 %",
-    "else",
+    "other reasons",
 ]
 NAMES = [cell.name for cell in CELLS]
 # The least share of fixes with a global proof, or with one for a region; what is not named here is reported only.

@@ -27,7 +27,7 @@ HEADER = [
     "one place",
     "of these named",
     "several, the truth among them",
-    "several, without it",
+    "several, without the truth",
     "none",
     "ok",
     "ok, wrong",

@@ -55,7 +55,7 @@ def _ranks(rows: pd.DataFrame) -> list[str]:
         alone[one.method] += one.alone
         other[one.method] += one.other_alone
     lines = [
-        f"| | method | right, % | 95 % | ok but wrong, % | median ms | alone right : {first} alone |",
+        f"| | method | right, % | 95 % | ok but wrong, % | median ms | only this right : only {first} right |",
         "|---:|---|---:|---:|---:|---:|---:|",
     ]
     for place, name in enumerate(order, 1):
