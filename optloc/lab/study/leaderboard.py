@@ -1,4 +1,4 @@
-"""The leaderboard of the public test set as a page of Markdown: who is right how often, how fast, and on which data."""
+"""Leaderboard of the public test set as a page of Markdown: shares of right answers, times, and the test data."""
 
 from __future__ import annotations
 
@@ -16,23 +16,18 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SET = "bench"
-"""Name of the shipped study that is the test set."""
+"""Name of the shipped study that contains the test set."""
 
 _JUDGE = "truth"
 
 
 def page(folder: Path, design: StudyDesign) -> str:
-    """Return the leaderboard of a folder as Markdown.
+    """Return the leaderboard as Markdown.
 
-    Parameters
-    ----------
-    folder : Path
-        Output folder of a run of the test set.
-    design : StudyDesign
-        Its design: tells which data these are.
+    `folder` is the output folder of a run of the test set; `design` is the design of that run.
     """
     rows, manifest = judged(read_frame(folder, COLUMNS)), read_manifest(folder)
-    # The judge knows the truth: it is compared with nobody.
+    # The baseline "truth" starts at the true position and judges the others, so it is not ranked.
     ranked = rows[rows["method"].astype(str) != _JUDGE]
     lines = ["---", "orphan: true", "---", "", "<!-- table -->", "", _about(manifest, design), ""]
     lines += [*_ranks(ranked), "", "Share of right answers by scene, %:", "", *_by_case(ranked)]
@@ -55,7 +50,7 @@ def _ranks(rows: pd.DataFrame) -> list[str]:
         alone[one.method] += one.alone
         other[one.method] += one.other_alone
     lines = [
-        f"| | method | right, % | 95 % | ok but wrong, % | median ms | alone right : {first} alone |",
+        f"| | method | right, % | 95 % | ok but wrong, % | median ms | only it right : only {first} right |",
         "|---:|---|---:|---:|---:|---:|---:|",
     ]
     for place, name in enumerate(order, 1):
@@ -79,5 +74,5 @@ def _by_case(rows: pd.DataFrame) -> list[str]:
 
 
 def _cell(text: str) -> str:
-    """Return text as a cell of a table: names come from whoever ran the set."""
+    """Return text as a table cell of Markdown, escaped because names of methods come from users."""
     return "".join(f"\\{c}" if c in "\\|`*_<>[]" else c for c in text)

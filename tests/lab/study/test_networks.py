@@ -117,13 +117,13 @@ def test_the_convex_start_leaves_out_what_it_does_not_serve():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (HALL.replace('["truth", "one-random"]', '"scipy"'), "finds no networks"),
-        (HALL.replace('baseline = ["truth", "one-random"]', 'method = "auto"'), "finds no networks"),
-        (QUICK.replace('"gtrs+lsr"', '"calibrate"'), "serves networks alone"),
-        (QUICK.replace('method = "gtrs+lsr"', 'baseline = "ten-random"'), "serves networks alone"),
+        (HALL.replace('["truth", "one-random"]', '"scipy"'), "cannot solve networks"),
+        (HALL.replace('baseline = ["truth", "one-random"]', 'method = "auto"'), "cannot solve networks"),
+        (QUICK.replace('"gtrs+lsr"', '"calibrate"'), "solves networks only"),
+        (QUICK.replace('method = "gtrs+lsr"', 'baseline = "ten-random"'), "solves networks only"),
         (QUICK + HALL[HALL.index("[[network]]") : HALL.index("[[method]]")], "both scenarios and networks"),
         (HALL.replace("[[network]]", "[[networks]]"), "unknown key 'networks'"),
-        (HALL[: HALL.index("[[network]]")] + HALL[HALL.index("[[method]]") :], "nothing to study"),
+        (HALL[: HALL.index("[[network]]")] + HALL[HALL.index("[[method]]") :], "no scenario and no network"),
         (HALL.replace('"20 m", "20 m"', '"20 kg", "20 m"'), "kg"),
         (HALL.replace("dimension = 2", "dimension = 3"), "2 widths do not fit 3 dimensions"),
         (HALL.replace("pulses = 12", 'noise = ["0 m"]'), "not positive"),
