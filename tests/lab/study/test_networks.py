@@ -128,7 +128,7 @@ def test_the_convex_start_leaves_out_what_it_does_not_serve():
         (HALL.replace("dimension = 2", "dimension = 3"), "2 widths do not fit 3 dimensions"),
         (HALL.replace("pulses = 12", 'noise = ["0 m"]'), "not positive"),
         (HALL.replace("pulses = 12", 'emission = "-3 m"'), "emission is negative"),
-        (HALL.replace("pulses = 12", 'outliers = { share = 0.1, size = { toa = "3 m" } }'), "arrivals alone"),
+        (HALL.replace("pulses = 12", 'outliers = { share = 0.1, size = { toa = "3 m" } }'), "arrivals only"),
         (HALL.replace("pulses = 12", "sweep = { pulse = [3] }"), "did you mean 'pulses'"),
     ],
 )
