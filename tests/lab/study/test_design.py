@@ -31,13 +31,18 @@ BAD = {
         for i, (method, solver, hostile, words) in enumerate(
             [
                 ("gtrs+nlp", "sqpmethod", 'jit = true, compiler = "shell"', "a study may not set 'jit' of sqpmethod"),
-                ("gtrs+nlp", "sqpmethod", 'jit_options = { compiler = "true; cc" }', "'jit_options' is no setting"),
+                (
+                    "gtrs+nlp",
+                    "sqpmethod",
+                    'jit_options = { compiler = "true; cc" }',
+                    "a study may not set 'jit_options'",
+                ),
                 ("gtrs+nlp", "ipopt", 'output_file = "stray.txt"', "a study may not set 'output_file' of ipopt"),
-                ("gtrs+nlp", "ipopt", 'option_file_name = "stray.opt"', "'option_file_name' is no setting"),
+                ("gtrs+nlp", "ipopt", 'option_file_name = "stray.opt"', "a study may not set 'option_file_name'"),
                 ("gtrs+nlp", "ipopt", 'linear_solver = "ma27"', "a study may not set 'linear_solver' of ipopt"),
                 ("sdp", "SCS", 'write_data_filename = "stray"', "a study may not set 'write_data_filename' of SCS"),
                 ("sdp", "SCS", 'log_csv_filename = "stray.csv"', "a study may set acceleration_interval"),
-                ("sdp", "CLARABEL", 'direct_solve_method = "pardiso"', "'direct_solve_method' is no setting"),
+                ("sdp", "CLARABEL", 'direct_solve_method = "pardiso"', "a study may not set 'direct_solve_method'"),
                 ("sdp", "SCS", "max_iters = -1", "max_iters is -1"),
                 ("sdp", "SCS", "max_iters = 2.5", "give a whole number from 1 to 1e+09"),
                 ("sdp", "SCS", 'eps_abs = "1e-3"', "eps_abs is '1e-3'"),

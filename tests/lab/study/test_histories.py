@@ -176,7 +176,7 @@ def test_what_cannot_be_followed_is_a_sentence(folder, tmp_path):
     held = held.replace('["toa"]', '["azimuth"]').replace(flown, flown.replace("3 m", "1 deg"))
     drawn = draw(design(held).cells[2].case, 0, 2)
     asked = question(folder, [], 2)
-    with pytest.raises(InvalidProblem, match="depend on the place"):
+    with pytest.raises(InvalidProblem, match="depend on the position"):
         histories(type(asked)("t", drawn, asked.methods, asked.least))
     with pytest.raises(InvalidProblem):
         question(tmp_path, [], 3)
