@@ -309,7 +309,7 @@ def histories(
     ],
     methods: Methods = None,
     plugin: Plugins = None,
-    trials: Annotated[int, typer.Option(min=1, help="Most trials, or epochs of a file; the first ones are used.")] = 20,
+    trials: Annotated[int, typer.Option(min=1, help="Most trials, or epochs of a file, from the first on.")] = 20,
     case: Annotated[str | None, typer.Option(metavar="LABEL", help="Case of a study; the first by default.")] = None,
     noise: Annotated[
         str | None, typer.Option(metavar="LABEL", help="Noise level of a study; the first by default.")

@@ -75,8 +75,8 @@ _ENTRIES = {
     ),
     "adsb": DatasetEntry(
         "locards_adsb",
-        "Arrival times of 763 messages of airliners, each heard by five of 27 receivers 9 to 322 km away, with the "
-        "aircraft's height. Truth: the aircraft's own report, tens of metres.",
+        "Arrival times of 763 messages of airliners, each received by five of 27 receivers 9 to 322 km away, with the "
+        "aircraft's height. Truth: the report of the aircraft, tens of metres.",
         "Schaefer, Strohmeier, Leonardi, Lenders: LocaRDS, Sensors 21(16), 2021 (Zenodo 4739276), by way of "
         "github.com/lschoe/mpyc, demos/data/mlat",
         "CC-BY-SA",

@@ -4,10 +4,12 @@ Windows are 1.5 s long, and centred at every 3 s from 2 s after the first range.
 3 beacons are kept. The true motion within a window is removed. The known `correction` of a row is the true range at the
 row's time minus the true range at the window's centre.
 
-Three forms: the ranges as measured ("raw"), less the mean residual of each beacon ("offset"), or corrected by an affine
-fit of the residuals of each beacon ("affine"). Rows are independent. Their sigma is the rms of all residuals: 3.0 m raw
-(2.8 m of it a mean, as ranges are 7 % too long), 1.15 m less the means, 0.53 m after the fit. A fourth form, "scaled",
-is for estimates of the scale: ranges as measured, with the sigma after the fit, 0.53 m.
+The ranges have four forms. Rows are independent, and their sigma is the rms of all residuals:
+
+- "raw": as measured; 3.0 m, of which 2.8 m are a mean, as ranges are 7 % too long;
+- "offset": less the mean residual of each beacon; 1.15 m;
+- "affine": corrected by an affine fit of the residuals of each beacon; 0.53 m;
+- "scaled": as measured, for estimates of the scale, with the sigma of "affine".
 """
 
 from __future__ import annotations
@@ -21,8 +23,8 @@ from optloc.problem import Array, Motion, Problem, assemble, measured
 
 # Metres: the rms of the residuals at the truth after each calibration, see above.
 SIGMA = {"raw": 3.0, "offset": 1.15, "affine": 0.53, "scaled": 0.53}
-# Seconds: windows do not overlap, and the first one is within the data. At 1.7 m/s the mower moves by up to 2.5 m in a
-# window; the correction by the truth removes this motion.
+# Seconds: windows do not overlap, and the first window is within the data. At 1.7 m/s the mower moves by up to 2.5 m in
+# a window; the correction by the truth removes this motion.
 STEP, WIDTH, LEAD = 3.0, 1.5, 2.0
 LEAST = 3  # beacons that determine a position in the plane; two leave a mirror image
 

@@ -67,7 +67,7 @@ def choose(value: Any, known: Iterable[Any], option: str) -> Any:
 
 
 def places(table: pd.DataFrame, columns: Iterable[str] = XYZ) -> Array:
-    """Return coordinates (n, d) in metres, from those of the columns that exist in the table."""
+    """Return coordinates (n, d) in metres from all `columns` that exist in the table."""
     return table[[column for column in columns if column in table]].to_numpy(dtype=np.float64)
 
 

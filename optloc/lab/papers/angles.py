@@ -126,7 +126,7 @@ def fly_circle(name: str, slow: float, fast: float, rate: float, seconds: tuple[
 
     Notes
     -----
-    The last part has the velocity of the first, as printed, whatever the heading at the end of the circle.
+    The last part has the velocity of the first, as printed, so the heading jumps at the end of the circle.
     """
     ahead, left = np.array([2.0, 1.0, 0.0]) / np.sqrt(5.0), np.array([-1.0, 2.0, 0.0]) / np.sqrt(5.0)
     one, two, three = (np.arange(n + 1.0)[:, None] for n in seconds)
@@ -439,8 +439,8 @@ def run_rays(count: int, seed: int, key: int, tick: Tick) -> list[SimulatedRays]
 def still(count: int, sigma: float) -> Problem:
     """Return one epoch of angles to a fixed target.
 
-    Two stations are those of simulation 3. The text does not give the positions of more stations: here they are between
-    the two, and every other one is 20 km further away from the target.
+    Two stations have the positions of simulation 3. The text gives no positions for more stations. Here they are
+    between the two, and every second station is 20 km further away from the target.
     """
     place = np.zeros((count, 3))
     place[:, 0] = np.linspace(-40e3, 40e3, count)

@@ -300,7 +300,7 @@ def mean_error(cov: Array) -> Array:
 
 
 def polynomial_ratio(order: int, points: int) -> float:
-    """Return the end-point error of a line (order 1) or parabola (2) through equal points, over that of one point."""
+    """Return the end-point error of a line (order 1) or parabola (2) through equal points, relative to one point."""
     # The corner of the inverse normal matrix of equidistant points, in closed form.
     k = points
     if order == 1:
@@ -470,7 +470,9 @@ def predict_twice(dynamics: Dynamics, interval: float, dimension: int) -> Update
 
 
 def taylor(problem: Problem, start: Array, *, sign: float = 1.0, steps: int = 50) -> Array:
-    """Return positions (..., d) after undamped steps of the linearised fix, equations 5 to 8; not finite after divergence.
+    """Return positions (..., d) after undamped steps of the linearised fix, equations 5 to 8.
+
+    Positions are not finite if the steps diverge.
 
     Parameters
     ----------

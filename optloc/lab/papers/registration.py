@@ -437,15 +437,15 @@ _EPOCHS, _INTERVAL, _SEED = 200, 3.0, 20170502
 _ARRIVAL, _STATION = 10.0, 1.0
 
 _PROBLEM = """\
-# Five aircraft time an emitter 360 km away for ten minutes, each by a clock of its own. The emitter stands at 200 km,
-# 300 km, 0; the clocks of R2 to R5 are 100, -133, 167 and -100 ns late against that of R1.
+# Five aircraft measure the arrival times of an emitter 360 km away for ten minutes, each with a separate clock. The
+# emitter is at 200 km, 300 km, 0. The clocks of R2 to R5 are 100, -133, 167 and -100 ns late against the clock of R1.
 format = 2
 title = "Five aircraft, one emitter, four clock errors"
 
 [stations]
-file = "registration-stations.csv"   # where each aircraft is at the first and at the last second
-sigma = "1 m"                        # of each coordinate of its position
-span = "noise"                       # drawn anew at every epoch
+file = "registration-stations.csv"   # position of each aircraft at the first and at the last second
+sigma = "1 m"                        # of each coordinate of the position
+span = "noise"                       # independent at every epoch
 
 [[measurements]]
 kind = "tdoa"
@@ -459,7 +459,7 @@ motion = "static"
 
 [[biases]]
 name = "clock"
-members = ["R2", "R3", "R4", "R5"]   # against that of R1
+members = ["R2", "R3", "R4", "R5"]   # against the clock of R1
 """
 
 

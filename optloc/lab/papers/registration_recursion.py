@@ -68,7 +68,7 @@ def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Arr
     state : array (trials, n)
         Position, or position and velocity at time zero.
     arrivals : array (trials, s, k)
-        Range differences against the first station; those of the first station are zero.
+        Range differences against the first station, metres; the first station has zero.
     track : array (3, s, k)
         Stations, metres.
     times : array (k,)

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 # Values printed in section 4 of the paper.
 
 SIGMA0 = (1855.0, 2758.0, 160.0)
-"""Coordinates of the one-shot bound, metres."""
+"""Coordinates of the single-epoch bound, metres."""
 
 ACCURACY_FIXED = {
     150: (99.60, 89.38, 92.10, 86.65),
@@ -465,7 +465,7 @@ class RegistrationSample:
     many : int
         Trials of tables 3 and 4, which count failures.
     fixed, moving : tuple of int
-        Epochs at which the fixed and the moving target are scored, including those of the printed tables.
+        Epochs at which the fixed and the moving target are scored, including the epochs of the printed tables.
     last : int
         Epochs of tables 3 and 4.
     """

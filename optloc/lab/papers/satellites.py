@@ -321,8 +321,8 @@ NAMES = {
 }
 """Names of the filters in tables and figures."""
 
-# Steps at which errors are shown; a shorter sample has the first of them. Effects of the height come late, those of
-# orbits later.
+# Steps at which errors are shown; a shorter sample shows only its own steps. Effects of the height come late, effects
+# of orbits later.
 _STEPS, _STEPS_HEIGHT, _STEPS_MOVING = (1, 10, 50, 100, 200), (1, 100, 200), (50, 100, 200)
 
 # Steps that are left out of the comparison of filters: there the first fixes have most weight.

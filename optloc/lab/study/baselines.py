@@ -88,11 +88,10 @@ def single_step(problem: Problem, start: Array) -> Array:
 def recursion(problem: Problem, start: Array, *, iterations: int = 2) -> Array:
     """Return the vectors (N, size) of the registration paper's recursion: undamped steps, epoch by epoch.
 
-    Each step uses all data up to its epoch.
+    Each step uses all data up to its epoch. The first steps use forty epochs, and every step is accepted.
 
-    The recursion uses the first forty epochs together, and it accepts every step. `problem` is a flat batch of N runs
-    without unknowns of single epochs, `start` are vectors (N, size), and `iterations` are the steps at each epoch. The
-    result is NaN if the steps diverge, or if the problem has unknowns of single epochs.
+    `problem` is a flat batch of N runs, `start` are vectors (N, size), and `iterations` are the steps at each epoch.
+    The result is NaN if the steps diverge, or if the problem has unknowns of single epochs.
     """
     if problem.layout.n_local or tied(problem):
         return np.full_like(start, np.nan)

@@ -188,7 +188,7 @@ def design_of(
     trials, seed : int, optional
         Replace the values of the file; `trials` also replaces the values of single scenarios.
     more : sequence of StudyMethod
-        Methods in addition to those of the file.
+        Methods in addition to the methods of the file.
 
     Raises
     ------

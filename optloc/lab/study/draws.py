@@ -188,7 +188,7 @@ def _block(case: Case, number: int, size: int) -> tuple[Array, Array, Array, Arr
     rng, problem, table = np.random.default_rng(geometry), case.template, case.table
     stations = np.broadcast_to(problem.stations.position.mean(0), (size, *problem.stations.position.shape[-2:]))
     if table.layout is not None:
-        if table.layout.placement != "frozen":  # the template holds the one draw of frozen stations
+        if table.layout.placement != "frozen":  # the template contains the frozen stations
             stations = place_stations(table.layout, case.where, rng, size)
         problem = _at(problem, stations)
     real, flaws = add_flaws(problem, table, case.where)
@@ -213,7 +213,7 @@ def _at(problem: Problem, stations: Array) -> Problem:
 
 
 def _vector(problem: Problem, values: dict[str, Array], size: int, steps: np.random.SeedSequence) -> Array:
-    """Return parameter vectors (size, n) with the named values; other unknowns are zero, also those of single epochs.
+    """Return parameter vectors (size, n) with the named values; other unknowns are zero, also unknowns of epochs.
 
     Walks start at their values and add random steps.
     """
@@ -405,7 +405,7 @@ def _velocities(truth: TruthTable, dimension: int, where: str, rng: Rng, count: 
     return np.asarray(speed * way / np.linalg.norm(way, axis=-1, keepdims=True))
 
 
-# Errors: biases of the file, which methods may estimate, and flaws, which no method has a model of.
+# Errors: biases of the file, which methods may estimate, and injected errors, which no method has a model of.
 
 
 def _biases(case: Case, bias: Bias, rng: Rng, size: int) -> Array:
@@ -489,7 +489,7 @@ def _sizes(problem: Problem, given: Amount | dict[str, Amount], where: str) -> d
 
 
 def _draw_errors(flaws: tuple[Flaw, ...], lengths: dict[str, int], rng: Rng, size: int) -> dict[str, Array]:
-    """Return the errors (size, stations) of each flaw by name; `lengths` are the numbers of stations."""
+    """Return the injected errors (size, stations) by name, SI units; `lengths` are the numbers of stations by name."""
     small = [flaw for flaw in flaws if flaw.share is None]
     drawn: dict[str, Array] = {f.name: f.size * rng.standard_normal((size, lengths[f.name])) for f in small}
     # One chance and one sign for each station: a bad station is bad in all kinds, and in the same direction.

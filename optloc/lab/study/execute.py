@@ -221,7 +221,7 @@ class _Work:
         if cell not in self._given_up:
             self._cost[cell] = self._cost.get(cell, 0.0) + (task.share if lost.status == LATE else _DEATH)
             if self._cost[cell] >= _PATIENCE:
-                reason = f"given up after too many failures in this scenario; the last one: {lost.reason}"
+                reason = f"given up after too many failures in this scenario; last failure: {lost.reason}"
                 self._given_up[cell] = replace(lost, reason=reason)
         if cell in self._given_up:
             return part_of_lost(chunk, self._given_up[cell])

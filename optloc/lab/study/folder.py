@@ -117,7 +117,7 @@ def manifest_of(design: StudyDesign) -> StudyManifest:
 def joined(found: StudyManifest, wanted: StudyManifest) -> StudyManifest | None:
     """Return the manifest of a folder with the methods of another design added; None if the data differ.
 
-    Existing parts are kept, except those of methods whose names the new design uses: the new design replaces these.
+    Existing parts are kept. But if the new design has a method of the same name, its parts replace the old parts.
     """
     if not found.data or found.data != wanted.data:
         return None

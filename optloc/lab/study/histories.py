@@ -418,11 +418,12 @@ def question(
     place : Path
         Output folder of a study, or a problem file.
     names : sequence of str
-        Methods as `optloc.lab.study.methods.added` takes them: in addition to those of a study, or all for a file.
+        Methods as `optloc.lab.study.methods.added` takes them. They are added to the methods of a study; a problem
+        file has no other methods.
     count : int
-        Most trials; the first ones are used.
+        Most trials, from the first on.
     case, noise : str, optional
-        Case and noise level of a study; the first ones by default.
+        Case and noise level of a study; by default the first case and the first level.
 
     Raises
     ------

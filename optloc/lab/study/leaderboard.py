@@ -50,7 +50,7 @@ def _ranks(rows: pd.DataFrame) -> list[str]:
         alone[one.method] += one.alone
         other[one.method] += one.other_alone
     lines = [
-        f"| | method | right, % | 95 % | ok but wrong, % | median ms | only it right : only {first} right |",
+        f"| | method | right, % | 95 % | ok but wrong, % | median ms | only this right : only {first} right |",
         "|---:|---|---:|---:|---:|---:|---:|",
     ]
     for place, name in enumerate(order, 1):

@@ -162,7 +162,7 @@ def methods_of(table: MethodTable, number: int) -> Iterator[StudyMethod]:
 
 
 def added(names: Sequence[str]) -> list[StudyMethod]:
-    """Return methods that the user names in addition to those of a file.
+    """Return methods that the user names in addition to the methods of a file.
 
     Each name is a method such as gtrs+lsr, a baseline, or a function to load: FILE.py:FUNCTION or MODULE:FUNCTION.
     Raise InvalidProblem for an unknown method, or a function that cannot be loaded.

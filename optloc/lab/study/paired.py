@@ -35,7 +35,7 @@ class Median(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Comparison of a method with another one on the same trials.
+    """Comparison of a method with another method on the same trials.
 
     Parameters
     ----------
@@ -46,9 +46,9 @@ class Pair:
     trials : int
         Number of trials that both have run.
     alone, other_alone : int
-        Trials in which only the method, or only the other one, is right.
+        Trials in which only the method, or only the other method, is right.
     share, low, high : float
-        Share of `alone` in these trials, and its interval. Above one half the method is the better one.
+        Share of `alone` in these trials, and its interval. Above one half the method is better.
     p : float
         Probability of such a share, or one farther from one half, if both methods are equally good.
     error : Median

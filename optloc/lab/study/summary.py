@@ -51,9 +51,13 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        With five more columns: `above` (cost less the lowest known, of all methods and of the truth), `right`
-        (answered, and no better point is known), `wrong` (status ok, but a better point is known), `false` (a global
-        proof that a better point refutes), and `case` (scenario and swept values as text).
+        The rows with five more columns:
+
+        - `above`: cost less the lowest known cost, of all methods and of the truth;
+        - `right`: answered, and no better point is known;
+        - `wrong`: status ok, but a better point is known;
+        - `false`: a global proof that a better point refutes;
+        - `case`: scenario and swept values as text.
     """
     import pandas as pd
 

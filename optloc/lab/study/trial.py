@@ -62,7 +62,7 @@ class Column:
 
 COLUMNS: tuple[Column, ...] = (
     Column("key", "category", "", "Cell: a scenario at one noise level and one set of swept values, with one method."),
-    Column("data", "category", "", "Digest of what was drawn: equal data and trial mean equal measurements."),
+    Column("data", "category", "", "Digest of the simulated data: equal data and trial mean equal measurements."),
     Column("scenario", "category", "", "Name of the scenario."),
     Column("method", "category", "", "Name of the method as tables show it; different settings have different names."),
     Column("solver", "category", "", "Requested solver, for instance SCS; empty: the default of the method."),
@@ -178,7 +178,7 @@ FAILED = DIED, LATE, INVALID = "died", "timeout", "invalid"
 """Statuses of a trial without a fix: an error or a dead process, a time limit, an invalid answer."""
 
 VALUES: tuple[str, ...] = tuple(column.name for column in COLUMNS if column.value)
-"""Columns that are equal bit for bit on one machine, whatever the executor."""
+"""Columns that are equal bit for bit on one machine, with every executor."""
 
 
 @cache
