@@ -159,8 +159,8 @@ def _size(table: NetworkTable, where: str) -> float:
 
 def _trial(case: NetworkCase, number: int) -> tuple[Network, NetworkEstimate, int]:
     """Return one network, its true values and the number of its arrivals with a gross error."""
-    # A seed sequence mixes words of 32 bits. Positions, noise and gross errors have separate streams, so that a change of
-    # one does not shift the others.
+    # A seed sequence mixes words of 32 bits. Positions, noise and gross errors have separate streams: a change of one
+    # does not shift the others.
     key = [int(case.key[:8], 16), int(case.key[8:], 16)]
     words = np.random.SeedSequence([case.seed, *key], spawn_key=(number,)).spawn(3)
     place, noise, flaws = (np.random.default_rng(word) for word in words)
