@@ -43,6 +43,7 @@ def _datasets() -> Rows:
 
 
 def _folder() -> dict[str, Any]:
+    """Return the folder of data sets and the names of the sets in it, for the report on the installation."""
     from optloc.lab.datasets import available
 
     folder = os.environ.get("OPTLOC_DATA")

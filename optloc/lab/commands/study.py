@@ -371,6 +371,7 @@ def _say(line: str) -> None:
 
 
 def _record(found: Any) -> dict[str, Any]:
+    """Return the progress of a study as a dictionary for JSON."""
     m = found.manifest
     return {
         "name": m.name,
@@ -413,12 +414,14 @@ def _bar(title: str, total: int, quiet: bool) -> Iterator[Any]:
 
 
 def _in_words(counts: Counter[str], most: int = 3) -> str:
+    """Return the most frequent statuses with their counts as text; the others are summed up."""
     first = [f"{status} {count}" for status, count in counts.most_common(most)]
     rest = counts.total() - sum(count for _, count in counts.most_common(most))
     return ", ".join([*first, *([f"other {rest}"] if rest else [])])
 
 
 def _show(found: Any, console: Console) -> None:
+    """Print the progress of a study: a table of statuses by method, and the reasons of failures."""
     m = found.manifest
     state = "complete" if found.complete else f"{found.done} of {found.chunks} chunks"
     line = f"{m.title or m.name}: {state}, {found.rows} of {m.rows} rows"
@@ -436,6 +439,7 @@ def _show(found: Any, console: Console) -> None:
 
 
 def _show_comparison(found: list[Any], one: Path, two: Path, console: Console) -> None:
+    """Print a table for each case and noise level with both studies."""
     console.print(f"A = {one}, B = {two}", highlight=False, markup=False, soft_wrap=True)
     for case, same in groupby(found, lambda difference: difference.cell[:3]):
         scenario, sweep, noise = case
@@ -453,6 +457,7 @@ def _show_comparison(found: list[Any], one: Path, two: Path, console: Console) -
 
 
 def _show_pairs(found: list[Any], console: Console) -> None:
+    """Print a table for each case and noise level with the paired comparisons of methods."""
     for (case, noise), same in groupby(found, lambda one: (one.case, one.noise)):
         rows = list(same)
         title = f"{case}, {noise}: against {rows[0].against}"
@@ -468,6 +473,7 @@ def _show_pairs(found: list[Any], console: Console) -> None:
 
 
 def _profile_record(found: Any) -> dict[str, Any]:
+    """Return data and performance profiles as a dictionary for JSON."""
     from dataclasses import asdict
 
     from optloc.lab.study.profiles import RATIOS, shares
@@ -489,6 +495,7 @@ def _profile_record(found: Any) -> dict[str, Any]:
 
 
 def _show_profiles(found: Any, console: Console) -> None:
+    """Print the shares of trials that each method solves within multiples of the least work."""
     from optloc.lab.report.sheets import duration, number, percent, solved_within
     from optloc.lab.study.profiles import RATIOS, shares
 
@@ -504,6 +511,7 @@ def _show_profiles(found: Any, console: Console) -> None:
 
 
 def _show_histories(found: Any, reached: list[Any], tau: float, console: Console) -> None:
+    """Print for each method how many trials reach the minimum, and the quartiles of the work."""
     console.print(found.title, style="bold", highlight=False, markup=False, soft_wrap=True)
     table = Table("method")
     for name in ("trials", f"within {tau:g}", "evaluations", "iterations"):

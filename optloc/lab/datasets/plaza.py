@@ -66,6 +66,7 @@ def load(folder: Path, form: str) -> Windows:
 
 
 def _calibrate(form: str, z: Array, distance: Array, a: Array) -> Array:
+    """Return the ranges (n,) in metres, calibrated by the residuals of each beacon a (n,) at the truth."""
     if form in ("raw", "scaled"):
         return z
     out = np.empty_like(z)

@@ -104,11 +104,13 @@ def _flight(folder: Path, flight: str) -> tuple[float, Array, pd.DataFrame, pd.D
 
 
 def _problem(stations: Array, a: Array, b: Array, z: Array, epoch: Array, times: Array) -> Problem:
+    """Return the problem of range differences z (m,) in metres, with a free target in each epoch."""
     rows = measured("tdoa", z, a=a, b=b, sigma=INDEPENDENT, epoch=epoch)
     return assemble(stations, rows, times=times, motions=(Motion(span="epoch"),))
 
 
 def _covariance(a: Array, b: Array, stations: int, *, shared: bool) -> Array:
+    """Return the covariance (m, m) of the rows of a window, m^2."""
     if not shared:
         return INDEPENDENT**2 * np.eye(len(a))
     # The error of an anchor enters all its rows of the window, with the sign of the anchor in the difference.
@@ -117,4 +119,5 @@ def _covariance(a: Array, b: Array, stations: int, *, shared: bool) -> Array:
 
 
 def _noise(inside: list[Array], covariances: list[Array]) -> Noise:
+    """Return the noise of all windows; `inside` are the row numbers of each."""
     return group([Block(rows[None], covariance[None]) for rows, covariance in zip(inside, covariances, strict=True)])

@@ -88,6 +88,7 @@ def _states(*parts: tuple[Array, Array, Array]) -> Array:
 
 
 def _straight() -> AnglesScenario:
+    """Return simulation 1: a straight course with constant acceleration."""
     # Printed: 2 m/s and 0.2 m/s² for 50 s. The direction is not printed.
     t, still = np.arange(51.0)[:, None], np.zeros((51, 2))
     ahead = np.array([1.0, 0.0])
@@ -96,6 +97,7 @@ def _straight() -> AnglesScenario:
 
 
 def _winding() -> AnglesScenario:
+    """Return simulation 2: a sine."""
     # Printed: x = 2t, y = 10 sin(5πt/180). The real and imaginary parts of a complex wave are cosine and sine.
     t, rate = np.arange(51.0), np.pi / 36.0
     wave, zero = np.exp(1j * rate * t), np.zeros(51)
@@ -455,5 +457,6 @@ def _size(error: Array) -> Array:
 
 
 def _bias(error: Array) -> tuple[float, float]:
+    """Return the length of the mean error, and the root mean square error, of finite errors (trials, d)."""
     good = error[np.isfinite(error).all(-1)]
     return float(np.linalg.norm(good.mean(0))), float(np.sqrt((good**2).sum(-1).mean()))

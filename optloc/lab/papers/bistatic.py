@@ -135,6 +135,7 @@ class Errors:
 
 
 def _errors(position: Array, slow: bool, epochs: Array) -> Errors:
+    """Return the errors of positions (trials, q, 3) after numbers of epochs (q,)."""
     exact = polar(truth(int(epochs.max()), slow=slow)[epochs - 1])
     error = polar(position) - exact
     # Azimuths are compared on the circle.
@@ -317,6 +318,7 @@ def kilometres(value: float) -> str:
 
 
 def _cells(errors: Array) -> tuple[str, str, str]:
+    """Return errors of range, azimuth and elevation (3,) as text."""
     return kilometres(errors[0]), f"{errors[1]:.5f}", f"{errors[2]:.5f}"
 
 

@@ -361,6 +361,7 @@ def _scenes(drawn: Mapping[str, KinematicDraw]) -> tuple[list[TableLine], dict[s
 
 
 def _mean(cov: Array) -> float:
+    """Return the mean error in the plane, averaged over covariances, metres."""
     return float(mean_error(cov).mean())
 
 

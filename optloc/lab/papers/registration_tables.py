@@ -311,6 +311,7 @@ def table_noises(cases: Sequence[TableCase], sure: Sequence[RegistrationScore], 
 
 
 def _compared(case: TableCase) -> tuple[str, ...]:
+    """Return the columns of a case that tables 3 and 4 share, as text."""
     lengths = (case.plain.rmse, case.found.rmse, case.bound)
     shares = (case.plain.share, case.image, case.found.share)
     return (*(metres(v) for v in lengths), *(percent(v) for v in shares))
@@ -381,6 +382,7 @@ def table_readings() -> TextTable:
 
 
 def _bound(epochs: int, sigma: float, station_sigma: float, shape: Shape) -> float:
+    """Return the bound of the position of the fixed target, metres."""
     made = problem(PRINTED, epochs, sigma=sigma, station_sigma=station_sigma, shape=shape)
     return rms(crlb(made, truth(PRINTED, made)))
 

@@ -142,6 +142,7 @@ def _log(axis: Any, scale: Any, low: float, high: float) -> None:
 
 
 def _line(axes: Axes, mark: Look, x: Array, y: Array, *, marker: bool, steps: bool = False, width: float = 1.5) -> None:
+    """Draw the curve of a method in its style."""
     (line,) = axes.plot(
         x,
         y,
@@ -220,6 +221,7 @@ def profile_picture(found: Profiles, looks: Looks) -> Figure:
 
 
 def _data_profile(axes: Axes, found: Profiles, looks: Looks) -> None:
+    """Draw the share of trials that each method solves within budgets of work."""
     needed = found.spent[found.solved]
     budgets = np.geomspace(needed.min() / 1.5, 1.5 * needed.max(), _FINE)
     _curves(axes, found, looks, budgets, found.data(budgets))
@@ -227,6 +229,7 @@ def _data_profile(axes: Axes, found: Profiles, looks: Looks) -> None:
 
 
 def _performance_profile(axes: Axes, found: Profiles, looks: Looks) -> None:
+    """Draw the share of trials that each method solves within multiples of the least work."""
     needed = np.where(found.solved, found.spent, np.inf)
     with np.errstate(invalid="ignore"):
         slower = np.where(found.solved, needed / needed.min(0), 1.0)
@@ -237,6 +240,7 @@ def _performance_profile(axes: Axes, found: Profiles, looks: Looks) -> None:
 
 
 def _curves(axes: Axes, found: Profiles, looks: Looks, x: Array, shares: Array) -> None:
+    """Draw the stepped curves (methods, q) of shares over x (q,)."""
     for method, share in zip(found.methods, shares, strict=True):
         _line(axes, looks[method], x, share, marker=False, steps=True)
     axes.set_xscale("log")

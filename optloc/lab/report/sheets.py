@@ -56,6 +56,7 @@ def percent(share: float) -> str:
 
 
 def _interval(hits: float, count: float) -> str:
+    """Return a share in per cent with its 95 % interval as text."""
     low, high = wilson(hits, count)
     return f"{percent(float(hits / count))} ({100 * float(low):.1f} to {100 * float(high):.1f})"
 
@@ -69,11 +70,13 @@ Column = tuple[str, Callable[[Any], str]]
 
 
 def _sheet(name: str, title: str, note: str, frame: pd.DataFrame, columns: list[Column], words: int) -> Sheet:
+    """Return a table of a frame: each column has a heading and a function from a row to text."""
     rows = tuple(tuple(show(row) for _, show in columns) for row in frame.itertuples(index=False))
     return Sheet(frame, TextTable(name, title, tuple(head for head, _ in columns), rows, note), words)
 
 
 def _case(words: tuple[str, ...] = ("case", "noise", "method")) -> list[Column]:
+    """Return the columns of case, noise level and method."""
     columns: dict[str, Column] = {
         "case": ("case", lambda r: str(r.case)),
         "noise": ("noise", lambda r: noise_text(r.noise_label)),

@@ -97,6 +97,7 @@ def scenario_maps(design: StudyDesign, frame: pd.DataFrame) -> Iterator[Place]:
 
 
 def _place(title: str, case: Case, rows: pd.DataFrame) -> Place:
+    """Return the map of a case at one noise level, with the true positions of its trials."""
     # The stations are fixed, so the stations of one trial serve all trials.
     one = draw(case, 0, 1)
     problem, d = one.problem.take(np.zeros(1, dtype=int)), one.problem.dimension
@@ -201,6 +202,7 @@ def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None
 
 
 def _found(folder: Path) -> _StudyContent:
+    """Return the content of the report from the output folder of a study."""
     manifest = read_manifest(folder)
     rows = read_frame(folder, [*summary.COLUMNS])
     if not len(rows):
@@ -223,6 +225,7 @@ def _found(folder: Path) -> _StudyContent:
 
 
 def _page(found: _StudyContent, parts: list[PagePart]) -> str:
+    """Return the HTML page of the report."""
     m, rows = found.manifest, len(found.frame)
     state = "complete" if rows == m.rows else f"{rows} of {m.rows} rows: not finished, so the results may change"
     trials = found.frame[["data", "trial"]].drop_duplicates()
@@ -235,6 +238,7 @@ def _page(found: _StudyContent, parts: list[PagePart]) -> str:
 
 
 def _part(section: _Section, found: _StudyContent, pictures: list[Picture]) -> PagePart:
+    """Return a section of the page with its drawings and its folded tables."""
     folded = [found.sheets[name] for name in section.tables]
     # Draw before the files are written: the files get a legend inside the figure, the page does not.
     drawings = [inline(picture) for picture in pictures]
@@ -258,6 +262,7 @@ def _figure_files(place: Path, picture: Picture, *, legend: bool) -> list[Path]:
 
 
 def _table_file(place: Path, sheet: Sheet, ending: str) -> Path:
+    """Write a table as .csv or .tex, and return its path."""
     path = place / "tables" / f"{sheet.shown.name}.{ending}"
     make_folder(path.parent)
     if ending != "csv":
@@ -288,14 +293,17 @@ def _maps(place: Path, found: _StudyContent) -> tuple[PagePart, list[Path]]:
 
 
 def _of_cells(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
+    """Return pictures of the cells of the study."""
     return list(make(found.cells, found.looks))  # type: ignore[call-overload,no-any-return]
 
 
 def _of_rows(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
+    """Return pictures of the rows of the study."""
     return list(make(found.frame, found.looks))  # type: ignore[call-overload,no-any-return]
 
 
 def _profiles(found: _StudyContent) -> list[Picture]:
+    """Return the pictures of both profiles; empty without profiles."""
     return [] if found.profiles is None else list(drawn.profiles(found.profiles, found.looks))
 
 

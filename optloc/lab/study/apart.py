@@ -190,6 +190,7 @@ class WorkerPool:
             raise InvalidProblem(f"no process can be started ({error})", sys.executable, advice) from None
 
     def _begin(self) -> Apart:
+        """Start a process, send it the import path and the server function, and return it when it is ready."""
         with self._lock:
             if self._closed:
                 raise InvalidProblem("the run was stopped", "study", "run the same command to continue")

@@ -105,6 +105,7 @@ def recursion(problem: Problem, start: Array, *, iterations: int = 2) -> Array:
 
 
 def _full_step(problem: Problem, x: Array) -> Array:
+    """Return the vectors (N, size) after one undamped Gauss-Newton step; NaN for singular equations."""
     # No damping: these baselines demonstrate steps that are too long.
     move, ok = step(equations_at(problem, x), np.zeros(len(x)))
     return x + np.where(ok[:, None], move, np.nan)
@@ -343,6 +344,8 @@ class Baseline:
 
 
 def _iterate(method: str) -> Callable[[DrawnCase, Array], Fix]:
+    """Return a baseline function that runs a method of optloc from a start."""
+
     def run(drawn: DrawnCase, start: Array) -> Fix:
         from optloc.solvers import solve
 
@@ -352,6 +355,7 @@ def _iterate(method: str) -> Callable[[DrawnCase, Array], Fix]:
 
 
 def _truth(drawn: DrawnCase, start: Array) -> Fix:
+    """Return the fixes of damped least squares from the truth."""
     return _iterate("lsr")(drawn, drawn.truth)
 
 
@@ -371,6 +375,7 @@ def _original(steps: Callable[[Problem, Array], Array]) -> Callable[[DrawnCase, 
 
 
 def _network(summary: str, refine: Callable[[Network, int], NetworkResult]) -> Baseline:
+    """Return a baseline for networks only, which refines them one by one."""
     return Baseline(only_networks, summary, guess=False, slow=True, networks=each(refine))
 
 

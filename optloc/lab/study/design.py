@@ -260,6 +260,7 @@ def _one_kind(study: StudyFile, methods: list[StudyMethod]) -> None:
 
 
 def _distinct(names: list[str], source: str, what: str) -> None:
+    """Raise InvalidProblem if two tables have the same name."""
     twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
         raise InvalidProblem(f"there are two {what}s {twice[0]!r}", source, f"give each {what} a different name")
@@ -304,6 +305,7 @@ _Table = TypeVar("_Table", ScenarioTable, NetworkTable)
 
 
 def _sweep(table: _Table, where: str) -> Iterator[tuple[dict[str, Any], _Table]]:
+    """Yield the swept values and the table with these values, for each combination of the lists."""
     for name, values in table.sweep.items():
         if not values or name in ("name", "sweep", "noise", "trials"):
             what = "has no values" if not values else "cannot be swept"
@@ -329,6 +331,7 @@ def _sweep(table: _Table, where: str) -> Iterator[tuple[dict[str, Any], _Table]]
 
 
 def _template(table: ScenarioTable, folder: Path, where: str, seed: int) -> Problem:
+    """Return the problem of a scenario without measurements, from its file or its layout."""
     if (table.problem is None) == (table.layout is None):
         raise InvalidProblem("a scenario has one geometry", where, "give either problem or [scenario.layout]")
     if table.layout is not None:

@@ -259,6 +259,7 @@ def place_stations(layout: LayoutTable, where: str, rng: Rng, count: int) -> Arr
 
 
 def _given(layout: LayoutTable, where: str) -> Array:
+    """Return the stations (s, d) of a layout with given positions, metres."""
     place = join(where, "places")
     if layout.places is None or len(layout.places) != layout.stations:
         found = 0 if layout.places is None else len(layout.places)
@@ -272,6 +273,7 @@ def _given(layout: LayoutTable, where: str) -> Array:
 
 
 def _fixed(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    """Return the same position for all trials, (n, d) in metres."""
     count, d = len(stations), stations.shape[-1]
     if truth.at is not None:
         return np.broadcast_to(metres(truth.at, join(where, "at"), d), (count, d))
@@ -283,6 +285,7 @@ def _fixed(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rn
 
 
 def _in_box(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    """Return uniform positions (n, d) in a box, metres."""
     (count, _, d), centre = stations.shape, stations.mean(1)
     assert truth.box is not None
     box = metres(truth.box, join(where, "box"), d)
@@ -291,6 +294,7 @@ def _in_box(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: R
 
 
 def _in_shell(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    """Return positions (n, d) in random directions and distances from the stations' centre, metres."""
     (count, _, d), centre = stations.shape, stations.mean(1)
     assert truth.distance is not None
     low, high = metres(truth.distance, join(where, "distance"))
@@ -299,12 +303,14 @@ def _in_shell(truth: TruthTable, frame: Frame, stations: Array, where: str, rng:
 
 
 def _in_hull(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    """Return random positions (n, d) in the hull of the stations, metres."""
     # Uniform over the weights, not over the volume: this works for every hull, even a flat one.
     share = rng.dirichlet(np.ones(stations.shape[1]), len(stations))
     return np.asarray((share[..., None] * stations).sum(1))
 
 
 def _in_area(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    """Return positions (n, 3) at uniform latitudes and longitudes, metres in the frame."""
     count = len(stations)
     spans = [np.array(span) for span in (truth.lat_deg, truth.lon_deg) if span]
     lat, lon = (np.radians(rng.uniform(span[0], span[1], count)) for span in spans)

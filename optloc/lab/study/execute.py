@@ -147,6 +147,7 @@ def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[TrialPart]:
 
 
 def _parallel(tasks: Iterator[tuple[Chunk, float]], begun: Begun) -> Iterator[TrialPart | Lost]:
+    """Yield the results of tasks as joblib completes them."""
     from joblib import Parallel, delayed, parallel_config
 
     with parallel_config(**begun.options), catch_warnings():
@@ -181,6 +182,7 @@ class _Task:
 
     @property
     def share(self) -> float:
+        """Return the share of the time limit of the whole chunk."""
         return max(self.chunk.count / self.whole.count, _LEAST)
 
 
@@ -238,6 +240,7 @@ class _Work:
         return None
 
     def _seconds(self, task: _Task) -> float:
+        """Return the time limit of a task in seconds; 0 if its cell was given up."""
         if task.chunk.cell.key in self._given_up:
             return 0.0
         return min(self._limit, max(task.share * self._limit, _BUILD))
@@ -280,6 +283,7 @@ def beside(names: Sequence[str], chunk: Chunk, seconds: float) -> TrialPart | Lo
 
 @contextmanager
 def _processes(by: Executor) -> Iterator[Begun]:
+    """Yield an executor of worker processes on this machine."""
     jobs = by.jobs or workers()
     # The workers of joblib are threads: each waits for a worker process.
     with closing(WorkerPool(jobs)) as pool:
@@ -288,6 +292,7 @@ def _processes(by: Executor) -> Iterator[Begun]:
 
 @contextmanager
 def _dask(by: Executor) -> Iterator[Begun]:
+    """Yield an executor on a Dask cluster; start a local cluster if there is no address."""
     try:
         from distributed import Client, KilledWorker, LocalCluster
     except ImportError:
@@ -326,6 +331,7 @@ def _deaf() -> Iterator[None]:
 
 @contextmanager
 def _ray(by: Executor) -> Iterator[Begun]:
+    """Yield an executor on a Ray cluster; start a local cluster if there is no address."""
     try:
         import ray
         from ray.util.joblib import register_ray

@@ -154,6 +154,7 @@ def histories(asked: Trials) -> Histories:
 
 
 def _rows(method: str, trial: int, way: ConvergenceTrace, least: float) -> pd.DataFrame:
+    """Return the history of one trial as rows of the table."""
     import pandas as pd
 
     best = np.minimum.accumulate(way.cost)
@@ -254,6 +255,7 @@ def _choice(method: StudyMethod) -> Choice:
 
 
 def _by_listening(baseline: Baseline, drawn: DrawnCase, start: Array) -> tuple[list[ConvergenceTrace], str]:
+    """Return the costs that an external minimizer evaluates, trial by trial, and a remark."""
     ways, failed = [], ""
     for i in range(len(start)):
         kept: list[float] = []
@@ -285,6 +287,7 @@ class _Steps(NamedTuple):
 def _by_stopping(
     method: Pipeline, problem: Problem, start: Array | None, choice: Choice
 ) -> tuple[list[ConvergenceTrace], str]:
+    """Return the costs of runs that stop after growing numbers of iterations, and a remark."""
     words, n = list(method.words), problem.batch_shape[0]
     pool = None if start is None else begin(problem, start)
     known = {word for formulation in FORMULATIONS.values() for word in formulation.starts}
@@ -310,6 +313,7 @@ def _by_stopping(
 
 
 def _nowhere() -> ConvergenceTrace:
+    """Return an empty history."""
     return ConvergenceTrace(*(np.zeros(0) for _ in ConvergenceTrace._fields))
 
 
@@ -434,6 +438,7 @@ def question(
 
 
 def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, noise: str | None) -> Trials:
+    """Return trials and methods of a study for one case and noise level."""
     manifest = read_manifest(folder)
     design = design_of_manifest(manifest)
     if design is None:
@@ -460,6 +465,7 @@ def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, 
 
 
 def _chosen(word: str | None, known: Mapping[str, object], what: str) -> str:
+    """Return the wanted name, or the first one; raise InvalidProblem if it is unknown."""
     names = list(known)
     if word is None:
         return names[0]
@@ -488,6 +494,7 @@ def _known(folder: Path, case: Case, count: int) -> tuple[DrawnCase, Array]:
 
 
 def _of_file(file: Path, names: Sequence[str], count: int) -> Trials:
+    """Return the epochs of a problem file as trials, with the cost of their fixes as least known cost."""
     loaded = read(file)
     problem = by_epoch(loaded.problem).flat() if separable(loaded.problem) else loaded.problem.flat()
     kept = np.arange(min(count, problem.batch_shape[0]))

@@ -35,6 +35,7 @@ def page(folder: Path, design: StudyDesign) -> str:
 
 
 def _about(manifest: StudyManifest, design: StudyDesign) -> str:
+    """Return a line with version, date, test set, seed and machine."""
     return (
         f"optloc {manifest.version}, {manifest.created[:10]}, test set {design.data[:16]}, seed {manifest.seed}, "
         f"{design.cells[0].case.trials} trials a scene; {manifest.machine}."
@@ -42,6 +43,7 @@ def _about(manifest: StudyManifest, design: StudyDesign) -> str:
 
 
 def _ranks(rows: pd.DataFrame) -> list[str]:
+    """Return the lines of the ranking as a Markdown table."""
     order = methods(rows)
     first = order[0]
     alone = dict.fromkeys(order, 0)
@@ -65,6 +67,7 @@ def _ranks(rows: pd.DataFrame) -> list[str]:
 
 
 def _by_case(rows: pd.DataFrame) -> list[str]:
+    """Return the lines of a Markdown table: share of right answers by scene and method."""
     order = methods(rows)
     wide = rows.pivot_table(index="case", columns="method", values="right", aggfunc="mean", observed=True)
     lines = [f"| scene | {' | '.join(map(_cell, order))} |", f"|---|{'---:|' * len(order)}"]

@@ -183,6 +183,7 @@ def _list(value: str | list[str] | None) -> list[str]:
 
 
 def _name(table: MethodTable, name: str, solver: str | None, count: int) -> str:
+    """Return the name of a method in tables."""
     # The default name does not contain settings, so methods that differ only by settings need a name in the file.
     guess = table.baseline is not None and BASELINES[name].guess
     words = [name, *([f"from the {table.start}"] if guess else []), *([f"({solver})"] if solver else [])]
@@ -257,6 +258,7 @@ def require_program(method: StudyMethod, found: MethodRun) -> None:
 
 
 def _solved(method: StudyMethod, drawn: DrawnCase | Networks) -> Any:
+    """Return the fixes of drawn trials, or the results for drawn networks."""
     if isinstance(drawn, Networks):
         finds = calibrated if method.baseline is None else baseline_of(method.baseline).networks
         assert finds is not None  # `design_of_text` rejects other methods

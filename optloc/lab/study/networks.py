@@ -141,6 +141,7 @@ def noise_of(level: Amount, where: str) -> float:
 
 
 def _lengths(table: NetworkTable, key: str, where: str) -> Array:
+    """Return the lengths of a key of the table as an array in metres; raise InvalidProblem if negative."""
     given = getattr(table, key)
     values = given if isinstance(given, list) else [] if given is None else [given]
     lengths = np.array([Units("length").plain(value, "m", join(where, key)) for value in values])
@@ -150,6 +151,7 @@ def _lengths(table: NetworkTable, key: str, where: str) -> Array:
 
 
 def _size(table: NetworkTable, where: str) -> float:
+    """Return the size of gross errors in metres."""
     assert table.outliers is not None
     size, place = table.outliers.size, join(where, "outliers.size")
     if isinstance(size, dict):
@@ -186,6 +188,7 @@ def _trial(case: NetworkCase, number: int) -> tuple[Network, NetworkEstimate, in
 
 
 def _digest(case: NetworkCase, network: Network) -> str:
+    """Return 16 hexadecimal digits that identify the drawn arrivals."""
     made = hashlib.blake2b(case.key.encode(), digest_size=8)
     for array in (network.z, network.sigma):
         made.update(np.ascontiguousarray(array).tobytes())
@@ -236,6 +239,7 @@ def calibrated(networks: Networks) -> tuple[NetworkResult, ...]:
 
 
 def _of_calibration(found: Calibration) -> NetworkResult:
+    """Return a calibration as the result of a method."""
     reason = found.findings[0] if found.findings else ""
     others = tuple(one.stations for one in found.alternatives)
     values = (found.stations, found.clocks, found.covariance, found.cost, found.dof)
@@ -355,6 +359,7 @@ def found_columns(known: KnownNetworks, found: tuple[NetworkResult, ...]) -> dic
 
 
 def _row(one: NetworkResult, network: Network, truth: NetworkEstimate, bound: Array) -> dict[str, Any]:
+    """Return the columns of the result for one network."""
     error = apart(one.stations, truth.stations[0])
     size, located = error.size, bool(np.isfinite(one.stations).all())
     # in the frame of the result, like its covariance

@@ -109,6 +109,7 @@ def paired(frame: pd.DataFrame, against: str) -> list[Pair]:
 
 
 def _pair(both: pd.DataFrame, case: str, noise: str, method: str, against: str) -> Pair:
+    """Return the comparison of two methods over the trials that both have run."""
     from scipy.stats import binomtest
 
     right, other = (both[name].to_numpy(dtype=bool) for name in ("right", "right_other"))

@@ -146,6 +146,7 @@ def cells(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _cell(part: pd.DataFrame) -> dict[str, Any]:
+    """Return the statistics of the rows of one cell."""
     chosen = accuracy_rows(part)
     error, bound, off = (part[n].to_numpy(dtype=float)[chosen] for n in ("error", "crlb", "deviation"))
     ratio, half = over_bound(error, bound)
@@ -354,6 +355,7 @@ def compared(one: Path, two: Path) -> list[Difference]:
 
 
 def _difference(cell: tuple[str, ...], a: pd.DataFrame, b: pd.DataFrame) -> Difference:
+    """Return the difference of two studies in a cell with the rows a and b."""
     # Compare the digest of the drawn numbers, not the seed; only in the trials that both have.
     both = a[["trial", "data"]].merge(b[["trial", "data"]], on="trial")
     same_data = bool(len(both)) and bool((both["data_x"].astype(str) == both["data_y"].astype(str)).all())
@@ -366,6 +368,7 @@ def _difference(cell: tuple[str, ...], a: pd.DataFrame, b: pd.DataFrame) -> Diff
 
 
 def _identical(a: pd.DataFrame, b: pd.DataFrame) -> bool:
+    """Return whether the columns of values are equal bit for bit."""
     if len(a) != len(b):
         return False
     names = list(VALUES)
@@ -375,6 +378,7 @@ def _identical(a: pd.DataFrame, b: pd.DataFrame) -> bool:
 
 
 def _side(frame: pd.DataFrame) -> Side:
+    """Return the statistics of one study in a cell."""
     answered = frame["answered"].to_numpy(dtype=bool)
     error, bound = (frame[name].to_numpy(dtype=float)[answered] for name in ("error", "crlb"))
     rmse, limit = (float(np.sqrt(np.mean(v**2))) if len(v) else np.nan for v in (error, bound[np.isfinite(bound)]))

@@ -315,6 +315,7 @@ def _solve_in_halves(
 
 
 def _solve(cell: Cell, known: KnownTrials | KnownNetworks) -> Values:
+    """Return the values of the trials, solved in one call."""
     count = len(known.drawn.seed)
     found = run(cell.method, known.drawn)
     values = fix_values(cell.case, known, found.fix)
@@ -544,6 +545,7 @@ def _squared(error: Array, matrix: Array) -> Array:
 
 
 def _nearest(problem: Problem, fix: Fix, truth: Array, name: str, error: Array) -> Array:
+    """Return the least error (n,) of each estimate and its alternatives, metres."""
     best = np.linalg.norm(error, axis=-1)
     # If two minima fit, the list should contain the right one.
     for i in range(fix.alternatives.x.shape[1]):
