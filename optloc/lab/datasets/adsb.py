@@ -136,15 +136,15 @@ def heard(folder: Path, *, refraction: bool = False) -> Heard:
     # Sorted by message: five rows for each, so that the columns fold to (n, 5).
     rows = rows.iloc[np.argsort(message, kind="stable")]
     toa = rows["toa_s"].to_numpy().reshape(len(truth), -1)
-    own = stations.loc[rows["station"]]
-    place = places(own).reshape(*toa.shape, 3)
+    receivers = stations.loc[rows["station"]]
+    place = places(receivers).reshape(*toa.shape, 3)
     geodetic = np.column_stack([np.deg2rad(truth[["lat_deg", "lon_deg"]]), truth["h_geo_m"]])
     arrival = SPEED_OF_LIGHT * (toa - toa.min(-1, keepdims=True))
     made = Heard(place, arrival, np.zeros_like(arrival), geodetic)
     if not refraction:
         return made
     distance = np.linalg.norm(made.truth[:, None] - place, axis=-1)
-    return replace(made, excess=_refraction(own["h_m"].to_numpy().reshape(toa.shape), geodetic[:, 2:], distance))
+    return replace(made, excess=_refraction(receivers["h_m"].to_numpy().reshape(toa.shape), geodetic[:, 2:], distance))
 
 
 def _refraction(low: Array, high: Array, distance: Array) -> Array:

@@ -123,7 +123,7 @@ class Session:
         """
         times = np.unique(self.rows["t_gps_s"])
         rows = self.rows[self.rows["sat"].str.startswith("G")]
-        always = [str(name) for name, heard in rows.groupby("sat").size().items() if heard == len(times)]
+        always = [str(name) for name, count in rows.groupby("sat").size().items() if count == len(times)]
         wide = rows[rows["sat"].isin(always)].pivot_table([*_XYZ, self.column], "t_gps_s", "sat")
         place = np.stack([wide[column][always].to_numpy() for column in _XYZ], axis=-1)
         triples = np.array(list(combinations(range(len(always)), 3)))

@@ -71,8 +71,8 @@ def _calibrate(form: str, z: Array, distance: Array, a: Array) -> Array:
         return z
     out = np.empty_like(z)
     for beacon in np.unique(a):
-        own = a == beacon
-        excess = z[own] - distance[own]
-        scale, offset = np.polyfit(distance[own], excess, 1) if form == "affine" else (0.0, excess.mean())
-        out[own] = (z[own] - offset) / (1.0 + scale)
+        rows = a == beacon
+        excess = z[rows] - distance[rows]
+        scale, offset = np.polyfit(distance[rows], excess, 1) if form == "affine" else (0.0, excess.mean())
+        out[rows] = (z[rows] - offset) / (1.0 + scale)
     return out

@@ -335,10 +335,10 @@ def table_claims(found: Mapping[str, Errors]) -> TextTable:
     """Return the share of runs in which the paper's claims for 10 epochs hold."""
     lines = []
     for name, column, limit, claim in CLAIMS:
-        held = [np.abs(errors.error[:, errors.epochs == 10, column]) < limit for errors in found.values()]
+        within = [np.abs(errors.error[:, errors.epochs == 10, column]) < limit for errors in found.values()]
         spread = [errors.rms(10)[column] for errors in found.values()]
         unit = "{:.0f} m" if column == 0 else "{:.4f} rad"
-        lines.append((name, claim, *(percent(each.mean()) for each in held), *map(unit.format, spread)))
+        lines.append((name, claim, *(percent(each.mean()) for each in within), *map(unit.format, spread)))
     header = ("error", "printed", *(f"{name}, share" for name in found), *(f"{name}, rms" for name in found))
     return tabulate("claims", header, lines)
 

@@ -113,11 +113,11 @@ def table_efficiency(drawn: Mapping[str, KinematicDraw]) -> TextTable:
     """Return last-step errors of filter, iterated filter and batch, with the bound."""
     rows = []
     for name in ("CV", "CA"):
-        own, order = drawn[name], ORDERS[name]
-        last = bounds(own.scenario, own.truth, order)[:, -1]
+        data, order = drawn[name], ORDERS[name]
+        last = bounds(data.scenario, data.truth, order)[:, -1]
         limit = float(np.sqrt(np.trace(last, axis1=-2, axis2=-1).mean()))
-        plain, iterated = (score_track(own, track_all(own, PLAIN[order], update)) for update in ("ekf", "iekf"))
-        lengths = (plain.last, iterated.last, batch(own, order).last, limit)
+        plain, iterated = (score_track(data, track_all(data, PLAIN[order], update)) for update in ("ekf", "iekf"))
+        lengths = (plain.last, iterated.last, batch(data, order).last, limit)
         rows.append((name, *map(km, lengths), f"{plain.last / limit:.3f}", f"{plain.level:.2f}"))
     header = ("model on its own motion", "EKF", "IEKF", "batch ML", "bound", "EKF / bound", "NEES of the EKF")
     return tabulate("efficiency", header, rows)
@@ -350,13 +350,13 @@ def _scenes(drawn: Mapping[str, KinematicDraw]) -> tuple[list[TableLine], dict[s
     lines.append(TableLine("static, 20 updates, on static", score_track(still, track), _mean(limit[:, 1:]), seconds))
     figures = {}
     for number, (model, motion) in enumerate((("CV", "CV"), ("CV", "CA"), ("CA", "CA")), 2):
-        own, order = drawn[motion], ORDERS[model]
-        track, seconds = _timed(partial(track_all, own, PLAIN[order]), runs)
-        score = score_track(own, track)
-        bound = bounds(scene, own.truth, order)[:, 1:] if model == motion else None
+        data, order = drawn[motion], ORDERS[model]
+        track, seconds = _timed(partial(track_all, data, PLAIN[order]), runs)
+        score = score_track(data, track)
+        bound = bounds(scene, data.truth, order)[:, 1:] if model == motion else None
         name = f"{model} on {motion}"
         lines.append(TableLine(name, score, None if bound is None else _mean(bound), seconds, name))
-        figures[f"figure-{number}"] = figure_scene(own, track.position, score, bound)
+        figures[f"figure-{number}"] = figure_scene(data, track.position, score, bound)
     return lines, figures
 
 

@@ -87,14 +87,14 @@ def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Arr
     slope -= slope.mean(2, keepdims=True)
     if n > 3:
         slope = np.concatenate([slope, slope * times], axis=1)
-    rows, mean, left = slope.reshape(trials, n, -1), slope.mean(3), misfit.mean(2)
+    rows, mean, offset = slope.reshape(trials, n, -1), slope.mean(3), misfit.mean(2)
     information = rows @ rows.swapaxes(1, 2) - len(times) * (mean @ mean.swapaxes(1, 2))
-    vector = rows @ misfit.reshape(trials, -1, 1) - len(times) * (mean @ left[..., None])
+    vector = rows @ misfit.reshape(trials, -1, 1) - len(times) * (mean @ offset[..., None])
     solved, ok = linalg.solve(information, vector)
     # A singular system has no step: return NaN, which counts as lost, instead of an arbitrary solution.
     move = np.where(ok[:, None], solved[..., 0], np.nan)
-    left = left - (move[:, None] @ mean)[:, 0]
-    return move, left[:, 1:] - left[:, :1]
+    offset = offset - (move[:, None] @ mean)[:, 0]
+    return move, offset[:, 1:] - offset[:, :1]
 
 
 # The recursion with gain ratios and range differences (section 3.2), whose weights depend on the position.
@@ -206,8 +206,8 @@ def joint_step(state: Array, measured: Array, track: Array, weight: Array, total
     sums = both.reshape(trials, -1, wide).swapaxes(1, 2) @ white.reshape(trials, -1, wide)
     shared = white.sum(1)
     away, fine = linalg.solve(total, shared)
-    left = sums - shared.swapaxes(1, 2) @ away
-    solved, ok = linalg.solve(left[:, :-1, :-1], left[:, :-1, -1:])
+    reduced = sums - shared.swapaxes(1, 2) @ away
+    solved, ok = linalg.solve(reduced[:, :-1, :-1], reduced[:, :-1, -1:])
     # A singular system has no step: return NaN, which counts as lost, instead of an arbitrary solution.
     move = np.where((ok & fine)[:, None], solved[..., 0], np.nan)
     return move, away[..., -1] - (away[..., :-1] @ move[..., None])[..., 0]

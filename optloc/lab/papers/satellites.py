@@ -260,8 +260,8 @@ def run_heights(steps: int, trials: int, sequence: np.random.SeedSequence) -> di
         drawn = simulate(problem(epochs, height=sigma), exact[0], key, trials)
         out[name] = score(followed(drawn, from_fixes(drawn), dynamics()), exact)
     level = simulate(problem(epochs, height=None), exact[0], keys[2], trials)
-    held = followed(with_height_rows(level), from_fixes(level), dynamics())
-    out["known: the ellipsoid itself"] = score(held, exact)
+    track = followed(with_height_rows(level), from_fixes(level), dynamics())
+    out["known: the ellipsoid itself"] = score(track, exact)
     # Truth of the last two: a constant error of the height for the whole run, and a metre of noise.
     assumed = with_bias(problem(epochs, height=1.0), "height", per="kind", kind="height", sigma=HEIGHT)
     wrong = HEIGHT * np.random.default_rng(keys[3]).standard_normal((trials, 1))
@@ -280,8 +280,8 @@ def run_climbing(steps: int, trials: int, sequence: np.random.SeedSequence) -> S
     drawn = simulate(problem(steps + 2), exact[0], draws, trials)
     # The measured heights are zero plus noise, although the target climbs.
     level = HEIGHT * np.random.default_rng(errors).standard_normal((trials, steps + 2))
-    said = drawn.with_rows(z=np.concatenate([drawn.rows[0].z, level], axis=-1))
-    return score(followed(said, from_fixes(said), dynamics()), exact)
+    measured_zero = drawn.with_rows(z=np.concatenate([drawn.rows[0].z, level], axis=-1))
+    return score(followed(measured_zero, from_fixes(measured_zero), dynamics()), exact)
 
 
 # Radius of the Earth, metres, accurate enough for a direction: the height is then set to zero.
@@ -385,8 +385,8 @@ def table_pairs(found: Mapping[float, tuple[Mapping[str, SatelliteRun], Array]])
     """Return the share of runs in which the modified covariance has a smaller final error than each other filter."""
     lines = []
     for width, (runs, _) in found.items():
-        own = runs["mvekf"].error[:, -1]
-        better = [f"{100 * (own < runs[rival].error[:, -1]).mean():.0f} %" for rival in ("ekf", "iekf", "mgekf")]
+        modified = runs["mvekf"].error[:, -1]
+        better = [f"{100 * (modified < runs[rival].error[:, -1]).mean():.0f} %" for rival in ("ekf", "iekf", "mgekf")]
         lines.append((f"{width / 1e3:.0f} km", *better))
     return tabulate("pairs", ("start error", "better than EKF", "better than IEKF", "better than MGEKF"), lines)
 

@@ -36,14 +36,14 @@ if TYPE_CHECKING:
 # Colour and marker of each noise level in a panel where all levels share the row of a method.
 _LEVELS = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "D"), (PURPLE, "^"), (BLACK, "v"), (GREY, "P"))
 # Most panels of distributions. With more of them, one panel shows all noise levels of a case.
-_MOST = 12
+_MOST_PANELS = 12
 # Least cost above the best that is drawn: rounding errors are smaller.
-_LEAST = 1e-6
+_LEAST_COST = 1e-6
 # Points of a stepped curve: two for each pixel of a panel.
-_FINE = 480
+_CURVE_POINTS = 480
 # Upper limits of logarithmic axes: errors in units of the bound, costs above the best. Differences beyond do not
 # matter.
-_FARTHEST, _DEAREST = 1e4, 1e8
+_LARGEST_ERROR, _LARGEST_COST = 1e4, 1e8
 
 
 def success(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
@@ -159,7 +159,7 @@ def _line(axes: Axes, mark: Look, x: Array, y: Array, *, marker: bool, steps: bo
 
 def distributions(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     """Yield the distributions of errors in units of the bound: a picture for each noise level, or for each case."""
-    apart = len(frame[["case", "noise_label"]].drop_duplicates()) <= _MOST
+    apart = len(frame[["case", "noise_label"]].drop_duplicates()) <= _MOST_PANELS
     names = ["case", "noise", "noise_label"] if apart else ["case"]
     from scipy.special import gammainc
 
@@ -177,7 +177,7 @@ def distributions(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
         theory = gammainc(part["dimension"].iloc[0] / 2.0, x**2 / 2.0)
         axes.plot(x, theory, color=BLACK, linewidth=3.5, alpha=0.18, zorder=1)
         axes.set_xscale("log")
-        axes.set_xlim(0.1, float(np.clip(np.nanmax([10.0, *axes.get_xlim()]), 10.0, _FARTHEST)))
+        axes.set_xlim(0.1, float(np.clip(np.nanmax([10.0, *axes.get_xlim()]), 10.0, _LARGEST_ERROR)))
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlabel("error in units of the bound")
         axes.set_ylabel("share of trials")
@@ -192,9 +192,9 @@ def gaps(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
             some = part[part["method"] == mark.name]
             values = some["above"].to_numpy(dtype=float)[some["located"].to_numpy(dtype=bool)]
             if len(values):
-                _line(axes, mark, *distribution(np.maximum(values, _LEAST), len(some)), marker=False, steps=True)
+                _line(axes, mark, *distribution(np.maximum(values, _LEAST_COST), len(some)), marker=False, steps=True)
         axes.set_xscale("log")
-        axes.set_xlim(_LEAST * 0.7, float(np.clip(axes.get_xlim()[1], 10.0, _DEAREST)))
+        axes.set_xlim(_LEAST_COST * 0.7, float(np.clip(axes.get_xlim()[1], 10.0, _LARGEST_COST)))
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlabel("cost above the best known")
         axes.set_ylabel("share of trials")
@@ -223,7 +223,7 @@ def profile_picture(found: Profiles, looks: Looks) -> Figure:
 def _data_profile(axes: Axes, found: Profiles, looks: Looks) -> None:
     """Draw the share of trials that each method solves within budgets of work."""
     needed = found.spent[found.solved]
-    budgets = np.geomspace(needed.min() / 1.5, 1.5 * needed.max(), _FINE)
+    budgets = np.geomspace(needed.min() / 1.5, 1.5 * needed.max(), _CURVE_POINTS)
     _curves(axes, found, looks, budgets, found.data(budgets))
     axes.set_xlabel(WORK[found.work])
 
@@ -234,7 +234,7 @@ def _performance_profile(axes: Axes, found: Profiles, looks: Looks) -> None:
     with np.errstate(invalid="ignore"):
         slower = np.where(found.solved, needed / needed.min(0), 1.0)
     # To 1.5 times the last solved trial: no curve rises beyond.
-    ratios = np.geomspace(1.0, max(10.0, 1.5 * float(slower.max())), _FINE)
+    ratios = np.geomspace(1.0, max(10.0, 1.5 * float(slower.max())), _CURVE_POINTS)
     _curves(axes, found, looks, ratios, found.performance(ratios))
     axes.set_xlabel(f"{WORK[found.work].partition(' (')[0]} / least of any method")
 
@@ -265,7 +265,7 @@ def history_picture(found: Histories, looks: Looks) -> Figure:
             if np.isnan(counts).any():
                 continue
             at = np.unique(counts)
-            low, middle, high = np.maximum(band(found, name, by, at), _LEAST)
+            low, middle, high = np.maximum(band(found, name, by, at), _LEAST_COST)
             # A logarithmic axis has no zero, so iterations are drawn from one on.
             x = at + 1.0 if by == "iterations" else at
             _line(
@@ -278,7 +278,7 @@ def history_picture(found: Histories, looks: Looks) -> Figure:
                 width=width,
             )
             # Infinite values are drawn beyond the upper end of the panel.
-            top = np.where(np.isfinite(high), high, _DEAREST)
+            top = np.where(np.isfinite(high), high, _LARGEST_COST)
             axes.fill_between(x, low, top, color=looks[name].colour, alpha=_BAND, step="post", linewidth=0)
         axes.set_yscale("log")
         _log(axes.xaxis, axes.set_xscale, 1.0, axes.get_xlim()[1])

@@ -48,9 +48,9 @@ if TYPE_CHECKING:
 # Points of a map along each axis: 4096 bounds take a fraction of a second, and isolines are smooth.
 _POINTS = 64
 # Most maps of a report, and most trials of a map; more dots would cover one another.
-_MOST, _REACH = 8, 400
+_MOST_MAPS, _MOST_DOTS = 8, 400
 # Margin of a map around stations and true positions, as a share of the longer side.
-_WIDEN = 0.2
+_MARGIN = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ def scenario_maps(design: StudyDesign, frame: pd.DataFrame) -> Iterator[Place]:
     first: dict[str, Case | NetworkCase] = {}
     for cell in design.cells:
         first.setdefault(case_label(cell.case.table.name, cell.case.sweep), cell.case)
-    for title, case in list(first.items())[:_MOST]:
+    for title, case in list(first.items())[:_MOST_MAPS]:
         if isinstance(case, NetworkCase):
             continue
         layout = case.table.layout
@@ -91,12 +91,12 @@ def scenario_maps(design: StudyDesign, frame: pd.DataFrame) -> Iterator[Place]:
             continue
         rows = frame[(frame["case"] == title) & (frame["noise_label"] == case.label)]
         try:
-            yield _place(title, case, rows)
+            yield _scenario_map(title, case, rows)
         except InvalidProblem:
             continue
 
 
-def _place(title: str, case: Case, rows: pd.DataFrame) -> Place:
+def _scenario_map(title: str, case: Case, rows: pd.DataFrame) -> Place:
     """Return the map of a case at one noise level, with the true positions of its trials."""
     # The stations are fixed, so the stations of one trial serve all trials.
     one = draw(case, 0, 1)
@@ -104,16 +104,16 @@ def _place(title: str, case: Case, rows: pd.DataFrame) -> Place:
     per_trial = rows.groupby("trial", sort=True).agg(
         off=("wrong", "any"), x=("truth_x", "first"), y=("truth_y", "first"), z=("truth_z", "first")
     )
-    position = per_trial[["x", "y", "z"]].to_numpy(dtype=float)[:_REACH, :d]
+    position = per_trial[["x", "y", "z"]].to_numpy(dtype=float)[:_MOST_DOTS, :d]
     earth = problem.frame.geodetic and d == 3
     plain = map_coordinates(problem.frame, position, earth)
     # Height of the middle trial, rounded to metres because the page prints it.
     height = float(np.round(np.median(plain[:, 2]))) if d == 3 and len(plain) else 0.0
-    west, east, south, north = extent(problem, position, widen=_WIDEN)
+    west, east, south, north = extent(problem, position, widen=_MARGIN)
     found = bound_map(
         problem, one.truth[0], np.linspace(west, east, _POINTS), np.linspace(south, north, _POINTS), height
     )
-    off = per_trial["off"].to_numpy(dtype=bool)[:_REACH]
+    off = per_trial["off"].to_numpy(dtype=bool)[:_MOST_DOTS]
     return Place(f"{title}, {noise_text(case.label)}", found, plain[:, :2], off)
 
 
@@ -173,25 +173,27 @@ def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None
         If the folder has no study or no finished part, matplotlib is missing, or a file cannot be written.
     """
     figure_class()
-    place = folder / "report" if out is None else out
-    target = place / "report.html"
+    target_folder = folder / "report" if out is None else out
+    target = target_folder / "report.html"
     say = tell or (lambda _: None)
     say("reading")
-    found = _found(folder)
-    make_folder(place)
+    found = _study_content(folder)
+    make_folder(target_folder)
     claim(target)
     with together():
-        files = [_table_file(place, sheet, ending) for sheet in found.sheets.values() for ending in ("csv", "tex")]
+        files = [
+            _table_file(target_folder, sheet, ending) for sheet in found.sheets.values() for ending in ("csv", "tex")
+        ]
         parts = [PagePart("ranking", "Ranking", tables=[found.sheets["ranking"]])]
         for section in _SECTIONS:
             say(section.title.lower())
             pictures = section.make(found)
             if pictures:
                 parts.append(_part(section, found, pictures))
-                files += [path for one in pictures for path in _figure_files(place, one, legend=section.lines)]
+                files += [path for one in pictures for path in _figure_files(target_folder, one, legend=section.lines)]
         if found.places:
             say("maps")
-            part, more = _maps(place, found)
+            part, more = _maps(target_folder, found)
             parts.append(part)
             files += more
         source = found.manifest.text
@@ -201,7 +203,7 @@ def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None
     return [target, *files]
 
 
-def _found(folder: Path) -> _StudyContent:
+def _study_content(folder: Path) -> _StudyContent:
     """Return the content of the report from the output folder of a study."""
     manifest = read_manifest(folder)
     rows = read_frame(folder, [*summary.COLUMNS])
@@ -212,13 +214,13 @@ def _found(folder: Path) -> _StudyContent:
     # Best first: the order of tables, legends and colours.
     order, cells = summary.methods(frame), summary.cells(frame)
     design = design_of_manifest(manifest)
-    known = references(design)
+    references_of_design = references(design)
     # Methods that know the truth are not ranked, unless the study has no others.
-    rivals = frame[~frame["method"].isin(known)]
+    rivals = frame[~frame["method"].isin(references_of_design)]
     rivals = rivals if len(rivals) else frame
     # If every trial failed, there are no times and no profiles.
-    some = frame["processor"].notna().any()
-    profiled = profiles(rivals) if some else None
+    timed = frame["processor"].notna().any()
+    profiled = profiles(rivals) if timed else None
     tables = {sheet.shown.name: sheet for sheet in sheets(frame, rivals, cells, order, profiled)}
     places = [] if design is None else list(scenario_maps(design, frame))
     return _StudyContent(manifest, frame, cells, marks(order), tables, places, profiled)
@@ -292,17 +294,17 @@ def _maps(place: Path, found: _StudyContent) -> tuple[PagePart, list[Path]]:
     return PagePart("maps", "Maps of the bound", text, maps=maps, headings=True), files
 
 
-def _of_cells(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
+def _cell_pictures(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
     """Return pictures of the cells of the study."""
     return list(make(found.cells, found.looks))  # type: ignore[call-overload,no-any-return]
 
 
-def _of_rows(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
+def _row_pictures(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
     """Return pictures of the rows of the study."""
     return list(make(found.frame, found.looks))  # type: ignore[call-overload,no-any-return]
 
 
-def _profiles(found: _StudyContent) -> list[Picture]:
+def _profile_pictures(found: _StudyContent) -> list[Picture]:
     """Return the pictures of both profiles; empty without profiles."""
     return [] if found.profiles is None else list(drawn.profiles(found.profiles, found.looks))
 
@@ -312,7 +314,7 @@ _SECTIONS = (
         "success",
         "Right answers",
         "Right: the method claims an answer, and no lower cost is known for the same data. Bars are 95 % intervals.",
-        partial(_of_cells, drawn.success),
+        partial(_cell_pictures, drawn.success),
         lines=False,
         tables=("success", "statuses"),
     ),
@@ -321,7 +323,7 @@ _SECTIONS = (
         "Error over the bound, against noise",
         "Root mean square error of the answers, divided by the Cramer-Rao bound at the truth. Bars are 95 % "
         "intervals. A single gross error can lift a point far, so look at the distributions too.",
-        partial(_of_cells, drawn.accuracy),
+        partial(_cell_pictures, drawn.accuracy),
         tables=("accuracy",),
     ),
     _Section(
@@ -329,7 +331,7 @@ _SECTIONS = (
         "Distribution of errors",
         "Share of trials whose error, in units of the bound, is at most the value on the axis. A curve ends at the "
         "share of trials with an answer. The broad grey curve belongs to an efficient estimate.",
-        partial(_of_rows, drawn.distributions),
+        partial(_row_pictures, drawn.distributions),
     ),
     _Section(
         "gaps",
@@ -337,7 +339,7 @@ _SECTIONS = (
         "Share of trials whose cost exceeds the lowest known cost, of any method or of the truth, by at most the value "
         "on the axis. Positions without refinement count too, so the figure shows how tight a relaxation is. Less than "
         "a millionth is drawn at a millionth.",
-        partial(_of_rows, drawn.gaps),
+        partial(_row_pictures, drawn.gaps),
         tables=("certificates",),
     ),
     _Section(
@@ -347,7 +349,7 @@ _SECTIONS = (
         "multiple of the time of the trial's fastest method (Dolan and Moré 2002). Solved: the cost exceeds the least "
         "known cost by at most a thousandth; the status does not matter. If a call makes many fixes, each trial gets "
         "their mean time. Methods that start at the truth are left out.",
-        _profiles,
+        _profile_pictures,
         tables=("profiles",),
     ),
     _Section(
@@ -355,7 +357,7 @@ _SECTIONS = (
         "Time against size",
         "Median time of a fix; bars reach from the 10th to the 90th percentile. Points of one size are drawn side by "
         "side.",
-        partial(_of_rows, drawn.timing),
+        partial(_row_pictures, drawn.timing),
         tables=("timing",),
     ),
 )

@@ -25,7 +25,7 @@ from optloc.problem import InvalidProblem, load_plugin, plugins
 
 # Seconds. To start a worker: half a second if a processor is free. Until an idle worker ends, because a cluster does
 # not signal the end of a study. Between the end of the pipe and the end of the process, which has the exit code.
-_START, _IDLE, _MOMENT = 120.0, 60.0, 0.2
+_START, _IDLE, _END_WAIT = 120.0, 60.0, 0.2
 # Workers times threads would exceed the processors, and each thread of BLAS reserves memory.
 _ONE = ("OPTLOC", "OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM", "NUMEXPR_NUM", "NUMBA_NUM")
 # From the start on, the system kills the worker's group when the parent closes its end of the pipe or writes to it. A
@@ -86,7 +86,7 @@ class Apart:
             self.end()
             raise TimeoutError from None
         if found is None:
-            raise EOFError(self.end(_MOMENT))
+            raise EOFError(self.end(_END_WAIT))
         return found
 
     def end(self, seconds: float = 0.0) -> str:
@@ -100,7 +100,7 @@ class Apart:
             self._process.kill()
             code = self._process.wait()
         # A forked copy that left the group may hold the other ends of the pipes.
-        if self._pipes.acquire(timeout=_MOMENT):
+        if self._pipes.acquire(timeout=_END_WAIT):
             with suppress(OSError), self._process:
                 self._pipes.release()
         how = f"exit code {code}" if code >= 0 else f"signal {-code} ({signal.strsignal(-code)})"
@@ -169,8 +169,8 @@ class WorkerPool:
     def close(self) -> None:
         """End all workers."""
         with self._lock:
-            self._closed, left = True, list(self._all)
-        for apart in left:
+            self._closed, processes = True, list(self._all)
+        for apart in processes:
             apart.end()
 
     def _take(self, *, again: bool = True) -> Apart:

@@ -52,7 +52,7 @@ _LEAST, _LEAST_FAST = 10, 500
 # Most measurements of a chunk: large problems have fewer trials in it, and twenty times fewer if solved one by one.
 _NUMBERS, _SLOWER = 100_000, 20
 # Chunks of a cell, unless they become too small: this number of workers can share a cell.
-_SHARES = 8
+_LEAST_CHUNKS = 8
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Cell:
             (_SLOW, _NUMBERS // _SLOWER, _LEAST) if method.slow else (_FAST, _NUMBERS, _LEAST_FAST)
         )
         most = max(_LEAST, min(longest, numbers // case.numbers))
-        return int(np.clip(-(-case.trials // _SHARES), min(least, most), most))
+        return int(np.clip(-(-case.trials // _LEAST_CHUNKS), min(least, most), most))
 
 
 @dataclass(frozen=True)
@@ -223,12 +223,12 @@ def design_of_text(
         methods += more
         _one_kind(study, methods)
         # Trials of the command line also replace the numbers of single scenarios.
-        own = {} if trials is None else {"trials": None}
+        override = {} if trials is None else {"trials": None}
         cases: list[Case | NetworkCase] = []
         for scenario in study.scenario:
-            cases += cases_of(scenario.model_copy(update=own), folder, study.seed, study.trials)
+            cases += cases_of(scenario.model_copy(update=override), folder, study.seed, study.trials)
         for network in study.network:
-            cases += network_cases(network.model_copy(update=own), study.seed, study.trials)
+            cases += network_cases(network.model_copy(update=override), study.seed, study.trials)
     except InvalidProblem as error:
         where = ", ".join(part for part in (source, error.where) if part)
         raise InvalidProblem(error.what, where, error.advice) from None
@@ -415,18 +415,18 @@ def _noise(problem: Problem, level: Level, from_file: bool, where: str) -> tuple
         raise InvalidProblem(f"the levels do not fit the kinds: {odd!r}", where, f"name {', '.join(kinds)}")
     wanted = {kind: sigma_of(kind, amount, where) for kind, amount in level.items()}
     # Only standard deviations change: the correlations of the file or the layout stay.
-    own = np.sqrt(variances(problem.noise, problem.count))
+    present = np.sqrt(variances(problem.noise, problem.count))
     sigma = np.concatenate([np.full(rows.count, wanted[rows.kind]) for rows in problem.rows])
     unit = SI_UNIT[MODELS[kinds[0]].quantity]  # type: ignore[index]  # models hold known quantities only
-    return _scale(problem.noise, sigma / own), wanted[kinds[0]], unit
+    return _scale(problem.noise, sigma / present), wanted[kinds[0]], unit
 
 
 def _scale(noise: Noise, factor: Array) -> Noise:
     """Return noise whose standard deviations are multiplied by a factor (m,), one for each row."""
     blocks = []
     for block in noise.blocks:
-        own = factor[block.row]
-        blocks.append(Block(block.row, block.covariance * own[:, :, None] * own[:, None, :]))
+        size = factor[block.row]
+        blocks.append(Block(block.row, block.covariance * size[:, :, None] * size[:, None, :]))
     return Noise(tuple(blocks))
 
 

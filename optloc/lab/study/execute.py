@@ -100,10 +100,10 @@ def run_design(
         done = finished_parts(folder, manifest, say)
         known = known_data(design, folder, done)
         if tell is not None and done:
-            had = progress(folder)
-            tell(had.rows, had.counts)
-        left = [chunk for chunk in design.chunks if chunk.key not in done]
-        with closing(compute_all(left, by)) as parts:
+            existing = progress(folder)
+            tell(existing.rows, existing.counts)
+        missing = [chunk for chunk in design.chunks if chunk.key not in done]
+        with closing(compute_all(missing, by)) as parts:
             for part in parts:
                 note_data(known, part.table, folder)
                 store(folder, part)

@@ -438,8 +438,8 @@ def progress(folder: Path) -> Progress:
             method, status = str(row["method"]), str(row["status"])
             methods[method, status] += int(row["count_all"])
             if status in EXPLAINED and (method, status) not in failures:
-                own = pc.and_(pc.equal(table["method"], method), pc.equal(table["status"], status))
-                failures[method, status] = str(table["reason"].filter(own)[0])
+                selected = pc.and_(pc.equal(table["method"], method), pc.equal(table["status"], status))
+                failures[method, status] = str(table["reason"].filter(selected)[0])
     counts: Counter[str] = Counter()
     for (_, status), count in methods.items():
         counts[status] += count

@@ -47,10 +47,10 @@ COUNTS = {"evaluations": "evaluations of the cost", "iterations": "iterations"}
 """Counts of a history: columns of the table, and labels of axes."""
 
 # Default methods for a problem file: the usual method, and three that need a start.
-_USUAL = ("gtrs+lsr", "gauss-newton", "scipy", "ipopt")
+_DEFAULT_METHODS = ("gtrs+lsr", "gauss-newton", "scipy", "ipopt")
 # Iterations after which a run is stopped: each of the first thirty, which is more than a well-started method needs.
 # Then in steps of a tenth, so that a slow run to a limit of two hundred costs fifty runs.
-_EACH, _FARTHER = 30, 1.1
+_EVERY_ITERATION, _GROWTH = 30, 1.1
 # Most steps, the same as in the stages `lsr` and `taylor`.
 _DAMPED, _PLAIN = 100, 50
 
@@ -240,12 +240,12 @@ def way_of(method: StudyMethod, drawn: DrawnCase) -> tuple[list[ConvergenceTrace
     """Return the history of a method on each trial, empty if there is none, and a remark about missing parts."""
     if method.baseline is None:
         assert method.method is not None
-        return _by_stopping(Pipeline.parse(method.method), drawn.problem, None, _choice(method))
+        return _record_stopped_runs(Pipeline.parse(method.method), drawn.problem, None, _choice(method))
     baseline = baseline_of(method.baseline)
     start = start_of(method.start, method.width, drawn)
     if not baseline.method:
-        return _by_listening(baseline, drawn, start)
-    return _by_stopping(Pipeline.parse(baseline.method), drawn.problem, start, _choice(method))
+        return _record_evaluations(baseline, drawn, start)
+    return _record_stopped_runs(Pipeline.parse(baseline.method), drawn.problem, start, _choice(method))
 
 
 def _choice(method: StudyMethod) -> Choice:
@@ -254,7 +254,7 @@ def _choice(method: StudyMethod) -> Choice:
     return Choice("nonlinear", named, method.settings if named == method.solver else {})
 
 
-def _by_listening(baseline: Baseline, drawn: DrawnCase, start: Array) -> tuple[list[ConvergenceTrace], str]:
+def _record_evaluations(baseline: Baseline, drawn: DrawnCase, start: Array) -> tuple[list[ConvergenceTrace], str]:
     """Return the costs that an external minimizer evaluates, trial by trial, and a remark."""
     ways, failed = [], ""
     for i in range(len(start)):
@@ -284,7 +284,7 @@ class _Steps(NamedTuple):
     counted: bool
 
 
-def _by_stopping(
+def _record_stopped_runs(
     method: Pipeline, problem: Problem, start: Array | None, choice: Choice
 ) -> tuple[list[ConvergenceTrace], str]:
     """Return the costs of runs that stop after growing numbers of iterations, and a remark."""
@@ -295,15 +295,15 @@ def _by_stopping(
         pool = SOLVERS[words[0]].run(problem, None)
         words = words[1:]
     if pool is None:
-        return [_nowhere()] * n, f"{words[0]} has no history"
+        return [_empty_trace()] * n, f"{words[0]} has no history"
     parts: list[list[ConvergenceTrace]] = []
-    while words and words[0] in _FOLLOWED and (steps := _FOLLOWED[words[0]](problem, pool, choice)) is not None:
-        parts.append(_ways(n, pool, steps))
+    while words and words[0] in _STAGES and (steps := _STAGES[words[0]](problem, pool, choice)) is not None:
+        parts.append(_traces(n, pool, steps))
         pool = SOLVERS[words.pop(0)].run(problem, pool)
     if not parts and start is not None:
-        return [_nowhere()] * n, f"{words[0]} has no history for this problem"
+        return [_empty_trace()] * n, f"{words[0]} has no history for this problem"
     if not parts:  # a start in closed form
-        parts.append(_ways(n, pool, _stay(problem, pool)))
+        parts.append(_traces(n, pool, _no_steps(problem, pool)))
     ways = [_joined([part[i] for part in parts]) for i in range(n)]
     rest = "+".join(words) + (" and its fallback" if words and method.then else "")
     if rest:
@@ -312,25 +312,25 @@ def _by_stopping(
     return ways, "shown stage by stage; machine code that runs both stages at once has no history" * shortcut(method)
 
 
-def _nowhere() -> ConvergenceTrace:
+def _empty_trace() -> ConvergenceTrace:
     """Return an empty history."""
     return ConvergenceTrace(*(np.zeros(0) for _ in ConvergenceTrace._fields))
 
 
-def _ways(n: int, pool: Pool, steps: _Steps) -> list[ConvergenceTrace]:
+def _traces(n: int, pool: Pool, steps: _Steps) -> list[ConvergenceTrace]:
     """Return the history of each trial: at each count, the best of its candidates, which run in parallel."""
     item, _ = pool.occupied
     out = []
     for i in range(n):
-        own = item == i
-        if not own.any():
-            out.append(_nowhere())
+        members = item == i
+        if not members.any():
+            out.append(_empty_trace())
             continue
-        most = steps.took[own].max()
+        most = steps.took[members].max()
         last = int(np.searchsorted(steps.at, most)) + 1
-        at, cost = np.minimum(steps.at[:last], most), np.nan_to_num(steps.cost[:last, own], nan=np.inf)
+        at, cost = np.minimum(steps.at[:last], most), np.nan_to_num(steps.cost[:last, members], nan=np.inf)
         # Each step is one evaluation, and so is the start of each candidate.
-        made = 1.0 + np.minimum(at[:, None], steps.took[own])
+        made = 1.0 + np.minimum(at[:, None], steps.took[members])
         out.append(
             ConvergenceTrace(cost.min(1), made.sum(1) if steps.counted else np.full(last, np.nan), at.astype(float))
         )
@@ -349,12 +349,14 @@ def _joined(parts: Sequence[ConvergenceTrace]) -> ConvergenceTrace:
 
 def _counts(most: int) -> Array:
     """Return the counts after which a run is stopped, the last one `most`."""
-    farther = _EACH * _FARTHER ** np.arange(1, 2 + max(0, int(np.log(max(most, 1) / _EACH) / np.log(_FARTHER))))
-    found = np.union1d(np.arange(_EACH + 1), farther.astype(int))
+    later = _EVERY_ITERATION * _GROWTH ** np.arange(
+        1, 2 + max(0, int(np.log(max(most, 1) / _EVERY_ITERATION) / np.log(_GROWTH)))
+    )
+    found = np.union1d(np.arange(_EVERY_ITERATION + 1), later.astype(int))
     return np.append(found[found < most], most)
 
 
-def _stay(problem: Problem, pool: Pool) -> _Steps:
+def _no_steps(problem: Problem, pool: Pool) -> _Steps:
     """Return the steps of candidates that do not move."""
     item, slot = pool.occupied
     cost = _cost(problem.take(item), pool.x[item, slot])
@@ -401,8 +403,8 @@ def _nonlinear(problem: Problem, pool: Pool, choice: Choice) -> _Steps | None:
     return _Steps(at, np.stack(cost), np.array(took), counted=False)
 
 
-_Follow = Callable[[Problem, Pool, Choice], _Steps | None]
-_FOLLOWED: dict[str, _Follow] = {
+_Recorder = Callable[[Problem, Pool, Choice], _Steps | None]
+_STAGES: dict[str, _Recorder] = {
     "lsr": partial(_least_squares, damped=True, limit=_DAMPED),
     "taylor": partial(_least_squares, damped=False, limit=_PLAIN),
     "nlp": _nonlinear,
@@ -445,14 +447,14 @@ def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, 
         raise InvalidProblem("a problem file of the study is missing or invalid", str(folder), "restore it")
     cells: dict[str, dict[str, Case | NetworkCase]] = {}
     for cell in design.cells:
-        own = cells.setdefault(case_label(cell.case.table.name, cell.case.sweep), {})
-        own.setdefault(noise_text(cell.case.label), cell.case)
+        levels = cells.setdefault(case_label(cell.case.table.name, cell.case.sweep), {})
+        levels.setdefault(noise_text(cell.case.label), cell.case)
     title = _chosen(case, cells, "case")
     level = _chosen(noise, cells[title], "noise")
-    wanted = cells[title][level]
-    if isinstance(wanted, NetworkCase):
+    chosen = cells[title][level]
+    if isinstance(chosen, NetworkCase):
         raise InvalidProblem(f"{title} has networks, which have no histories", str(folder), "choose another case")
-    drawn, least = _known(folder, wanted, count)
+    drawn, least = _known(folder, chosen, count)
     methods = {cell.method.name: cell.method for cell in design.cells if not cell.method.reference}
     methods |= {method.name: method for method in added(names)}
     known = {*methods, *(cell.method.name for cell in design.cells)}
@@ -508,4 +510,4 @@ def _of_file(file: Path, names: Sequence[str], count: int) -> Trials:
     nothing = np.full((n, problem.layout.size), np.nan)
     drawn = DrawnCase(problem, nothing, wild, ("",) * n, ("",) * n, np.zeros(n, dtype=int), places[0])
     least = solve(problem).cost
-    return Trials(loaded.title or file.name, drawn, tuple(added(names or _USUAL)), np.asarray(least))
+    return Trials(loaded.title or file.name, drawn, tuple(added(names or _DEFAULT_METHODS)), np.asarray(least))

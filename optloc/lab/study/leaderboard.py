@@ -56,13 +56,13 @@ def _ranks(rows: pd.DataFrame) -> list[str]:
         "|---:|---|---:|---:|---:|---:|---:|",
     ]
     for place, name in enumerate(order, 1):
-        own = rows[rows["method"].astype(str) == name]
-        count = len(own)
-        low, high = wilson(float(own["right"].sum()), float(count))
-        duel = "" if name == first else f"{alone[name]} : {other[name]}"
-        shares = f"{100 * own['right'].mean():.2f} | {100 * float(low):.2f} to {100 * float(high):.2f}"
-        wrong, time = 100 * own["wrong"].mean(), 1e3 * float(np.median(own["seconds"]))
-        lines.append(f"| {place} | {_cell(name)} | {shares} | {wrong:.2f} | {time:.3g} | {duel} |")
+        part = rows[rows["method"].astype(str) == name]
+        count = len(part)
+        low, high = wilson(float(part["right"].sum()), float(count))
+        comparison = "" if name == first else f"{alone[name]} : {other[name]}"
+        shares = f"{100 * part['right'].mean():.2f} | {100 * float(low):.2f} to {100 * float(high):.2f}"
+        wrong, time = 100 * part["wrong"].mean(), 1e3 * float(np.median(part["seconds"]))
+        lines.append(f"| {place} | {_cell(name)} | {shares} | {wrong:.2f} | {time:.3g} | {comparison} |")
     return lines
 
 

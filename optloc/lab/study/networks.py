@@ -273,11 +273,11 @@ def refined(network: Network, starts: NetworkEstimate) -> NetworkResult:
 
 def _covariance(network: Network, at: NetworkEstimate) -> tuple[Array, int]:
     """Return the covariance of an estimate in the frame of all stations, NaN if singular, and the frame's freedoms."""
-    told = determined(likelihood(network), at)
-    p, free = told.jacobian.shape[1], told.free.shape[1]
-    if not told.open.shape[1]:
+    frame = determined(likelihood(network), at)
+    p, free = frame.jacobian.shape[1], frame.free.shape[1]
+    if not frame.open.shape[1]:
         try:
-            return told.covariance(told.free.T), free
+            return frame.covariance(frame.free.T), free
         except np.linalg.LinAlgError:
             pass
     return np.full((p, p), np.nan), free

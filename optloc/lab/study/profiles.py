@@ -142,8 +142,8 @@ def profiles(frame: pd.DataFrame, *, tau: float = TAU, work: str = "processor", 
     if not methods:
         raise InvalidProblem(f"no method of the study counts {work}", "--work", "use --work processor")
     # The work of a failed trial is unknown; the trial counts as not solved.
-    told = rows[rows["method"].astype(str).isin(methods)].fillna({"work": np.inf})
-    spent, solved, total = instances(told, methods, "work", "solved")
+    counted = rows[rows["method"].astype(str).isin(methods)].fillna({"work": np.inf})
+    spent, solved, total = instances(counted, methods, "work", "solved")
     solved &= np.isfinite(spent)
     order = sorted(range(len(methods)), key=lambda i: (-int(solved[i].sum()), _median(spent[i][solved[i]]), methods[i]))
     silent = tuple(str(name) for name in known.index[known == 0])
