@@ -18,6 +18,7 @@ def _commands(app: typer.Typer) -> None:
 
 
 def _studies() -> Rows:
+    """Return the shipped studies for `optloc list studies`."""
     import tomllib
 
     from optloc.lab.study.design import shipped
@@ -27,6 +28,7 @@ def _studies() -> Rows:
 
 
 def _datasets() -> Rows:
+    """Return the data sets for `optloc list datasets`, and whether their files exist."""
     from optloc.lab.datasets import available
     from optloc.lab.datasets.catalogue import ENTRIES
 

@@ -1,4 +1,4 @@
-"""Common code of all readers: the folder and its checked tables, and windows of rows, each one epoch."""
+"""Common code of all readers: the folder and its checked tables, and the windows that divide rows into epochs."""
 
 from __future__ import annotations
 
@@ -24,14 +24,16 @@ XYZ = ("x_m", "y_m", "z_m")
 
 
 def root(folder: str | Path | None = None) -> Path:
-    """Return the folder of all data sets; raise InvalidProblem if there is none."""
+    """Return the folder of all data sets; raise InvalidProblem if it is not set or does not exist."""
     given = os.environ.get(VARIABLE, "") if folder is None else folder
     if not str(given):
-        advice = f"set the variable {VARIABLE} to the folder that holds the data sets, or name it by folder="
+        advice = f"set the variable {VARIABLE} to the folder of the data sets, or give the folder as folder="
         raise InvalidProblem("no folder of data sets is set, and optloc contains no data", VARIABLE, advice)
     place = Path(given).expanduser()
     if not place.is_dir():
-        raise InvalidProblem("there is no such folder", str(place), f"correct {VARIABLE}, or name it by folder=")
+        raise InvalidProblem(
+            "there is no such folder", str(place), f"correct {VARIABLE}, or give the folder as folder="
+        )
     return place
 
 
@@ -71,7 +73,7 @@ def places(table: pd.DataFrame, columns: Iterable[str] = XYZ) -> Array:
     return table[[column for column in columns if column in table]].to_numpy(dtype=np.float64)
 
 
-# Short windows of consecutive rows, each one epoch of a free target.
+# Short windows of consecutive rows; each window is an epoch of a free target.
 
 
 @dataclass(frozen=True, slots=True)

@@ -469,6 +469,7 @@ _SIZES: dict[Size, AnglesSample] = {"quick": AnglesSample(200, 200, 60, 10), "fu
 
 
 def _run(sample: AnglesSample, seed: int, tick: Tick) -> Report:
+    """Run all simulations of the paper, and return the report."""
     one = draw(STRAIGHT, sample.trials, seed, 0)
     straight = run_straight(one, tick)
     wholes = run_wholes(one, tick)

@@ -465,6 +465,7 @@ def one_run(found: Mapping[str, Errors]) -> Figure:
 def _figures(
     stays: Mapping[str, Errors], tracks: Mapping[str, Errors], fits: Mapping[int, Mapping[str, Errors]]
 ) -> dict[str, Figure]:
+    """Return the figures of the fixed target, of the slow one and of one run, by file name."""
     counts = np.unique(np.geomspace(1, max(fits), 40).astype(int))
     # Two epochs determine a course, but its bound is beyond the axis.
     later = counts[counts >= 5]
@@ -510,6 +511,8 @@ _SIZES: dict[Size, BistaticSample] = {"quick": BistaticSample(1000, 150, 200), "
 
 
 def _run(sample: BistaticSample, seed: int, tick: Tick) -> Report:
+    """Run all simulations of the paper, and return the report."""
+
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))
 

@@ -299,6 +299,7 @@ _WORK = 11  # calls of `tick` below
 
 
 def _run(sample: KinematicSample, seed: int, tick: Tick) -> Report:
+    """Run all simulations of the paper, and return the report."""
     scene = KinematicScenario()
 
     def done(value: T) -> T:

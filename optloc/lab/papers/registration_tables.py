@@ -347,6 +347,7 @@ def against_time(histories: Mapping[str, History], printed: Mapping[str, float],
 
 
 def _panel(ax: Axes, history: History, printed: float, since: int) -> None:
+    """Draw the errors of a history and the bound against time, from the second `since` on."""
     step = history.setting.scenario.interval
     keep = [i for i, k in enumerate(history.epochs) if k * step >= since]
     epochs = [history.epochs[i] for i in keep]
@@ -487,11 +488,13 @@ _SIZES: dict[Size, RegistrationSample] = {
 
 
 def _work(sample: RegistrationSample) -> int:
+    """Return the number of calls of `tick`."""
     histories = 4 * len(sample.fixed) + len(sample.moving) + 5
     return histories + len(INITIAL) + 2 * len(NOISE) + 1
 
 
 def _run(sample: RegistrationSample, seed: int, tick: Tick) -> Report:
+    """Run all simulations of the paper, and return the report."""
     fixed = {
         name: run_history(
             RegistrationSetting(PRINTED, sample.trials, seed, key, station_sigma=size), sample.fixed, tick

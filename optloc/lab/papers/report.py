@@ -242,7 +242,7 @@ def label(ax: Axes, across: str, up: str) -> None:
     """Name both axes and draw a faint grid."""
     ax.set_xlabel(across)
     ax.set_ylabel(up)
-    ax.grid(visible=True, which="both", alpha=0.25)  # faint, so that the curves stand out
+    ax.grid(visible=True, which="both", alpha=0.25)  # faint, so that the curves dominate
 
 
 def explain(figure: Figure, columns: int | None = None) -> None:

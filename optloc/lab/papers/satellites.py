@@ -490,7 +490,7 @@ _HEADINGS = {"north": 0.0, "north-east": 0.25 * np.pi, "east": 0.5 * np.pi, "sou
 """Directions of flight of satellites, radians; the opposite ones fly the same circles backwards."""
 
 _PANEL = 100e3
-"""Start error of a figure, metres: the first one at which the filters differ widely."""
+"""Start error of a figure, metres: the smallest error at which the filters differ widely."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -521,6 +521,8 @@ _SIZES: dict[Size, SatellitesSample] = {"quick": SatellitesSample(200, 100), "fu
 
 
 def _run(sample: SatellitesSample, seed: int, tick: Tick) -> Report:
+    """Run all simulations of the paper, and return the report."""
+
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))
 

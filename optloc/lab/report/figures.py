@@ -121,6 +121,7 @@ def _noise_axis(part: pd.DataFrame) -> tuple[dict[str, float], list[str], str]:
 
 
 def _ticks(axes: Axes, place: dict[str, float], labels: list[str]) -> None:
+    """Set the ticks of the noise levels, with a margin on both sides."""
     x = np.array(list(place.values()))
     axes.set_xticks(x, labels, fontsize=8)
     # An eighth of the axis on each side, for marks and their bars; a single level needs an axis too.

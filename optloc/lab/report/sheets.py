@@ -49,7 +49,7 @@ def percent(share: float) -> str:
     if not np.isfinite(share):
         return "–"
     text = f"{100 * share:.1f}"
-    # Shares that one decimal would round to 0.0 or 100.0.
+    # These shares would be rounded to 0.0 or 100.0.
     if share not in {0.0, 1.0} and not 0.0005 <= share < 0.9995:
         text = "> 99.9" if share > 0.5 else "< 0.1"
     return text if text not in {"0.0", "100.0"} else text[:-2]

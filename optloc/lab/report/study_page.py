@@ -345,7 +345,7 @@ _SECTIONS = (
     _Section(
         "profile",
         "Data and performance profiles",
-        "Share of trials that a method solves within a given processor time (Moré and Wild 2009), and within a "
+        "Share of trials that a method solves: within a given processor time (Moré and Wild 2009), or within a "
         "multiple of the time of the trial's fastest method (Dolan and Moré 2002). Solved: the cost exceeds the least "
         "known cost by at most a thousandth; the status does not matter. If a call makes many fixes, each trial gets "
         "their mean time. Methods that start at the truth are left out.",

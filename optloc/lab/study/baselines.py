@@ -149,9 +149,9 @@ def teller(trial: int) -> Callable[[float], None]:
 
 
 def weighings(problem: Problem) -> int:
-    """Return the number of solutions of a trial: each after the first uses noise weights at the last position.
+    """Return the number of times that a trial is solved, each time with noise weights at the last solution.
 
-    It is 1 if the noise does not depend on the position.
+    The number is 1 if the noise does not depend on the position.
     """
     return WEIGHINGS if depends_on_place(problem) else 1
 
@@ -194,7 +194,7 @@ def least_squares(problem: Problem, start: Array, limit: int = _EVALUATIONS) -> 
 def whiten_one(
     one: Problem, tell: Callable[[float], None]
 ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """Return functions for SciPy: residual (m,) and Jacobian (m, size) of one problem, in standard deviations.
+    """Return two functions for SciPy: residual (m,) and Jacobian (m, size) of one problem, in standard deviations.
 
     Each unknown with a prior adds a residual. The residual function passes its cost to `tell`.
     """
@@ -246,6 +246,7 @@ def lifted_sdp(problem: Problem) -> Fix:
         centre, scale = spread_of(problem)
 
         def relax(i: int) -> None:
+            """Solve the relaxation of problem i."""
             K, z = _linear(problem.take(np.array([i])), float(scale[i]))
             stations = np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))
             found = lifted_ranges(K, z, (stations[i, 0] - centre[i]) / scale[i])
@@ -417,8 +418,10 @@ _OWN = {
         "no missing arrival",
         by_nuclear_norm,
     ),
-    "one-random": _network("networks: least squares from one network of random places", at_random(1)),
-    "ten-random": _network("networks: the best of least squares from ten networks of random places", at_random(10)),
+    "one-random": _network("networks: least squares from one network of random positions", at_random(1)),
+    "ten-random": _network(
+        "networks: the best result of least squares from ten networks of random positions", at_random(10)
+    ),
 }
 
 BASELINES: Registry[Baseline] = Registry("optloc.baselines", lambda value: isinstance(value, Baseline), _OWN)

@@ -325,7 +325,7 @@ def _sweep(table: _Table, where: str) -> Iterator[tuple[dict[str, Any], _Table]]
             for part in path:
                 at = at.setdefault(part, {})
                 if not isinstance(at, dict):
-                    raise InvalidProblem(f"{name!r} names no key", join(where, "sweep"), "write table.key")
+                    raise InvalidProblem(f"there is no key {name!r}", join(where, "sweep"), "write table.key")
             at[last] = value
         yield swept, conform(type(table), data, where) if swept else table
 

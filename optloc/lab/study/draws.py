@@ -490,7 +490,7 @@ def _sizes(problem: Problem, given: Amount | dict[str, Amount], where: str) -> d
     named = given if isinstance(given, dict) else dict.fromkeys(kinds, given)
     for kind in named:
         if kind not in kinds:
-            raise InvalidProblem(f"no rows are of kind {kind!r}", where, nearest(kind, kinds))
+            raise InvalidProblem(f"the problem has no rows of kind {kind!r}", where, nearest(kind, kinds))
     return {kind: sigma_of(kind, amount, where) for kind, amount in named.items()}
 
 

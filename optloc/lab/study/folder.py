@@ -217,7 +217,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def _renew(path: Path, content: bytes) -> None:
-    """Replace a file of optloc in the folder, which needs no option --force."""
+    """Replace a file that optloc wrote to the folder, so no option --force is needed."""
     scratch = path.with_name(f".optloc-{path.name}")
     _write(scratch, content)
     try:

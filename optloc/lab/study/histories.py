@@ -213,7 +213,7 @@ class Reach:
 
 
 def reach(found: Histories, tau: float) -> list[Reach]:
-    """Return for each method how often and how fast it comes within `tau` of the least known cost."""
+    """Return for each method the number of trials within `tau` of the least known cost, and the work to get there."""
     check_accuracy(tau)
     out = []
     for name in found.methods:
@@ -237,7 +237,7 @@ def reach(found: Histories, tau: float) -> list[Reach]:
 
 
 def way_of(method: StudyMethod, drawn: DrawnCase) -> tuple[list[ConvergenceTrace], str]:
-    """Return the history of a method on each trial, empty if there is none, and a remark about missing parts."""
+    """Return the history of a method on each trial, empty if it has no history, and a remark about missing parts."""
     if method.baseline is None:
         assert method.method is not None
         return _record_stopped_runs(Pipeline.parse(method.method), drawn.problem, None, _choice(method))
@@ -269,7 +269,7 @@ def _record_evaluations(baseline: Baseline, drawn: DrawnCase, start: Array) -> t
         ways.append(ConvergenceTrace(cost, np.arange(1.0, len(cost) + 1.0), np.full(len(cost), np.nan)))
     if not any(len(way.cost) for way in ways):
         return ways, "it evaluates no cost" + (f" ({failed})" if failed else "")
-    return ways, f"it ended with an error in some trial ({failed})" if failed else ""
+    return ways, f"it ended with an error in at least one trial ({failed})" if failed else ""
 
 
 class _Steps(NamedTuple):
@@ -348,7 +348,7 @@ def _joined(parts: Sequence[ConvergenceTrace]) -> ConvergenceTrace:
 
 
 def _counts(most: int) -> Array:
-    """Return the counts after which a run is stopped, the last one `most`."""
+    """Return the counts after which a run is stopped; the last count is `most`."""
     later = _EVERY_ITERATION * _GROWTH ** np.arange(
         1, 2 + max(0, int(np.log(max(most, 1) / _EVERY_ITERATION) / np.log(_GROWTH)))
     )
@@ -434,7 +434,7 @@ def question(
     Raises
     ------
     InvalidProblem
-        If a folder or a file cannot be read, or has no such case.
+        If a folder or a file cannot be read, or does not have the case.
     """
     return _of_study(place, names, count, case, noise) if place.is_dir() else _of_file(place, names, count)
 
@@ -467,7 +467,7 @@ def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, 
 
 
 def _chosen(word: str | None, known: Mapping[str, object], what: str) -> str:
-    """Return the wanted name, or the first one; raise InvalidProblem if it is unknown."""
+    """Return the wanted name, by default the first name; raise InvalidProblem if it is unknown."""
     names = list(known)
     if word is None:
         return names[0]

@@ -78,7 +78,7 @@ def _equations(one: Problem) -> Callable[[Array], Normal]:
 def load_minimizer(name: str) -> None:
     """Load ``FILE.py:FUNCTION`` or ``MODULE:FUNCTION`` of the user, so that `baseline_of` finds the function.
 
-    Raise InvalidProblem if there is no such file, module or function.
+    Raise InvalidProblem if the file, the module or the function does not exist.
     """
     place, _, _ = name.rpartition(":")
     load_plugin(place)

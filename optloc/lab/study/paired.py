@@ -90,9 +90,9 @@ def median_of(differences: Array) -> Median:
 
 
 def paired(frame: pd.DataFrame, against: str) -> list[Pair]:
-    """Return the comparison of every other method with one method, in every case at every noise level.
+    """Return the comparison of every other method with the method `against`, in every case at every noise level.
 
-    `frame` are judged rows of a study, see `optloc.lab.study.summary.judged`; `against` is the name of the one method.
+    `frame` are judged rows of a study, see `optloc.lab.study.summary.judged`.
     Raise InvalidProblem if no method has this name.
     """
     names = [str(name) for name in frame["method"].unique()]

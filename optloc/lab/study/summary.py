@@ -118,7 +118,9 @@ def noise_text(label: str) -> str:
 
 
 def cells(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return one row for each case, noise level and method of judged rows, in the order of `levels` and `methods`.
+    """Return one row for each case, noise level and method of judged rows, sorted in this order.
+
+    Methods are in the order of `methods`.
 
     Returns
     -------
@@ -472,7 +474,7 @@ def over_bound(error: Array, bound: Array) -> tuple[float, float]:
 
 
 def shifted_mean(times: Array, shift: float) -> float:
-    """Return the shifted geometric mean exp(mean(log(t + s))) - s of times, seconds; NaN if there are none.
+    """Return the shifted geometric mean exp(mean(log(t + s))) - s of times, seconds; NaN without times.
 
     Large times count less than in a mean, and times far below the shift all count the same.
 

@@ -45,7 +45,7 @@ class Column:
     kind : "category", "int", "float" or "bool"
         Category: text, dictionary encoded.
     unit : str
-        SI unit; empty if there is none.
+        SI unit; empty for columns without a unit.
     meaning : str
         One sentence.
     value : bool
@@ -70,7 +70,7 @@ COLUMNS: tuple[Column, ...] = (
         "noise", "float", "", "Noise level in the unit `noise_unit`: deviation of a row of the first kind, or factor."
     ),
     Column("noise_unit", "category", "", "m, m/s, rad or 1; x if levels are factors on the noise of a file."),
-    Column("noise_label", "category", "", "The level as the study file writes it."),
+    Column("noise_label", "category", "", "The level as written in the study file."),
     Column("sweep", "category", "", "Swept values as a JSON object of name and value; {} without a sweep."),
     Column("kinds", "category", "", "Measurement kinds of the scenario, joined by +."),
     Column("dimension", "int", "", "2 or 3."),
@@ -89,7 +89,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("answered", "bool", "", "Whether the status has a position with a covariance, with or without findings."),
     Column("reason", "category", "", "Sentence that belongs to the status."),
     Column("located", "bool", "", "Whether there is a finite position at all, refined or not."),
-    Column("outliers", "int", "", "Number of stations, in a network of arrivals, with a gross error."),
+    Column("outliers", "int", "", "Number of stations with a gross error; in a network, number of arrivals."),
     Column("rejected", "int", "", "Number of rows to which the method gives less than half their weight."),
     Column("truth_x", "float", "m", "True position of the target, metres in the frame."),
     Column("truth_y", "float", "m", "As truth_x."),
@@ -127,7 +127,7 @@ COLUMNS: tuple[Column, ...] = (
         "nees",
         "float",
         "1",
-        "e' C^-1 e with the claimed covariance C; its expectation is `dimension` (of networks scaled to it).",
+        "e' C^-1 e with the claimed covariance C; its expectation is `dimension`; for networks it is scaled to this.",
     ),
     Column(
         "cost",
