@@ -7,7 +7,7 @@ names a cell of the recomputed tables, so that text and tables always agree. The
 - ``table("slow")`` is a table; its title is the heading above it, and its note is the text below it;
 - ``cell("slow", "line fit", "mean error, km")`` is the text of a cell: table, first cells of the row, column;
 - ``value(...)`` is the first number of a cell, ``value(..., part=1)`` the second; ``digits`` rounds the result;
-- ``made``, ``seed`` and ``sample`` are the version, the seed and the sizes; ``scene`` is the module of the paper.
+- ``made``, ``seed`` and ``sample`` are version and date, seed and sizes; ``scene`` is the module of the paper.
 """
 
 from __future__ import annotations

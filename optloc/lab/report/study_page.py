@@ -66,7 +66,7 @@ class Place:
     truths : array (n, 2)
         True positions of trials, as x and y of the map.
     off : bool array (n,)
-        Trials in which a method claimed an answer whose cost is not the lowest known. Plain minimisers do not count.
+        Whether some method was wrong but ok in the trial: its status is ok, and a lower cost is known.
     """
 
     title: str
