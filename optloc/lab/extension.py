@@ -18,6 +18,7 @@ def _commands(app: typer.Typer) -> None:
 
 
 def _studies() -> Rows:
+    """Return the shipped studies for `optloc list studies`."""
     import tomllib
 
     from optloc.lab.study.design import shipped
@@ -27,6 +28,7 @@ def _studies() -> Rows:
 
 
 def _datasets() -> Rows:
+    """Return the data sets for `optloc list datasets`, and whether their files exist."""
     from optloc.lab.datasets import available
     from optloc.lab.datasets.catalogue import ENTRIES
 
@@ -43,6 +45,7 @@ def _datasets() -> Rows:
 
 
 def _folder() -> dict[str, Any]:
+    """Return the folder of data sets and the names of the sets in it, for the report on the installation."""
     from optloc.lab.datasets import available
 
     folder = os.environ.get("OPTLOC_DATA")
@@ -50,7 +53,7 @@ def _folder() -> dict[str, Any]:
 
 
 def _accuracy(asked: PictureRequest) -> None:
-    """Errors of a study's methods against the bound."""
+    """Draw the errors of a study's methods and the bound against the noise."""
     import numpy as np
 
     from optloc.cli import write_picture
@@ -60,17 +63,17 @@ def _accuracy(asked: PictureRequest) -> None:
     from optloc.show import plot_accuracy
 
     if not asked.file.is_dir():
-        raise InvalidProblem("the errors of methods are those of a study", str(asked.file), "name its output folder")
+        raise InvalidProblem("this picture needs a study", str(asked.file), "give the output folder of a study")
     rows = read_frame(asked.file, [*summary.COLUMNS])
     if not len(rows):
-        raise InvalidProblem("nothing of the study is finished yet", str(asked.file), "run the study")
+        raise InvalidProblem("the study has no finished part yet", str(asked.file), "run the study")
     cells = summary.cells(summary.judged(rows))
     names = list(dict.fromkeys(str(case) for case in cells["case"]))
     name = names[0] if asked.epoch is None else asked.epoch
     if name not in names:
         raise InvalidProblem(f"there is no case {name!r}", "--epoch", nearest(name, names))
     case = cells[cells["case"].astype(str) == name]
-    # Methods may lack some noise levels: reindexed, so that all have values (or NaN) at the same ones.
+    # Methods may lack some noise levels: reindex, so that each method has a value or NaN at each level.
     noise = np.unique(case["noise"].to_numpy(dtype=float))
     bound = case.groupby("noise")["bound"].max().reindex(noise).to_numpy(dtype=float)
     errors = {

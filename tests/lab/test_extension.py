@@ -45,5 +45,5 @@ def test_the_picture_of_accuracy_is_of_one_case_of_a_study(tmp_path, monkeypatch
     assert {name: value.tolist() for name, value in errors.items()} == {"a": [2.0], "b": [2.0]}
     with pytest.raises(InvalidProblem, match="there is no case 'other'"):
         extension._accuracy(asked(tmp_path, epoch="other"))
-    with pytest.raises(InvalidProblem, match="errors of methods are those of a study"):
+    with pytest.raises(InvalidProblem, match="this picture needs a study"):
         extension._accuracy(asked(tmp_path / "none"))

@@ -1,4 +1,4 @@
-"""``optloc reproduce``: the simulations of a paper, made again."""
+"""``optloc reproduce``: simulations of a paper, repeated."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ def reproduce(
         "quick"
     ),
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where tables and pictures go; optloc-NAME by default.")
+        Path | None, typer.Option(metavar="DIR", help="Folder of tables and pictures; optloc-NAME by default.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Decides all draws.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 1,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Make the simulations of a paper again: tables and pictures with printed value, reproduced value and bound."""
+    """Repeat the simulations of a paper: tables and pictures with printed value, reproduced value and bound."""
     raise typer.Exit(_run(name, size, out, seed, quiet))
 
 
 def _run(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
-    """Make the tables and pictures of a paper again, print the tables, and return the exit code."""
+    """Repeat the simulations of a paper, print the tables, and return the exit code."""
     from optloc.cli import bar, say
     from optloc.lab.papers import Size, paper, reproduction, write
 
@@ -41,7 +41,7 @@ def _run(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
     if size not in get_args(Size):
         raise InvalidProblem(f"there is no size {size!r}", "--size", nearest(size, get_args(Size)))
     folder = Path(f"optloc-{name}") if out is None else out
-    # before the work, so that a place that cannot be written is known at once
+    # Before the work, so that a folder that cannot be written to is reported at once.
     make_folder(folder)
     claim(folder / "README.md")
     ready = reproduction(name, cast(Size, size), seed)
@@ -56,5 +56,5 @@ def _run(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
         for row in found.rows:
             table.add_row(*row)
         console.print(table)
-    say(console, f"{len(written)} files are in {folder}; begin with README.md.")
+    say(console, f"{len(written)} files are in {folder}; read README.md first.")
     return 0

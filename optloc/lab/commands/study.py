@@ -33,10 +33,10 @@ from optloc.problem import InvalidProblem
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
 
-# Difference of two shares of answers, in its standard deviations, that is called one: 3 in 1000 by chance.
+# Least difference of two shares of answers that is reported, in standard deviations. By chance 3 in 1000 exceed it.
 _DIFFERS = 3.0
 
-# Processes that are believed to be meant; each takes 200 MB or so.
+# Each process takes about 200 MB. A larger number is a typing error.
 _MOST_JOBS = 1024
 
 study = typer.Typer(
@@ -79,20 +79,20 @@ def run(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Output folder; NAME-study by default. Goes on where it stopped.")
+        Path | None, typer.Option(metavar="DIR", help="Output folder; NAME-study by default. A stopped run continues.")
     ] = None,
     executor: Annotated[
         str, typer.Option("--executor", "-x", metavar="NAME", help="processes, dask or ray.")
     ] = "processes",
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Cluster that exists, such as tcp://host:8786; implies dask.")
+        str | None, typer.Option(metavar="ADDRESS", help="Running cluster, such as tcp://host:8786; implies dask.")
     ] = None,
     jobs: Jobs = None,
     limit: Annotated[
-        float, typer.Option("--task-limit", metavar="SECONDS", help="Time that a task may take: methods may hang.")
+        float, typer.Option("--task-limit", metavar="SECONDS", help="Time limit of a task, as a method may hang.")
     ] = 600.0,
-    trials: Annotated[int | None, typer.Option(min=1, help="Trials, in the place of those of the file.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed, in the place of that of the file.")] = None,
+    trials: Annotated[int | None, typer.Option(min=1, help="Number of trials, instead of the file's.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed, instead of the file's.")] = None,
     methods: Methods = None,
     plugin: Plugins = None,
     outside: Outside = False,
@@ -101,7 +101,7 @@ def run(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Run a study, or go on with one that was stopped: finished parts are kept, and new methods run alone."""
+    """Run a study, or continue a stopped one: finished parts are kept, and only new methods run."""
     from optloc.lab.study.design import design_of
     from optloc.lab.study.execute import executor as chosen, run_design
     from optloc.lab.study.methods import added
@@ -109,16 +109,16 @@ def run(
 
     for name in plugin or ():
         load_plugin(name)
-    # A scheduler can only be meant for dask.
+    # Only dask has a scheduler.
     by = chosen("dask" if scheduler is not None and executor == "processes" else executor, jobs, scheduler, limit)
     design = design_of(file, trials=trials, seed=seed, more=added(methods or ()))
     folder = Path(f"{design.study.name}-study".replace(" ", "-").replace("/", "-")) if out is None else out
     try:
         with _bar(design.study.name, design.rows, quiet or as_json) as tell:
             found = run_design(design, folder, by, tell, lambda line: typer.echo(line, err=True))
-    # Not an error: parts are written as they are finished.
+    # Not an error: finished parts are already on disk.
     except KeyboardInterrupt:
-        typer.echo(f"Stopped. What is finished is in {folder}; the same command goes on from there.", err=True)
+        typer.echo(f"Stopped. Finished parts are in {folder}; run the same command to continue.", err=True)
         raise typer.Exit(STOPPED) from None
     if as_json:
         _print_json(_record(found))
@@ -129,7 +129,7 @@ def run(
 
 @study.command(epilog=example("optloc study status runs/my"))
 def status(folder: Folder, as_json: Json = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
-    """Say how far a study is, and what its methods answered. Exit code 1 while something is left to do."""
+    """Print the progress of a study and the statuses of its methods. Exit code 1 while the study is not finished."""
     from optloc.lab.study.folder import progress
 
     found = progress(folder)
@@ -144,7 +144,7 @@ def status(folder: Folder, as_json: Json = False, quiet: Quiet = False, verbose:
 def report(
     folder: Folder,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where the report goes; report in the study's folder by default.")
+        Path | None, typer.Option(metavar="DIR", help="Folder of the report; report in the study's folder by default.")
     ] = None,
     force: Force = False,
     quiet: Quiet = False,
@@ -152,7 +152,7 @@ def report(
 ) -> None:
     """Make one HTML page of a study, and its tables (CSV, LaTeX) and figures (PNG, SVG) as files.
 
-    A study that is not finished has a report too: of what is there.
+    For a study that is not finished, the report covers the finished parts.
     """
     from optloc.lab.report.study_page import write_report
 
@@ -161,18 +161,18 @@ def report(
     with console.status("report") if shown else nullcontext() as status:
         files = write_report(folder, out, (lambda text: status.update(f"report: {text}")) if status else None)
     if not quiet:
-        _say(f"{files[0]} is the report; {len(files) - 1} tables and figures are beside it.")
+        _say(f"{files[0]} is the report; {len(files) - 1} tables and figures are in the same folder.")
 
 
 @study.command(epilog=example("optloc study compare runs/before runs/after"))
 def compare(
-    one: Annotated[Path, typer.Argument(metavar="A", help="Output folder of a study.")],
-    two: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
+    one: Annotated[Path, typer.Argument(metavar="A", help="Output folder of the first study.")],
+    two: Annotated[Path, typer.Argument(metavar="B", help="Output folder of the second study.")],
     as_json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Set two studies side by side, cell by cell. Exit code 1 where a share of answers differs by 3 sigma."""
+    """Compare two studies cell by cell. Exit code 1 if a share of answers differs by more than 3 sigma."""
     from dataclasses import asdict
 
     from optloc.lab.study.summary import compared
@@ -191,19 +191,19 @@ def compare(
 def bench(
     methods: Methods = None,
     plugin: Plugins = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Output folder; new methods run alone.")] = Path(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Output folder; only new methods run.")] = Path(
         "bench-study"
     ),
     page: Annotated[
-        Path | None, typer.Option(metavar="OUT.md", help="Where the leaderboard goes; standard output by default.")
+        Path | None, typer.Option(metavar="OUT.md", help="File of the leaderboard; standard output by default.")
     ] = None,
     jobs: Jobs = None,
-    trials: Annotated[int | None, typer.Option(min=1, help="Fewer trials, to try it out: other data.")] = None,
+    trials: Annotated[int | None, typer.Option(min=1, help="Fewer trials, for a test; the data differ.")] = None,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Solve the public test set by a few methods and yours, and write who is right how often as a page."""
+    """Solve the public test set by a few methods and yours, and write a leaderboard of right answers as a page."""
     from optloc.cli import write_text
     from optloc.lab.study.design import design_of
     from optloc.lab.study.execute import executor, run_design
@@ -225,13 +225,13 @@ def bench(
 def pairs(
     folder: Folder,
     against: Annotated[
-        str | None, typer.Option(metavar="METHOD", help="Whom the others are compared with; the first of the study.")
+        str | None, typer.Option(metavar="METHOD", help="Method to compare with; the first of the study by default.")
     ] = None,
     as_json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Compare methods on the same trials: who alone is right, differences of errors and times, with 95 % intervals."""
+    """Compare methods trial by trial: answers that only one gets right, differences of errors and of times."""
     from dataclasses import asdict
 
     from optloc.lab.study.folder import read_frame, read_manifest
@@ -255,7 +255,7 @@ def pairs(
 def profiles(
     folder: Folder,
     tau: Annotated[
-        float, typer.Option(metavar="COST", help="Cost above the least known with which a trial counts as solved.")
+        float, typer.Option(metavar="COST", help="A trial is solved at this cost above the least known, or less.")
     ] = 1e-3,
     work: Annotated[
         str, typer.Option(metavar="NAME", help="processor (time) or evaluations (of the cost).")
@@ -268,7 +268,7 @@ def profiles(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Say which share of the trials each method solves, within how much work: data and performance profiles."""
+    """Print data and performance profiles: the share of trials that each method solves within a given work."""
     from optloc.cli import claim_outputs, write_picture
     from optloc.lab.study import summary
     from optloc.lab.study.folder import design_of_manifest, read_frame, read_manifest, references
@@ -277,7 +277,7 @@ def profiles(
     claim_outputs(picture=plot)
     frame = read_frame(folder, summary.COLUMNS)
     if not len(frame):
-        raise InvalidProblem("nothing of the study is finished yet", str(folder), "run the study")
+        raise InvalidProblem("the study has no finished part yet", str(folder), "run the study")
     known = references(design_of_manifest(read_manifest(folder)))
     found = profiled(frame, tau=tau, work=work, out=known)
     if plot is not None:
@@ -309,22 +309,22 @@ def histories(
     ],
     methods: Methods = None,
     plugin: Plugins = None,
-    trials: Annotated[int, typer.Option(min=1, help="Trials, or epochs of a file, at most: the first ones.")] = 20,
+    trials: Annotated[int, typer.Option(min=1, help="Most trials, or epochs of a file, from the first on.")] = 20,
     case: Annotated[str | None, typer.Option(metavar="LABEL", help="Case of a study; the first by default.")] = None,
     noise: Annotated[
         str | None, typer.Option(metavar="LABEL", help="Noise level of a study; the first by default.")
     ] = None,
     tau: Annotated[
-        float, typer.Option(metavar="COST", help="Cost above the least known that counts as reached.")
+        float, typer.Option(metavar="COST", help="The minimum is reached at this cost above the least known.")
     ] = 1e-3,
-    out: Annotated[Path | None, typer.Option(metavar="OUT", help="Every point of every way: .csv or .parquet.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="OUT", help="Table of all points: .csv or .parquet.")] = None,
     plot: Annotated[Path | None, typer.Option(metavar="OUT", help="Picture: .png, .svg or .pdf.")] = None,
     as_json: Json = False,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Follow methods on their way down: the cost against evaluations of it and against iterations."""
+    """Record how methods descend: the cost against evaluations of the cost and against iterations."""
     from optloc.cli import claim_outputs, write_picture, write_table
     from optloc.lab.study.histories import histories as followed, reach, trials_of
     from optloc.problem import load_plugin
@@ -371,6 +371,7 @@ def _say(line: str) -> None:
 
 
 def _record(found: Any) -> dict[str, Any]:
+    """Return the progress of a study as a dictionary for JSON."""
     m = found.manifest
     return {
         "name": m.name,
@@ -395,7 +396,7 @@ def _record(found: Any) -> dict[str, Any]:
 
 @contextmanager
 def _bar(title: str, total: int, quiet: bool) -> Iterator[Any]:
-    """Yield a function that moves a bar with the counts of statuses; it is drawn on terminals only."""
+    """Yield a function that advances a progress bar and updates its counts of statuses; only terminals show the bar."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Screen(stderr=True)
@@ -413,12 +414,14 @@ def _bar(title: str, total: int, quiet: bool) -> Iterator[Any]:
 
 
 def _in_words(counts: Counter[str], most: int = 3) -> str:
+    """Return the most frequent statuses with their counts as text; the others are summed up."""
     first = [f"{status} {count}" for status, count in counts.most_common(most)]
     rest = counts.total() - sum(count for _, count in counts.most_common(most))
     return ", ".join([*first, *([f"other {rest}"] if rest else [])])
 
 
 def _show(found: Any, console: Console) -> None:
+    """Print the progress of a study: a table of statuses by method, and the reasons of failures."""
     m = found.manifest
     state = "complete" if found.complete else f"{found.done} of {found.chunks} chunks"
     line = f"{m.title or m.name}: {state}, {found.rows} of {m.rows} rows"
@@ -431,11 +434,12 @@ def _show(found: Any, console: Console) -> None:
         table.add_row(method, *(str(found.methods.get((method, name), 0)) for name in statuses))
     console.print(table)
     for (method, name), reason in found.failures.items():
-        line = f"{method}: {name} in {found.methods[method, name]} trials, such as: {reason}"
+        line = f"{method}: {name} in {found.methods[method, name]} trials, for example: {reason}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _show_comparison(found: list[Any], one: Path, two: Path, console: Console) -> None:
+    """Print a table for each case and noise level with both studies."""
     console.print(f"A = {one}, B = {two}", highlight=False, markup=False, soft_wrap=True)
     for case, same in groupby(found, lambda difference: difference.cell[:3]):
         scenario, sweep, noise = case
@@ -453,12 +457,13 @@ def _show_comparison(found: list[Any], one: Path, two: Path, console: Console) -
 
 
 def _show_pairs(found: list[Any], console: Console) -> None:
+    """Print a table for each case and noise level with the paired comparisons of methods."""
     for (case, noise), same in groupby(found, lambda one: (one.case, one.noise)):
         rows = list(same)
         title = f"{case}, {noise}: against {rows[0].against}"
         console.print(title, style="bold", highlight=False, markup=False, soft_wrap=True)
         table = Table("method")
-        for name in ("trials", "it alone right", "other alone", "p", "error less, m", "time over"):
+        for name in ("trials", "only it right", "only other right", "p", "error difference, m", "time ratio"):
             table.add_column(name, justify="right")
         for one in rows:
             cells = (f"{m.value:.2g} [{m.low:.2g}, {m.high:.2g}]" for m in (one.error, one.time))
@@ -468,6 +473,7 @@ def _show_pairs(found: list[Any], console: Console) -> None:
 
 
 def _profile_record(found: Any) -> dict[str, Any]:
+    """Return data and performance profiles as a dictionary for JSON."""
     from dataclasses import asdict
 
     from optloc.lab.study.profiles import RATIOS, shares
@@ -489,6 +495,7 @@ def _profile_record(found: Any) -> dict[str, Any]:
 
 
 def _show_profiles(found: Any, console: Console) -> None:
+    """Print the shares of trials that each method solves within multiples of the least work."""
     from optloc.lab.report.sheets import duration, number, percent, solved_within
     from optloc.lab.study.profiles import RATIOS, shares
 
@@ -504,6 +511,7 @@ def _show_profiles(found: Any, console: Console) -> None:
 
 
 def _show_histories(found: Any, reached: list[Any], tau: float, console: Console) -> None:
+    """Print for each method how many trials reach the minimum, and the quartiles of the work."""
     console.print(found.title, style="bold", highlight=False, markup=False, soft_wrap=True)
     table = Table("method")
     for name in ("trials", f"within {tau:g}", "evaluations", "iterations"):
@@ -517,7 +525,7 @@ def _show_histories(found: Any, reached: list[Any], tau: float, console: Console
 
 
 def _quartiles(values: tuple[float, ...] | None) -> str:
-    """Return the median with the quartiles; a dash where nobody counts."""
+    """Return the median with the quartiles in brackets; a dash if the method does not count."""
     if values is None:
         return "-"
     low, middle, high = ("∞" if isinf(value) else f"{value:g}" for value in values)

@@ -1,4 +1,4 @@
-"""Real measurements with true positions, read from a local folder; none of the data are part of optloc."""
+"""Real measurements with true positions, read from a local folder; optloc ships none of the data."""
 
 from optloc.lab.datasets.catalogue import NAMES, Dataset, available, load
 

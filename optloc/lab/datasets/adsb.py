@@ -1,12 +1,12 @@
-"""Messages of airliners, each heard by five of 27 receivers, as arrivals and a height. ECEF.
+"""Messages of airliners, each received by five of 27 receivers: arrival times and a height, in ECEF.
 
-Each message is an epoch with a free position and an unknown emission time; arrival times are counted from the first
-arrival of their message, so that metres keep their digits. The height is the aircraft's own, by GNSS.
+Each message is an epoch with a free position and an unknown emission time. Arrival times are counted from the first
+arrival of the message, so that metres keep their digits. The height is from the GNSS of the aircraft.
 
-Noise: arrivals 30 m, the robust residual spread that comes with the set (10 m of it is timing; the rest are station
-biases, refraction and errors of the truth), height 30 m (the quantum is 25 ft). Propagation is taken as in vacuum, or
-through air whose refractivity is 315 ppm at sea level with a scale height of 7.5 km, as a known correction of each
-arrival.
+Noise: arrivals 30 m, the robust residual spread that comes with the set. Timing is 10 m of it; the rest are station
+biases, refraction and errors of the truth. Heights have 30 m (their quantum is 25 ft). Propagation is as in vacuum, or
+through air, as a known correction of each arrival. The refractivity of air is 315 ppm at sea level, with a scale height
+of 7.5 km.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ REFRACTIVITY, SCALE_HEIGHT = 315e-6, 7500.0
 
 @dataclass(frozen=True, slots=True)
 class Messages:
-    """The problem and the true positions (k, 3), ECEF metres."""
+    """All messages as one problem, and the true positions (k, 3), ECEF metres."""
 
     problem: Problem
     truth: Array
 
     def horizontal(self, position: Array, messages: Array) -> Array:
-        """Return horizontal errors (n,) of the positions (n, 3) of some messages, metres."""
+        """Return the horizontal errors (n,) of positions (n, 3) of the messages with these indices (n,), metres."""
         there = self.truth[messages]
         local = np.einsum("kij,kj->ki", ECEF.enu_axes(there), position - there)
         return np.asarray(np.linalg.norm(local[:, :2], axis=1))
@@ -43,9 +43,10 @@ class Messages:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """Messages with stations of their own: places (n, s, 3), arrivals (n, s), known excess of each (n, s), metres.
+    """Messages as a batch: each message has its own stations, so every array has the message as its first axis.
 
-    `geodetic` is the true latitude, longitude (radians) and height of each aircraft, (n, 3).
+    `stations` (n, s, 3) are ECEF metres, `arrival` (n, s) metres, `excess` (n, s) the known excess of each path in
+    metres. `geodetic` (n, 3) is the true latitude, longitude (radians) and height (metres) of each aircraft.
     """
 
     stations: Array
@@ -59,7 +60,10 @@ class Heard:
         return ECEF.from_geodetic(*np.moveaxis(self.geodetic, -1, 0))
 
     def problem(self, given: str) -> Problem:
-        """Return the messages as a batch; `given` is how the height enters: "exactly", "row", or "nothing"."""
+        """Return the messages as a batch of problems.
+
+        `given` selects the use of the height: "exactly" (a constraint), "row" (a measurement) or "nothing".
+        """
         choose(given, ("exactly", "row", "nothing"), "given")
         each = np.arange(self.arrival.shape[1])
         rows = [measured("toa", self.arrival, a=each, sigma=ARRIVAL, correction=self.excess)]
@@ -69,16 +73,16 @@ class Heard:
         return assemble(station_array(self.stations[:, None]), *rows, frame=ECEF, constraints=known)
 
     def triplets(self) -> Heard:
-        """Return every three of the five stations, ten problems for each message in turn."""
+        """Return all choices of three of the five stations: ten problems for each message, ordered by message."""
         picked = np.array(list(combinations(range(self.arrival.shape[1]), 3)))
         stations, arrival, excess = (v[:, picked] for v in (self.stations, self.arrival, self.excess))
         geodetic = np.repeat(self.geodetic, len(picked), axis=0)
         return Heard(stations.reshape(-1, 3, 3), arrival.reshape(-1, 3), excess.reshape(-1, 3), geodetic)
 
     def unbiased(self) -> Heard:
-        """Return the messages less the median residual of each station at the truth."""
+        """Return the messages with the median residual of each station at the truth as a further known correction."""
         off = self.arrival - self.excess - np.linalg.norm(self.truth[:, None] - self.stations, axis=-1)
-        # less the emission time of each message, of which the median of its five residuals tells
+        # The median of the five residuals of a message estimates its emission time.
         off = off - np.median(off, axis=1, keepdims=True)
         _, station = np.unique(self.stations.reshape(-1, 3), axis=0, return_inverse=True)
         station = station.reshape(off.shape)
@@ -86,12 +90,12 @@ class Heard:
         return replace(self, excess=self.excess + bias[station])
 
     def take(self, index: Array) -> Heard:
-        """Return some messages."""
+        """Return the messages with these indices."""
         return Heard(self.stations[index], self.arrival[index], self.excess[index], self.geodetic[index])
 
 
 def dataset(folder: Path, *, refraction: bool = False) -> tuple[Problem, Array]:
-    """Return the messages as epochs with a row of height each, and the truth (k, 3)."""
+    """Return the problem of all messages, each an epoch with arrivals and a height, and the truth (k, 3), metres."""
     data = load(folder, refraction=refraction)
     return data.problem, data.truth
 
@@ -103,7 +107,7 @@ def load(folder: Path, *, refraction: bool = False) -> Messages:
     stations, rows, truth = (table(folder, name) for name in ("stations", "measurements", "truth"))
     messages = pd.MultiIndex.from_frame(truth[["set", "msg"]])
     epoch = messages.get_indexer(pd.MultiIndex.from_frame(rows[["set", "msg"]]))
-    # from the first arrival of each message: seconds of the day times c would leave metres their last digits only
+    # Count from the first arrival: seconds of the day times c would leave few digits for metres.
     first = rows.groupby(["set", "msg"])["toa_s"].transform("min")
     z = SPEED_OF_LIGHT * (rows["toa_s"] - first).to_numpy()
     place, there = places(stations), places(truth)
@@ -122,29 +126,29 @@ def load(folder: Path, *, refraction: bool = False) -> Messages:
 
 
 def heard(folder: Path, *, refraction: bool = False) -> Heard:
-    """Return all messages, each with the five stations that heard it."""
+    """Return all messages as a batch, each with the five stations that received it."""
     import pandas as pd
 
     stations, rows, truth = (table(folder, name) for name in ("stations", "measurements", "truth"))
     stations = stations.set_index("station")
     keys = pd.MultiIndex.from_frame(truth[["set", "msg"]])
     message = keys.get_indexer(pd.MultiIndex.from_frame(rows[["set", "msg"]]))
-    # five rows a message, in the order of the messages: the tables then fold to (n, 5)
+    # Sorted by message: five rows for each, so that the columns fold to (n, 5).
     rows = rows.iloc[np.argsort(message, kind="stable")]
     toa = rows["toa_s"].to_numpy().reshape(len(truth), -1)
-    own = stations.loc[rows["station"]]
-    place = places(own).reshape(*toa.shape, 3)
+    receivers = stations.loc[rows["station"]]
+    place = places(receivers).reshape(*toa.shape, 3)
     geodetic = np.column_stack([np.deg2rad(truth[["lat_deg", "lon_deg"]]), truth["h_geo_m"]])
     arrival = SPEED_OF_LIGHT * (toa - toa.min(-1, keepdims=True))
     made = Heard(place, arrival, np.zeros_like(arrival), geodetic)
     if not refraction:
         return made
     distance = np.linalg.norm(made.truth[:, None] - place, axis=-1)
-    return replace(made, excess=_refraction(own["h_m"].to_numpy().reshape(toa.shape), geodetic[:, 2:], distance))
+    return replace(made, excess=_refraction(receivers["h_m"].to_numpy().reshape(toa.shape), geodetic[:, 2:], distance))
 
 
 def _refraction(low: Array, high: Array, distance: Array) -> Array:
-    """Return by how much air lengthens paths between two heights, metres."""
-    # the mean of an exponential atmosphere along a straight path between the heights
+    """Return the excess of optical paths through air between two heights, metres."""
+    # Mean refractivity of an exponential atmosphere along a straight path between the heights.
     drop = np.exp(-low / SCALE_HEIGHT) - np.exp(-high / SCALE_HEIGHT)
     return np.asarray(REFRACTIVITY * SCALE_HEIGHT * drop / (high - low) * distance)

@@ -1,4 +1,4 @@
-"""The table of data sets, and the one door to all of them."""
+"""Table of the data sets that optloc reads, and the functions that load them."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from optloc.problem import Array, InvalidProblem, Problem, nearest
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """Real measurements as a problem, with what is known of the truth.
+    """Real measurements as a problem, with the truth.
 
     Parameters
     ----------
     name : str
         Name in `NAMES`.
     problem : Problem
-        In SI units; its epochs, or its batch, are the fixes to be made.
+        In SI units. Each epoch, or each problem of its batch, is to be fixed.
     truth : array (..., d)
         True position of each epoch, of each problem of the batch, or of each target, metres in the problem's frame.
     description : str
-        What was measured, where and how well.
+        Measurements, site and accuracy of the truth.
     source : str
-        Where the data come from.
+        Origin of the data.
     licence : str
-        Under which terms.
+        Licence of the data.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Dataset:
 
 @dataclass(frozen=True, slots=True)
 class DatasetEntry:
-    """A line of the table: the folder, what is said of it, and its files with their SHA-256."""
+    """Entry of the table: folder, description, source and licence of a set, and the SHA-256 of each of its files."""
 
     folder: str
     description: str
@@ -53,11 +53,11 @@ class DatasetEntry:
     sha256: Mapping[str, str]
 
     def reader(self, name: str) -> Callable[..., tuple[Problem, Array]]:
-        """Return the function that reads the set: `dataset` of the module of that name."""
+        """Return the function that reads the set: `dataset` of the module `name`."""
         return import_module(f"optloc.lab.datasets.{name}").dataset  # type: ignore[no-any-return]
 
 
-# SHA-256 of the files that the numbers of the documentation were made from.
+# SHA-256 of the files that produced the numbers of the documentation.
 _ENTRIES = {
     "uwb": DatasetEntry(
         "util_uwb_tdoa",
@@ -75,8 +75,8 @@ _ENTRIES = {
     ),
     "adsb": DatasetEntry(
         "locards_adsb",
-        "Arrival times of 763 messages of airliners, each heard by five of 27 receivers 9 to 322 km away, with the "
-        "aircraft's height. Truth: the aircraft's own report, tens of metres.",
+        "Arrival times of 763 messages of airliners, each received by five of 27 receivers 9 to 322 km away, with the "
+        "aircraft's height. Truth: the report of the aircraft, tens of metres.",
         "Schaefer, Strohmeier, Leonardi, Lenders: LocaRDS, Sensors 21(16), 2021 (Zenodo 4739276), by way of "
         "github.com/lschoe/mpyc, demos/data/mlat",
         "CC-BY-SA",
@@ -140,15 +140,15 @@ NAMES = tuple(_ENTRIES)
 
 
 def available(folder: str | Path | None = None) -> tuple[str, ...]:
-    """Return the names of the data sets whose files are there; none where no folder is set.
+    """Return the names of the data sets whose files exist; an empty tuple if no folder is set.
 
     Parameters
     ----------
     folder : str or Path, optional
-        Folder that holds one folder for each set; by default what the variable OPTLOC_DATA names.
+        Folder that contains one folder for each set; by default the value of the variable OPTLOC_DATA.
     """
     try:
-        # the files are looked for, not read: checking their sums is left to `load`
+        # Only the existence of the files is tested: `load` checks their sums.
         place = root(folder)
     except InvalidProblem:
         return ()
@@ -163,22 +163,22 @@ def load(name: str, *, folder: str | Path | None = None, verify: bool = True, **
     name : str
         One of `NAMES`.
     folder : str or Path, optional
-        Folder that holds one folder for each set; by default what the variable OPTLOC_DATA names.
+        Folder that contains one folder for each set; by default the value of the variable OPTLOC_DATA.
     verify : bool
-        Whether the files must be those that the numbers of the documentation were made from, by their SHA-256.
+        Whether to require, by SHA-256, the same files that produced the numbers of the documentation.
     **options
-        Which part of the set, and in what form; see the page of the data sets.
+        Part and form of the set; see the page of the data sets.
 
     Raises
     ------
     InvalidProblem
-        Where no folder is set, a file is missing or another one, or an option is unknown.
+        If no folder is set, a file is missing or has another SHA-256, or an option is unknown.
     """
     if name not in ENTRIES:
         raise InvalidProblem(f"there is no data set {name!r}", "datasets.load", nearest(name, NAMES))
     entry = ENTRIES[name]
     read = entry.reader(name)
-    known = list(signature(read).parameters)[1:]  # the first is the folder
+    known = list(signature(read).parameters)[1:]  # without the first, the folder
     for option in options:
         if option not in known:
             raise InvalidProblem(f"the data set {name!r} has no option {option!r}", "options", nearest(option, known))

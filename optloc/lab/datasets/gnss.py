@@ -1,8 +1,8 @@
-"""Pseudoranges of two fixed receivers, as epochs of many satellites or draws of three. ECEF.
+"""Pseudoranges of two fixed receivers, in ECEF: epochs of many satellites, or random draws of three.
 
-Satellites move, so every problem of a batch has stations of its own. Noise: 1 m a pseudorange in a draw of three, about
-the robust spread that comes with the set (0.4 to 2 m, mostly slow errors of each satellite); 1 m over the sine of the
-elevation where an epoch has all its satellites. Satellites below 10 deg are left out.
+Satellites move, so every problem of a batch has its own stations. A draw of three has noise of 1 m a pseudorange. This
+is about the robust spread that comes with the set (0.4 to 2 m, mostly slow errors of each satellite). In an epoch with
+all satellites the noise is 1 m over the sine of the elevation. Satellites below 10 deg are left out.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SIGMA = 1.0  # metres: between the robust spreads of 0.4 to 2 m that come with the set
-MASK = np.deg2rad(10.0)  # below it the troposphere and reflections outgrow the noise: the usual mask of surveyors
+MASK = np.deg2rad(10.0)  # below it, errors of troposphere and reflections exceed the noise: the usual mask of surveyors
 _XYZ = ("sat_x_m", "sat_y_m", "sat_z_m")
 
 
 @dataclass(frozen=True, slots=True)
 class Receptions:
-    """Problems of one session: satellites (n, s, 3), pseudoranges, sigmas and weights (n, s), their systems (s,).
+    """Problems of one session: satellites (n, s, 3), pseudoranges, sigmas and weights (n, s), all in metres.
 
-    `truth` is the receiver (3,), `geodetic` its latitude, longitude (radians) and height.
+    `systems` (s,) are the initials of the satellite systems. `truth` is the receiver (3,), ECEF metres. `geodetic` is
+    its latitude, longitude (radians) and height (metres).
     """
 
     satellites: Array
@@ -42,8 +43,8 @@ class Receptions:
     geodetic: tuple[float, float, float]
 
     def by_arrival(self, offset: tuple[str, ...]) -> Problem:
-        """Return the epochs as arrivals with an unknown clock, and an unknown offset of some systems against it."""
-        # the rows of a system are those of its satellites: one member of the bias each
+        """Return the epochs as arrivals with an unknown clock, and unknown clock offsets of the systems in `offset`."""
+        # A bias affects rows by their station: each satellite of a system refers to the offset of the system.
         touched = [i for i, system in enumerate(self.systems) if system in offset]
         member = np.array([offset.index(self.systems[i]) for i in touched])
         bias = Bias("system", offset, np.array(touched), member, np.ones(len(touched)))
@@ -59,7 +60,7 @@ class Receptions:
     def by_difference(self, *, masked: bool = False) -> Problem:
         """Return the draws as differences to their first satellite, with the true height known exactly.
 
-        `masked`: the receiver's elevation mask is known too.
+        `masked` adds the constraint that the satellites are above the elevation mask of the receiver.
         """
         known = height(exactly=self.geodetic[2])
         if masked:
@@ -75,7 +76,10 @@ class Receptions:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """All rows of one session above the mask, and its receiver (3,), ECEF metres, and geodetic in radians."""
+    """All rows of one session above the mask, the column of the pseudorange, and the position of the receiver.
+
+    `truth` (3,) is in ECEF metres, `geodetic` is latitude, longitude (radians) and height (metres).
+    """
 
     rows: pd.DataFrame
     column: str
@@ -90,16 +94,17 @@ class Session:
         k, s = np.searchsorted(times, rows["t_gps_s"]), np.searchsorted(names, rows["sat"])
         shape = (len(times), len(names))
         z, sigma, weight = np.zeros(shape), np.ones(shape), np.zeros(shape)
-        # a satellite that is not heard keeps the place of its first epoch, with weight zero: no row may be NaN
+        # An absent satellite has weight zero and the position of its first epoch, because no row may be NaN.
         place = np.empty((*shape, 3))
         place[:] = places(rows.groupby("sat")[list(_XYZ)].first().loc[names], _XYZ)
         z[k, s], weight[k, s], place[k, s] = rows[self.column], 1.0, places(rows, _XYZ)
-        # the path through the atmosphere, and with it what models leave of it, grows as 1 / sin of the elevation
+        # The path through the atmosphere, and with it the error of atmospheric models, grows as 1 / sin of the
+        # elevation.
         sigma[k, s] = SIGMA / np.sin(rows["el_rad"])
         return Receptions(place, z, sigma, weight, tuple(n[0] for n in names), self.truth, self.geodetic)
 
     def run(self, column: str | None = None) -> Problem:
-        """Return all epochs as one problem of a receiver that stays: arrivals at a clock of each epoch."""
+        """Return all epochs as one problem of a fixed receiver: arrivals, with an unknown clock in each epoch."""
         rows, column = self.rows, column or self.column
         (times, k), (names, s) = (np.unique(rows[c].to_numpy(), return_inverse=True) for c in ("t_gps_s", "sat"))
         place = np.zeros((len(times), len(names), 3))
@@ -112,13 +117,13 @@ class Session:
         )
 
     def three(self) -> Problem:
-        """Return the differences of three satellites that are heard all the time, with the true height known exactly.
+        """Return the differences of three satellites that are present in all epochs, with the exact height.
 
         Of all such GPS satellites these are the three with the best horizontal geometry at the first epoch.
         """
         times = np.unique(self.rows["t_gps_s"])
         rows = self.rows[self.rows["sat"].str.startswith("G")]
-        always = [str(name) for name, heard in rows.groupby("sat").size().items() if heard == len(times)]
+        always = [str(name) for name, count in rows.groupby("sat").size().items() if count == len(times)]
         wide = rows[rows["sat"].isin(always)].pivot_table([*_XYZ, self.column], "t_gps_s", "sat")
         place = np.stack([wide[column][always].to_numpy() for column in _XYZ], axis=-1)
         triples = np.array(list(combinations(range(len(always)), 3)))
@@ -142,7 +147,7 @@ class Session:
         )
 
     def draws(self, count: int, seed: int) -> Receptions:
-        """Return three random satellites of a random epoch, `count` times."""
+        """Return `count` random draws: a random epoch, and three random satellites of this epoch."""
         rng = np.random.default_rng(seed)
         members = list(self.rows.groupby("t_gps_s").indices.values())
         drawn = np.array([rng.choice(members[rng.integers(len(members))], 3, replace=False) for _ in range(count)])
@@ -152,12 +157,15 @@ class Session:
 
 
 def conditioning(satellites: Array, truth: Array, geodetic: tuple[float, float, float]) -> Array:
-    """Return the smallest singular value (n,) of the horizontal difference directions of satellites (n, s, 3)."""
+    """Return the smallest singular value (n,) of the horizontal parts of the differences of directions to satellites.
+
+    The satellites (n, s, 3) are in ECEF metres.
+    """
     lat, lon = geodetic[:2]
     up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
     line = satellites - truth
     line = line / np.linalg.norm(line, axis=-1, keepdims=True)
-    # the up component is known from the height: what is left is horizontal
+    # The height is known, so only the horizontal components matter.
     apart = line[:, 1:] - line[:, :1]
     return np.asarray(np.linalg.svd(apart - (apart @ up)[..., None] * up, compute_uv=False)[:, 1])
 
@@ -165,10 +173,10 @@ def conditioning(satellites: Array, truth: Array, geodetic: tuple[float, float, 
 def dataset(
     folder: Path, *, session: str = "K078", column: str = "prc_l1_m", form: str = "epochs", every: int = 1
 ) -> tuple[Problem, Array]:
-    """Return a session, and the receiver (3,).
+    """Return the problem of a session, and the true receiver (3,), ECEF metres.
 
-    `form` is "epochs", a batch of arrivals with the offsets of Galileo and QZSS; "run", all epochs of a receiver that
-    stays; or "three", differences of three satellites and the known height.
+    `form` is "epochs", a batch of arrivals with the offsets of Galileo and QZSS; "run", all epochs of a fixed receiver;
+    or "three", differences of three satellites and the known height.
     """
     choose(form, ("epochs", "run", "three"), "form")
     data = load(folder, session, column)
@@ -179,7 +187,7 @@ def dataset(
 
 
 def load(folder: Path, session: str, column: str) -> Session:
-    """Return one session by `column`, "prc_l1_m" or "prc_if_m"."""
+    """Return one session; `column` selects the pseudorange: "prc_l1_m" (L1) or "prc_if_m" (ionosphere-free)."""
     tables = [table(folder, name) for name in ("truth", "measurements")]
     choose(session, tables[0]["session"], "session")
     choose(column, ("prc_l1_m", "prc_if_m"), "column")

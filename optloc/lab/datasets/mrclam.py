@@ -1,8 +1,8 @@
-"""A robot that sees landmarks, in the plane: near-instant epochs, each with a free target.
+"""Azimuths and ranges from landmarks to a robot, in the plane. Each short epoch has a free target.
 
-The azimuth is from landmark to robot in world axes. Noise: 2 deg an azimuth (their robust
-spread is 0.5 deg; 1 in 100 is beyond 5 deg) and 0.1 m a range. Ranges alone get 0.15 m, the spread of their residuals:
-what they say apart depends on it, where they put the minima does not.
+The azimuth is from landmark to robot in world axes. Noise: 2 deg an azimuth (their robust spread is 0.5 deg; 1 in 100
+is beyond 5 deg) and 0.1 m a range. Ranges without azimuths have 0.15 m, the spread of their residuals. This number
+changes the statistics of the fixes, but not the positions of the minima.
 """
 
 from __future__ import annotations
@@ -15,15 +15,18 @@ import numpy as np
 from optloc.lab.datasets.reading import choose, places, table
 from optloc.problem import Array, Motion, Problem, assemble, measured
 
-# Radians and metres. Four times the robust spread of azimuths, for one in a hundred is beyond 5 degrees.
+# Radians and metres. Four times the robust spread of azimuths, because one in a hundred is beyond 5 degrees.
 SIGMA = {"azimuth": np.deg2rad(2.0), "range": 0.1}
-ALONE = {**SIGMA, "range": 0.15}  # the spread of the residuals of ranges that no azimuth corrects
+ALONE = {**SIGMA, "range": 0.15}  # metres: the spread of the residuals of ranges in fixes without azimuths
 COLUMN = {"azimuth": "az_rad", "range": "range_m"}
 
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
-    """One set: landmarks (s, 2), true positions (k, 2), and its rows: landmark, epoch, value by kind."""
+    """One set: landmarks (s, 2) and true positions (k, 2) in metres, and its rows.
+
+    Each row has a landmark `a`, an `epoch` and, by kind, a value `z` in radians or metres.
+    """
 
     landmarks: Array
     truth: Array
@@ -32,13 +35,13 @@ class Sightings:
     z: dict[str, Array]
 
     def every(self, n: int, first: int = 0) -> Sightings:
-        """Return every n-th epoch, from a first one on."""
+        """Return every n-th epoch, counted from the epoch `first`."""
         inside = self.epoch % n == first
         z = {kind: values[inside] for kind, values in self.z.items()}
         return Sightings(self.landmarks, self.truth[first::n], self.a[inside], self.epoch[inside] // n, z)
 
     def problem(self, kinds: tuple[str, ...], *, known: bool = False) -> Problem:
-        """Return the epochs by some kinds of rows as one problem; `known`: at places that are not asked for."""
+        """Return the epochs with rows of these kinds as one problem; with `known`, the true positions are given."""
         sigma = sigmas(kinds)
         rows = [measured(kind, self.z[kind], a=self.a, sigma=sigma[kind], epoch=self.epoch) for kind in kinds]
         motion = Motion(span="epoch", known=self.truth[:, None] if known else None)
@@ -53,7 +56,7 @@ def sigmas(kinds: tuple[str, ...]) -> dict[str, float]:
 def dataset(
     folder: Path, *, number: int = 1, kinds: tuple[str, ...] = ("azimuth", "range"), every: int = 1
 ) -> tuple[Problem, Array]:
-    """Return every n-th epoch of a set by some kinds of rows, and the truth (k, 2)."""
+    """Return every n-th epoch of a set with rows of these kinds, and the truth (k, 2), metres."""
     for kind in kinds:
         choose(kind, COLUMN, "kinds")
     data = load(folder, number).every(every)
@@ -61,14 +64,14 @@ def dataset(
 
 
 def load(folder: Path, number: int) -> Sightings:
-    """Return one set: 1, 2 or 5."""
+    """Return the set with this number: 1, 2 or 5."""
     import pandas as pd
 
     tables = [table(folder, name) for name in ("stations", "truth", "measurements")]
     choose(number, np.unique(tables[0]["set"]).tolist(), "number")
     stations, truth, rows = (found[found["set"] == number] for found in tables)
     epoch = pd.Index(truth["epoch"]).get_indexer(rows["epoch"])
-    order = np.argsort(epoch, kind="stable")  # stable: rows of one epoch stay as the file has them
+    order = np.argsort(epoch, kind="stable")  # stable: rows of one epoch keep the order of the file
     rows = rows.iloc[order]
     return Sightings(
         places(stations),

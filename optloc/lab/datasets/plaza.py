@@ -1,13 +1,15 @@
-"""Radio ranges of a mower, in the plane: windows, each one epoch of a free target.
+"""Radio ranges of a mower, in the plane, cut into windows. Each window is one epoch of a free target.
 
-Windows are 1.5 s long, centred at every 3 s from 2 s after the first range; the 155 that hear at least 3 beacons are
-kept. The motion within a window is taken out with the truth: what the true range at a row's time exceeds the true range
-at the window's centre is the row's known `correction`.
+Windows are 1.5 s long, and centred at every 3 s from 2 s after the first range. The 155 windows with ranges to at least
+3 beacons are kept. The true motion within a window is removed. The known `correction` of a row is the true range at the
+row's time minus the true range at the window's centre.
 
-Three forms: the ranges as they are ("raw"), less the mean residual of each beacon ("offset"), or with the affine fit
-of each beacon's residual undone ("affine"). Rows are independent; sigma is the rms of all
-residuals: 3.0 m raw (2.8 m of it a mean, as ranges are 7 % too long), 1.15 m less the means, 0.53 m after the fit.
-Where the scale is to be learnt, "scaled", the ranges are as they are, with the sigma that the scale leaves: 0.53 m.
+The ranges have four forms. Rows are independent, and their sigma is the rms of all residuals:
+
+- "raw": as measured; 3.0 m, of which 2.8 m are a mean, as ranges are 7 % too long;
+- "offset": less the mean residual of each beacon; 1.15 m;
+- "affine": corrected by an affine fit of the residuals of each beacon; 0.53 m;
+- "scaled": as measured, for estimates of the scale, with the sigma of "affine".
 """
 
 from __future__ import annotations
@@ -21,14 +23,14 @@ from optloc.problem import Array, Motion, Problem, assemble, measured
 
 # Metres: the rms of the residuals at the truth after each calibration, see above.
 SIGMA = {"raw": 3.0, "offset": 1.15, "affine": 0.53, "scaled": 0.53}
-# Seconds: windows do not overlap, and the first one lies within the data. At 1.7 m/s the mower moves by up to 2.5 m in
-# one, which the truth takes out.
+# Seconds: windows do not overlap, and the first window is within the data. At 1.7 m/s the mower moves by up to 2.5 m in
+# a window; the correction by the truth removes this motion.
 STEP, WIDTH, LEAD = 3.0, 1.5, 2.0
-LEAST = 3  # beacons in a window that fix a place in the plane; two leave its mirror image
+LEAST = 3  # beacons that determine a position in the plane; two leave a mirror image
 
 
 def dataset(folder: Path, *, form: str = "raw") -> tuple[Problem, Array]:
-    """Return the windows as epochs, and the truth (k, 2)."""
+    """Return the windows as epochs of one problem, and the truth (k, 2), metres."""
     data = load(folder, form)
     return data.problem, data.truth
 
@@ -64,12 +66,13 @@ def load(folder: Path, form: str) -> Windows:
 
 
 def _calibrate(form: str, z: Array, distance: Array, a: Array) -> Array:
+    """Return the ranges (n,) in metres, calibrated by the residuals of each beacon a (n,) at the truth."""
     if form in ("raw", "scaled"):
         return z
     out = np.empty_like(z)
     for beacon in np.unique(a):
-        own = a == beacon
-        excess = z[own] - distance[own]
-        scale, offset = np.polyfit(distance[own], excess, 1) if form == "affine" else (0.0, excess.mean())
-        out[own] = (z[own] - offset) / (1.0 + scale)
+        rows = a == beacon
+        excess = z[rows] - distance[rows]
+        scale, offset = np.polyfit(distance[rows], excess, 1) if form == "affine" else (0.0, excess.mean())
+        out[rows] = (z[rows] - offset) / (1.0 + scale)
     return out

@@ -1,9 +1,9 @@
-"""Bearings of markers from a moving, tracked camera: groups of six of one marker, or a whole run as one problem.
+"""Bearings of markers from a moving camera of known pose: groups of six bearings of a marker, or a run as one problem.
 
-Each bearing is an azimuth and an elevation in the camera's own axes; every group is a problem of its own, whose six
-stations are the camera's places and attitudes at those frames. Noise: 0.3 deg an angle (robust spread 0.2 deg).
+Each bearing is an azimuth and an elevation in the axes of the camera. Every group is a separate problem: its six
+stations are the poses of the camera at six frames. Noise: 0.3 deg an angle (robust spread 0.2 deg).
 
-A whole run is one problem too: one camera that moves, and markers that stay.
+A whole run is also one problem: one moving camera and fixed markers.
 """
 
 from __future__ import annotations
@@ -20,19 +20,21 @@ from optloc.problem import Array, Motion, Problem, assemble, measured, station_a
 if TYPE_CHECKING:
     import pandas as pd
 
-SIGMA = np.deg2rad(0.3)  # of an angle in a group: half as much again as its robust spread
-# As the camera turns the noise grows: bearings and poses are 0.09 s apart, by a fit of the residuals at the true places
-# to the rate.
+SIGMA = np.deg2rad(0.3)  # of an angle in a group: 1.5 times the robust spread
+# Radians and seconds. The noise grows with the turning rate, because bearings and poses are 0.09 s apart. The number is
+# a fit of the residuals at the true positions against the rate.
 STILL, LAG = np.deg2rad(0.2), 0.09
-SIZE = 6  # bearings in a group; markers that were seen less often are left out
+SIZE = 6  # bearings in a group; markers with fewer bearings are left out
 _QUATERNION = ["qx", "qy", "qz", "qw"]
 
 
 @dataclass(frozen=True, slots=True)
 class MarkGroups:
-    """Camera places (n, 6, 3) and axes (n, 6, 3, 3; rows are its axes in the room), angles (n, 6, 2), truth (n, 3).
+    """Groups of six bearings of one marker each, in SI units and radians.
 
-    `rate` (n, 6) is how fast the camera turns, radians a second.
+    `place` (n, 6, 3) and `axes` (n, 6, 3, 3) are the camera's positions and its axes in the room, one axis a row.
+    `angles` (n, 6, 2) are azimuths and elevations, `truth` (n, 3) the markers, `rate` (n, 6) the turning rate of the
+    camera in rad/s.
     """
 
     place: Array
@@ -44,7 +46,7 @@ class MarkGroups:
     def problem(self, *, turning: bool = False, known: bool = False) -> Problem:
         """Return the groups as a batch of problems.
 
-        `turning`: with noise that grows as the camera turns; `known`: of markers whose places are not asked for.
+        With `turning`, the noise grows with the turning rate; with `known`, the positions of the markers are given.
         """
         stations = replace(station_array(self.place[:, None]), axes=self.axes[:, None])
         sigma, each = _sigma(self.rate) if turning else SIGMA, np.arange(SIZE)
@@ -54,9 +56,9 @@ class MarkGroups:
         return assemble(stations, *rows, motions=(Motion(known=self.truth[:, None, None]) if known else Motion(),))
 
     def turned(self, turn: Array) -> MarkGroups:
-        """Return the groups with the camera's axes turned by a rotation vector (3,) of its mount, radians.
+        """Return the groups with the camera's axes turned by the rotation vector `turn` (3,) of its mount, radians.
 
-        The same rotation as optloc's boresight, made by another library: the unit quaternion along (1, turn / 2).
+        SciPy makes the same rotation as optloc's boresight: the unit quaternion along (1, turn / 2).
         """
         from scipy.spatial.transform import Rotation
 
@@ -66,29 +68,29 @@ class MarkGroups:
 
 @dataclass(frozen=True, slots=True)
 class CameraBearings:
-    """One run: all bearings of the markers that are left in, in the order of time, and the camera's poses by frame."""
+    """One run: the bearings of the markers in order of time, the poses of the camera by frame, the markers by tag."""
 
     poses: pd.DataFrame
     rows: pd.DataFrame
     markers: pd.DataFrame
 
     def half(self, number: int) -> CameraBearings:
-        """Return every other frame, from the first (0) or the second (1) on."""
+        """Return the even frames (`number` 0) or the odd frames (1)."""
         frames = np.unique(self.rows["frame"])[number::2]
         return replace(self, rows=self.rows[self.rows["frame"].isin(frames)])
 
     def often(self) -> CameraBearings:
-        """Return the markers that were seen at least six times."""
+        """Return the bearings of markers with at least six bearings."""
         counts = self.rows["tag"].value_counts()
         return replace(self, rows=self.rows[self.rows["tag"].isin(counts.index[counts >= SIZE])])
 
     @property
     def truth(self) -> Array:
-        """Return the places of the markers (t, 3), metres, in the order of `problem`."""
+        """Return the positions of the markers (t, 3), metres, in the order of `problem`."""
         return places(self.markers.loc[np.unique(self.rows["tag"])])
 
     def problem(self) -> Problem:
-        """Return the run as one problem: a camera that moves, markers that stay."""
+        """Return the run as one problem: a moving camera, and a fixed target for each marker."""
         frames, epoch = np.unique(self.rows["frame"].to_numpy(), return_inverse=True)
         tags, target = np.unique(self.rows["tag"].to_numpy(), return_inverse=True)
         poses = self.poses.loc[frames]
@@ -105,11 +107,11 @@ class CameraBearings:
         )
 
     def groups(self, count: int, seed: int) -> MarkGroups:
-        """Return groups of six random bearings of a marker."""
+        """Return `count` groups of six random bearings of a marker."""
         rng = np.random.default_rng(seed)
         counts = self.rows["tag"].value_counts().sort_index()
         counts = counts[counts >= SIZE]
-        # groups fall to markers as their bearings do, so that every bearing is as likely
+        # Markers are drawn in proportion to their bearings, so that all bearings have the same probability.
         tags = rng.choice(counts.index.to_numpy(), count, p=counts.to_numpy() / counts.sum())
         members = np.stack([rng.choice(np.flatnonzero(self.rows["tag"] == tag), SIZE, replace=False) for tag in tags])
         pose = self.poses.loc[self.rows["frame"].to_numpy()[members].ravel()]
@@ -133,10 +135,10 @@ def dataset(
     seed: int = 1,
     without: tuple[int, ...] = (),
 ) -> tuple[Problem, Array]:
-    """Return a run, and the truth of its markers, (n, 3).
+    """Return the problem of a run, and the true positions (n, 3), metres.
 
-    `form` is "groups", a batch of `count` groups of six bearings of one marker, or "run", the whole run with the
-    markers that were seen at least six times.
+    `form` is "groups", a batch of `count` groups of six bearings of one marker. Or it is "run", the whole run with the
+    markers that have at least six bearings.
     """
     choose(form, ("groups", "run"), "form")
     data = read_run(folder, run, attitude, without=without)
@@ -147,7 +149,7 @@ def dataset(
 
 
 def read_run(folder: Path, name: str, attitude: str, *, without: tuple[int, ...] = ()) -> CameraBearings:
-    """Return one run, with the attitude of the mount by design ("nom") or calibrated ("cal"), without some markers."""
+    """Return one run without some markers; `attitude` of the mount: by design ("nom") or calibrated ("cal")."""
     tables = [table(folder, file) for file in ("stations", "truth", "measurements")]
     choose(name, tables[0]["run"].unique(), "run")
     choose(attitude, ("nom", "cal"), "attitude")
@@ -158,27 +160,27 @@ def read_run(folder: Path, name: str, attitude: str, *, without: tuple[int, ...]
 
 
 def load(folder: Path, name: str, attitude: str, groups: int, seed: int) -> MarkGroups:
-    """Return groups of one run, with the attitude of the mount by design ("nom") or calibrated ("cal")."""
+    """Return groups of one run; `attitude` of the mount: by design ("nom") or calibrated ("cal")."""
     return read_run(folder, name, attitude).groups(groups, seed)
 
 
 def _sigma(rate: Array) -> Array:
-    """Return the standard deviation of angles while the camera turns, radians."""
+    """Return the standard deviation of angles at turning rates in rad/s, radians."""
     return np.hypot(STILL, LAG * rate)
 
 
 def _axes(poses: pd.DataFrame) -> Array:
-    """Return the axes (n, 3, 3) of the camera in the room, as rows."""
+    """Return the axes (n, 3, 3) of the camera in the room, one axis a row."""
     from scipy.spatial.transform import Rotation
 
     return np.swapaxes(Rotation.from_quat(poses[_QUATERNION].to_numpy()).as_matrix(), -1, -2)
 
 
 def _rate(poses: pd.DataFrame) -> Array:
-    """Return how fast the camera turns at each frame, radians a second: the faster of the steps before and after."""
+    """Return the turning rate of the camera at each frame, rad/s: the larger of the rates before and after it."""
     from scipy.spatial.transform import Rotation
 
-    # the first and the last frame have one step only
+    # the first and the last frame have one neighbour only
     attitude, times = Rotation.from_quat(poses[_QUATERNION].to_numpy()), poses["t_s"].to_numpy()
     step = (attitude[:-1].inv() * attitude[1:]).magnitude() / np.diff(times)
     return np.asarray(np.maximum(np.append(step, 0.0), np.insert(step, 0, 0.0)))

@@ -1,4 +1,4 @@
-"""Published studies, made again from their text: for each paper a line here, a module with a `STUDY`, and a page."""
+"""Published simulations, reproduced from their text: each paper has an entry, a module with a `STUDY`, and a page."""
 
 from __future__ import annotations
 
@@ -68,12 +68,9 @@ def paper(name: str) -> Paper:
 
 
 def reproduction(name: str, size: Size, seed: int) -> Reproduction:
-    """Return the reproduction of a paper, ready to run; only its own modules are loaded.
+    """Return the reproduction of a paper, ready to run; only the modules of the paper are loaded.
 
-    Raises
-    ------
-    InvalidProblem
-        For an unknown paper, or where matplotlib is missing.
+    Raise InvalidProblem for an unknown paper, or if matplotlib is missing.
     """
     study = import_module(f"optloc.lab.papers.{paper(name).module}").STUDY
     ready: Reproduction = study.reproduction(study.sizes[size], seed)

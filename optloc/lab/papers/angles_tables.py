@@ -1,4 +1,4 @@
-"""The paper `angles` made again: what is run, its tables and its figures, with printed value and bound beside each."""
+"""Simulations, tables and figures of the paper `angles`: each reproduced value with the printed value and the bound."""
 
 from __future__ import annotations
 
@@ -64,13 +64,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# What the paper prints in section 3.
+# Values printed in section 3 of the paper.
 
 PRINTED_STRAIGHT = (0.032, 0.0897, 0.176)
 """Simulation 1: root mean square errors of position (m), velocity (m/s) and acceleration (m/s^2)."""
 
 PRINTED_WINDING = (0.16, 0.267, 0.47)
-"""Simulation 2: the same."""
+"""Simulation 2: errors as in `PRINTED_STRAIGHT`."""
 
 
 # Filters in the three simulations: errors against time, bounds and lost tracks.
@@ -79,10 +79,11 @@ UPDATES = ("ekf", "iekf", "mgekf", "mvekf")
 """Names in `optloc.tracking.UPDATES`, in the order of the tables."""
 
 SETTLED = 20
-"""Seconds of simulation 3 that are not scored, two time constants of the model: it begins at the fix of one second."""
+"""Seconds of simulation 3 without a score, because it begins at the fix of a single epoch: two time constants of the
+model."""
 
 _CLOSE = (0.1, 0.2)
-"""Standard deviations of velocity and acceleration where the place of the start is varied; see `STRAIGHT_START`."""
+"""Standard deviations of velocity and acceleration for the starts at several positions; see `STRAIGHT_START`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +93,9 @@ class ErrorCurve:
     Parameters
     ----------
     label : str
-        What made them.
+        Name of the method.
     seconds : array (q,)
-        When.
+        Times.
     error : array (q, 3)
         Root mean square errors, or bounds, of position, velocity and acceleration.
     """
@@ -109,7 +110,7 @@ class ErrorCurve:
         return np.asarray(np.sqrt((self.error[inside] ** 2).mean(0)))
 
     def phases(self, scenario: AnglesScenario) -> list[float]:
-        """Return the root mean square position error of each phase; the first `SETTLED` seconds do not count."""
+        """Return the root mean square position error of each phase in metres, without the first `SETTLED` seconds."""
         first = (SETTLED, *scenario.phases[:-1])
         return [float(self.total(a, b)[0]) for a, b in zip(first, scenario.phases, strict=True)]
 
@@ -134,7 +135,7 @@ def bound_curve(label: str, scenario: AnglesScenario, start: State, dynamics: Dy
 
 def run_straight(drawn: AnglesDraw, tick: Tick) -> list[ErrorCurve]:
     """Return simulation 1: the filter with the right and the printed transition, three limits, and bounds."""
-    # a_max is not printed: 150, 10 and one and a half times the acceleration of the target.
+    # The paper prints no a_max: these are 150, 10 and one and a half times the acceleration of the target.
     start, out = start_at_truth(drawn, STRAIGHT_START, known=2), []
     for limit in (30.0, 2.0, 0.3):
         for name, make in (("filter", current_statistical), ("printed f33", printed_transition)):
@@ -148,7 +149,7 @@ def run_straight(drawn: AnglesDraw, tick: Tick) -> list[ErrorCurve]:
 
 def run_winding(drawn: AnglesDraw, tick: Tick) -> list[ErrorCurve]:
     """Return simulation 2: started at rest, and by a fit of the first three epochs."""
-    # a_max is not printed: with 30 m/s² and this start the printed errors come out within 15 %.
+    # The paper prints no a_max: 30 m/s² and this start reproduce the printed errors within 15 %.
     model = current_statistical(TIME_CONSTANT, 30.0)
     start = start_at_truth(drawn, WINDING_START, known=1)
     out = [
@@ -186,7 +187,7 @@ class TableReading:
     scenario : AnglesScenario
         One of `READINGS`.
     limit : float
-        Largest acceleration of the model.
+        Largest acceleration of the model, m/s^2.
     error, bound : list of float
         Metres, by phase.
     """
@@ -213,7 +214,7 @@ def run_readings(count: int, seed: int, key: int, tick: Tick) -> list[TableReadi
 
 
 def run_snapshot() -> ErrorCurve:
-    """Return the bound of every second of the repaired simulation 3 by itself, whose last two columns are NaN."""
+    """Return the bound of a separate fix at each second of the repaired simulation 3; the last two columns are NaN."""
     least = snapshot_bound(REPAIRED)
     error = np.full((len(least), 3), np.nan)
     error[:, 0] = least
@@ -227,7 +228,7 @@ The first is zero for a start by a fit of the first epochs."""
 
 
 def run_starts(drawn: AnglesDraw, tick: Tick) -> Lost:
-    """Return who is lost from starts on the line through the stations, and from a fit of three epochs."""
+    """Return the shares of tracks lost from starts near the line through the stations, and from a fit of 3 epochs."""
     out: Lost = {}
     fit = fit_start(drawn, 3)
     # Metres off the line through both stations, which are 50 and 100 m away.
@@ -240,8 +241,8 @@ def run_starts(drawn: AnglesDraw, tick: Tick) -> Lost:
 
 
 def run_clamps(drawn: AnglesDraw, tick: Tick) -> dict[str, float]:
-    """Return the share of lost tracks with the variance as published and clamped, from 3 m and with a_max 0.3."""
-    # 0.3 leaves 0.1 m/s² above the target's acceleration: from starts 0.2 m/s² wide estimates cross the limit.
+    """Return the share of lost tracks with the published and with the clamped variance, from 3 m and with a_max 0.3."""
+    # 0.3 is 0.1 m/s² above the target's acceleration: starts that are 0.2 m/s² wide cross the limit.
     start = scatter_starts(drawn, (3.0, *_CLOSE))
     models = {"as published": printed_variance, "clamped": current_statistical}
     found = {
@@ -267,11 +268,11 @@ def run_ends(drawn: AnglesDraw, tick: Tick) -> dict[str, Array]:
 # The tables.
 
 _PARTS = ("position, m", "velocity, m/s", "acceleration, m/s²")
-_FAR = 1e6  # metres: what is beyond is on its way to nowhere, and the mean is that of a few such tracks
+_FAR = 1e6  # metres: such tracks diverge, and a few of them would dominate the mean
 
 
 def short(value: float) -> str:
-    """Return a number with three significant digits, "lost" where it is not finite or beyond 1000 km."""
+    """Return a number with three significant digits; "lost" if it is not finite or beyond 1000 km."""
     if not np.isfinite(value) or value > _FAR:
         return "lost"
     if value == 0.0 or value >= 1e2:
@@ -337,7 +338,7 @@ def table_wholes(found: Sequence[tuple[str, Array]], bound: Array) -> TextTable:
 
 
 def table_rays(found: Sequence[SimulatedRays]) -> TextTable:
-    """Return bias and error of fixes of a target that stays."""
+    """Return bias and error of fixes of a fixed target."""
     names = ("plain", "weighted", "instrumental", "maximum likelihood")
     lines = [
         (f"{each.stations}", f"{1e3 * each.sigma:g} mrad", name, *_row((*values, each.bound)))
@@ -347,9 +348,9 @@ def table_rays(found: Sequence[SimulatedRays]) -> TextTable:
     return tabulate("rays", ("stations", "noise", "fix", "bias", "error", "bound"), lines)
 
 
-# Figures 1 to 7 of the paper as errors and bounds against time, and one of the starts that lose the track.
+# Figures 1 to 7 of the paper as errors and bounds against time, and a figure of the starts that lose the track.
 
-_EDGES = (1e-3, 1e8)  # of the axis of distances, metres: from far below the noise to where tracks run away
+_EDGES = (1e-3, 1e8)  # of the axis of distances, metres: from far below the noise to diverging tracks
 Style = tuple[str, str, str]
 """Label, colour and line style of a curve."""
 
@@ -360,7 +361,7 @@ def three_parts(curves: Mapping[Style, ErrorCurve], values: Sequence[float]) -> 
     Parameters
     ----------
     curves : mapping of (label, colour, line) to ErrorCurve
-        What is drawn.
+        The curves.
     values : sequence of three float
         Printed errors over the whole track.
     """
@@ -420,13 +421,7 @@ def figure_circles(found: Mapping[float, Sequence[ErrorCurve]], snapshot: ErrorC
 
 
 def figure_starts(ends: Mapping[str, Array]) -> Figure:
-    """Return the share of tracks that end nearer to the truth than a distance.
-
-    Parameters
-    ----------
-    ends : mapping of str to array (trials,)
-        Distances at the end, by label.
-    """
+    """Return the share of tracks that end nearer to the truth than each distance; `ends` (trials,) are in metres."""
     figure = canvas(7.0, 4.4)
     ax = figure.subplots()
     looks = ((Ink.RED, "-", 1.5), (Ink.BLUE, "-", 4.0), (Ink.GREEN, "--", 1.5))
@@ -442,14 +437,14 @@ def figure_starts(ends: Mapping[str, Array]) -> Figure:
     return figure
 
 
-# Everything that the paper shows, in a quick and in a full size.
+# All results of the paper, in a quick and in a full size.
 
 _TICKS = 31  # calls of `tick` below
 
 
 @dataclass(frozen=True, slots=True)
 class AnglesSample:
-    """How much is drawn.
+    """Numbers of trials.
 
     Parameters
     ----------
@@ -469,11 +464,12 @@ class AnglesSample:
     readings: int
 
 
-# Quick: a minute or two. Full: as many trials as the counts of lost tracks need to be known to a per cent.
+# Quick: a minute or two. Full: the shares of lost tracks are accurate to a per cent.
 _SIZES: dict[Size, AnglesSample] = {"quick": AnglesSample(200, 200, 60, 10), "full": AnglesSample(1000, 1000, 400, 100)}
 
 
 def _run(sample: AnglesSample, seed: int, tick: Tick) -> Report:
+    """Run all simulations of the paper, and return the report."""
     one = draw(STRAIGHT, sample.trials, seed, 0)
     straight = run_straight(one, tick)
     wholes = run_wholes(one, tick)

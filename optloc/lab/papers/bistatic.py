@@ -1,6 +1,7 @@
 """Slow targets by one receiver and one illuminator of opportunity: excess path, azimuth and elevation.
 
-The recursion of the paper, its cures, and fixes without a guess run on the same data; the page is ``bistatic.md``.
+The recursion of the paper, its corrections, and fixes without a guess run on the same data; the page is
+``bistatic.md``.
 """
 
 from __future__ import annotations
@@ -35,16 +36,16 @@ from optloc.tracking import Track, first_fix, followed, lines, polynomial, simpl
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# The scene, printed where nothing else is said: receiver at the origin, illuminator on the x axis, a target 81 km away.
+# The scene: receiver at the origin, illuminator on the x axis, a target 81 km away. Values are printed unless noted.
 
 BASELINE = 150e3
 """Distance of the illuminator, metres."""
 
 RANGE, AZIMUTH, ELEVATION = 81.2e3, 1.446, 0.123
-"""Place of the target at t = 0: metres and radians."""
+"""Position of the target at t = 0: metres and radians."""
 
 COURSE = np.array([4.0, 10.0, 6.0])
-"""Velocity of the slow target, metres per second; signs as printed, so that its range grows by 11 m/s."""
+"""Velocity of the slow target, m/s; signs as printed, so that its range grows by 11 m/s."""
 
 PATH = 20e-9 * SPEED_OF_LIGHT
 """Standard deviation of the excess path, metres: 20 ns."""
@@ -53,11 +54,12 @@ ANGLE = float(np.radians(1.0))
 """Standard deviation of both angles, radians."""
 
 EPOCHS = 200
-"""Epochs, one a second; not printed. The lag of the recursion then exceeds its noise, as the paper says it does."""
+"""Number of epochs, one a second; not printed. With 200 the lag of the recursion exceeds its noise, as the paper
+states."""
 
 
 def place(distance: float = RANGE, azimuth: float = AZIMUTH, elevation: float = ELEVATION) -> Array:
-    """Return a position (3,) in metres."""
+    """Return a position (3,) in metres from a distance in metres and angles in radians."""
     ahead = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
     return distance * np.array(ahead)
 
@@ -65,16 +67,8 @@ def place(distance: float = RANGE, azimuth: float = AZIMUTH, elevation: float = 
 def problem(epochs: int, *, order: int = 0, path: float = PATH, reference: float | None = None) -> Problem:
     """Return the estimation problem of the first epochs, without measurements.
 
-    Parameters
-    ----------
-    epochs : int
-        Number of epochs.
-    order : 0 or 1
-        A target that stays, or one that moves uniformly.
-    path : float
-        Standard deviation of the excess path, metres.
-    reference : float, optional
-        Second at which the state holds; 0 by default.
+    `order` is 0 for a fixed target and 1 for uniform motion. `path` is the standard deviation of the excess path in
+    metres. The state holds at the second `reference`, 0 by default.
     """
     epoch = np.arange(epochs)
     return assemble(
@@ -89,7 +83,7 @@ def problem(epochs: int, *, order: int = 0, path: float = PATH, reference: float
 def draw(
     epochs: int, trials: int, sequence: np.random.SeedSequence, *, slow: bool = False, path: float = PATH
 ) -> Problem:
-    """Return measured runs (trials,) of the target that stays, or of the slow one."""
+    """Return measured runs (trials,) of the fixed target, or of the slow one."""
     start = np.concatenate([place(), COURSE]) if slow else place()
     return simulate(problem(epochs, order=int(slow), path=path), start, sequence, trials)
 
@@ -103,13 +97,13 @@ _ONE = problem(1)
 
 
 def polar(position: Array) -> Array:
-    """Return range, azimuth and elevation (..., 3) of positions (..., 3)."""
+    """Return range, azimuth and elevation (..., 3) of positions (..., 3), metres and radians."""
     angles = predict(_ONE, position)[..., 1:]
     return np.concatenate([np.linalg.norm(position, axis=-1)[..., None], angles], axis=-1)
 
 
 SPEED = 50.0
-"""Prior standard deviation of each coordinate of the velocity for the Kalman filters, m/s: the target makes 12."""
+"""Prior standard deviation of each coordinate of the velocity for the Kalman filters, m/s; the target has 12."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +135,7 @@ class Errors:
 
 
 def _errors(position: Array, slow: bool, epochs: Array) -> Errors:
+    """Return the errors of positions (trials, q, 3) after numbers of epochs (q,)."""
     exact = polar(truth(int(epochs.max()), slow=slow)[epochs - 1])
     error = polar(position) - exact
     # Azimuths are compared on the circle.
@@ -154,14 +149,14 @@ def of_track(track: Track, epochs: int, *, slow: bool) -> Errors:
 
 
 def kalman(drawn: Problem, update: str) -> Track:
-    """Return the track of a Cartesian Kalman filter with constant velocity, begun from the first epoch."""
+    """Return the track of a Cartesian Kalman filter with constant velocity, started from the first epoch."""
     dynamics = polynomial(1)
     start = state_of(drawn, first_fix(drawn, dynamics, 1, speed=SPEED), 1)
     return followed(drawn, start, dynamics, update)
 
 
 def run_still(epochs: int, trials: int, sequence: np.random.SeedSequence) -> dict[str, Errors]:
-    """Return the errors for a target that stays: of the corrected recursion, and of the closed-form fix."""
+    """Return the errors for a fixed target: of the corrected recursion, and of the closed-form fix."""
     drawn = draw(epochs, trials, sequence)
     return {
         "simplified": of_track(simplified(drawn), epochs, slow=False),
@@ -171,8 +166,8 @@ def run_still(epochs: int, trials: int, sequence: np.random.SeedSequence) -> dic
 
 Tracker = Callable[[Problem], Track]
 
-# The period of the restarts is not printed: here from little lag to little noise. A floor of 0.05 is the gain of a mean
-# of twenty epochs.
+# The paper prints no period of the restarts: these span little lag to little noise. A floor of 0.05 is the gain of a
+# mean of twenty epochs.
 TRACKERS: Mapping[str, Tracker] = {
     "single fix": lambda drawn: lines(drawn, 0, window=1),
     "simplified, no restart": simplified,
@@ -186,7 +181,7 @@ TRACKERS: Mapping[str, Tracker] = {
     "Cartesian IEKF": lambda drawn: kalman(drawn, "iekf"),
     "line fit": lines,
 }
-"""Every tracker of the slow target, by the name that tables give it."""
+"""All trackers of the slow target, by their names in tables."""
 
 
 def run_slow(epochs: int, trials: int, sequence: np.random.SeedSequence, tick: Tick) -> dict[str, Errors]:
@@ -202,23 +197,23 @@ def run_slow(epochs: int, trials: int, sequence: np.random.SeedSequence, tick: T
 def run_batches(
     epochs: int, trials: int, sequence: np.random.SeedSequence, *, path: float = PATH, whole: int | None = None
 ) -> dict[str, Errors]:
-    """Return the errors after a number of epochs: of the pseudo-linear course, and of the batch fit started by it.
+    """Return the errors after a number of epochs of the pseudo-linear course, and of the batch fit that starts from it.
 
     Parameters
     ----------
     epochs : int
-        Epochs that are used.
+        Number of epochs used.
     trials : int
         Independent draws.
     sequence : SeedSequence
-        Decides the draw.
+        Seed of the draws.
     path : float
         Standard deviation of the excess path, metres.
     whole : int, optional
-        Epochs that are drawn, so that shorter records are the beginnings of the same ones.
+        Number of epochs drawn, so that shorter records are the first parts of longer ones.
     """
     drawn = draw(epochs if whole is None else whole, trials, sequence, slow=True, path=path)
-    # The state at the last epoch, where trackers are judged as well.
+    # The state at the last epoch, at which trackers are also scored.
     run = replace(cut(drawn, 0, epochs), motions=(Motion(1, reference=float(epochs - 1)),))
     course = course_starts(run)
     assert course is not None
@@ -231,25 +226,25 @@ def run_batches(
 
 
 def _spread(cov: Array, at: Array) -> Array:
-    """Return standard deviations (..., 3) of range, azimuth and elevation of covariances (..., 3, 3) at positions."""
+    """Return standard deviations (..., 3) of range, azimuth and elevation from covariances (..., 3, 3) at positions."""
     r = np.linalg.norm(at, axis=-1)
     flat = np.hypot(at[..., 0], at[..., 1])
     u = at / r[..., None]
     east = np.stack([-at[..., 1], at[..., 0], 0.0 * flat], axis=-1) / flat[..., None]
     axes = np.stack([u, east, np.cross(u, east)], axis=-2)
     size = np.sqrt(np.einsum("...ai,...ij,...aj->...a", axes, cov, axes))
-    # Metres across are radians of elevation by the range, and of azimuth by its horizontal part.
+    # An error across is divided by the range for the elevation, and by its horizontal part for the azimuth.
     return np.asarray(size / np.stack([np.ones_like(r), flat, r], axis=-1))
 
 
 def bound_still(epochs: Array) -> Array:
-    """Return the bound (q, 3) of range, azimuth and elevation of a target that stays, after numbers of epochs."""
+    """Return the bound (q, 3) of range, azimuth and elevation of a fixed target, after numbers of epochs (q,)."""
     course = crlb_course(problem(int(epochs.max())), place(), epochs)
     return _spread(course.covariance, place())
 
 
 def bound_moving(epochs: Array, path: float = PATH) -> Array:
-    """Return the same (q, 3) of the slow target's present place, with constant velocity."""
+    """Return the bound (q, 3) of range, azimuth and elevation of the slow target, after numbers of epochs (q,)."""
     course = crlb_course(problem(int(epochs.max()), order=1, path=path), np.concatenate([place(), COURSE]), epochs)
     since = (epochs - 1.0)[:, None, None]
     ahead = np.concatenate([np.broadcast_to(np.eye(3), (len(epochs), 3, 3)), since * np.eye(3)], axis=-1)
@@ -270,15 +265,15 @@ def printed_angles(epochs: int, trials: int, sequence: np.random.SeedSequence) -
     """
     noise = ANGLE * np.random.default_rng(sequence).standard_normal((trials, epochs))
     out = noise.copy()
-    # The factor is 1 + 1/i instead of 1 - 1/i: what is there grows, and more is added.
+    # The factor is 1 + 1/i instead of 1 - 1/i, so the old error grows, and a new error is added.
     for i in range(2, epochs + 1):
         out[:, i - 1] = out[:, i - 2] - (noise[:, i - 1] - out[:, i - 2]) / i
     return out
 
 
-# What a ground below the target, or its known height, adds to the fix of one epoch.
+# Effect of a ground below the target, or of its known height, on the fix of one epoch.
 
-# High; so near to the ground that a fix may fall below it; and in a direction where the path says little of the range.
+# High; so near to the ground that a fix may be below it; and in a direction where the path hardly constrains the range.
 CASES = {
     "target of the paper, 10 km high": (1.446, 0.123),
     "the same, 0.2 km high": (1.446, float(np.arcsin(200.0 / RANGE))),
@@ -288,22 +283,15 @@ CASES = {
 
 
 def fix_grounded(azimuth: float, elevation: float, trials: int, sequence: np.random.SeedSequence) -> dict[str, Array]:
-    """Return root mean square errors (range, height, in space) of fixes of one epoch, metres, by what is known.
+    """Return root mean square errors (range, height, in space) of fixes of one epoch, metres, by the known constraint.
 
-    Parameters
-    ----------
-    azimuth, elevation : float
-        Direction of the target, radians.
-    trials : int
-        Independent draws.
-    sequence : SeedSequence
-        Decides the draw.
+    `azimuth` and `elevation` are the direction of the target in radians; `sequence` is the seed of the draws.
     """
     at = place(azimuth=azimuth, elevation=elevation)
     drawn = simulate(problem(1), at, sequence, trials)
     open_ = np.full(3, np.inf)
     floor, level = np.array([-np.inf, -np.inf, 0.0]), np.array([np.inf, np.inf, at[2]])
-    # A known height is a slab without thickness; the ground is one without a ceiling.
+    # A known height is a slab without thickness; the ground is one without an upper face.
     regions = {
         "free": (),
         "above ground": box(floor.tolist(), open_.tolist()),
@@ -318,31 +306,24 @@ def fix_grounded(azimuth: float, elevation: float, trials: int, sequence: np.ran
     return out
 
 
-# The tables: what is claimed, what the recursion does, what the cures do, and the bounds.
+# Tables of the claims, the recursion, the corrections and the bounds.
 
 CLAIMS = (("range", 0, 1e3, "< 1 km"), ("azimuth", 1, 0.005, "< 0.005 rad"), ("elevation", 2, 0.008, "< 0.008 rad"))
-"""What the text claims of the errors after 10 epochs."""
+"""Claims of the text on the errors after 10 epochs."""
 
 
 def kilometres(value: float) -> str:
-    """Return metres as kilometres with three digits."""
+    """Return metres as kilometres with three decimals."""
     return f"{value / 1e3:.3f}"
 
 
 def _cells(errors: Array) -> tuple[str, str, str]:
+    """Return errors of range, azimuth and elevation (3,) as text."""
     return kilometres(errors[0]), f"{errors[1]:.5f}", f"{errors[2]:.5f}"
 
 
 def table_still(found: Mapping[str, Errors], bounds: Mapping[int, Array]) -> TextTable:
-    """Return root mean square errors of a target that stays.
-
-    Parameters
-    ----------
-    found : mapping of str to Errors
-        By estimator.
-    bounds : mapping of int to array (3,)
-        Bound by number of epochs.
-    """
+    """Return root mean square errors of a fixed target; `found` is by estimator, `bounds` (3,) by number of epochs."""
     lines = []
     for count, bound in bounds.items():
         lines += [(str(count), name, *_cells(errors.rms(count))) for name, errors in found.items()]
@@ -354,10 +335,10 @@ def table_claims(found: Mapping[str, Errors]) -> TextTable:
     """Return the share of runs in which the paper's claims for 10 epochs hold."""
     lines = []
     for name, column, limit, claim in CLAIMS:
-        held = [np.abs(errors.error[:, errors.epochs == 10, column]) < limit for errors in found.values()]
+        within = [np.abs(errors.error[:, errors.epochs == 10, column]) < limit for errors in found.values()]
         spread = [errors.rms(10)[column] for errors in found.values()]
         unit = "{:.0f} m" if column == 0 else "{:.4f} rad"
-        lines.append((name, claim, *(percent(each.mean()) for each in held), *map(unit.format, spread)))
+        lines.append((name, claim, *(percent(each.mean()) for each in within), *map(unit.format, spread)))
     header = ("error", "printed", *(f"{name}, share" for name in found), *(f"{name}, rms" for name in found))
     return tabulate("claims", header, lines)
 
@@ -367,14 +348,7 @@ def table_slow(
 ) -> TextTable:
     """Return root mean square errors of the slow target.
 
-    Parameters
-    ----------
-    tracks : mapping of str to Errors
-        By tracker.
-    fits : mapping of int to mapping of str to Errors
-        Fits of whole records, by number of epochs.
-    bounds : mapping of int to array (3,)
-        Bound by number of epochs; those of `fits`.
+    `tracks` is by tracker. `fits` are fits of whole records, by number of epochs; `bounds` (3,) has the same numbers.
     """
     early, late = sorted(fits)
     lines = [
@@ -412,7 +386,7 @@ def table_directions() -> TextTable:
 
 
 def table_ground(trials: int, sequence: np.random.SeedSequence, tick: Tick) -> TextTable:
-    """Return what a ground or a known height is worth in all `CASES`."""
+    """Return the effect of a ground or a known height in all `CASES`."""
     lines = []
     for (name, direction), child in zip(CASES.items(), sequence.spawn(len(CASES)), strict=True):
         found = fix_grounded(*direction, trials, child)
@@ -432,7 +406,7 @@ def table_printed(azimuth: Array) -> TextTable:
 
 # The figures: errors against time, and one run.
 
-# Dashes over a full line: two estimators that agree are both seen.
+# Dashes over a full line show two estimators that agree.
 _STYLE = {
     "single fix": (Ink.GREY, "-"),
     "simplified": (Ink.RED, "-"),
@@ -443,7 +417,7 @@ _STYLE = {
     "Cartesian EKF": (Ink.ORANGE, "-"),
     "line fit": (Ink.BLUE, "-"),
 }
-_AXES = {"range, km": 1e-3, "azimuth, rad": 1.0, "elevation, rad": 1.0}  # panels, and what they multiply SI units by
+_AXES = {"range, km": 1e-3, "azimuth, rad": 1.0, "elevation, rad": 1.0}  # panels, and their factors on SI units
 _SHOWN = ("single fix", "simplified, no restart", "restart every 50", "gain floor 0.05", "Cartesian EKF", "line fit")
 _RUN = ("single fix", "simplified, no restart", "restart every 50", "line fit")
 
@@ -458,7 +432,7 @@ def against_time(found: Mapping[str, Errors], bound: tuple[Array, Array], points
     bound : tuple of array (q,) and array (q, 3)
         Numbers of epochs and the bound.
     points : mapping of str to Errors
-        Estimates after one number of epochs each.
+        Estimates, each after one number of epochs.
     """
     figure = canvas(15.0, 4.6)
     for i, (ax, (name, unit)) in enumerate(zip(figure.subplots(1, 3), _AXES.items(), strict=True)):
@@ -491,8 +465,9 @@ def one_run(found: Mapping[str, Errors]) -> Figure:
 def _figures(
     stays: Mapping[str, Errors], tracks: Mapping[str, Errors], fits: Mapping[int, Mapping[str, Errors]]
 ) -> dict[str, Figure]:
+    """Return the figures of the fixed target, of the slow one and of one run, by file name."""
     counts = np.unique(np.geomspace(1, max(fits), 40).astype(int))
-    # Two epochs determine a course, but so badly that its bound is off the scale.
+    # Two epochs determine a course, but its bound is beyond the axis.
     later = counts[counts >= 5]
     batch = "batch maximum likelihood"
     ends = np.concatenate([fits[k][batch].error for k in sorted(fits)], axis=1)
@@ -504,21 +479,21 @@ def _figures(
     }
 
 
-# Everything that the paper shows, in a quick and in a full size.
+# All results of the paper, in a quick and in a full size.
 
-_COUNTS = (1, 10, 50, 200)  # of epochs: the start, what the paper claims, and its restarts
+_COUNTS = (1, 10, 50, 200)  # of epochs: the start, the claim of the paper, and its restarts
 _EARLY = 50  # epochs after which the lag of the recursion is about its noise
-_AZIMUTHS = (0.05, 0.2, 0.5, 1.0, 1.446, 2.0, 2.6, 3.1)  # from the illuminator to its opposite, the target among them
+_AZIMUTHS = (0.05, 0.2, 0.5, 1.0, 1.446, 2.0, 2.6, 3.1)  # from the illuminator to its opposite, with the target
 
 
 @dataclass(frozen=True, slots=True)
 class BistaticSample:
-    """How much is drawn.
+    """Numbers of trials.
 
     Parameters
     ----------
     still, slow : int
-        Trials of the target that stays, and of the slow one.
+        Trials of the fixed target, and of the slow one.
     ground : int
         Trials of each case with a ground.
     epochs : int
@@ -531,11 +506,13 @@ class BistaticSample:
     epochs: int = EPOCHS
 
 
-# Quick: half a minute; the slow target is dear, for its record is solved as a whole. Full: errors within two per cent.
+# Quick: half a minute, mostly for the whole records of the slow target. Full: errors within two per cent.
 _SIZES: dict[Size, BistaticSample] = {"quick": BistaticSample(1000, 150, 200), "full": BistaticSample(2000, 1000, 2000)}
 
 
 def _run(sample: BistaticSample, seed: int, tick: Tick) -> Report:
+    """Run all simulations of the paper, and return the report."""
+
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))
 

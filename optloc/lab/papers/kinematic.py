@@ -1,7 +1,6 @@
-"""Targets that stand, fly on or accelerate, by range differences: filters on the scene of the paper, and errors.
+"""Static, uniform and accelerated targets by range differences: scene, filters and errors of a paper.
 
-The tables and figures that are made of them are those of `optloc.lab.papers.kinematic_tables`, the page is
-``kinematic.md``.
+`optloc.lab.papers.kinematic_tables` makes the tables and figures; the page is ``kinematic.md``.
 """
 
 from __future__ import annotations
@@ -38,14 +37,14 @@ from optloc.tracking import (
     whitened,
 )
 
-# The scene of the paper: three targets, four stations, twenty updates behind one fix.
+# The scene of the paper: three targets, four stations, twenty updates after one fix.
 
 ORDERS = {"static": 0, "CV": 1, "CA": 2}
-"""Models of motion, and how targets move, by name."""
+"""Orders of the models of motion, and of the motions of targets, by name."""
 
 
 def _star(radius: float) -> Array:
-    """Return the reference station at the origin and three around it, at 90, 210 and 330 degrees."""
+    """Return the reference station at the origin and three around it, at 90, 210 and 330 degrees; metres."""
     angle = np.radians([90.0, 210.0, 330.0])
     return np.vstack([np.zeros(2), radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
 
@@ -54,8 +53,8 @@ def _star(radius: float) -> Array:
 class KinematicScenario:
     """Stations and targets in the plane; the first station is the reference.
 
-    The paper gives targets, speeds, accelerations and the number of steps; the rest was chosen, see the text of the
-    reproduction.
+    The paper gives targets, speeds, accelerations and the number of steps. The other values are chosen here; the page
+    gives the reasons.
 
     Parameters
     ----------
@@ -68,7 +67,7 @@ class KinematicScenario:
     interval : float
         Seconds between epochs.
     steps : int
-        Updates behind the first fix.
+        Number of updates after the first fix.
     speed, rate : float
         Prior standard deviation of each coordinate of velocity and acceleration, SI units.
     """
@@ -91,14 +90,9 @@ class KinematicScenario:
         return self.interval * np.arange(self.steps + 1)
 
     def course(self, order: int, since: float = 0.0) -> Array:
-        """Return the states [p, v, a] (t, k, 6) of targets that stand (0), fly on (1) or accelerate (2).
+        """Return the true states [p, v, a] (t, k, 6) of static (0), uniform (1) or accelerated (2) targets.
 
-        Parameters
-        ----------
-        order : 0, 1 or 2
-            Which derivatives are not zero.
-        since : float
-            Time at which an acceleration begins, seconds.
+        An acceleration begins at `since` seconds.
         """
         t = self.times[:, None]
         late = np.maximum(t - since, 0.0)  # seconds of acceleration
@@ -108,7 +102,7 @@ class KinematicScenario:
         return np.concatenate([place, v + a * late, a * (t >= since)], axis=-1)
 
     def problem(self) -> Problem:
-        """Return a run of one target without measurements; a state is free at each epoch."""
+        """Return a run of one target without measurements; every epoch has a free position."""
         k, others = self.steps + 1, len(self.stations) - 1
         a, epoch = np.tile(np.arange(1, others + 1), k), np.repeat(np.arange(k), others)
         rows = measured("tdoa", a=a, b=0, epoch=epoch, sigma=self.sigma)
@@ -128,7 +122,7 @@ class KinematicDraw:
     runs : Problem
         Batch (n, t) of runs of one target.
     fix : State
-        Positions (n, t) that the first epoch gives.
+        Positions (n, t) from the first epoch.
     """
 
     scenario: KinematicScenario
@@ -138,48 +132,40 @@ class KinematicDraw:
 
     @property
     def position(self) -> Array:
-        """Return the true positions (t, k - 1, 2) behind the first epoch, metres."""
+        """Return the true positions (t, k - 1, 2) after the first epoch, metres."""
         return self.truth[:, 1:, :2]
 
 
 def draw(scenario: KinematicScenario, truth: Array, trials: int, key: tuple[int, ...]) -> KinematicDraw:
     """Return measurements of targets, and the fix of the first epoch, without a guess.
 
-    Parameters
-    ----------
-    scenario : KinematicScenario
-        The scene.
-    truth : array (t, k, 6)
-        See `KinematicScenario.course`.
-    trials : int
-        Independent trials n.
-    key : tuple of int
-        Decides the draw.
+    `truth` (t, k, 6) is from `KinematicScenario.course`, `trials` is the number n of independent trials, `key` the
+    seed.
     """
     places = truth[..., :2].reshape(len(truth), -1)
     runs = simulate(scenario.problem(), places, np.random.SeedSequence(key), trials=trials)
-    # Drawn along the course; a tracker takes scan by scan, each of a target that stands.
+    # Drawn along the course. A tracker takes scan by scan, and a target is static within a scan.
     runs = replace(runs, motions=(Motion(0),))
     first = solve(cut(runs, 0, 1))
     return KinematicDraw(scenario, truth, runs, State(float(scenario.times[0]), first.position, first.covariance()))
 
 
 def strip_labels(drawn: KinematicDraw, detection: float, false: float, key: tuple[int, ...]) -> RowCandidates:
-    """Return the rows of all targets without their names, some lost, among false ones.
+    """Return the rows of all targets without labels, some missing, with false rows added.
 
     Parameters
     ----------
     drawn : KinematicDraw
         Measurements.
     detection : float
-        Probability that a row is seen.
+        Probability that a row is detected.
     false : float
-        Mean number of false rows of a channel and epoch; they are uniform over the baseline.
+        Mean number of false rows of a channel and epoch, uniform over the baseline.
     key : tuple of int
-        Decides what is lost and added.
+        Seed of missing and false rows.
     """
     rng = np.random.default_rng(np.random.SeedSequence(key))
-    # (n, k m, t): the rows of a channel lie together and do not say whose they are; NaN is a row that is not there.
+    # (n, k m, t): the rows of a channel are together and carry no target; NaN is a missing row.
     seen = np.moveaxis(drawn.runs.z, 1, -1)
     seen = np.where(rng.random(seen.shape) < detection, seen, np.nan)
     count = rng.poisson(false, seen.shape[:-1])[..., None]
@@ -196,7 +182,7 @@ def baseline(scenario: KinematicScenario) -> float:
 
 
 LOST = 10e3
-"""An error at the last epoch from which a track counts as lost, metres: ten times that of a single fix."""
+"""A track with a larger error at the last epoch is lost, metres: ten times the error of a single fix."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +194,7 @@ class KinematicScore:
     error : array (n, t, k)
         Distances from the truth, metres.
     nees : array (n, t, k)
-        Normalised estimation errors squared of the positions; 2 on average where covariances are right.
+        Normalised estimation errors squared of the positions; 2 on average if the covariances are right.
     """
 
     error: Array
@@ -242,7 +228,7 @@ class KinematicScore:
 
 
 def score(drawn: KinematicDraw, position: Array, cov: Array | None = None) -> KinematicScore:
-    """Return the errors of positions (n, t, k, 2) behind the first epoch, with their covariances where known."""
+    """Return the errors of positions (n, t, k, 2) after the first epoch, and their NEES if covariances are given."""
     away = position - drawn.position
     nees = np.full(away.shape[:-1], np.nan)
     if cov is not None:
@@ -251,7 +237,7 @@ def score(drawn: KinematicDraw, position: Array, cov: Array | None = None) -> Ki
 
 
 def start_from_fix(drawn: KinematicDraw, order: int) -> State:
-    """Return the state of the first epoch: the fix, and priors of what it does not see."""
+    """Return the state of the first epoch: the fix, and priors of velocity and acceleration."""
     return resized(drawn.fix, order, 2, speed=drawn.scenario.speed, rate=drawn.scenario.rate)
 
 
@@ -266,7 +252,7 @@ def score_track(drawn: KinematicDraw, track: Track) -> KinematicScore:
 
 
 def fixes(drawn: KinematicDraw) -> KinematicScore:
-    """Return the errors of fixes of single epochs, each without a guess and without the others.
+    """Return the errors of separate fixes of single epochs, without a guess.
 
     The first epoch is left out, as it is with tracks.
     """
@@ -279,7 +265,7 @@ def batch(drawn: KinematicDraw, order: int) -> KinematicScore:
     sizes = {"velocity": drawn.scenario.speed, "acceleration": drawn.scenario.rate}
     priors = [Prior(name, np.zeros(2), size**2 * np.eye(2)) for name, size in list(sizes.items())[:order]]
     found = solve(replace(drawn.runs, motions=(Motion(order),), priors=tuple(priors)))
-    # Estimates hold at time zero; tracks are judged at the last epoch.
+    # Estimates hold at time zero; tracks are scored at the last epoch.
     T = float(drawn.scenario.times[-1])
     ahead = np.kron([1.0, T, 0.5 * T * T][: order + 1], np.eye(2))
     away = found.x @ ahead.T - drawn.position[:, -1]
@@ -289,7 +275,7 @@ def batch(drawn: KinematicDraw, order: int) -> KinematicScore:
 
 
 def bounds(scenario: KinematicScenario, truth: Array, order: int) -> Array:
-    """Return the posterior Cramer-Rao bound of the position (t, k, 2, 2), that of the first fix included."""
+    """Return the posterior Cramer-Rao bound of the position (t, k, 2, 2), m^2, with the first fix."""
     made = replace(scenario.problem(), motions=(Motion(0),))
     first = crlb(cut(made, 0, 1), truth[:, 0, :2])
     n = 2 * (order + 1)
@@ -300,7 +286,7 @@ def bounds(scenario: KinematicScenario, truth: Array, order: int) -> Array:
 
 
 def mean_error(cov: Array) -> Array:
-    """Return the mean distance (...) from its mean of a normal vector in the plane with covariances (..., 2, 2).
+    """Return the mean length (...) of a zero-mean normal vector in the plane with covariances (..., 2, 2).
 
     References
     ----------
@@ -314,7 +300,7 @@ def mean_error(cov: Array) -> Array:
 
 
 def polynomial_ratio(order: int, points: int) -> float:
-    """Return the end-point error of a line (order 1) or parabola (2) through equally good points, over that of one."""
+    """Return the end-point error of a line (order 1) or parabola (2) through equal points, relative to one point."""
     # The corner of the inverse normal matrix of equidistant points, in closed form.
     k = points
     if order == 1:
@@ -323,22 +309,22 @@ def polynomial_ratio(order: int, points: int) -> float:
 
 
 def theory(order: int, steps: int) -> float:
-    """Return the mean of `polynomial_ratio` over the steps behind one fix."""
+    """Return the mean of `polynomial_ratio` over the steps after one fix."""
     return float(np.mean([polynomial_ratio(order, k) for k in range(2, steps + 2)]))
 
 
 @dataclass(frozen=True, slots=True)
 class PaperFilter:
-    """A way from measurements to positions.
+    """A filter from measurements to positions.
 
     Parameters
     ----------
     name : str
-        As tables call it.
+        Name in tables.
     models : tuple of Dynamics
         One model, or several.
     switch : float
-        Probability to change the model from scan to scan; 0: the models run side by side and the best is taken.
+        Probability of a change of the model from scan to scan; 0: the models run in parallel and the best is taken.
     """
 
     name: str
@@ -354,7 +340,7 @@ class PaperFilter:
             made = parallel(drawn.runs, drawn.fix, self.models, speed=scene.speed, rate=scene.rate, update="ekf")
             return score(drawn, made.position)
         q = len(self.models)
-        # Rows sum to one: a switch goes to each of the others alike.
+        # Rows sum to one: a switch goes to each other model with equal probability.
         chain = np.full((q, q), self.switch / (q - 1)) + (1.0 - self.switch * q / (q - 1)) * np.eye(q)
         found = imm(drawn.runs, drawn.fix, self.models, chain, speed=scene.speed, rate=scene.rate, update="ekf")
         return score_track(drawn, found.track)
@@ -370,21 +356,21 @@ FILTERS = (
     PaperFilter("best of static, CV, CA by likelihood", PLAIN),
     PaperFilter("IMM of CV and CA with sd(jerk) = 0.05 km/s³", (polynomial(1), polynomial(2, 50.0)), 0.05),
 )
-"""What is tried against a motion that is not the model's; 0.1 km/s² is the acceleration that comes."""
+"""Filters for a motion that differs from the model; 0.1 km/s² is the true acceleration."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """A way to tell whose a row is.
+    """Rule of association of rows with targets.
 
     Parameters
     ----------
     name : str
-        As tables call it.
+        Name in tables.
     associate : Associate
         The rule.
     missing : "drop" or "expect"
-        "expect" where a missed row repeats the prediction.
+        "expect": a missing row repeats the prediction.
     """
 
     name: str
@@ -420,8 +406,8 @@ def rules(scenario: KinematicScenario, detection: float, false: float) -> tuple[
     )
 
 
-# Seen with 0.7, and two false rows for three true ones, tell the rules apart: the nearest row loses half of the uniform
-# targets, whole sets a few per cent.
+# A detection of 0.7, and two false rows for three true ones, separate the rules: the nearest row loses half of the
+# uniform targets, whole sets a few per cent.
 def association(
     scenario: KinematicScenario,
     order: int,
@@ -441,9 +427,9 @@ def association(
     trials : int
         Independent trials, three targets each.
     key : tuple of int
-        Decides the draw.
+        Seed of the draws.
     detection, false : float
-        Probability that a row is seen; mean number of false rows of a channel and epoch.
+        Probability that a row is detected; mean number of false rows of a channel and epoch.
     """
     drawn = draw(scenario, scenario.course(order), trials, (*key, 0))
     given = strip_labels(drawn, detection, false, (*key, 1))
@@ -456,32 +442,25 @@ def association(
     return Association(drawn, scores)
 
 
-# What the equations do as they are printed.
+# Effects of the equations as printed.
 
 
 def predict_twice(dynamics: Dynamics, interval: float, dimension: int) -> Update:
-    """Return the update of equations 28 to 31 as printed: the transition is applied once more within H.
+    """Return the update of equations 28 to 31 as printed, which applies the transition a second time within H.
 
-    Parameters
-    ----------
-    dynamics : Dynamics
-        Model of motion.
-    interval : float
-        Seconds between epochs.
-    dimension : int
-        2 or 3.
+    `interval` is the time between epochs in seconds; `dimension` is 2 or 3.
     """
     n = (dynamics.order + 1) * dimension
     F = dynamics.step(interval, np.zeros(n), dimension)[0]
 
     def update(scan: Problem, mean: Array, cov: Array) -> Updated:
         white = whitened(scan, mean)
-        H = white.H @ F  # the slip: `mean` and `cov` have been predicted already
+        H = white.H @ F  # the printed error: `mean` and `cov` are predictions already
         S = H @ cov @ np.swapaxes(H, -1, -2) + np.eye(H.shape[-2])
         gain = np.swapaxes(linalg.solve(S, H @ cov)[0], -1, -2)
         solved = linalg.solve(S, white.residual[..., None])[0][..., 0]
         nis = (white.residual * solved).sum(-1)
-        # The likelihood too is that of the printed update, so that it can be compared with the right one.
+        # The likelihood also belongs to the printed update, so that it can be compared with the right one.
         lower, _ = linalg.factor(S)
         logdet = white.logdet + 2.0 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(-1)
         moved = mean + (gain @ white.residual[..., None])[..., 0]
@@ -491,7 +470,9 @@ def predict_twice(dynamics: Dynamics, interval: float, dimension: int) -> Update
 
 
 def taylor(problem: Problem, start: Array, *, sign: float = 1.0, steps: int = 50) -> Array:
-    """Return positions after undamped steps of the linearised fix, equations 5 to 8.
+    """Return positions (..., d) after undamped steps of the linearised fix, equations 5 to 8.
+
+    Positions are not finite if the steps diverge.
 
     Parameters
     ----------
@@ -500,16 +481,11 @@ def taylor(problem: Problem, start: Array, *, sign: float = 1.0, steps: int = 50
     start : array (..., d)
         Starting positions, metres.
     sign : float
-        1, or -1 for the residual with the sign that equations 8 and 15 print.
+        1, or -1 for the sign of the residual that equations 8 and 15 print.
     steps : int
         Number of steps.
-
-    Returns
-    -------
-    array (..., d)
-        Not finite where the steps ran away.
     """
-    # Undamped, so steps overflow where they run away: that is what is counted.
+    # Undamped steps overflow if they diverge, and these runs are counted.
     x = np.broadcast_to(start, (*problem.batch_shape, start.shape[-1]))
     with np.errstate(all="ignore"):
         for _ in range(steps):
@@ -520,16 +496,9 @@ def taylor(problem: Problem, start: Array, *, sign: float = 1.0, steps: int = 50
 
 
 def weighting(problem: Problem, place: Array, covariance: Array) -> tuple[float, float]:
-    """Return root mean square errors of a fix with equal weights and with those of the covariance, to first order.
+    """Return root mean square errors of a fix with equal weights and with optimal weights, to first order, metres.
 
-    Parameters
-    ----------
-    problem : Problem
-        One epoch.
-    place : array (d,)
-        Target, metres.
-    covariance : array (m, m)
-        True covariance of the rows.
+    `place` (d,) is the target, `covariance` (m, m) the true covariance of the rows of one epoch.
     """
     H = linearise(problem, place).shared
     plain = np.linalg.solve(H.T @ H, H.T)

@@ -1,4 +1,4 @@
-"""Tables and figures of the paper `kinematic`: printed, reproduced, bound and theory side by side."""
+"""Tables and figures of the paper `kinematic`: printed value, reproduced value, bound and theory."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# What the paper prints in its table 1.
+# Values printed in table 1 of the paper.
 
 ERROR = {"static": 0.982, "CV on CV": 0.591, "CV on CA": 10.618, "CA on CA": 0.781}
 """Mean position error, kilometres: static algorithm and target, and scenes 1 to 3."""
@@ -66,11 +66,11 @@ class TableLine:
     score : KinematicScore
         Errors.
     bound : float or None
-        Bound of the mean error, metres; None where the model is wrong.
+        Bound of the mean error, metres; None if the model is wrong.
     seconds : float
         Computing time of one run of three targets, as a share of the batch.
     key : str, optional
-        Which printed line it is.
+        Key of the printed line.
     """
 
     name: str
@@ -81,7 +81,7 @@ class TableLine:
 
 
 def km(value: float) -> str:
-    """Return metres as kilometres: three decimals, fewer where they are many, a dash where there is none."""
+    """Return metres as kilometres with three decimals, or fewer for large numbers; a dash if not finite."""
     if not np.isfinite(value):
         return ABSENT
     size = 1e-3 * value
@@ -101,7 +101,7 @@ def table_errors(lines: Sequence[TableLine]) -> TextTable:
 
 
 def table_ratios(fix: KinematicScore, matched: Mapping[str, KinematicScore], steps: int) -> TextTable:
-    """Return what is left of table 1 when its noise is divided out."""
+    """Return ratios of errors of table 1, which do not depend on the noise."""
     rows = []
     for name, score in matched.items():
         ratios = (ERROR[f"{name} on {name}"] / ERROR["static"], score.mean / fix.mean, theory(ORDERS[name], steps))
@@ -110,14 +110,14 @@ def table_ratios(fix: KinematicScore, matched: Mapping[str, KinematicScore], ste
 
 
 def table_efficiency(drawn: Mapping[str, KinematicDraw]) -> TextTable:
-    """Return last-step errors of filter, iterated filter and batch beside the bound."""
+    """Return last-step errors of filter, iterated filter and batch, with the bound."""
     rows = []
     for name in ("CV", "CA"):
-        own, order = drawn[name], ORDERS[name]
-        last = bounds(own.scenario, own.truth, order)[:, -1]
+        data, order = drawn[name], ORDERS[name]
+        last = bounds(data.scenario, data.truth, order)[:, -1]
         limit = float(np.sqrt(np.trace(last, axis1=-2, axis2=-1).mean()))
-        plain, iterated = (score_track(own, track_all(own, PLAIN[order], update)) for update in ("ekf", "iekf"))
-        lengths = (plain.last, iterated.last, batch(own, order).last, limit)
+        plain, iterated = (score_track(data, track_all(data, PLAIN[order], update)) for update in ("ekf", "iekf"))
+        lengths = (plain.last, iterated.last, batch(data, order).last, limit)
         rows.append((name, *map(km, lengths), f"{plain.last / limit:.3f}", f"{plain.level:.2f}"))
     header = ("model on its own motion", "EKF", "IEKF", "batch ML", "bound", "EKF / bound", "NEES of the EKF")
     return tabulate("efficiency", header, rows)
@@ -130,7 +130,7 @@ def table_models(found: Mapping[str, Sequence[KinematicScore]]) -> TextTable:
 
 
 def table_choice(found: Mapping[str, Array]) -> TextTable:
-    """Return how often the likelihood prefers the right model."""
+    """Return the shares of runs in which the likelihood prefers the right model, by motion and step."""
     rows = [(name, *(f"{100.0 * shares[step - 1]:.1f}" for step in _STEPS)) for name, shares in found.items()]
     return tabulate("choice", ("motion", *(f"step {step}" for step in _STEPS)), rows)
 
@@ -155,11 +155,11 @@ def table_equations(
     matched: Mapping[str, KinematicScore],
     tests: Mapping[str, Association],
 ) -> TextTable:
-    """Return what the printed equations do beside their corrected form."""
-    # One row for each equation of the list on the page that can be run.
+    """Return the effects of the printed equations and of their corrected form."""
+    # One row for each equation in the list of the page that can be run.
     rows: list[tuple[str, ...]] = [*_steps_of_a_fix(seed, drawn["static"])]
     scene = drawn["static"].scenario
-    # Differences that share the reference station: each of the two arrivals has half the variance.
+    # Differences share the reference station: each of the two arrivals has half the variance.
     shared = scene.sigma**2 / 2.0 * (np.eye(3) + 1.0)
     epoch = cut(replace(scene.problem(), motions=(Motion(0),)), 0, 1)
     costs = weighting(epoch, scene.position[0], shared)
@@ -176,7 +176,7 @@ def table_equations(
 
 
 def _steps_of_a_fix(seed: int, drawn: KinematicDraw) -> Iterator[tuple[str, str, str, str]]:
-    """Yield how many runs of the linearised fix arrive, with the printed and with the right sign."""
+    """Yield the shares of runs of the linearised fix that converge, with the printed and with the right sign."""
     one = cut(drawn.runs, 0, 1)
     fix, inside = solve(one).position, np.array([1e3, 1e3])
     rng = np.random.default_rng(np.random.SeedSequence((seed, 9)))
@@ -202,7 +202,7 @@ def figure_scene(drawn: KinematicDraw, position: Array, score: KinematicScore, b
     drawn : KinematicDraw
         The truth.
     position : array (n, t, k, 2)
-        Estimates.
+        Estimates, metres.
     score : KinematicScore
         Their errors.
     bound : array (t, k, 2, 2), optional
@@ -236,12 +236,7 @@ def figure_scene(drawn: KinematicDraw, position: Array, score: KinematicScore, b
 def figure_models(found: Mapping[str, Array], names: Sequence[str]) -> Figure:
     """Return the mean probability of each model against the step, one panel for each motion.
 
-    Parameters
-    ----------
-    found : mapping of str to array (k, q)
-        By motion.
-    names : sequence of q str
-        Models.
+    `found` has arrays (k, q) by motion, `names` are the q models.
     """
     figure = canvas(4.0 * len(found), 3.8)
     panels = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
@@ -256,13 +251,7 @@ def figure_models(found: Mapping[str, Array], names: Sequence[str]) -> Figure:
 
 
 def figure_losses(found: Mapping[str, KinematicScore]) -> Figure:
-    """Return the share of tracks that are far from the truth against the step.
-
-    Parameters
-    ----------
-    found : mapping of str to KinematicScore
-        By rule.
-    """
+    """Return the share of lost tracks against the step; `found` is by rule."""
     figure = canvas(7.0, 4.6)
     ax = figure.subplots()
     for i, (rule, score) in enumerate(found.items()):
@@ -279,18 +268,18 @@ def _steps(ax: Axes, up: str) -> None:
     ax.set_xticks(range(0, 21, 5))
 
 
-# Everything that the paper shows, in a quick and in a full size.
+# All results of the paper, in a quick and in a full size.
 
-_STEPS = (1, 2, 3, 4, 5, 10, 20)  # the choice of the model is made in the first five
+_STEPS = (1, 2, 3, 4, 5, 10, 20)  # the model is chosen in the first five steps
 _HALFWAY = 10  # step from which the targets of the last column of `table_models` accelerate
-_SAME = 1.0  # metres within which steps have reached the fix, whose own error is a kilometre
-_WILD = 1e6  # metres around the origin from which steps start anywhere: twice as far as the targets are
+_SAME = 1.0  # metres within which steps have reached the fix, whose error is a kilometre
+_WILD = 1e6  # metres around the origin for random starts: twice the distance of the targets
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class KinematicSample:
-    """How much is drawn.
+    """Numbers of trials.
 
     Parameters
     ----------
@@ -304,12 +293,13 @@ class KinematicSample:
     mixed: int
 
 
-# Both know the mean errors to one per cent or better; the paper has 100 runs. Association is what takes the time.
+# Both give the mean errors to one per cent or better; the paper has 100 runs. Association takes most of the time.
 _SIZES: dict[Size, KinematicSample] = {"quick": KinematicSample(500, 300), "full": KinematicSample(2000, 1000)}
 _WORK = 11  # calls of `tick` below
 
 
 def _run(sample: KinematicSample, seed: int, tick: Tick) -> Report:
+    """Run all simulations of the paper, and return the report."""
     scene = KinematicScenario()
 
     def done(value: T) -> T:
@@ -317,7 +307,7 @@ def _run(sample: KinematicSample, seed: int, tick: Tick) -> Report:
         return value
 
     drawn = {name: done(draw(scene, scene.course(i), sample.trials, (seed, i))) for name, i in ORDERS.items()}
-    # Keys 0 to 2 draw the motions, 3 the one that changes, 4 and 5 the association test, 9 wild starts.
+    # Keys 0 to 2 draw the motions, 3 the changing motion, 4 and 5 the association test, 9 the random starts.
     half = float(scene.times[_HALFWAY])
     late = done(draw(scene, scene.course(2, since=half), sample.trials, (seed, 3)))
     lines, scenes = done(_scenes(drawn))
@@ -343,7 +333,7 @@ def _run(sample: KinematicSample, seed: int, tick: Tick) -> Report:
 
 
 def _timed(work: Callable[[], T], runs: int) -> tuple[T, float]:
-    """Return what work gives, and seconds for one run."""
+    """Return the result of `work`, and the seconds for one run."""
     before = perf_counter()
     made = work()
     return made, (perf_counter() - before) / runs
@@ -351,7 +341,7 @@ def _timed(work: Callable[[], T], runs: int) -> tuple[T, float]:
 
 def _scenes(drawn: Mapping[str, KinematicDraw]) -> tuple[list[TableLine], dict[str, Figure]]:
     """Return the lines of table 1, and figures 2 to 4."""
-    # Times are shares of a batch: what one run costs among many, without the overhead of calls.
+    # Times are shares of a batch: the cost of one run among many, without the overhead of calls.
     still = drawn["static"]
     scene, runs = still.scenario, len(still.runs.z)
     first, seconds = _timed(partial(fixes, still), runs * scene.steps)
@@ -361,22 +351,23 @@ def _scenes(drawn: Mapping[str, KinematicDraw]) -> tuple[list[TableLine], dict[s
     lines.append(TableLine("static, 20 updates, on static", score_track(still, track), _mean(limit[:, 1:]), seconds))
     figures = {}
     for number, (model, motion) in enumerate((("CV", "CV"), ("CV", "CA"), ("CA", "CA")), 2):
-        own, order = drawn[motion], ORDERS[model]
-        track, seconds = _timed(partial(track_all, own, PLAIN[order]), runs)
-        score = score_track(own, track)
-        bound = bounds(scene, own.truth, order)[:, 1:] if model == motion else None
+        data, order = drawn[motion], ORDERS[model]
+        track, seconds = _timed(partial(track_all, data, PLAIN[order]), runs)
+        score = score_track(data, track)
+        bound = bounds(scene, data.truth, order)[:, 1:] if model == motion else None
         name = f"{model} on {motion}"
         lines.append(TableLine(name, score, None if bound is None else _mean(bound), seconds, name))
-        figures[f"figure-{number}"] = figure_scene(own, track.position, score, bound)
+        figures[f"figure-{number}"] = figure_scene(data, track.position, score, bound)
     return lines, figures
 
 
 def _mean(cov: Array) -> float:
+    """Return the mean error in the plane, averaged over covariances, metres."""
     return float(mean_error(cov).mean())
 
 
 def _sides(drawn: KinematicDraw, right: int) -> tuple[Array, Array]:
-    """Return how often the right model (k,) is chosen, and the mean probability of each (k, q)."""
+    """Return the share of choices of the right model (k,), and the mean probability of each model (k, q)."""
     scene = drawn.scenario
     made = parallel(drawn.runs, drawn.fix, PLAIN, speed=scene.speed, rate=scene.rate, update="ekf")
     return (made.choice == right).mean((0, 1)), made.probability.mean((0, 1))

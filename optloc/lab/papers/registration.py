@@ -1,7 +1,7 @@
-"""Moving stations with biases, by time differences and gain ratios: the paper's recursion and the fix without a guess.
+"""Moving stations with biases, by time differences and gain ratios: the recursion of a paper and fixes without a guess.
 
-Both run on the same data. The tables and figures that are made of them are those of
-`optloc.lab.papers.registration_tables`, the page is ``registration.md``.
+Both run on the same data. `optloc.lab.papers.registration_tables` makes the tables and figures; the page is
+``registration.md``.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from optloc.problem import (
 )
 from optloc.solvers import solve
 
-# The scenes of the paper, as printed, and one more whose stations span space and never meet.
+# The scenes of the paper, as printed, and a scene whose stations span space and never meet.
 
 SPEED = 3e8
 """Speed of light of the paper, metres per second; with it 100 ns are exactly 30 m."""
@@ -41,7 +41,7 @@ NANOSECOND = 1e-9 * SPEED
 
 Shape = Literal["full", "half", "diag"]
 
-# Variance of a row's own noise, and of what all rows of an epoch share, over sigma squared.
+# Variance of the independent noise of a row, and of the common noise of all rows of an epoch, over sigma squared.
 _SHAPES: dict[Shape, tuple[float, float]] = {"full": (1.0, 1.0), "half": (0.5, 0.5), "diag": (1.0, 0.0)}
 
 
@@ -56,9 +56,9 @@ class RegistrationScenario:
     position, velocity : array (s, 3)
         Stations at t = 0, metres and metres per second.
     target : array (3,)
-        Its place at t = 0, metres.
+        Position of the target at t = 0, metres.
     course : array (3,), optional
-        Its velocity, metres per second; None: it stays, and nothing but its place is unknown.
+        Velocity of the target, metres per second. None: the target is fixed, and only its position is unknown.
     delays : array (s - 1,)
         Biases of the range differences, metres.
     gains : array (s - 1,)
@@ -75,7 +75,7 @@ class RegistrationScenario:
     course: Array | None = None
     delays: Array = field(default_factory=lambda: np.array([30.0, -40.0, 50.0, -30.0]))
     gains: Array = field(default_factory=lambda: np.array([0.3, -0.4, 0.5, -0.3]))
-    # 10 ns, though the text says 20: only so is the printed sigma0 that of this scene.
+    # 10 ns, although the text says 20: only 10 ns reproduces the printed sigma0 of this scene.
     sigma: float = 3.0
     interval: float = 1.0
 
@@ -109,7 +109,7 @@ PRINTED = RegistrationScenario(
     ),
     target=np.array([200e3, 300e3, 0.0]),
 )
-"""Table 1 as printed: all stations lie in one plane at every epoch, and the fourth and fifth meet at 50 s."""
+"""Table 1 as printed: all stations are in one plane at every epoch, and the fourth and fifth meet at 50 s."""
 
 MOVING = replace(PRINTED, target=np.array([200e3, 300e3, 5e3]), course=np.array([-100.0, 0.0, 0.0]))
 """The same stations and the target of section 4.4, which flies straight."""
@@ -124,7 +124,7 @@ SPATIAL = RegistrationScenario(
     ),
     target=np.array([200e3, 300e3, 0.0]),
 )
-"""Stations of like size and speed that span space at every epoch and keep their distance."""
+"""Stations of similar size and speed that span space at every epoch and keep their distance."""
 
 
 def problem(
@@ -146,28 +146,28 @@ def problem(
     epochs : int
         Number of epochs K.
     sigma : float, optional
-        Standard deviation of an arrival, metres; that of the scene by default.
+        Standard deviation of an arrival, metres; the scene's value by default.
     station_sigma : float
-        Standard deviation of each coordinate of a station, drawn anew at each epoch, metres; 0 for exact stations.
+        Standard deviation of each coordinate of a station, drawn at each epoch, metres; 0 for exact stations.
     gain_sigma : float, optional
         Standard deviation of a gain ratio; None: time differences only.
     prior : float, optional
         Prior standard deviation of the biases of the range differences, metres; None: unknown.
     shape : "full", "half" or "diag"
-        Covariance of the rows of one kind and epoch: sigma^2 times I + 11', its half, or I. The paper's text allows
-        all three, its numbers only the first.
+        Covariance of the rows of one kind and epoch: sigma^2 times I + 11', its half, or I. The text of the paper
+        allows all three, its numbers only the first.
 
     Returns
     -------
     Problem
-        Unknowns: position, velocity where the target moves, "delay", and "gain" with gain ratios.
+        Unknowns: position, velocity if the target moves, "delay", and "gain" with gain ratios.
     """
     count, spread = len(scenario.position), scenario.sigma if sigma is None else sigma
     a, epoch = np.tile(np.arange(1, count), epochs), np.repeat(np.arange(epochs), count - 1)
     kinds = {"tdoa": spread} if gain_sigma is None else {"tdoa": spread, "groa": gain_sigma}
     rows = [measured(kind, a=a, b=0, epoch=epoch, sigma=size) for kind, size in kinds.items()]
     covariance = np.broadcast_to(station_sigma**2 * np.eye(3), (count, 3, 3)) if station_sigma else None
-    # The reference is row 0 of the stations; a station error that lasts one epoch is noise of its rows.
+    # The reference is station 0; a station error that lasts one epoch is noise of its rows.
     made = assemble(
         Stations(scenario.track(epochs), scenario.names, covariance=covariance, span="noise"),
         *rows,
@@ -198,12 +198,12 @@ def truth(scenario: RegistrationScenario, problem: Problem) -> Array:
 
 
 FAR = 10.0
-"""An estimate further from the truth than this many bounds is lost: no noise moves it there."""
+"""An estimate further from the truth than this number of bounds is lost: noise does not explain the distance."""
 
 
 @dataclass(frozen=True, slots=True)
 class RegistrationSetting:
-    """What is drawn.
+    """Setting of a draw.
 
     Parameters
     ----------
@@ -214,9 +214,9 @@ class RegistrationSetting:
     seed : int
         Seed of the whole reproduction.
     key : int
-        Number of this draw within it.
+        Number of this draw within the reproduction.
     sigma, station_sigma, gain_sigma : float, optional
-        As `problem` takes them.
+        As in `problem`.
     """
 
     scenario: RegistrationScenario
@@ -238,12 +238,12 @@ class RegistrationSetting:
         )
 
     def draw(self, epochs: int) -> Problem:
-        """Return all trials, measured."""
+        """Return all trials with measurements."""
         made = self.problem(epochs)
         return simulate(made, truth(self.scenario, made), self._sequence(0), self.trials)
 
     def first(self, drawn: Problem, epochs: int) -> Problem:
-        """Return the first epochs of what was drawn."""
+        """Return the first epochs of a draw."""
         return self.problem(epochs).with_rows(z=drawn.z[..., drawn.epoch < epochs])
 
     def bound(self, epochs: int) -> Array:
@@ -256,14 +256,14 @@ class RegistrationSetting:
         return crlb_course(made, truth(self.scenario, made), epochs).covariance
 
     def starts(self, width: float) -> Array:
-        """Return Gaussian starts (trials, n) around the truth, `width` one-shot standard deviations wide.
+        """Return Gaussian starts (trials, n) around the truth, `width` one-shot standard deviations wide, SI units.
 
-        The velocity of a moving target is wrong by `width` times 10 m/s in each coordinate.
+        The velocity of a moving target has an error of `width` times 10 m/s in each coordinate.
         """
         scene = self.scenario
         rng = np.random.default_rng(self._sequence(1))
         spread, centre = one_shot(scene, sigma=self.sigma), scene.target
-        # One epoch says nothing of the velocity: 10 m/s is a tenth of the target's speed.
+        # One epoch does not determine the velocity: 10 m/s is a tenth of the target's speed.
         if scene.course is not None:
             spread, centre = np.concatenate([spread, np.full(3, 10.0)]), np.concatenate([centre, scene.course])
         return np.asarray(centre + width * spread * rng.standard_normal((self.trials, len(centre))))
@@ -280,20 +280,20 @@ def one_shot(scenario: RegistrationScenario = PRINTED, *, sigma: float | None = 
 
 
 def rms(bound: Array) -> float:
-    """Return the root mean square of the length of a position error with a covariance (n, n)."""
+    """Return the root mean square length of a position error with a covariance (n, n), metres."""
     return float(np.sqrt(np.trace(bound[:3, :3])))
 
 
 @dataclass(frozen=True, slots=True)
 class RegistrationScore:
-    """Estimates of one kind of all trials, against the truth.
+    """Errors of one kind of estimate in all trials.
 
     Parameters
     ----------
     error : array (trials, n)
-        Estimate less truth, SI units; not finite where there is none.
+        Estimate less truth, SI units; not finite without an estimate.
     lost : bool array (trials,)
-        Estimates without sense: not finite, or further away than `FAR` bounds.
+        Useless estimates: not finite, or further away than `FAR` bounds.
     """
 
     error: Array
@@ -315,15 +315,15 @@ def score(estimate: Array, exact: Array, bound: Array) -> RegistrationScore:
     """Return the score of estimates (trials, n) of a truth (n,) with a bound (n, n)."""
     error = estimate - exact
     with np.errstate(invalid="ignore", over="ignore"):
-        # Not "further", so that NaN is far too.
+        # Written so that NaN counts as far.
         far = ~((error[:, :3] ** 2).sum(-1) < (FAR * rms(bound)) ** 2)
     return RegistrationScore(error, far | ~np.isfinite(error).all(-1))
 
 
 def branch(fix: Fix, exact: Array) -> Array:
-    """Return of every fix and its alternatives the vector (trials, n) nearest to a truth in position.
+    """Return, from every fix and its alternatives, the vector (trials, n) whose position is nearest to the truth.
 
-    For a target that moves straight two mirror images explain the data exactly; both are listed.
+    For a target that moves straight, two mirror images explain the data exactly, and a fix lists both.
     """
     pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
     with np.errstate(invalid="ignore"):
@@ -341,12 +341,9 @@ def wander(
     width: float = 1.0,
     first: int = FIRST,
 ) -> tuple[RegistrationScore, ...]:
-    """Return the scores of the paper's recursion after some numbers of epochs, whose bounds are given.
+    """Return the scores of the paper's recursion after some numbers of epochs.
 
-    Parameters
-    ----------
-    width : float
-        Width of the starts in one-shot standard deviations.
+    `bounds` are the bounds (n, n) at these epochs. `width` is the width of the starts in one-shot standard deviations.
     """
     scene, last = setting.scenario, max(epochs)
     z, *gains = (rows.z.reshape(setting.trials, drawn.epochs, -1)[:, :last] for rows in drawn.rows)
@@ -382,15 +379,15 @@ class GhostSolution:
 
     @property
     def doubt(self) -> float:
-        """Return the probability that noise makes it cheaper than the truth."""
+        """Return the probability that noise makes this minimum cheaper than the truth."""
         # The difference of both costs is normal with mean `gap` and standard deviation 2 sqrt(gap).
         return 0.5 * erfc(sqrt(self.gap) / 2.0 / sqrt(2.0))
 
 
 def mirror(scenario: RegistrationScenario) -> tuple[Array, Array]:
-    """Return place at t = 0 and velocity, (3,) each, of the target's image in the plane of the stations.
+    """Return position at t = 0 and velocity, (3,) each, of the target's image in the plane of the stations, SI units.
 
-    The plane is the one that fits the stations best at t = 0, and moves with their mean velocity.
+    The plane fits the stations best at t = 0, and moves with their mean velocity.
     """
     centre = scenario.position.mean(0)
     normal = np.linalg.svd(scenario.position - centre)[2][-1]  # the direction of least spread
@@ -403,7 +400,7 @@ def mirror(scenario: RegistrationScenario) -> tuple[Array, Array]:
 def ghost(
     scenario: RegistrationScenario, epochs: int, *, sigma: float | None = None, station_sigma: float = 1.0
 ) -> GhostSolution | None:
-    """Return the minimum to which the mirror image of the target leads, or None where that is the truth.
+    """Return the minimum that is reached from the mirror image of the target, or None if this minimum is the truth.
 
     Parameters
     ----------
@@ -412,13 +409,13 @@ def ghost(
     epochs : int
         Number of epochs.
     sigma, station_sigma : float
-        As `problem` takes them.
+        As in `problem`.
     """
     made = problem(scenario, epochs, sigma=sigma, station_sigma=station_sigma)
     exact = truth(scenario, made)
     place, velocity = mirror(scenario)
     if scenario.course is None:
-        # The image drifts with the stations; one that stays fits best where it is half way.
+        # The image drifts with the stations; the best fixed target is at the middle of its path.
         state = place + 0.5 * scenario.times(epochs)[-1] * velocity
     else:
         state = np.concatenate([place, velocity])
@@ -433,22 +430,22 @@ def ghost(
 
 NAMES = ("R1", "R2", "R3", "R4", "R5")
 DELAYS = (100.0, -133.0, 167.0, -100.0)
-"""Nanoseconds by which the clocks of R2 to R5 are late: 30, -40, 50 and -30 m, the biases of `RegistrationScenario`."""
+"""Delays of the clocks of R2 to R5, nanoseconds: 30, -40, 50 and -30 m, the biases of `RegistrationScenario`."""
 
 # Ten minutes in a file of a dozen kilobytes, and the noise of the paper: nanoseconds, metres.
 _EPOCHS, _INTERVAL, _SEED = 200, 3.0, 20170502
 _ARRIVAL, _STATION = 10.0, 1.0
 
 _PROBLEM = """\
-# Five aircraft time an emitter 360 km away for ten minutes, each by a clock of its own. The emitter stands at 200 km,
-# 300 km, 0; the clocks of R2 to R5 are 100, -133, 167 and -100 ns late against that of R1.
+# Five aircraft measure the arrival times of an emitter 360 km away for ten minutes, each with a separate clock. The
+# emitter is at 200 km, 300 km, 0. The clocks of R2 to R5 are 100, -133, 167 and -100 ns late against the clock of R1.
 format = 2
 title = "Five aircraft, one emitter, four clock errors"
 
 [stations]
-file = "registration-stations.csv"   # where each aircraft is at the first and at the last second
-sigma = "1 m"                        # of each coordinate of its position
-span = "noise"                       # drawn anew at every epoch
+file = "registration-stations.csv"   # position of each aircraft at the first and at the last second
+sigma = "1 m"                        # of each coordinate of the position
+span = "noise"                       # independent at every epoch
 
 [[measurements]]
 kind = "tdoa"
@@ -462,14 +459,14 @@ motion = "static"
 
 [[biases]]
 name = "clock"
-members = ["R2", "R3", "R4", "R5"]   # against that of R1
+members = ["R2", "R3", "R4", "R5"]   # against the clock of R1
 """
 
 
 def files() -> Mapping[str, str]:
     """Return the texts of the problem file and its tables, by name.
 
-    The measurements are drawn here from arrivals at displaced stations, apart from `optloc.simulate`.
+    The measurements are drawn here from arrivals at displaced stations, independently of `optloc.simulate`.
     """
     rng = np.random.default_rng(_SEED)
     times = _INTERVAL * np.arange(_EPOCHS)

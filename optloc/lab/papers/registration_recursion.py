@@ -1,6 +1,6 @@
-"""The algorithm of the paper `registration` as printed: two undamped steps over all past data at every new epoch.
+"""Algorithm of the paper `registration` as printed: two undamped steps over all past data at every new epoch.
 
-It starts from a given place at the fortieth epoch and never looks for another minimum: a baseline.
+It starts from a given position at the fortieth epoch and does not search for another minimum: a baseline.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def recursion(track: Array, times: Array, z: Array, start: Array, *, first: int 
     z : array (trials, k, s - 1)
         Range differences against the first station, metres.
     start : array (trials, n)
-        Position, or position and velocity at time zero, from which the first estimate is made.
+        Start of the first estimate: position, or position and velocity at time zero.
     first : int
         Epochs of the first estimate.
     iterations : int
@@ -37,14 +37,14 @@ def recursion(track: Array, times: Array, z: Array, start: Array, *, first: int 
     Returns
     -------
     array (trials, k - first + 1, n + s - 1)
-        State and biases after `first`, `first + 1` ... epochs; NaN from where the steps ran away.
+        State and biases after `first`, `first + 1` ... epochs; NaN after the steps have diverged.
     """
     trials, epochs = z.shape[:2]
     out = np.empty((trials, epochs - first + 1, start.shape[-1] + z.shape[-1]))
     arrivals = np.zeros((trials, z.shape[-1] + 1, epochs))
     arrivals[:, 1:] = z.swapaxes(1, 2)
     track = np.ascontiguousarray(track.T)
-    with np.errstate(all="ignore"):  # what runs away overflows, and stays lost
+    with np.errstate(all="ignore"):  # steps that diverge overflow, and stay lost
         for low in range(0, trials, _BLOCK):
             part = slice(low, low + _BLOCK)
             state = start[part]
@@ -57,20 +57,20 @@ def recursion(track: Array, times: Array, z: Array, start: Array, *, first: int 
 
 
 def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Array, Array]:
-    """Return one Gauss-Newton step (trials, n) of the state and the biases (trials, s - 1) that go with it.
+    """Return one Gauss-Newton step (trials, n) of the state, and the biases (trials, s - 1) after the step.
 
-    The sums of eq. 11 and 12 over the epochs. The inverse of R, proportional to I + 11', takes the mean of each epoch
-    out of the arrivals, and eliminating the unknown biases takes the mean of the run out of each channel: what is left
-    are outer products.
+    The step uses the sums of eq. 11 and 12 over the epochs. R is proportional to I + 11', so its inverse removes the
+    mean of each epoch from the arrivals. Elimination of the unknown biases removes the mean of each channel over the
+    run. Outer products remain.
 
     Parameters
     ----------
     state : array (trials, n)
         Position, or position and velocity at time zero.
     arrivals : array (trials, s, k)
-        Range differences against the first station, whose own are zero.
+        Range differences against the first station, metres; the first station has zero.
     track : array (3, s, k)
-        Stations.
+        Stations, metres.
     times : array (k,)
         Seconds.
     """
@@ -82,22 +82,22 @@ def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Arr
     distance = np.sqrt(np.einsum("tcsk,tcsk->tsk", slope, slope))
     slope /= distance[:, None]  # unit vectors (trials, 3, s, k)
     misfit = arrivals - distance  # (trials, s, k)
-    # First the mean of each epoch over the stations, then that of each channel over the epochs, in the sums below.
+    # First the mean of each epoch over the stations, then the mean of each channel over the epochs, in the sums below.
     misfit -= misfit.mean(1, keepdims=True)
     slope -= slope.mean(2, keepdims=True)
     if n > 3:
         slope = np.concatenate([slope, slope * times], axis=1)
-    rows, mean, left = slope.reshape(trials, n, -1), slope.mean(3), misfit.mean(2)
+    rows, mean, offset = slope.reshape(trials, n, -1), slope.mean(3), misfit.mean(2)
     information = rows @ rows.swapaxes(1, 2) - len(times) * (mean @ mean.swapaxes(1, 2))
-    vector = rows @ misfit.reshape(trials, -1, 1) - len(times) * (mean @ left[..., None])
+    vector = rows @ misfit.reshape(trials, -1, 1) - len(times) * (mean @ offset[..., None])
     solved, ok = linalg.solve(information, vector)
-    # A singular system has no step: NaN, and lost, instead of one that a solver makes up.
+    # A singular system has no step: return NaN, which counts as lost, instead of an arbitrary solution.
     move = np.where(ok[:, None], solved[..., 0], np.nan)
-    left = left - (move[:, None] @ mean)[:, 0]
-    return move, left[:, 1:] - left[:, :1]
+    offset = offset - (move[:, None] @ mean)[:, 0]
+    return move, offset[:, 1:] - offset[:, :1]
 
 
-# The same with gain ratios beside the range differences (section 3.2), whose weights depend on the place.
+# The recursion with gain ratios and range differences (section 3.2), whose weights depend on the position.
 
 
 def joint_recursion(
@@ -112,8 +112,8 @@ def joint_recursion(
 ) -> Array:
     """Return the estimates of the paper's joint recursion for a fixed target after every epoch.
 
-    An epoch is weighed where the target is thought to be when it arrives, and its weight stays; its residuals and
-    derivatives are those of the present estimate.
+    The weight of an epoch is computed at the estimate when the epoch arrives, and then stays. Its residuals and
+    derivatives are computed at the present estimate.
 
     Parameters
     ----------
@@ -122,9 +122,9 @@ def joint_recursion(
     z, gains : array (trials, k, s - 1)
         Range differences against the first station, metres, and gain ratios.
     start : array (trials, 3)
-        Position from which the first estimate is made, metres.
+        Position at which the first estimate starts, metres.
     sigma : (float, float, float)
-        Standard deviations: of an arrival and of a coordinate of a station, metres, with that of a gain between them.
+        Standard deviations of an arrival (metres), of a gain, and of a coordinate of a station (metres).
     first : int
         Epochs of the first estimate.
     iterations : int
@@ -133,12 +133,12 @@ def joint_recursion(
     Returns
     -------
     array (trials, k - first + 1, 3 + 2 (s - 1))
-        Position and biases of both kinds after `first`, `first + 1` ... epochs; NaN from where the steps ran away.
+        Position and biases of both kinds after `first`, `first + 1` ... epochs; NaN after the steps have diverged.
     """
     trials, epochs = z.shape[:2]
     measured = np.concatenate([z, gains], axis=-1)
     out = np.empty((trials, epochs - first + 1, start.shape[-1] + measured.shape[-1]))
-    with np.errstate(all="ignore"):  # what runs away overflows, and stays lost
+    with np.errstate(all="ignore"):  # steps that diverge overflow, and stay lost
         for low in range(0, trials, _BLOCK):
             part = slice(low, low + _BLOCK)
             state, weights = start[part], joint_weights(start[part], track[:first], sigma)
@@ -158,8 +158,8 @@ def joint_recursion(
 def joint_weights(state: Array, track: Array, sigma: tuple[float, float, float]) -> Array:
     """Return the inverse covariances (trials, k, 2 m, 2 m) of differences and ratios, m of each, at positions.
 
-    R of eq. 40: noise of one kind is sigma^2 (I + 11'), and the errors of the stations tie both kinds by
-    G_i . G_j' = size^2 (1 + delta) of the lines of sight, here with r_1 and the ratios of the ranges.
+    The covariance is R of eq. 40: noise of one kind is sigma^2 (I + 11'). The errors of the stations couple both kinds
+    by G_i . G_j' = size^2 (1 + delta) of the lines of sight, here with r_1 and the ratios of the ranges.
     """
     arrival, gain, size = sigma
     distance = np.linalg.norm(state[:, None, None] - track, axis=-1)
@@ -174,9 +174,9 @@ def joint_weights(state: Array, track: Array, sigma: tuple[float, float, float])
 
 
 def joint_step(state: Array, measured: Array, track: Array, weight: Array, total: Array) -> tuple[Array, Array]:
-    """Return one Gauss-Newton step (trials, 3) of the position and the biases (trials, 2 m) that go with it.
+    """Return one Gauss-Newton step (trials, 3) of the position, and the biases (trials, 2 m) after the step.
 
-    The sums of eq. 11 and 12 with the matrices of eq. 39, the constant biases eliminated.
+    The step uses the sums of eq. 11 and 12 with the matrices of eq. 39; the constant biases are eliminated.
 
     Parameters
     ----------
@@ -206,8 +206,8 @@ def joint_step(state: Array, measured: Array, track: Array, weight: Array, total
     sums = both.reshape(trials, -1, wide).swapaxes(1, 2) @ white.reshape(trials, -1, wide)
     shared = white.sum(1)
     away, fine = linalg.solve(total, shared)
-    left = sums - shared.swapaxes(1, 2) @ away
-    solved, ok = linalg.solve(left[:, :-1, :-1], left[:, :-1, -1:])
-    # A singular system has no step: NaN, and lost, instead of one that a solver makes up.
+    reduced = sums - shared.swapaxes(1, 2) @ away
+    solved, ok = linalg.solve(reduced[:, :-1, :-1], reduced[:, :-1, -1:])
+    # A singular system has no step: return NaN, which counts as lost, instead of an arbitrary solution.
     move = np.where((ok & fine)[:, None], solved[..., 0], np.nan)
     return move, away[..., -1] - (away[..., :-1] @ move[..., None])[..., 0]

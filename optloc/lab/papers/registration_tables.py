@@ -1,4 +1,4 @@
-"""Tables and figures of the paper `registration`: printed value, reproduced value, bound, and trials that are lost."""
+"""Tables and figures of the paper `registration`: printed value, reproduced value, bound, and lost trials."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# What the paper prints in section 4.
+# Values printed in section 4 of the paper.
 
 SIGMA0 = (1855.0, 2758.0, 160.0)
-"""Coordinates of the one-shot bound, metres."""
+"""Coordinates of the single-epoch bound, metres."""
 
 ACCURACY_FIXED = {
     150: (99.60, 89.38, 92.10, 86.65),
@@ -63,13 +63,13 @@ ACCURACY_FIXED = {
     300: (99.97, 98.42, 99.36, 99.02),
     400: (99.99, 99.29, 99.98, 99.86),
 }
-"""TextTable 2: accuracy of the four biases at given seconds, per cent."""
+"""Table 2: accuracy of the four biases at given seconds, per cent."""
 
 INITIAL = {1: (39.3, 0.0), 5: (37.1, 0.0), 10: (36.7, 0.0), 15: (37.8, 0.0), 20: (38.0, 2.5)}
-"""TextTable 3: root mean square error in metres and divergence in per cent, for starts n sigma0 wide."""
+"""Table 3: root mean square error in metres and divergence in per cent, for starts n sigma0 wide."""
 
 NOISE = {20: (39.3, 36.7, 0.0), 30: (74.6, 73.3, 1.0), 40: (120.6, 110.0, 8.5), 50: (153.6, 146.7, 15.0)}
-"""TextTable 4: error and bound in metres and divergence in per cent, for a noise labelled in nanoseconds."""
+"""Table 4: error and bound in metres and divergence in per cent, by the printed noise in nanoseconds."""
 
 BOUND = 36.7
 """The bound of table 3, metres."""
@@ -80,7 +80,7 @@ ACCURACY_MOVING = {
     550: (99.14, 99.34, 87.71, 79.19),
     700: (99.92, 99.68, 95.69, 93.08),
 }
-"""TextTable 5: the same as table 2 for the moving target."""
+"""Table 5: accuracies as in table 2, for the moving target."""
 
 ACCURACY_JOINT = {
     150: (99.50, 97.39, 98.17, 96.89, 99.88, 99.97, 99.97, 99.93),
@@ -88,19 +88,19 @@ ACCURACY_JOINT = {
     300: (99.98, 98.04, 98.13, 96.91, 99.98, 99.96, 99.96, 99.96),
     400: (99.94, 99.51, 99.23, 98.69, 99.99, 99.99, 99.98, 99.98),
 }
-"""TextTable 6: the same with gain ratios, four delays and four gains."""
+"""Table 6: accuracies as in table 2, with gain ratios: four delays and four gains."""
 
 # Figures 1 to 3.
 FIXED = {"5 m": 75.0, "1 m": 39.0}
 PRINTED_MOVING = {"1 m": 633.0}
 JOINT = {"5 m": 71.0, "1 m": 36.0}
-"""Root mean square errors at 600 s that the text of section 4 names, metres, by station error: figures 1 to 3."""
+"""Root mean square errors at 600 s in the text of section 4, metres, by station error: figures 1 to 3."""
 
 
-# Both routes after growing numbers of epochs.
+# Recursion and fixes after growing numbers of epochs.
 
 
-# Without a proof, which takes a second a run: thousands of runs are scored here, and none is handed on.
+# Without a proof, which takes a second a run: thousands of runs are only scored here.
 _METHOD = "searched"
 
 
@@ -111,7 +111,7 @@ class History:
     Parameters
     ----------
     setting : RegistrationSetting
-        What was drawn.
+        Setting of the draw.
     epochs : tuple of int
         Numbers of epochs.
     bounds : array (t, n, n)
@@ -121,9 +121,9 @@ class History:
     found : tuple of RegistrationScore
         The fix without a guess.
     ambiguous : tuple of float
-        Share of fixes that say that the data allow another place.
+        Share of fixes with the status ambiguous: the data allow another position.
     silent : tuple of float
-        Share of fixes that are lost though nothing speaks against their place.
+        Share of lost fixes that have no finding against their position.
     """
 
     setting: RegistrationSetting
@@ -136,20 +136,20 @@ class History:
 
 
 def run_history(setting: RegistrationSetting, epochs: Sequence[int], tick: Tick, *, first: int = FIRST) -> History:
-    """Return the scores of both routes on the same data.
+    """Return the scores of the recursion and of the fixes on the same data.
 
     Parameters
     ----------
     setting : RegistrationSetting
-        What is drawn.
+        Setting of the draw.
     epochs : sequence of int
-        Numbers of epochs to look at.
+        Numbers of epochs.
     tick : callable
-        Called after each of them, and after the recursion.
+        Called after each number of epochs, and after the recursion.
     first : int
-        Epochs of its first estimate.
+        Epochs of the first estimate of the recursion.
     """
-    # One long draw: shorter runs are its beginnings, so that curves against time are of the same trials.
+    # One long draw: shorter runs are its first parts, so that curves against time show the same trials.
     drawn = setting.draw(max(epochs))
     bounds = setting.bounds(epochs)
     exact = truth(setting.scenario, drawn)
@@ -180,7 +180,7 @@ class TableCase:
     label : float
         Width of the start in sigma0, or the printed noise in nanoseconds.
     epochs : int
-        Epochs used.
+        Number of epochs used.
     sigma : float
         Noise of an arrival, metres.
     bound : float
@@ -201,28 +201,21 @@ class TableCase:
 
 
 def metres(value: float) -> str:
-    """Return a number with four significant digits and no exponent, a dash where it is not finite."""
+    """Return a number with four significant digits and no exponent; a dash if it is not finite."""
     if value == 0.0 or not np.isfinite(value):
         return "0" if value == 0.0 else ABSENT
     return f"{value:.{max(0, 3 - int(np.floor(np.log10(max(abs(value), 0.1)))))}f}"
 
 
 def accuracy(error: Array, bias: Array) -> Array:
-    """Return 100 (1 - |error| / |bias|), zero where the error is the larger."""
+    """Return 100 (1 - |error| / |bias|), and zero if the error exceeds the bias."""
     return np.asarray(np.maximum(0.0, 100.0 * (1.0 - np.abs(error) / np.abs(bias))))
 
 
 def table_biases(name: str, history: History, rows: Mapping[int, Sequence[float]]) -> TextTable:
-    """Return a table of bias accuracies at the seconds that the paper prints (its tables 2, 5 and 6).
+    """Return a table of bias accuracies at the printed seconds (tables 2, 5 and 6 of the paper).
 
-    Parameters
-    ----------
-    name : str
-        Of the table.
-    history : History
-        Scores, at those epochs among others.
-    rows : mapping of int to sequence of float
-        Printed accuracies of the channels, by second.
+    `history` contains scores at these epochs; `rows` are the printed accuracies of the channels, by second.
     """
     exact = truth(history.setting.scenario, history.setting.problem(1))
     lines = []
@@ -247,7 +240,7 @@ def table_biases(name: str, history: History, rows: Mapping[int, Sequence[float]
 
 
 def _mean(score: RegistrationScore, n: int, exact: Array) -> Array:
-    """Return the accuracy of the mean over all trials that are not lost; empty where there are none."""
+    """Return the accuracy of the mean over all trials that are not lost; empty if all are lost."""
     if score.lost.all():
         return np.zeros(0)
     error = score.error[~score.lost, n:].mean(0)
@@ -261,16 +254,9 @@ def _single(score: RegistrationScore, n: int, exact: Array) -> Array:
 
 
 def table_errors(name: str, histories: Mapping[str, History], printed: Mapping[str, float]) -> TextTable:
-    """Return root mean square errors, bounds and lost trials against time: the numbers behind a figure.
+    """Return root mean square errors, bounds and lost trials against time: the numbers of a figure.
 
-    Parameters
-    ----------
-    name : str
-        Of the table.
-    histories : mapping of str to History
-        By environment.
-    printed : mapping of str to float
-        Error at 600 s that the paper's text names, by environment.
+    `histories` is by environment; `printed` are errors at 600 s in the paper's text, by environment.
     """
     lines = []
     for environment, history in histories.items():
@@ -307,7 +293,7 @@ def table_noises(cases: Sequence[TableCase], sure: Sequence[RegistrationScore], 
     cases : sequence of TableCase
         One for each noise.
     sure : sequence of RegistrationScore
-        The recursion on the same data, started at the truth itself.
+        The recursion on the same data, started at the truth.
     later : sequence of float
         Bounds after 700 epochs, metres.
     """
@@ -325,6 +311,7 @@ def table_noises(cases: Sequence[TableCase], sure: Sequence[RegistrationScore], 
 
 
 def _compared(case: TableCase) -> tuple[str, ...]:
+    """Return the columns of a case that tables 3 and 4 share, as text."""
     lengths = (case.plain.rmse, case.found.rmse, case.bound)
     shares = (case.plain.share, case.image, case.found.share)
     return (*(metres(v) for v in lengths), *(percent(v) for v in shares))
@@ -341,11 +328,11 @@ def against_time(histories: Mapping[str, History], printed: Mapping[str, float],
     Parameters
     ----------
     histories : mapping of str to History
-        What is drawn, by station error.
+        Histories by station error.
     printed : mapping of str to float
-        Error at 600 s that the paper names, metres.
+        Error at 600 s in the paper, metres.
     zoom : int, optional
-        One more panel with the last history from this second on.
+        Start of one more panel of the last history, seconds.
     """
     panels = [(f"station error {name}", each, printed[name], 0) for name, each in histories.items()]
     if zoom is not None:
@@ -360,6 +347,7 @@ def against_time(histories: Mapping[str, History], printed: Mapping[str, float],
 
 
 def _panel(ax: Axes, history: History, printed: float, since: int) -> None:
+    """Draw the errors of a history and the bound against time, from the second `since` on."""
     step = history.setting.scenario.interval
     keep = [i for i, k in enumerate(history.epochs) if k * step >= since]
     epochs = [history.epochs[i] for i in keep]
@@ -376,7 +364,7 @@ def _panel(ax: Axes, history: History, printed: float, since: int) -> None:
     label(ax, "time, s", "position error, m (root mean square)")
 
 
-# Tables that the paper lacks: how to read its noise, its second minimum, and a scene that is not degenerate.
+# Tables that the paper lacks: readings of its noise, its second minimum, and a scene that is not degenerate.
 
 
 def table_readings() -> TextTable:
@@ -395,6 +383,7 @@ def table_readings() -> TextTable:
 
 
 def _bound(epochs: int, sigma: float, station_sigma: float, shape: Shape) -> float:
+    """Return the bound of the position of the fixed target, metres."""
     made = problem(PRINTED, epochs, sigma=sigma, station_sigma=station_sigma, shape=shape)
     return rms(crlb(made, truth(PRINTED, made)))
 
@@ -422,7 +411,7 @@ def _chance(share: float) -> str:
 
 
 def table_gains() -> TextTable:
-    """Return what gain ratios of growing accuracy add to the bound of the fixed target."""
+    """Return the bound of the fixed target for gain ratios of growing accuracy."""
     lines = []
     for sigma in (None, _GAIN, 0.1 * _GAIN, 0.01 * _GAIN, 0.001 * _GAIN):
         made = problem(PRINTED, 600, gain_sigma=sigma)
@@ -431,7 +420,7 @@ def table_gains() -> TextTable:
 
 
 def table_scenes(cases: Mapping[str, TableCase]) -> TextTable:
-    """Return what the printed stations and those that span space make of the same target."""
+    """Return the results for the same target with the printed stations and with stations that span space."""
     lines = []
     for (name, case), scenario in zip(cases.items(), (PRINTED, SPATIAL), strict=True):
         flat, close = flatness(scenario, 700), separation(scenario, 700)
@@ -460,17 +449,17 @@ def separation(scenario: RegistrationScenario, epochs: int) -> float:
     return float(np.linalg.norm(track[:, first] - track[:, second], axis=-1).min())
 
 
-# Everything that section 4 shows, in a quick and in a full size.
+# All results of section 4, in a quick and in a full size.
 
 _GAIN = 0.03  # standard deviation of a gain ratio; printed
-_MOVING_FIRST = 200  # epochs of the first estimate of the moving target: from 40 on, as printed, every trial runs away
+_MOVING_FIRST = 200  # epochs of the first estimate of the moving target: with 40, as printed, every trial diverges
 _WIDEST = 20.0  # widest start of table 3, in sigma0
-_NEAR = 5e3  # metres within which a trial is at the image: after 600 s that lies 23 km from the truth
+_NEAR = 5e3  # metres within which a trial is at the image, which is 23 km from the truth after 600 s
 
 
 @dataclass(frozen=True, slots=True)
 class RegistrationSample:
-    """How much is drawn.
+    """Numbers of trials.
 
     Parameters
     ----------
@@ -479,7 +468,7 @@ class RegistrationSample:
     many : int
         Trials of tables 3 and 4, which count failures.
     fixed, moving : tuple of int
-        Epochs at which the fixed and the moving target are looked at; those of the printed tables among them.
+        Epochs at which the fixed and the moving target are scored, including the epochs of the printed tables.
     last : int
         Epochs of tables 3 and 4.
     """
@@ -491,7 +480,7 @@ class RegistrationSample:
     last: int = 600
 
 
-# Full: the 200 trials of the paper, and 500 where failures of a few per cent are counted.
+# Full: the 200 trials of the paper, and 500 for the counts of failures of a few per cent.
 _SIZES: dict[Size, RegistrationSample] = {
     "quick": RegistrationSample(30, 60, (150, 200, 300, 400, 600), (300, 400, 550, 600, 700)),
     "full": RegistrationSample(200, 500, tuple(range(150, 701, 50)), tuple(range(250, 801, 50))),
@@ -499,11 +488,13 @@ _SIZES: dict[Size, RegistrationSample] = {
 
 
 def _work(sample: RegistrationSample) -> int:
+    """Return the number of calls of `tick`."""
     histories = 4 * len(sample.fixed) + len(sample.moving) + 5
     return histories + len(INITIAL) + 2 * len(NOISE) + 1
 
 
 def _run(sample: RegistrationSample, seed: int, tick: Tick) -> Report:
+    """Run all simulations of the paper, and return the report."""
     fixed = {
         name: run_history(
             RegistrationSetting(PRINTED, sample.trials, seed, key, station_sigma=size), sample.fixed, tick
@@ -547,7 +538,7 @@ def _run(sample: RegistrationSample, seed: int, tick: Tick) -> Report:
 
 
 def _case(setting: RegistrationSetting, epochs: int, width: float, tick: Tick, label: float = 0.0) -> TableCase:
-    """Return both routes on the same draw."""
+    """Return the scores of the recursion and of the fix on the same draw."""
     drawn, bound = setting.draw(epochs), setting.bound(epochs)
     (plain,) = wander(setting, drawn, (epochs,), (bound,), width=width)
     found = score(solve(drawn, _METHOD).x, truth(setting.scenario, drawn), bound)
@@ -567,7 +558,7 @@ def _at_image(setting: RegistrationSetting, epochs: int, plain: RegistrationScor
 
 
 def _starts(setting: RegistrationSetting, epochs: int, tick: Tick) -> list[TableCase]:
-    """Return table 3: one draw, and the recursion from starts of growing width."""
+    """Return the columns of table 3: one draw, and the recursion from starts of growing width."""
     drawn, bound = setting.draw(epochs), setting.bound(epochs)
     found = score(solve(drawn, _METHOD).x, truth(setting.scenario, drawn), bound)
     cases = []
@@ -580,7 +571,7 @@ def _starts(setting: RegistrationSetting, epochs: int, tick: Tick) -> list[Table
 
 
 def _noises(settings: Sequence[RegistrationSetting], epochs: int, tick: Tick) -> TextTable:
-    """Return table 4, whose labels are 10 ns too large; the recursion is started at the truth itself as well."""
+    """Return table 4, whose labels are 10 ns too large; the recursion also starts at the truth."""
     cases: list[TableCase] = []
     sure: list[RegistrationScore] = []
     for setting, printed in zip(settings, NOISE, strict=True):

@@ -1,13 +1,13 @@
-"""A paper made again: its study, its tables and figures, and the page that quotes them.
+"""Reproduction of a paper: its simulation, its tables and figures, and the page with their numbers.
 
-A paper is one module with a `STUDY` (two where the simulation is long) and one page, ``NAME.md`` beside it: Markdown
-with the essay, the titles and the notes. The page names cells of the recomputed tables where it states a number, so
-that prose and tables cannot disagree. In it
+A paper is one module with a `STUDY` (two modules for a long simulation) and one page, the file ``NAME.md`` in the same
+folder. The page is a Markdown template with the text, the titles and the notes. Where the page states a number, it
+names a cell of the recomputed tables, so that text and tables always agree. The template has these functions:
 
-- ``table("slow")`` is a table, whose title is the heading above it and whose note is the text below it;
-- ``cell("slow", "line fit", "mean error, km")`` is a cell as it stands: table, first cells of the row, column;
-- ``value(...)`` is the first number of a cell, ``value(..., part=1)`` the second; ``digits`` rounds what is made of it;
-- ``made``, ``seed`` and ``sample`` say how the numbers were made, and ``scene`` is the module of the paper.
+- ``table("slow")`` is a table; its title is the heading above it, and its note is the text below it;
+- ``cell("slow", "line fit", "mean error, km")`` is the text of a cell: table, first cells of the row, column;
+- ``value(...)`` is the first number of a cell, ``value(..., part=1)`` the second; ``digits`` rounds the result;
+- ``made``, ``seed`` and ``sample`` are version and date, seed and sizes; ``scene`` is the module of the paper.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Tick = Callable[[], None]
 """Called after each piece of work."""
 
 Size = Literal["quick", "full"]
-"""How much is drawn."""
+"""Size of the samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +52,9 @@ class Report:
     page : str
         The whole page in Markdown.
     tables : tuple of TextTable
-        With the titles and notes that they have on the page.
+        The tables, with their titles and notes from the page.
     pictures : tuple of Picture
-        The figures that the page shows.
+        The figures of the page.
     """
 
     page: str
@@ -62,7 +62,7 @@ class Report:
     pictures: tuple[Picture, ...]
 
     def markdown(self) -> str:
-        """Return the page that holds everything."""
+        """Return the whole page."""
         return self.page
 
 
@@ -84,12 +84,12 @@ class Reproduction:
 
 @dataclass(frozen=True, slots=True)
 class Study(Generic[S]):
-    """How a paper is made again, in any sample size.
+    """Reproduction of a paper in any sample size.
 
     Parameters
     ----------
     sizes : dict of "quick", "full" to sample
-        What is drawn in either size.
+        Sample of each size.
     work : callable
         ``(sample) -> int``, the number of pieces of about equal work.
     run : callable
@@ -101,14 +101,11 @@ class Study(Generic[S]):
     run: Callable[[S, int, Tick], Report]
 
     def reproduction(self, sample: S, seed: int) -> Reproduction:
-        """Return the reproduction with a sample of any size; the seed decides all draws.
+        """Return the reproduction with a sample of any size; `seed` is the seed of all random numbers.
 
-        Raises
-        ------
-        InvalidProblem
-            Where matplotlib is missing: before the work, not after it.
+        Raise InvalidProblem if matplotlib is missing: before the work, not after it.
         """
-        canvas(1.0, 1.0)  # raises where there is none
+        canvas(1.0, 1.0)  # raises if matplotlib is missing
         return Reproduction(self.work(sample), partial(self.run, sample, seed))
 
 
@@ -116,25 +113,25 @@ class Study(Generic[S]):
 
 
 def tabulate(name: str, header: Iterable[str], rows: Iterable[tuple[str, ...]]) -> TextTable:
-    """Return a table whose title and note stand on the page of its paper."""
+    """Return a table; the page of its paper contains its title and note."""
     return TextTable(name, "", tuple(header), tuple(rows))
 
 
 def typeset(name: str, sample: object, seed: int, tables: Sequence[TextTable], figures: Mapping[str, Figure]) -> Report:
-    """Return the report of a paper: its page filled from the tables, and what the page says of each of them.
+    """Return the report of a paper: its page with the numbers of the tables, and the tables with titles of the page.
 
     Parameters
     ----------
     name : str
-        The paper; its page is ``NAME.md`` beside this module.
+        The paper; its page is the file ``NAME.md`` in the folder of this module.
     sample : object
-        How much was drawn.
+        Sizes of the samples.
     seed : int
-        What decided the draws.
+        Seed of the draws.
     tables : sequence of TextTable
-        Everything that the page quotes.
+        All tables of the page.
     figures : mapping of str to matplotlib.figure.Figure
-        By the names that the page gives to their files.
+        Figures by the names of their files on the page.
     """
     made = f"optloc {version('optloc')}, {datetime.now(UTC):%Y-%m-%d}"
     page = render(name, {each.name: each for each in tables}, made=made, seed=seed, sample=sample)
@@ -147,22 +144,22 @@ def typeset(name: str, sample: object, seed: int, tables: Sequence[TextTable], f
 
 
 def render(name: str, tables: Mapping[str, TextTable], *, made: str, seed: int, sample: object) -> str:
-    """Return the page of a paper, filled from tables.
+    """Return the page of a paper with the numbers of tables.
 
     Parameters
     ----------
     name : str
         The paper.
     tables : mapping of str to TextTable
-        By name.
+        Tables by name.
     made : str
-        Program and day.
+        Version of optloc and date.
     seed, sample : int, object
-        How the tables were drawn.
+        Seed and sizes of the samples.
     """
     import jinja2
 
-    # Markdown, not HTML: nothing is to be escaped. A misspelt name raises instead of leaving a hole in a sentence.
+    # Markdown needs no escapes of HTML. A misspelt name raises an error instead of leaving a gap in a sentence.
     house = jinja2.Environment(undefined=jinja2.StrictUndefined, autoescape=False)  # noqa: S701
     house.filters["digits"] = digits
     house.globals.update(
@@ -176,7 +173,7 @@ def render(name: str, tables: Mapping[str, TextTable], *, made: str, seed: int, 
 
 
 def _wrap(page: str) -> str:
-    """Return a page whose paragraphs and items are broken at 120 characters, whatever was filled in."""
+    """Return a page whose paragraphs and items are wrapped at 120 characters after the numbers are inserted."""
     out = []
     for block in page.strip().split("\n\n"):
         if block.startswith(("#", "|", "!")):
@@ -192,33 +189,33 @@ def _wrap(page: str) -> str:
 
 
 def digits(number: float, count: int = 3) -> str:
-    """Return a number with so many significant digits and no exponent, a dash where there is none."""
+    """Return a number with `count` significant digits and no exponent; a dash if it is not finite."""
     if number == 0.0 or not isfinite(number):
         return "0" if number == 0.0 else ABSENT
-    rounded = float(f"{number:.{count - 1}e}")  # first, since 9.96 has a digit more when it is 10
+    rounded = float(f"{number:.{count - 1}e}")  # round first: 9.96 gets another digit when it becomes 10
     return f"{rounded:.{max(count - 1 - floor(log10(abs(rounded))), 0)}f}"
 
 
 def _entitle(table: TextTable, page: str) -> TextTable:
-    """Return a table with the heading above it and the text below it on a page."""
+    """Return a table with its title and note: the heading above it and the text below it on a page."""
     before, _, after = page.partition(table.markdown())
     title = before.rpartition("\n## ")[2].partition("\n")[0]
-    # One line: a page breaks its lines for those who write it, a terminal for those who read it.
+    # One line: the page wraps lines for its authors, and a terminal wraps them for its readers.
     return replace(table, title=title, note=" ".join(after.partition("\n## ")[0].split()))
 
 
-# Figures: what those of several papers share.
+# Common parts of the figures of papers.
 
 
 class Ink:
-    """The palette of Okabe and Ito, which the colour-blind can tell apart."""
+    """The palette of Okabe and Ito, which colour-blind readers can distinguish."""
 
     BLACK, GREY, BLUE, SKY = "#000000", "#7F7F7F", "#0072B2", "#56B4E9"
     RED, ORANGE, GREEN, PINK = "#D55E00", "#E69F00", "#009E73", "#CC79A7"
 
 
 def canvas(width: float, height: float) -> Figure:
-    """Return an empty figure of a size in inches; raise InvalidProblem where matplotlib is not installed."""
+    """Return an empty figure of a size in inches; raise InvalidProblem if matplotlib is not installed."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -233,7 +230,7 @@ def scale(ax: Axes) -> None:
 
     def between(value: float, _: float) -> str:
         low, high = ax.get_ylim()
-        crowded = high > 1e4 * low  # of more than four decades the names of the decades alone can be read
+        crowded = high > 1e4 * low  # beyond four decades there is room for the labels of decades only
         return f"{value:g}" if not crowded and f"{value:.0e}"[0] in "25" else ""
 
     ax.set_yscale("log")
@@ -245,11 +242,11 @@ def label(ax: Axes, across: str, up: str) -> None:
     """Name both axes and draw a faint grid."""
     ax.set_xlabel(across)
     ax.set_ylabel(up)
-    ax.grid(visible=True, which="both", alpha=0.25)  # faint: the curves are what is looked at
+    ax.grid(visible=True, which="both", alpha=0.25)  # faint, so that the curves dominate
 
 
 def explain(figure: Figure, columns: int | None = None) -> None:
-    """Put one legend for all panels below them; a name that several panels share stands once."""
+    """Draw one legend for all panels below them; a label of several panels appears once."""
     found = [ax.get_legend_handles_labels() for ax in figure.axes]
     shown = {name: handle for handles, names in found for handle, name in zip(handles, names, strict=True)}
     figure.legend(
@@ -263,14 +260,14 @@ def percent(share: float) -> str:
 
 
 def write(report: Report, folder: Path) -> list[Path]:
-    """Write README.md with everything, and every table as .csv and every picture as .png beside it.
+    """Write the page as README.md, and in the same folder every table as .csv and every picture as .png.
 
     Parameters
     ----------
     report : Report
-        What was reproduced.
+        The reproduced paper.
     folder : Path
-        Made where it does not exist.
+        Output folder; created if it does not exist.
 
     Returns
     -------
@@ -280,7 +277,7 @@ def write(report: Report, folder: Path) -> list[Path]:
     Raises
     ------
     InvalidProblem
-        Where a file cannot be written; then none is.
+        If a file cannot be written; then no file is written.
     """
     page = folder / "README.md"
     tables = [(folder / f"{table.name}.csv", table) for table in report.tables]

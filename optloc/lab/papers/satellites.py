@@ -1,6 +1,6 @@
 """Ships by the time differences of three satellites and a known height: four Kalman filters.
 
-Each filter runs from fixes, from starts that are far off, and with several kinds of height; the page is
+Each filter starts from fixes and from distant points, and runs with several kinds of height; the page is
 ``satellites.md``.
 """
 
@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# The scene: three satellites that stay above the Earth, and a slow target on the sea; printed where nothing else is
-# said.
+# The scene: three satellites that are fixed above the Earth, and a slow target on the sea. Values are printed unless
+# noted.
 
 SATELLITES = geodetic_to_ecef(
     np.radians([24.44, 25.09, 24.44]), np.radians([125.21, 125.68, 125.99]), np.full(3, 800e3)
@@ -60,7 +60,7 @@ START = geodetic_to_ecef(np.radians(25.80), np.radians(127.37), 0.0)
 """First position of the target, on the ellipsoid, ECEF metres."""
 
 COURSE = np.array([20.0, 20.0, 0.0])
-"""Its velocity as printed, ECEF metres per second: it climbs by 3.4 m/s."""
+"""Velocity of the target as printed, ECEF metres per second; the target climbs by 3.4 m/s."""
 
 SIGMA = 50e-9 * SPEED_OF_LIGHT
 """Standard deviation of a range difference, metres: 50 ns."""
@@ -69,34 +69,28 @@ HEIGHT = 500.0
 """Standard deviation of the assumed height, metres."""
 
 DRIVE = 0.01
-"""Standard deviation of the acceleration, m/s^2; not printed, and about that of a ship."""
+"""Standard deviation of the acceleration, m/s^2; not printed, and typical of a ship."""
 
 ORBIT = 7.4e3
-"""Speed of satellites that really move, metres per second: a circular orbit 800 km high has 7.45 km/s."""
+"""Speed of moving satellites, metres per second: a circular orbit 800 km high has 7.45 km/s."""
 
 
 def dynamics() -> Dynamics:
-    """Return the motion that the filters assume: constant velocity, driven by white accelerations."""
+    """Return the motion model of the filters: constant velocity, driven by white accelerations."""
     return polynomial(1, DRIVE)
 
 
 def surface_course() -> Array:
-    """Return the velocity (3,) without what makes the target climb."""
+    """Return the velocity (3,) of the target without its climb, ECEF metres per second."""
     up = ECEF.enu_axes(START)[2]
     return np.asarray(COURSE - (COURSE @ up) * up)
 
 
 def orbits(epochs: int, heading: float, *, interval: float = 1.0) -> Array:
-    """Return satellites (epochs, 3, 3) that circle the centre of the Earth together.
+    """Return positions (epochs, 3, 3) of satellites that circle the centre of the Earth together, ECEF metres.
 
-    Parameters
-    ----------
-    epochs : int
-        Number of epochs.
-    heading : float
-        Direction of flight of the formation's centre, radians from north towards east.
-    interval : float
-        Seconds between epochs.
+    `heading` is the direction of flight of the formation's centre, radians from north towards east; `interval` is in
+    seconds.
     """
     centre = SATELLITES.mean(0)
     east, north, _ = ECEF.enu_axes(centre)
@@ -127,11 +121,11 @@ def problem(
     order : 0 or 1
         Order of the target's motion.
     height : float, optional
-        Standard deviation of the height measured at each epoch, metres; None: it is exactly zero.
+        Standard deviation of the height measured at each epoch, metres; None: the height is exactly zero.
     satellites : array (3, 3) or (epochs, 3, 3)
         Positions, ECEF metres.
     correlated : bool
-        Whether both differences share the first satellite's arrival, each arrival having 50 ns over the root of 2.
+        Whether both differences share the first satellite's arrival; each arrival then has 50 ns over the root of 2.
     """
     epoch = np.arange(epochs)
     noise = {"arrival_sigma": SIGMA / np.sqrt(2.0)} if correlated else {"sigma": SIGMA}
@@ -144,7 +138,7 @@ def problem(
 
 
 def truth(epochs: int, course: Array = COURSE) -> Array:
-    """Return the true states (epochs, 6) of a target that moves uniformly, ECEF."""
+    """Return the true states (epochs, 6) of a target that moves uniformly, ECEF, SI units."""
     place = START + np.arange(epochs)[:, None] * course
     return np.concatenate([place, np.broadcast_to(course, (epochs, 3))], axis=1)
 
@@ -153,10 +147,10 @@ FILTERS = ("ekf", "iekf", "mgekf", "mvekf")
 """Names in `optloc.tracking.UPDATES`, in the order of the tables."""
 
 SPEED = 50.0
-"""Standard deviation of each coordinate of the velocity in starts that are far off, m/s: the ship makes 28."""
+"""Standard deviation of each coordinate of the velocity in distant starts, m/s; the ship has 28."""
 
 
-# What errors are relative to in the paper, metres.
+# Distance by which the paper divides errors, metres.
 _DISTANCE = 100e3
 
 
@@ -171,7 +165,7 @@ class SatelliteRun:
     error : array (trials, steps)
         Distance from the truth, metres.
     claimed : array (trials, steps)
-        The root of the trace of the filter's own position covariance, metres.
+        The root of the trace of the position covariance that the filter claims, metres.
     """
 
     position: Array
@@ -185,7 +179,7 @@ class SatelliteRun:
 
     @property
     def relative(self) -> Array:
-        """Return the mean error over the distance that the paper divides by (steps,)."""
+        """Return the mean error (steps,) over the distance by which the paper divides."""
         return np.asarray(self.error.mean(0) / _DISTANCE)
 
 
@@ -195,21 +189,22 @@ def root_trace(cov: Array) -> Array:
 
 
 def score(track: Track, exact: Array) -> SatelliteRun:
-    """Return the errors of a track whose last scans are those of true states (epochs, 6)."""
+    """Return the errors of a track; its scans are the last of the true states (epochs, 6)."""
     at = exact[len(exact) - len(track.times) :, :3]
     return SatelliteRun(track.position, np.linalg.norm(track.position - at, axis=-1), root_trace(track.cov))
 
 
 def from_fixes(drawn: Problem) -> State:
-    """Return the state at the second epoch from the fixes of the first two, each without a guess."""
-    # places and covariances are all that filters begin with: proofs would be most of the time
+    """Return the state at the second epoch from separate fixes of the first two epochs, without a guess."""
+    # filters need positions and covariances only, and proofs would take most of the time
     one, two = (solve(replace(cut(drawn, k, k + 1), motions=(Motion(0),)), "searched") for k in (0, 1))
     return two_point(one, two, (float(drawn.times[0]), float(drawn.times[1])))
 
 
 def prior(at: Array, satellites: Array = SATELLITES) -> Array:
-    """Return the covariance (6, 6) of position and velocity from fixes, a second apart, that reach their bound."""
-    # The second fix is the place, and less the first it is the velocity: both share its error.
+    """Return the covariance (6, 6) of position and velocity from two efficient fixes, a second apart."""
+    # The position is the second fix, and the velocity its difference from the first: both share the error of the
+    # second.
     one = crlb(problem(1, order=0, satellites=satellites), at)
     return np.block([[one, one], [one, 2.0 * one]])
 
@@ -227,14 +222,15 @@ def run_fixed(steps: int, trials: int, sequence: np.random.SeedSequence) -> tupl
 def run_wild(
     width: float, steps: int, trials: int, sequence: np.random.SeedSequence
 ) -> tuple[dict[str, SatelliteRun], Array]:
-    """Return all filters from starts that are wrong by `width` metres in each coordinate, and the posterior bound.
+    """Return all filters from starts with errors of `width` metres in each coordinate, and the posterior bound.
 
-    The same data are tracked from the first two fixes as well, by the filter "quartic + ekf".
+    The filter "quartic + ekf" tracks the same data from the first two fixes.
     """
     draws, errors = sequence.spawn(2)
     exact = truth(steps)
     drawn = simulate(problem(steps), exact[0], draws, trials)
-    # A second before the first scan, as a prediction of it: the first update is that of a filter under way.
+    # The start is a second before the first scan, so that the first update follows a prediction, as in a running
+    # filter.
     sigma = np.repeat([width, SPEED], 3)
     mean = exact[0] - np.concatenate([exact[0, 3:], np.zeros(3)])
     mean = mean + sigma * np.random.default_rng(errors).standard_normal((trials, 6))
@@ -246,7 +242,7 @@ def run_wild(
 
 
 def run_moving(satellites: Array, trials: int, sequence: np.random.SeedSequence) -> tuple[SatelliteRun, Array]:
-    """Return the IEKF with satellites (epochs, 3, 3) that move, from the first two fixes, and the posterior bound."""
+    """Return the IEKF with moving satellites (epochs, 3, 3) from fixes, and the posterior bound (steps,), metres."""
     exact = truth(len(satellites))
     drawn = simulate(problem(len(satellites), satellites=satellites), exact[0], sequence, trials)
     start = from_fixes(drawn)
@@ -256,7 +252,7 @@ def run_moving(satellites: Array, trials: int, sequence: np.random.SeedSequence)
 
 
 def run_heights(steps: int, trials: int, sequence: np.random.SeedSequence) -> dict[str, SatelliteRun]:
-    """Return the IEKF on the same sea-level target with several kinds of height, by what the filter takes it for."""
+    """Return the IEKF on the same sea-level target with several kinds of height, by the height model of the filter."""
     exact, epochs = truth(steps + 2, surface_course()), steps + 2
     keys = sequence.spawn(5)
     out = {}
@@ -264,9 +260,9 @@ def run_heights(steps: int, trials: int, sequence: np.random.SeedSequence) -> di
         drawn = simulate(problem(epochs, height=sigma), exact[0], key, trials)
         out[name] = score(followed(drawn, from_fixes(drawn), dynamics()), exact)
     level = simulate(problem(epochs, height=None), exact[0], keys[2], trials)
-    held = followed(with_height_rows(level), from_fixes(level), dynamics())
-    out["known: the ellipsoid itself"] = score(held, exact)
-    # The truth of the last two: one error of the height for the whole run, and a metre of noise about it.
+    track = followed(with_height_rows(level), from_fixes(level), dynamics())
+    out["known: the ellipsoid itself"] = score(track, exact)
+    # Truth of the last two: a constant error of the height for the whole run, and a metre of noise.
     assumed = with_bias(problem(epochs, height=1.0), "height", per="kind", kind="height", sigma=HEIGHT)
     wrong = HEIGHT * np.random.default_rng(keys[3]).standard_normal((trials, 1))
     vectors = np.concatenate([np.broadcast_to(exact[0], (trials, 6)), wrong], axis=1)
@@ -279,33 +275,29 @@ def run_heights(steps: int, trials: int, sequence: np.random.SeedSequence) -> di
 
 
 def run_climbing(steps: int, trials: int, sequence: np.random.SeedSequence) -> SatelliteRun:
-    """Return the IEKF on the target as printed, which climbs, while its height is said to be zero within 500 m."""
+    """Return the IEKF on the target as printed, which climbs, with heights that are measured as zero within 500 m."""
     exact, (draws, errors) = truth(steps + 2), sequence.spawn(2)
     drawn = simulate(problem(steps + 2), exact[0], draws, trials)
-    # The heights say zero, with their noise, whatever the target does.
+    # The measured heights are zero plus noise, although the target climbs.
     level = HEIGHT * np.random.default_rng(errors).standard_normal((trials, steps + 2))
-    said = drawn.with_rows(z=np.concatenate([drawn.rows[0].z, level], axis=-1))
-    return score(followed(said, from_fixes(said), dynamics()), exact)
+    measured_zero = drawn.with_rows(z=np.concatenate([drawn.rows[0].z, level], axis=-1))
+    return score(followed(measured_zero, from_fixes(measured_zero), dynamics()), exact)
 
 
-# Radius of the Earth, metres, near enough for a direction: the height is then set to zero.
+# Radius of the Earth, metres, accurate enough for a direction: the height is then set to zero.
 _EARTH = 6.37e6
 
 
 def far(angles: Sequence[float], bearings: int = 12) -> Array:
     """Return the bound of a fix at a known height, metres (q,), root mean square over bearings, by distance.
 
-    Parameters
-    ----------
-    angles : sequence of float
-        Distance of the target from the point below the satellites, radians at the centre of the Earth.
-    bearings : int
-        Number of directions.
+    `angles` (q,) are the distances of the target from the point below the satellites, radians at the centre of the
+    Earth.
     """
     centre = SATELLITES.mean(0)
     up = centre / np.linalg.norm(centre)
     east, north, _ = ECEF.enu_axes(centre)
-    # `up` is that of a sphere, the axes those of the ellipsoid: made square to it again.
+    # `up` belongs to a sphere, the axes to the ellipsoid: make the axes orthogonal to `up`.
     east, north = (v - (v @ up) * up for v in (east, north))
     turn = 2.0 * np.pi * np.arange(bearings) / bearings
     side = np.cos(turn)[:, None] * north + np.sin(turn)[:, None] * east
@@ -318,7 +310,7 @@ def far(angles: Sequence[float], bearings: int = 12) -> Array:
     return np.array(out)
 
 
-# The tables: the four filters from fixes and from afar, what the height is worth, and satellites that move.
+# The tables: the four filters from fixes and from distant starts, the effect of the height, and moving satellites.
 
 NAMES = {
     "ekf": "EKF",
@@ -327,27 +319,28 @@ NAMES = {
     "mvekf": "MVEKF",
     "quartic + ekf": "EKF from two fixes",
 }
-"""How tables and figures call the filters."""
+"""Names of the filters in tables and figures."""
 
-# Steps at which errors are looked at; a shorter sample has the first of them. The height tells late, orbits later.
+# Steps at which errors are shown; a shorter sample shows only its own steps. Effects of the height come late, effects
+# of orbits later.
 _STEPS, _STEPS_HEIGHT, _STEPS_MOVING = (1, 10, 50, 100, 200), (1, 100, 200), (50, 100, 200)
 
-# Steps that do not count where filters are compared: the first fixes still weigh most in them.
+# Steps that are left out of the comparison of filters: there the first fixes have most weight.
 _SETTLED = 10
 
-# A track that ends this near to the truth is not lost, metres: nine times the bound after 100 steps.
+# A track that ends within this distance of the truth is not lost, metres: nine times the bound after 100 steps.
 _NEAR = 1e3
 
 
 def metres(value: float) -> str:
-    """Return metres with a sensible number of digits; kilometres are marked."""
+    """Return metres with a sensible number of digits; large numbers are in km."""
     if value >= 1e4:
         return f"{value / 1e3:.0f} km"
     return f"{value:.1f}" if value < 1e3 else f"{value:.0f}"
 
 
 def table_fixed(found: Mapping[str, SatelliteRun], bound: Array) -> TextTable:
-    """Return the filters started by fixes; the bound is (steps,), metres."""
+    """Return the table of filters started by fixes; the bound is (steps,), metres."""
     steps = [step for step in _STEPS if step <= len(bound)]
     plain = found["ekf"].position
     lines = []
@@ -362,13 +355,13 @@ def table_fixed(found: Mapping[str, SatelliteRun], bound: Array) -> TextTable:
 
 
 def table_relative(panels: Mapping[str, tuple[Mapping[str, SatelliteRun], Array]]) -> TextTable:
-    """Return what the paper's figure shows, in its unit: mean errors over 100 km, by start and filter."""
+    """Return the values of the paper's figure, in its unit: mean errors over 100 km, by start and filter."""
     longest = max(len(bound) for _, bound in panels.values())
     steps = [step for step in _STEPS if step <= longest]
     lines = []
     for title, (runs, bound) in panels.items():
         for name, run in runs.items():
-            # a filter that is begun by fixes has no state before the second
+            # a filter that starts from two fixes has no state before the second
             at = [s - 1 - len(bound) + len(run.relative) for s in steps]
             shown = (f"{100.0 * run.relative[i]:.4f} %" if 0 <= i < len(run.relative) else ABSENT for i in at)
             lines.append((title, NAMES[name], *shown))
@@ -376,7 +369,7 @@ def table_relative(panels: Mapping[str, tuple[Mapping[str, SatelliteRun], Array]
 
 
 def table_starts(found: Mapping[float, tuple[Mapping[str, SatelliteRun], Array]]) -> TextTable:
-    """Return the filters after starts that are far off, by the standard deviation of each coordinate, metres."""
+    """Return the table of filters after distant starts, by the standard deviation of each coordinate, metres."""
     lines = []
     for width, (runs, bound) in found.items():
         for name, run in runs.items():
@@ -389,17 +382,17 @@ def table_starts(found: Mapping[float, tuple[Mapping[str, SatelliteRun], Array]]
 
 
 def table_pairs(found: Mapping[float, tuple[Mapping[str, SatelliteRun], Array]]) -> TextTable:
-    """Return in how many runs the modified covariance did better than its rivals at the end."""
+    """Return the share of runs in which the modified covariance has a smaller final error than each other filter."""
     lines = []
     for width, (runs, _) in found.items():
-        own = runs["mvekf"].error[:, -1]
-        better = [f"{100 * (own < runs[rival].error[:, -1]).mean():.0f} %" for rival in ("ekf", "iekf", "mgekf")]
+        modified = runs["mvekf"].error[:, -1]
+        better = [f"{100 * (modified < runs[rival].error[:, -1]).mean():.0f} %" for rival in ("ekf", "iekf", "mgekf")]
         lines.append((f"{width / 1e3:.0f} km", *better))
     return tabulate("pairs", ("start error", "better than EKF", "better than IEKF", "better than MGEKF"), lines)
 
 
 def table_heights(found: Mapping[str, SatelliteRun]) -> TextTable:
-    """Return errors and claims of the IEKF from fixes, by what is known of the height."""
+    """Return errors and claimed errors of the IEKF from fixes, by the knowledge of the height."""
     steps = [step for step in _STEPS_HEIGHT if step <= len(next(iter(found.values())).rms)]
     lines = [
         (name, *(f"{metres(run.rms[s - 1])} ({metres(run.claimed[:, s - 1].mean())})" for s in steps))
@@ -409,7 +402,7 @@ def table_heights(found: Mapping[str, SatelliteRun]) -> TextTable:
 
 
 def table_moving(found: Mapping[str, tuple[SatelliteRun, Array]], still: Array) -> TextTable:
-    """Return errors and bounds with satellites that fly, by heading, beside the bound (steps,) of those that stay."""
+    """Return errors and bounds with moving satellites, and the bound `still` (steps,) of fixed satellites."""
     steps = [step for step in _STEPS_MOVING if step <= len(still)]
     lines = [("as printed: they stay", *(f"{ABSENT} ({metres(still[s - 1])})" for s in steps))]
     for name, (run, bound) in found.items():
@@ -417,12 +410,12 @@ def table_moving(found: Mapping[str, tuple[SatelliteRun, Array]], still: Array) 
     return tabulate("moving", ("heading of the satellites", *(f"step {step}: rms (bound), m" for step in steps)), lines)
 
 
-# Degrees from the point below the satellites: from overhead to where a fix is worth tens of kilometres.
+# Degrees from the point below the satellites: from overhead to errors of tens of kilometres.
 _AWAY = (0.0, 5.0, 10.0, 20.0, 25.0)
 
 
 def table_one_shot() -> TextTable:
-    """Return the bounds of a single fix: by what is known, and by distance from the point below the satellites."""
+    """Return the bounds of a single fix, by known values, and by distance from the point below the satellites."""
     cases = {
         "50 ns each, height 500 m": problem(1, order=0),
         "50 ns each, height known": problem(1, order=0, height=None),
@@ -436,9 +429,9 @@ def table_one_shot() -> TextTable:
     return tabulate("one-shot", ("case", "bound, m"), lines)
 
 
-# The figures: errors of the four filters, and what the height is worth, against time.
+# The figures: errors of the four filters, and the effect of the height, against time.
 
-# Wide lines below narrow ones: filters that agree are all seen.
+# Wide lines below narrow ones, so that filters that agree are all visible.
 _STYLE = {
     "ekf": (Ink.RED, "-", 5.0),
     "mvekf": (Ink.ORANGE, "-", 3.2),
@@ -453,10 +446,7 @@ _STYLE_HEIGHT = ((Ink.BLUE, 1.8), (Ink.GREEN, 1.8), (Ink.SKY, 1.8), (Ink.RED, 4.
 def figure_filters(panels: Mapping[str, tuple[Mapping[str, SatelliteRun], Array]]) -> Figure:
     """Return root mean square errors and the posterior bound against steps, one panel for each start.
 
-    Parameters
-    ----------
-    panels : mapping of str to (mapping of str to SatelliteRun, array (steps,))
-        Filters and bound by title.
+    `panels` has the filters and the bound (steps,) by title.
     """
     figure = canvas(0.6 + 6.0 * len(panels), 8.8)
     rows = figure.subplots(2, len(panels), squeeze=False)
@@ -477,7 +467,7 @@ def figure_filters(panels: Mapping[str, tuple[Mapping[str, SatelliteRun], Array]
 
 
 def figure_heights(found: Mapping[str, SatelliteRun]) -> Figure:
-    """Return errors, and what the filter claims of them (dotted), against steps, by what is known of the height."""
+    """Return errors, and the claimed errors (dotted), against steps, by the knowledge of the height."""
     figure = canvas(8.0, 5.2)
     ax = figure.subplots()
     for (colour, width), (name, run) in zip(_STYLE_HEIGHT, found.items(), strict=True):
@@ -494,18 +484,18 @@ def _against_steps(ax: Axes) -> None:
     label(ax, "step, one a second", "position error, m (root mean square)")
 
 
-# Everything that the paper shows, in a quick and in a full size.
+# All results of the paper, in a quick and in a full size.
 
 _HEADINGS = {"north": 0.0, "north-east": 0.25 * np.pi, "east": 0.5 * np.pi, "south-east": 0.75 * np.pi}
-"""Directions in which satellites fly, radians; the opposite ones fly the same circles backwards."""
+"""Directions of flight of satellites, radians; the opposite ones fly the same circles backwards."""
 
 _PANEL = 100e3
-"""Start error that a figure shows, metres: the first at which the filters come far apart."""
+"""Start error of a figure, metres: the smallest error at which the filters differ widely."""
 
 
 @dataclass(frozen=True, slots=True)
 class SatellitesSample:
-    """How much is drawn.
+    """Numbers of trials and steps.
 
     Parameters
     ----------
@@ -514,9 +504,9 @@ class SatellitesSample:
     others : int
         Trials of each kind of height, and of each heading of moving satellites.
     widths : tuple of float
-        Start errors, metres; 100 km, which a figure shows, among them.
+        Start errors, metres, including the 100 km of a figure.
     steps, far : int
-        Steps of the filters, and of those from far starts; more than ten.
+        Steps of the filters, and of filters from distant starts; more than ten.
     """
 
     trials: int
@@ -531,6 +521,8 @@ _SIZES: dict[Size, SatellitesSample] = {"quick": SatellitesSample(200, 100), "fu
 
 
 def _run(sample: SatellitesSample, seed: int, tick: Tick) -> Report:
+    """Run all simulations of the paper, and return the report."""
+
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))
 

@@ -1,4 +1,4 @@
-"""The figures of a study's report, one panel each, so that a phone shows them one below the other."""
+"""Figures of a study's report: one panel each, so that a phone shows them one below the other."""
 
 from __future__ import annotations
 
@@ -33,25 +33,26 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Noise levels of one panel, which share a method's row.
+# Colour and marker of each noise level in a panel where all levels share the row of a method.
 _LEVELS = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "D"), (PURPLE, "^"), (BLACK, "v"), (GREY, "P"))
-# Panels of distributions at most: with more, one panel shows all noise levels of its case.
-_MOST = 12
-# Least cost above the best that is drawn: below it is what rounding leaves.
-_LEAST = 1e-6
-# Points of a curve with steps: two for each pixel of a panel.
-_FINE = 480
-# Ranges of logarithmic axes: errors in units of the bound, costs above the best. Beyond them all is equally bad.
-_FARTHEST, _DEAREST = 1e4, 1e8
+# Most panels of distributions. With more of them, one panel shows all noise levels of a case.
+_MOST_PANELS = 12
+# Least cost above the best that is drawn: rounding errors are smaller.
+_LEAST_COST = 1e-6
+# Points of a stepped curve: two for each pixel of a panel.
+_CURVE_POINTS = 480
+# Upper limits of logarithmic axes: errors in units of the bound, costs above the best. Differences beyond do not
+# matter.
+_LARGEST_ERROR, _LARGEST_COST = 1e4, 1e8
 
 
 def success(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
-    """Yield the shares of right answers of all methods, a picture for each case; one colour a noise level."""
+    """Yield one picture for each case: the share of right answers of each method. Each noise level has a colour."""
     for number, (case, part) in enumerate(table.groupby("case", observed=True)):
         levels = list(dict.fromkeys(part["noise_label"]))
         names = [name for name in looks if name in set(part["method"])]
-        # Levels of a method stand close together: of a row, one high, a fifth stays free; a row is a quarter of an inch
-        # high at least, so that names of eight points do not touch.
+        # The marks of a method's noise levels share four fifths of the row's height. A row is at least a quarter of an
+        # inch high, so that names of eight points do not touch.
         step = min(0.24, 0.8 / len(levels))
         height = 1.35 + len(names) * max(0.26, 0.12 * len(levels))
         figure, axes = panel(str(case), (SIZE[0], height))
@@ -67,10 +68,10 @@ def success(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
             )
         axes.set_yticks(np.arange(len(names)), [literal(name) for name in names], fontsize=8)
         axes.set_ylim(len(names) - 0.45, -0.55)
-        # Marks at 0 and 100 are whole.
+        # Room for whole marks at 0 and 100.
         axes.set_xlim(-3, 103)
         axes.set_xlabel("right answers (%)")
-        # So many short labels fit beside each other below a panel.
+        # Up to four short labels fit in one line below a panel.
         short = max(len(noise_text(level)) for level in levels) < 12
         figure.legend(loc="outside lower center", ncols=len(levels) if short and len(levels) < 5 else 2, **_PLAIN)
         yield Picture(f"success-{number + 1}", f"Right answers: {case}", figure)
@@ -80,7 +81,7 @@ _PLAIN: dict[str, Any] = {"frameon": False, "fontsize": 8}
 
 
 def accuracy(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
-    """Yield the root mean square errors over the bound against noise, a picture for each case."""
+    """Yield one picture for each case: root mean square error over the bound against noise."""
     for number, (case, part) in enumerate(table.groupby("case", observed=True)):
         figure, axes = panel(str(case))
         place, labels, name = _noise_axis(part)
@@ -103,7 +104,10 @@ def accuracy(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
 
 
 def _noise_axis(part: pd.DataFrame) -> tuple[dict[str, float], list[str], str]:
-    """Return where noise levels are drawn: by their number if that tells them apart, else side by side."""
+    """Return the x coordinate of each noise level, the labels of the ticks, and the label of the axis.
+
+    The coordinate is the logarithm of the noise if the levels have different positive values, else a running number.
+    """
     seen = part[["noise_label", "noise"]].drop_duplicates("noise_label")
     labels = [str(label) for label in seen["noise_label"]]
     unit = str(part["noise_unit"].iloc[0])
@@ -117,19 +121,20 @@ def _noise_axis(part: pd.DataFrame) -> tuple[dict[str, float], list[str], str]:
 
 
 def _ticks(axes: Axes, place: dict[str, float], labels: list[str]) -> None:
+    """Set the ticks of the noise levels, with a margin on both sides."""
     x = np.array(list(place.values()))
     axes.set_xticks(x, labels, fontsize=8)
-    # An eighth of the axis on each side for marks and their bars; one level alone has an axis too.
+    # An eighth of the axis on each side, for marks and their bars; a single level needs an axis too.
     margin = 0.12 * max(float(np.ptp(x)), 0.5)
     axes.set_xlim(x.min() - margin, x.max() + margin)
 
 
 def _log(axis: Any, scale: Any, low: float, high: float) -> None:
-    """Make an axis logarithmic, with labels that are plain numbers where it covers less than a decade and a half."""
+    """Make an axis logarithmic; below a factor of 30 its labels are plain numbers."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
     scale("log")
-    # A decade and a half: with less, ticks at powers of ten would leave one label or none.
+    # A decade and a half: on a shorter axis, ticks at powers of ten leave at most one label.
     if high / max(low, 1e-300) < 30.0 and low > 0.0:
         axis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -138,6 +143,7 @@ def _log(axis: Any, scale: Any, low: float, high: float) -> None:
 
 
 def _line(axes: Axes, mark: Look, x: Array, y: Array, *, marker: bool, steps: bool = False, width: float = 1.5) -> None:
+    """Draw the curve of a method in its style."""
     (line,) = axes.plot(
         x,
         y,
@@ -153,8 +159,8 @@ def _line(axes: Axes, mark: Look, x: Array, y: Array, *, marker: bool, steps: bo
 
 
 def distributions(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
-    """Yield the distributions of errors in units of the bound; noise levels apart unless there are many panels."""
-    apart = len(frame[["case", "noise_label"]].drop_duplicates()) <= _MOST
+    """Yield the distributions of errors in units of the bound: a picture for each noise level, or for each case."""
+    apart = len(frame[["case", "noise_label"]].drop_duplicates()) <= _MOST_PANELS
     names = ["case", "noise", "noise_label"] if apart else ["case"]
     from scipy.special import gammainc
 
@@ -172,7 +178,7 @@ def distributions(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
         theory = gammainc(part["dimension"].iloc[0] / 2.0, x**2 / 2.0)
         axes.plot(x, theory, color=BLACK, linewidth=3.5, alpha=0.18, zorder=1)
         axes.set_xscale("log")
-        axes.set_xlim(0.1, float(np.clip(np.nanmax([10.0, *axes.get_xlim()]), 10.0, _FARTHEST)))
+        axes.set_xlim(0.1, float(np.clip(np.nanmax([10.0, *axes.get_xlim()]), 10.0, _LARGEST_ERROR)))
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlabel("error in units of the bound")
         axes.set_ylabel("share of trials")
@@ -180,16 +186,16 @@ def distributions(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
 
 
 def gaps(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
-    """Yield the distributions of the cost above the lowest that is known, a picture for each case."""
+    """Yield one picture for each case: the distribution of the cost above the lowest known cost."""
     for number, (case, part) in enumerate(frame.groupby("case", observed=True)):
         figure, axes = panel(str(case))
         for mark in looks.values():
             some = part[part["method"] == mark.name]
             values = some["above"].to_numpy(dtype=float)[some["located"].to_numpy(dtype=bool)]
             if len(values):
-                _line(axes, mark, *distribution(np.maximum(values, _LEAST), len(some)), marker=False, steps=True)
+                _line(axes, mark, *distribution(np.maximum(values, _LEAST_COST), len(some)), marker=False, steps=True)
         axes.set_xscale("log")
-        axes.set_xlim(_LEAST * 0.7, float(np.clip(axes.get_xlim()[1], 10.0, _DEAREST)))
+        axes.set_xlim(_LEAST_COST * 0.7, float(np.clip(axes.get_xlim()[1], 10.0, _LARGEST_COST)))
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlabel("cost above the best known")
         axes.set_ylabel("share of trials")
@@ -197,7 +203,7 @@ def gaps(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
 
 
 def profiles(found: Profiles, looks: Looks) -> Iterator[Picture]:
-    """Yield the data profile and the performance profile over all trials that every method has seen."""
+    """Yield the data profile and the performance profile over the trials that every method ran."""
     for name, title, draw in _PROFILES:
         if found.solved.any():
             figure, axes = panel("")
@@ -206,7 +212,7 @@ def profiles(found: Profiles, looks: Looks) -> Iterator[Picture]:
 
 
 def profile_picture(found: Profiles, looks: Looks) -> Figure:
-    """Return both profiles side by side, with a legend."""
+    """Return a figure of both profiles with a legend."""
     figure, axes = panels("", len(_PROFILES))
     for one, (_, title, draw) in zip(axes, _PROFILES, strict=True):
         one.set_title(title, fontsize=10)
@@ -216,23 +222,26 @@ def profile_picture(found: Profiles, looks: Looks) -> Figure:
 
 
 def _data_profile(axes: Axes, found: Profiles, looks: Looks) -> None:
+    """Draw the share of trials that each method solves within budgets of work."""
     needed = found.spent[found.solved]
-    budgets = np.geomspace(needed.min() / 1.5, 1.5 * needed.max(), _FINE)
+    budgets = np.geomspace(needed.min() / 1.5, 1.5 * needed.max(), _CURVE_POINTS)
     _curves(axes, found, looks, budgets, found.data(budgets))
     axes.set_xlabel(WORK[found.work])
 
 
 def _performance_profile(axes: Axes, found: Profiles, looks: Looks) -> None:
+    """Draw the share of trials that each method solves within multiples of the least work."""
     needed = np.where(found.solved, found.spent, np.inf)
     with np.errstate(invalid="ignore"):
         slower = np.where(found.solved, needed / needed.min(0), 1.0)
-    # To half beyond the last trial that is solved, where no curve rises any more.
-    ratios = np.geomspace(1.0, max(10.0, 1.5 * float(slower.max())), _FINE)
+    # To 1.5 times the last solved trial: no curve rises beyond.
+    ratios = np.geomspace(1.0, max(10.0, 1.5 * float(slower.max())), _CURVE_POINTS)
     _curves(axes, found, looks, ratios, found.performance(ratios))
     axes.set_xlabel(f"{WORK[found.work].partition(' (')[0]} / least of any method")
 
 
 def _curves(axes: Axes, found: Profiles, looks: Looks, x: Array, shares: Array) -> None:
+    """Draw the stepped curves (methods, q) of shares over x (q,)."""
     for method, share in zip(found.methods, shares, strict=True):
         _line(axes, looks[method], x, share, marker=False, steps=True)
     axes.set_xscale("log")
@@ -241,14 +250,14 @@ def _curves(axes: Axes, found: Profiles, looks: Looks, x: Array, shares: Array) 
     axes.set_ylabel(f"share of trials solved to {found.tau:g}")
 
 
-# Share of a band of quartiles that one sees through: lines of other methods cross it.
+# Opacity of a band of quartiles: lines of other methods that cross the band stay visible.
 _BAND = 0.15
-# Widths of the first line and of the last, points: methods that go the same way are seen beside each other.
+# Widths of the first and of the last line, points: lines that coincide stay visible.
 _WIDTHS = (3.5, 1.2)
 
 
 def history_picture(found: Histories, looks: Looks) -> Figure:
-    """Return how methods came down, against evaluations and against iterations: medians over trials, with quartiles."""
+    """Return the descent of the cost against evaluations and against iterations: medians over trials, and quartiles."""
     trials = found.frame["trial"].nunique()
     figure, both = panels(f"{found.title}: {trials} trial{'s' * (trials > 1)}", len(COUNTS))
     for axes, (by, label) in zip(both, COUNTS.items(), strict=True):
@@ -257,8 +266,8 @@ def history_picture(found: Histories, looks: Looks) -> Figure:
             if np.isnan(counts).any():
                 continue
             at = np.unique(counts)
-            low, middle, high = np.maximum(band(found, name, by, at), _LEAST)
-            # A way that is drawn from zero on has no place on a logarithmic axis: its start stands at one.
+            low, middle, high = np.maximum(band(found, name, by, at), _LEAST_COST)
+            # A logarithmic axis has no zero, so iterations are drawn from one on.
             x = at + 1.0 if by == "iterations" else at
             _line(
                 axes,
@@ -269,8 +278,8 @@ def history_picture(found: Histories, looks: Looks) -> Figure:
                 steps=True,
                 width=width,
             )
-            # What is infinitely high reaches beyond the panel.
-            top = np.where(np.isfinite(high), high, _DEAREST)
+            # Infinite values are drawn beyond the upper end of the panel.
+            top = np.where(np.isfinite(high), high, _LARGEST_COST)
             axes.fill_between(x, low, top, color=looks[name].colour, alpha=_BAND, step="post", linewidth=0)
         axes.set_yscale("log")
         _log(axes.xaxis, axes.set_xscale, 1.0, axes.get_xlim()[1])
@@ -287,19 +296,20 @@ _PROFILES = (
 
 
 def timing(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
-    """Yield the times of a fix against the number of measurements, a picture for each mixture of kinds.
+    """Yield one picture for each mixture of kinds: the time of a fix against the number of measurements.
 
-    Drawn are the median, and bars from the 10th to the 90th percentile.
+    The picture shows the median, and bars from the 10th to the 90th percentile.
     """
     for number, (kinds, part) in enumerate(frame.groupby("kinds", observed=True)):
         figure, axes = panel(str(kinds).replace("+", " + "))
         sizes = sorted(part["rows"].unique())
-        # Methods of one size stand apart by 1.2 % of it, by half where one size has an axis from 0.9 to 1.1 of it.
+        # Marks of one size are 1.2 % apart. With a single size they are 0.6 % apart, as the axis covers 0.9 to 1.1 of
+        # it.
         step = 1.006 if len(sizes) == 1 else 1.012
         for mark in looks.values():
             grouped = part[part["method"] == mark.name].groupby("rows")["seconds"]
             low, middle, high = (grouped.quantile(share) for share in (0.1, 0.5, 0.9))
-            # A little apart, so that bars do not hide one another.
+            # Shifted, so that bars do not hide one another.
             x = middle.index.to_numpy(dtype=float) * step ** (mark.number - (len(looks) - 1) / 2)
             _line(axes, mark, x, middle.to_numpy(), marker=True)
             axes.vlines(x, low.to_numpy(), high.to_numpy(), color=mark.colour, linewidth=0.8)

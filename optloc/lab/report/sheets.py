@@ -1,4 +1,4 @@
-"""The tables of a study's report: numbers for machines, and the same as short text for people."""
+"""Tables of a study's report: as numbers for programs, and as short text for people."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 
 SHIFT = 1e-5
-"""Shift of geometric means of times, seconds: the time of a fast fix, below which faster counts for little."""
+"""Shift of geometric means of times, seconds: the time of a fast fix, so that shorter times change the mean little."""
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Return a number with some significant digits, a dash where there is none."""
+    """Return a number with some significant digits; a dash if the number is not finite."""
     if not np.isfinite(value):
         return "–"
-    # Between these a plain number is the shorter one.
+    # In this range a plain number is shorter than one with a power of ten.
     if value and not 1e-3 <= abs(value) < 1e5:
         mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
         return f"{mantissa}·10{str(int(power)).translate(_SUPERSCRIPT)}"
@@ -36,8 +36,8 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def duration(seconds: float) -> str:
-    """Return a time with the unit that suits it."""
-    # From 0.9995 on three digits round to 1.00 of the unit.
+    """Return a time in seconds as text, in s, ms, µs or ns."""
+    # From 0.9995 on, three digits round to 1.00 of the unit.
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         if seconds >= scale * 0.9995:
             return f"{number(seconds / scale)} {unit}"
@@ -45,23 +45,24 @@ def duration(seconds: float) -> str:
 
 
 def percent(share: float) -> str:
-    """Return a share in per cent; 100 and 0 stand for all and none only."""
+    """Return a share in per cent; only the shares 0 and 1 are printed as 0 and 100."""
     if not np.isfinite(share):
         return "–"
     text = f"{100 * share:.1f}"
-    # Shares that round to 0.0 or 100.0 with one decimal, and are neither.
+    # These shares would be rounded to 0.0 or 100.0.
     if share not in {0.0, 1.0} and not 0.0005 <= share < 0.9995:
         text = "> 99.9" if share > 0.5 else "< 0.1"
     return text if text not in {"0.0", "100.0"} else text[:-2]
 
 
 def _interval(hits: float, count: float) -> str:
+    """Return a share in per cent with its 95 % interval as text."""
     low, high = wilson(hits, count)
     return f"{percent(float(hits / count))} ({100 * float(low):.1f} to {100 * float(high):.1f})"
 
 
 def _at_most(hits: int, count: int) -> str:
-    """Return a count with the greatest share that it allows."""
+    """Return a count, and in brackets the upper end of the 95 % interval of its share."""
     return f"{hits} (≤ {number(100 * float(clopper_pearson(hits, count)[1]), 2)} %)"
 
 
@@ -69,11 +70,13 @@ Column = tuple[str, Callable[[Any], str]]
 
 
 def _sheet(name: str, title: str, note: str, frame: pd.DataFrame, columns: list[Column], words: int) -> Sheet:
+    """Return a table of a frame: each column has a heading and a function from a row to text."""
     rows = tuple(tuple(show(row) for _, show in columns) for row in frame.itertuples(index=False))
     return Sheet(frame, TextTable(name, title, tuple(head for head, _ in columns), rows, note), words)
 
 
 def _case(words: tuple[str, ...] = ("case", "noise", "method")) -> list[Column]:
+    """Return the columns of case, noise level and method."""
     columns: dict[str, Column] = {
         "case": ("case", lambda r: str(r.case)),
         "noise": ("noise", lambda r: noise_text(r.noise_label)),
@@ -83,10 +86,10 @@ def _case(words: tuple[str, ...] = ("case", "noise", "method")) -> list[Column]:
 
 
 def best_first(frame: pd.DataFrame, order: list[str]) -> Sheet:
-    """Return the methods, best first."""
+    """Return the ranking of the methods, best first."""
     table = ranking(frame, order, SHIFT)
     sums = frame.groupby("method", observed=True)[["answered", "right", "wrong", "false"]].sum()
-    # Over all rows, not over the instances that every method has seen, as the times are.
+    # Over all rows; the times are over the trials that every method ran.
     counts = frame.groupby("method", observed=True).size()
     table = table.join(sums, on="method").assign(trials=[int(counts[name]) for name in table["method"]])
     limits = wilson(table["right"].to_numpy(), table["trials"].to_numpy())
@@ -96,24 +99,24 @@ def best_first(frame: pd.DataFrame, order: list[str]) -> Sheet:
         ("trials", lambda r: str(r.trials)),
         ("right, % (95 %)", lambda r: _interval(r.right, r.trials)),
         ("answered, %", lambda r: percent(r.answered / r.trials)),
-        ("wrong though ok", lambda r: _at_most(r.wrong, r.trials)),
+        ("wrong but ok", lambda r: _at_most(r.wrong, r.trials)),
         ("false proofs", lambda r: str(r.false)),
         ("shifted mean time", lambda r: duration(r.mean)),
         ("relative", lambda r: number(r.relative)),
         ("fastest, %", lambda r: percent(r.fastest)),
     ]
     note = (
-        "Right: an answer, and neither another method nor the truth has a lower cost. Wrong though ok: the status is "
-        "ok, but a lower cost is known; in brackets the greatest share that this count allows (95 %). Mean time: "
+        "Right: an answer, and neither another method nor the truth has a lower cost. Wrong but ok: the status is ok, "
+        "but a lower cost is known; in brackets the upper end of the 95 % interval of the share. Mean time: "
         f"geometric, shifted by {duration(SHIFT)}, over the {int(table['instances'].max())} trials that every method "
-        "has seen; where a method is not right it counts ten times the slowest time of the study. "
-        "Methods that begin at the truth are not ranked."
+        "ran. An answer that is not right counts ten times the slowest time of the study. "
+        "Methods that start at the truth are not ranked."
     )
     return _sheet("ranking", "Ranking", note, table, columns, 1)
 
 
 def success(cells: pd.DataFrame) -> Sheet:
-    """Return how often methods were right, cell by cell."""
+    """Return the shares of right answers of each method, cell by cell."""
     names = "case noise noise_unit noise_label method trials answered right wrong died".split()
     table = cells[names].copy()
     table["right_low"], table["right_high"] = wilson(table["right"].to_numpy(), table["trials"].to_numpy())
@@ -122,14 +125,14 @@ def success(cells: pd.DataFrame) -> Sheet:
         ("trials", lambda r: str(r.trials)),
         ("right, % (95 %)", lambda r: _interval(r.right, r.trials)),
         ("answered, %", lambda r: percent(r.answered / r.trials)),
-        ("wrong though ok", lambda r: _at_most(r.wrong, r.trials)),
+        ("wrong but ok", lambda r: _at_most(r.wrong, r.trials)),
         ("died", lambda r: str(r.died)),
     ]
     return _sheet("success", "Right answers", "Intervals are Wilson's.", table, columns, 3)
 
 
 def statuses(frame: pd.DataFrame) -> Sheet:
-    """Return what methods said of their answers, status by status, and how often a better point is known."""
+    """Return the statuses of the answers of each method, with the trials in which a lower cost is known."""
     columns: list[Column] = [
         ("method", lambda r: str(r.method)),
         ("status", lambda r: str(r.status)),
@@ -138,14 +141,14 @@ def statuses(frame: pd.DataFrame) -> Sheet:
         ("a lower cost is known", lambda r: _at_most(r.better, r.trials)),
     ]
     note = (
-        "Only ok says that nothing stands against a fix: where it does and a lower cost is known, it was wrong though "
-        "ok. The other statuses say what may be wrong; in brackets the greatest share that the count allows (95 %)."
+        "A fix with the status ok has no known fault. If a lower cost is known all the same, the fix was wrong but ok. "
+        "Each other status names a possible fault. In brackets: upper end of the 95 % interval of the share."
     )
     return _sheet("statuses", "Statuses", note, by_status(frame), columns, 2)
 
 
 def accuracy(cells: pd.DataFrame) -> Sheet:
-    """Return how near to the bound answers were, cell by cell."""
+    """Return the errors of the answers relative to the bound, cell by cell."""
     names = "case noise noise_unit noise_label method rmse bound ratio ratio_half deviation_median deviation_p95 nees"
     columns = [
         *_case(),
@@ -157,9 +160,9 @@ def accuracy(cells: pd.DataFrame) -> Sheet:
         ("NEES / dimension", lambda r: number(r.nees)),
     ]
     note = (
-        "Over the answers of a method, or over all its positions where it claims none. The bound is averaged over the "
-        "same trials; a single gross error rules the root mean square, so read it beside the median. NEES over the "
-        "dimension is 1 where claimed covariances are true."
+        "Over the answers of a method, or over all its positions if it claims no answer. The bound is averaged over "
+        "the same trials. A single gross error dominates the root mean square, so compare it with the median. NEES "
+        "over the dimension is 1 if the claimed covariances are right."
     )
     return _sheet("accuracy", "Errors and bounds", note, cells[names.split()], columns, 3)
 
@@ -173,18 +176,18 @@ def timing(cells: pd.DataFrame) -> Sheet:
         ("median", lambda r: duration(r.seconds_median)),
         ("10 %", lambda r: duration(r.seconds_p10)),
         ("90 %", lambda r: duration(r.seconds_p90)),
-        ("first of its kind", lambda r: duration(r.build) if r.build else "–"),
+        ("first fix", lambda r: duration(r.build) if r.build else "–"),
         ("iterations", lambda r: number(r.iterations)),
     ]
     note = (
-        "Time of a call over the number of its fixes. First of its kind: longest time of the first fix in a process, "
-        "which compiles or canonicalises and is not in the other columns."
+        "Time of a call over the number of its fixes. First fix: longest time of the first fix in a process. It "
+        "includes compilation or canonicalisation, and the other columns leave it out."
     )
     return _sheet("timing", "Times", note, cells[names.split()], columns, 3)
 
 
 def solved_within(found: Profiles) -> Sheet:
-    """Return what each method solves within multiples of the least work on each trial."""
+    """Return the shares of trials that each method solves within multiples of the least work of any method."""
     import pandas as pd
 
     rows = [
@@ -202,13 +205,13 @@ def solved_within(found: Profiles) -> Sheet:
         ("median when solved", lambda r: shown(getattr(r, f"median_{found.work}"))),
     ]
     note = (
-        f"Solved: the cost exceeds the least that is known by {found.tau:g} at most, whatever the status. Then the "
-        f"share, in per cent, that is solved within multiples of the {_LEAST[found.work]} that the best method needs "
-        "for the trial. Methods that know the truth do not take part."
+        f"Solved: the cost exceeds the least known cost by at most {found.tau:g}; the status does not matter. The next "
+        f"columns give the share, in per cent, that is solved within multiples of the {_LEAST[found.work]} that the "
+        "best method needs for the trial. Methods that know the truth are left out."
     )
     if found.silent:
-        note += f" Not counted are those of {', '.join(found.silent)}."
-    return _sheet("profiles", "Solved within so much work", note, pd.DataFrame(rows), columns, 1)
+        note += f" Without a count of evaluations, and left out: {', '.join(found.silent)}."
+    return _sheet("profiles", "Solved within a given work", note, pd.DataFrame(rows), columns, 1)
 
 
 _LEAST = {"processor": "processor time", "evaluations": "evaluations of the cost"}
@@ -218,7 +221,7 @@ def _within(ratio: float, row: Any) -> str:
     return percent(getattr(row, f"within_{ratio:g}"))
 
 
-# Proofs that say something of an answer, from the strongest on.
+# Proofs of an answer, from the strongest on.
 _PROOFS = (PROVEN, "region", "local")
 
 
@@ -227,7 +230,7 @@ def _proven(kind: str, row: Any) -> str:
 
 
 def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
-    """Return what methods prove of their answers, and how often that was false."""
+    """Return the proofs of each method's answers, and the number of false ones."""
     import pandas as pd
 
     found = []
@@ -235,7 +238,7 @@ def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
         part = frame[frame["method"] == name]
         proofs = part["proof"].astype(str).value_counts()
         share = {f"proven_{kind}": int(proofs.get(kind, 0)) for kind in _PROOFS}
-        # How much of the cost a bound leaves open; NaN where nothing is proven.
+        # Gap between the cost and its proven lower bound; NaN without a proof.
         below = (part["cost"] - part["bound"]).to_numpy(dtype=float)
         below = below[np.isfinite(below)]
         by = ", ".join(sorted(set(part["certificate"].astype(str)) - {"none", "nan", ""}))
@@ -251,15 +254,15 @@ def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
         ("cost less bound, median", lambda r: number(r.cost_less_bound_median)),
     ]
     note = (
-        "Share of trials, in per cent, whose answer was proven best everywhere, in a region, or locally. A "
-        "global proof is false where another method, or the truth, has a lower cost; in brackets the greatest share of "
-        "false ones that the count allows (95 %)."
+        "Share of trials, in per cent, whose answer was proven best everywhere, in a region, or locally. A global "
+        "proof is false if another method, or the truth, has a lower cost. In brackets: upper end of the 95 % interval "
+        "of the share of false proofs."
     )
     return _sheet("certificates", "Certificates", note, table, columns, 2)
 
 
 def made_with(frame: pd.DataFrame) -> Sheet:
-    """Return where the rows were computed and with what."""
+    """Return the machines and library versions that computed the rows."""
     names = ["machine", "versions"]
     table = frame.groupby(names, observed=True).size().rename("rows").reset_index()
     columns: list[Column] = [
@@ -273,7 +276,7 @@ def made_with(frame: pd.DataFrame) -> Sheet:
 def sheets(
     frame: pd.DataFrame, rivals: pd.DataFrame, cells: pd.DataFrame, order: list[str], found: Profiles | None
 ) -> Iterator[Sheet]:
-    """Yield all tables of judged rows, of those that are ranked, of cells and of profiles, in reading order."""
+    """Yield all tables in reading order; `frame` are all judged rows, `rivals` the rows of the ranked methods."""
     yield best_first(rivals, [name for name in order if name in set(rivals["method"])])
     yield success(cells)
     yield statuses(frame)
@@ -306,9 +309,9 @@ _RAISED = dict(zip("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789", strict=True)
 
 
 def latex_text(text: str) -> str:
-    """Return text as LaTeX sets it."""
+    """Return text with LaTeX's special characters escaped."""
     out, power = [], ""
-    # Raised signs that follow one another are one power.
+    # Consecutive superscript digits are one power.
     for sign in [*text, ""]:
         if sign in _RAISED and sign:
             power += _RAISED[sign]
@@ -321,19 +324,19 @@ def latex_text(text: str) -> str:
 
 
 def latex(table: TextTable, words: int = 1) -> str:
-    """Return a table that breaks across pages; it needs the packages booktabs and longtable.
+    """Return a table as LaTeX that breaks across pages; it needs the packages booktabs and longtable.
 
     Parameters
     ----------
     table : TextTable
         Text cells.
     words : int
-        How many columns at the left are words; the others stand to the right.
+        Number of columns at the left that hold words and are aligned left; the others are aligned right.
     """
     columns = "l" * words + "r" * (len(table.header) - words)
     head = " & ".join(map(latex_text, table.header)) + r" \\"
     rows = [" & ".join(map(latex_text, row)) + r" \\" for row in table.rows]
-    # The note goes with the title: a paper has no other place for it.
+    # The note is part of the caption: a paper has no other place for the note.
     caption = latex_text(f"{table.title}. {table.note}".strip())
     lines = [
         "% needs \\usepackage{booktabs, longtable}",

@@ -1,4 +1,4 @@
-"""From the folder of a study to its report."""
+"""Report of a study: the HTML page, its tables and its figures, made from the output folder."""
 
 from __future__ import annotations
 
@@ -43,30 +43,30 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-# Maps of the scenarios of a study whose stations stand still.
+# Maps of the bound for scenarios whose stations are the same in all trials.
 
 # Points of a map along each axis: 4096 bounds take a fraction of a second, and isolines are smooth.
 _POINTS = 64
-# Maps of a report at most, and trials whose places decide what a map shows: as many as it has dots.
-_MOST, _REACH = 8, 400
-# How far a map goes beyond stations and true places, in shares of the longer side that they take.
-_WIDEN = 0.2
+# Most maps of a report, and most trials of a map; more dots would cover one another.
+_MOST_MAPS, _MOST_DOTS = 8, 400
+# Margin of a map around stations and true positions, as a share of the longer side.
+_MARGIN = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """The map of a case.
+    """Map of the bound of a case.
 
     Parameters
     ----------
     title : str
         Case and noise level.
     found : BoundMap
-        Its bound.
+        The bound at the points of the map.
     truths : array (n, 2)
-        True places of trials, as x and y of the map.
+        True positions of trials, as x and y of the map.
     off : bool array (n,)
-        Where a method other than a bare program claimed an answer that is not the best known.
+        Whether some method was wrong but ok in the trial: its status is ok, and a lower cost is known.
     """
 
     title: str
@@ -76,14 +76,14 @@ class Place:
 
 
 def scenario_maps(design: StudyDesign, frame: pd.DataFrame) -> Iterator[Place]:
-    """Yield the map of every case whose stations are the same in all trials, at its first noise level.
+    """Yield the map of each case whose stations are the same in all trials, at its first noise level.
 
-    Cases that have no map are left out.
+    Cases for which the bound has no map are left out.
     """
     first: dict[str, Case | NetworkCase] = {}
     for cell in design.cells:
         first.setdefault(case_label(cell.case.table.name, cell.case.sweep), cell.case)
-    for title, case in list(first.items())[:_MOST]:
+    for title, case in list(first.items())[:_MOST_MAPS]:
         if isinstance(case, NetworkCase):
             continue
         layout = case.table.layout
@@ -91,41 +91,42 @@ def scenario_maps(design: StudyDesign, frame: pd.DataFrame) -> Iterator[Place]:
             continue
         rows = frame[(frame["case"] == title) & (frame["noise_label"] == case.label)]
         try:
-            yield _place(title, case, rows)
+            yield _scenario_map(title, case, rows)
         except InvalidProblem:
             continue
 
 
-def _place(title: str, case: Case, rows: pd.DataFrame) -> Place:
-    # Stations stand still, so that one trial has those of all.
+def _scenario_map(title: str, case: Case, rows: pd.DataFrame) -> Place:
+    """Return the map of a case at one noise level, with the true positions of its trials."""
+    # The stations are fixed, so the stations of one trial serve all trials.
     one = draw(case, 0, 1)
     problem, d = one.problem.take(np.zeros(1, dtype=int)), one.problem.dimension
     per_trial = rows.groupby("trial", sort=True).agg(
         off=("wrong", "any"), x=("truth_x", "first"), y=("truth_y", "first"), z=("truth_z", "first")
     )
-    position = per_trial[["x", "y", "z"]].to_numpy(dtype=float)[:_REACH, :d]
+    position = per_trial[["x", "y", "z"]].to_numpy(dtype=float)[:_MOST_DOTS, :d]
     earth = problem.frame.geodetic and d == 3
     plain = map_coordinates(problem.frame, position, earth)
-    # The height of the middle trial, whole metres because the page says it.
+    # Height of the middle trial, rounded to metres because the page prints it.
     height = float(np.round(np.median(plain[:, 2]))) if d == 3 and len(plain) else 0.0
-    west, east, south, north = extent(problem, position, widen=_WIDEN)
+    west, east, south, north = extent(problem, position, widen=_MARGIN)
     found = bound_map(
         problem, one.truth[0], np.linspace(west, east, _POINTS), np.linspace(south, north, _POINTS), height
     )
-    off = per_trial["off"].to_numpy(dtype=bool)[:_REACH]
+    off = per_trial["off"].to_numpy(dtype=bool)[:_MOST_DOTS]
     return Place(f"{title}, {noise_text(case.label)}", found, plain[:, :2], off)
 
 
 Tell = Callable[[str], None]
-"""Hears what is being made."""
+"""Called with the name of each step of the report."""
 
-# Pixels of an inch in PNG files: a figure of 5.2 inches has 1040, enough for screens of twice the density.
+# Pixels of an inch in PNG files: a figure of 5.2 inches has 1040, enough for screens of twice the usual density.
 _DPI = 200
 
 
 @dataclass(frozen=True, slots=True)
 class _StudyContent:
-    """What a report is made of; profiles are those of methods that do not begin at the truth, None without a fix."""
+    """Content of a report. `profiles` leaves out methods that start at the truth; it is None if no trial has a fix."""
 
     manifest: StudyManifest
     frame: pd.DataFrame
@@ -138,7 +139,7 @@ class _StudyContent:
 
 @dataclass(frozen=True, slots=True)
 class _Section:
-    """Figures that belong together, with the text above them."""
+    """Section of the page: figures of one subject, and the text above them."""
 
     name: str
     title: str
@@ -150,16 +151,16 @@ class _Section:
 
 
 def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None) -> list[Path]:
-    """Write the report of a study, as far as it is finished.
+    """Write the report of the finished parts of a study.
 
     Parameters
     ----------
     folder : Path
         Output folder of a study.
     out : Path, optional
-        Where ``report.html``, ``tables`` and ``figures`` go; ``report`` in the folder of the study by default.
+        Folder of ``report.html``, ``tables`` and ``figures``; by default ``report`` in the folder of the study.
     tell : callable, optional
-        Hears what is being made.
+        Called with the name of each step.
 
     Returns
     -------
@@ -169,65 +170,69 @@ def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None
     Raises
     ------
     InvalidProblem
-        Where the folder holds no study or nothing of it is finished, matplotlib is missing, or a file cannot be
-        written.
+        If the folder has no study or no finished part, matplotlib is missing, or a file cannot be written.
     """
     figure_class()
-    place = folder / "report" if out is None else out
-    target = place / "report.html"
+    target_folder = folder / "report" if out is None else out
+    target = target_folder / "report.html"
     say = tell or (lambda _: None)
     say("reading")
-    found = _found(folder)
-    make_folder(place)
+    found = _study_content(folder)
+    make_folder(target_folder)
     claim(target)
     with replace_together():
-        files = [_table_file(place, sheet, ending) for sheet in found.sheets.values() for ending in ("csv", "tex")]
+        files = [
+            _table_file(target_folder, sheet, ending) for sheet in found.sheets.values() for ending in ("csv", "tex")
+        ]
         parts = [PagePart("ranking", "Ranking", tables=[found.sheets["ranking"]])]
         for section in _SECTIONS:
             say(section.title.lower())
             pictures = section.make(found)
             if pictures:
                 parts.append(_part(section, found, pictures))
-                files += [path for one in pictures for path in _figure_files(place, one, legend=section.lines)]
+                files += [path for one in pictures for path in _figure_files(target_folder, one, legend=section.lines)]
         if found.places:
             say("maps")
-            part, more = _maps(place, found)
+            part, more = _maps(target_folder, found)
             parts.append(part)
             files += more
         source = found.manifest.text
-        parts.append(PagePart("made", "How it was made", tables=[found.sheets["machine"]], source=source))
+        origin = "Machine, versions and study file"
+        parts.append(PagePart("made", origin, tables=[found.sheets["machine"]], source=source))
         write_text(target, _page(found, parts))
     return [target, *files]
 
 
-def _found(folder: Path) -> _StudyContent:
+def _study_content(folder: Path) -> _StudyContent:
+    """Return the content of the report from the output folder of a study."""
     manifest = read_manifest(folder)
     rows = read_frame(folder, [*summary.COLUMNS])
     if not len(rows):
         advice = "wait for the first part, or run the study"
-        raise InvalidProblem("nothing of the study is finished yet", str(folder), advice)
+        raise InvalidProblem("the study has no finished part yet", str(folder), advice)
     frame = summary.judged(rows)
     # Best first: the order of tables, legends and colours.
     order, cells = summary.methods(frame), summary.cells(frame)
     design = design_of_manifest(manifest)
-    known = references(design)
-    # Nobody competes with methods that know the truth, unless there are no others.
-    rivals = frame[~frame["method"].isin(known)]
+    references_of_design = references(design)
+    # Methods that know the truth are not ranked, unless the study has no others.
+    rivals = frame[~frame["method"].isin(references_of_design)]
     rivals = rivals if len(rivals) else frame
-    # Where every trial came to grief, nobody has spent anything.
-    some = frame["processor"].notna().any()
-    profiled = profiles(rivals) if some else None
+    # If every trial failed, there are no times and no profiles.
+    timed = frame["processor"].notna().any()
+    profiled = profiles(rivals) if timed else None
     tables = {sheet.shown.name: sheet for sheet in sheets(frame, rivals, cells, order, profiled)}
     places = [] if design is None else list(scenario_maps(design, frame))
     return _StudyContent(manifest, frame, cells, marks(order), tables, places, profiled)
 
 
 def _page(found: _StudyContent, parts: list[PagePart]) -> str:
+    """Return the HTML page of the report."""
     m, rows = found.manifest, len(found.frame)
-    state = "complete" if rows == m.rows else f"{rows} of {m.rows} rows: not finished, and what follows may change"
+    state = "complete" if rows == m.rows else f"{rows} of {m.rows} rows: not finished, so the results may change"
     trials = found.frame[["data", "trial"]].drop_duplicates()
     facts = (
-        f"{rows} fixes of {len(trials)} trials by {len(found.looks)} methods ({state}). optloc {m.version}, begun "
+        f"{rows} fixes of {len(trials)} trials by {len(found.looks)} methods ({state}). optloc {m.version}, started "
         f"{m.created[:10]}, seed {m.seed}, {m.machine}."
     )
     opening = [m.note] if m.note else []
@@ -235,16 +240,17 @@ def _page(found: _StudyContent, parts: list[PagePart]) -> str:
 
 
 def _part(section: _Section, found: _StudyContent, pictures: list[Picture]) -> PagePart:
+    """Return a section of the page with its drawings and its folded tables."""
     folded = [found.sheets[name] for name in section.tables]
-    # Before the files are written: these get a legend of their own.
+    # Draw before the files are written: the files get a legend inside the figure, the page does not.
     drawings = [inline(picture) for picture in pictures]
     return PagePart(section.name, section.title, section.text, drawings=drawings, wide=section.wide, folded=folded)
 
 
 def _figure_files(place: Path, picture: Picture, *, legend: bool) -> list[Path]:
-    """Write a picture as PNG and SVG, with a legend of the methods in it where the page has one.
+    """Write a picture as PNG and SVG; with `legend`, draw a legend of the methods into the figure first.
 
-    The legend is drawn into the figure: what stands in the page is made before.
+    The legend changes the figure, so the page's copy must be drawn before.
     """
     figure = picture.figure
     if legend:
@@ -258,6 +264,7 @@ def _figure_files(place: Path, picture: Picture, *, legend: bool) -> list[Path]:
 
 
 def _table_file(place: Path, sheet: Sheet, ending: str) -> Path:
+    """Write a table as .csv or .tex, and return its path."""
     path = place / "tables" / f"{sheet.shown.name}.{ending}"
     make_folder(path.parent)
     if ending != "csv":
@@ -270,11 +277,11 @@ def _table_file(place: Path, sheet: Sheet, ending: str) -> Path:
 
 
 def _maps(place: Path, found: _StudyContent) -> tuple[PagePart, list[Path]]:
-    """Return the maps of a page, which move where they are on Earth, and the files of their pictures."""
+    """Return the section of maps and the files of its pictures; maps of places on Earth can be moved and zoomed."""
     text = (
-        "Bound of the position error (root of its trace) at the height of the middle trial, over the place of the "
-        "target. On maps that move, blue dots are true positions, orange ones those where some method was wrong though "
-        "ok."
+        "Bound of the position error (root of its trace) for a target at each point of the map, at the height of the "
+        "middle trial. On interactive maps, dots are true positions. Where a method was wrong but ok, the dot is "
+        "orange; the others are blue."
     )
     maps: list[Canvas | Drawing] = []
     files = []
@@ -284,69 +291,73 @@ def _maps(place: Path, found: _StudyContent) -> tuple[PagePart, list[Path]]:
         trials = (one.truths, one.off)
         maps.append(map_element(one.found, name, one.title, trials) if one.found.geodetic else inline(picture))
         files += _figure_files(place, picture, legend=False)
-    return PagePart("maps", "Where the bound is small", text, maps=maps, headings=True), files
+    return PagePart("maps", "Maps of the bound", text, maps=maps, headings=True), files
 
 
-def _of_cells(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
+def _cell_pictures(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
+    """Return pictures of the cells of the study."""
     return list(make(found.cells, found.looks))  # type: ignore[call-overload,no-any-return]
 
 
-def _of_rows(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
+def _row_pictures(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
+    """Return pictures of the rows of the study."""
     return list(make(found.frame, found.looks))  # type: ignore[call-overload,no-any-return]
 
 
-def _profiles(found: _StudyContent) -> list[Picture]:
+def _profile_pictures(found: _StudyContent) -> list[Picture]:
+    """Return the pictures of both profiles; empty without profiles."""
     return [] if found.profiles is None else list(drawn.profiles(found.profiles, found.looks))
 
 
 _SECTIONS = (
     _Section(
         "success",
-        "How often it is right",
+        "Right answers",
         "Right: the method claims an answer, and no lower cost is known for the same data. Bars are 95 % intervals.",
-        partial(_of_cells, drawn.success),
+        partial(_cell_pictures, drawn.success),
         lines=False,
         tables=("success", "statuses"),
     ),
     _Section(
         "accuracy",
         "Error over the bound, against noise",
-        "Root mean square error of the answers over that of the Cramer-Rao bound at the truth; bars are 95 % "
-        "intervals. One gross error is enough to lift a point far, so look at the distributions too.",
-        partial(_of_cells, drawn.accuracy),
+        "Root mean square error of the answers, divided by the Cramer-Rao bound at the truth. Bars are 95 % "
+        "intervals. A single gross error can lift a point far, so look at the distributions too.",
+        partial(_cell_pictures, drawn.accuracy),
         tables=("accuracy",),
     ),
     _Section(
         "errors",
         "Distribution of errors",
-        "Share of trials whose error, in units of the bound, is at most so large. A curve ends at the share of trials "
-        "with an answer. The broad grey curve is that of an efficient estimate.",
-        partial(_of_rows, drawn.distributions),
+        "Share of trials whose error, in units of the bound, is at most the value on the axis. A curve ends at the "
+        "share of trials with an answer. The broad grey curve belongs to an efficient estimate.",
+        partial(_row_pictures, drawn.distributions),
     ),
     _Section(
         "gaps",
-        "How near to the best cost",
-        "Share of trials whose cost exceeds the lowest that is known, of any method or of the truth, by at most so "
-        "much. Positions that are not refined count too: this is how tight a relaxation is. Less than a millionth is "
-        "drawn at a millionth.",
-        partial(_of_rows, drawn.gaps),
+        "Cost above the best known",
+        "Share of trials whose cost exceeds the lowest known cost, of any method or of the truth, by at most the value "
+        "on the axis. Positions without refinement count too, so the figure shows how tight a relaxation is. Less than "
+        "a millionth is drawn at a millionth.",
+        partial(_row_pictures, drawn.gaps),
         tables=("certificates",),
     ),
     _Section(
         "profile",
         "Data and performance profiles",
-        "Share of trials that a method solves within so much processor time (Moré and Wild 2009), and within a "
-        "multiple of that of the fastest method of the trial (Dolan and Moré 2002). Solved: the cost exceeds the least "
-        "that is known by a thousandth at most, whatever the status. Where fixes are made many in a call, a trial has "
-        "their mean time. Methods that begin at the truth do not take part.",
-        _profiles,
+        "Share of trials that a method solves: within a given processor time (Moré and Wild 2009), or within a "
+        "multiple of the time of the trial's fastest method (Dolan and Moré 2002). Solved: the cost exceeds the least "
+        "known cost by at most a thousandth; the status does not matter. If a call makes many fixes, each trial gets "
+        "their mean time. Methods that start at the truth are left out.",
+        _profile_pictures,
         tables=("profiles",),
     ),
     _Section(
         "time",
         "Time against size",
-        "Median time of a fix; bars reach from the 10th to the 90th percentile. Points of one size stand side by side.",
-        partial(_of_rows, drawn.timing),
+        "Median time of a fix; bars reach from the 10th to the 90th percentile. Points of one size are drawn side by "
+        "side.",
+        partial(_row_pictures, drawn.timing),
         tables=("timing",),
     ),
 )

@@ -1,6 +1,7 @@
-"""Studies: many trials of scenarios x noise levels x methods in one long table, from a laptop to a cluster.
+"""Studies: many trials of scenarios, noise levels and methods, with one table of results, on a laptop or a cluster.
 
-From file to report: `document` is the study file; `design` cuts it into cells, a case with a method each, and chunks of
-trials; `draws` draws the trials of a case; `methods` solves them, with optloc or one of the `baselines`; `trial` scores
-them, a row each; `execute` does so for all chunks, wherever; `folder` keeps their parts; `summary` says what was found.
+`document` defines the study file. `design` divides the study into cells (a case with a method) and chunks of trials.
+`draws` simulates the trials of a case. `methods` solves them, with optloc or with one of the `baselines`. `trial`
+scores each answer as one row. `execute` runs all chunks on processes or a cluster. `folder` stores the finished parts.
+`summary` computes the statistics of a finished study.
 """

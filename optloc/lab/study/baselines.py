@@ -1,6 +1,7 @@
-"""What studies compare with: iterations from a guess, the papers' originals, general tools, weak relaxations.
+"""Baselines for comparison: iterations from a guess, methods of papers, general tools, weak relaxations.
 
-None of them looks for another minimum, and some claim whatever they arrive at: they are judged by what others find.
+No baseline searches for another minimum, and some claim every result as an answer. A study judges their answers by the
+lowest cost that any method finds.
 """
 
 from __future__ import annotations
@@ -49,29 +50,29 @@ from optloc.sites.calibration.restarts import starts_of
 from optloc.solvers import given, judge, judge_points, offer, spread_of
 
 _ASIDE = 0.2
-"""Width of the box of guesses in the middle, in radii of the array: off every station by chance, near to all alike."""
+"""Width of the box of random centres, in radii of the array. The random centre misses every station, and its distances
+to all stations are similar."""
 
 _FIRST = 40
-"""Epochs with which the recursion begins, so that its first normal equations are regular: those of the paper."""
+"""First epochs that the recursion uses together, as in the paper: its first normal equations are then regular."""
 
 _EVALUATIONS = 200
-"""Evaluations of SciPy at most, ten times what a start that leads somewhere takes (8 to 20 in shipped studies)."""
+"""Most evaluations of SciPy: ten times the number that a good start takes (8 to 20 in shipped studies)."""
 
 
 def start_of(kind: str, width: float, drawn: DrawnCase) -> Array:
-    """Return the starting vectors (n, size) of a guess: "truth", "centre" of the stations, or "box" around it.
+    """Return the starting vectors (n, size) of trials: "truth", "centre" of the stations, or "box" around the centre.
 
-    The centre is taken a tenth of the stations' spread off at random, lest it fall on a station, where ranges have no
-    derivative.
+    The centre is shifted at random by a tenth of the stations' spread, because ranges have no derivative at a station.
 
     Parameters
     ----------
     kind : str
-        Which guess.
+        Kind of guess.
     width : float
         Width of the box, metres.
     drawn : DrawnCase
-        The trials; the places in the box are theirs, whatever the method.
+        The trials. They contain the points in the box, so that all methods start at the same points.
     """
     if kind == "truth":
         return drawn.truth
@@ -83,46 +84,25 @@ def start_of(kind: str, width: float, drawn: DrawnCase) -> Array:
     return start
 
 
-# What the papers do between a guess and an answer, for any problem.
+# Iterations of the papers, for any problem.
 
 
 def single_step(problem: Problem, start: Array) -> Array:
-    """Return where one Gauss-Newton step from a guess leads.
+    """Return the vectors (N, size) after one Gauss-Newton step from `start` (N, size); NaN for singular equations.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems.
-    start : array (N, size)
-        Parameter vectors.
-
-    Returns
-    -------
-    array (N, size)
-        NaN where the normal equations are singular.
+    `problem` is a flat batch of N problems.
     """
     with np.errstate(all="ignore"):
         return _full_step(problem, start)
 
 
 def recursion(problem: Problem, start: Array, *, iterations: int = 2) -> Array:
-    """Return where the registration paper's recursion leads: undamped steps over all data so far, epoch by epoch.
+    """Return the vectors (N, size) of the registration paper's recursion: undamped steps, epoch by epoch.
 
-    It begins with the first forty epochs and never takes a step back.
+    Each step uses all data up to its epoch. The first steps use forty epochs, and every step is accepted.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N runs without unknowns of single epochs.
-    start : array (N, size)
-        Parameter vectors.
-    iterations : int
-        Steps at each epoch.
-
-    Returns
-    -------
-    array (N, size)
-        NaN where the steps ran away, and for problems that have unknowns of single epochs.
+    `problem` is a flat batch of N runs, `start` are vectors (N, size), and `iterations` are the steps at each epoch.
+    The result is NaN if the steps diverge, or if the problem has unknowns of single epochs.
     """
     if problem.layout.n_local or has_correlated_epochs(problem):
         return np.full_like(start, np.nan)
@@ -136,22 +116,16 @@ def recursion(problem: Problem, start: Array, *, iterations: int = 2) -> Array:
 
 
 def _full_step(problem: Problem, x: Array) -> Array:
-    # No damping: a step that is too long is what these baselines show.
+    """Return the vectors (N, size) after one undamped Gauss-Newton step; NaN for singular equations."""
+    # No damping: these baselines demonstrate steps that are too long.
     move, ok = step(equations_at(problem, x), np.zeros(len(x)))
     return x + np.where(ok[:, None], move, np.nan)
 
 
 def claim(problem: Problem, start: Array, x: Array) -> Fix:
-    """Return points (N, size) as fixes that claim to be answers wherever they are finite.
+    """Return points `x` (N, size) as fixes with the status ok, except points that are not finite.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems.
-    start : array (N, size)
-        Where they come from.
-    x : array (N, size)
-        Points.
+    `problem` is a flat batch of N problems; `start` (N, size) are the points where the method started.
     """
     found = np.asarray(np.isfinite(x).all(-1))
     with np.errstate(all="ignore"):
@@ -161,17 +135,17 @@ def claim(problem: Problem, start: Array, x: Array) -> Fix:
     return judge_points(problem, start, x[:, None], cost[:, None], code[:, None], stage)
 
 
-# Who wants to know which costs a method asks for, trial by trial: a study counts them, a history keeps them.
+# Listeners for the costs that a method evaluates, trial by trial: a study counts them, a history stores them.
 
 Listener = Callable[[int, float], None]
-"""Hears of each evaluation: which trial of the call, and the cost there."""
+"""Called at each evaluation with the number of the trial in the call, and the cost."""
 
 _LISTENER: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 
 @contextmanager
 def listening(by: Listener) -> Iterator[None]:
-    """Let somebody hear of every evaluation of a cost that a method of others is given inside."""
+    """Call a listener at each evaluation of a cost by an external method inside this context."""
     token = _LISTENER.set(by)
     try:
         yield
@@ -180,40 +154,33 @@ def listening(by: Listener) -> Iterator[None]:
 
 
 def teller(trial: int) -> Callable[[float], None]:
-    """Return what is told the costs of a trial, for whoever listens now."""
+    """Return a function that passes the costs of a trial to the current listener."""
     listener = _LISTENER.get()
     return (lambda _: None) if listener is None else lambda cost: listener(trial, cost)
 
 
 def weighings(problem: Problem) -> int:
-    """Return how often a trial is solved, the next time with the weights of the place that was found."""
+    """Return the number of times that a trial is solved, each time with noise weights at the last solution.
+
+    The number is 1 if the noise does not depend on the position.
+    """
     return WEIGHINGS if depends_on_place(problem) else 1
 
 
 def weighed_at(problem: Problem, x: Array, start: Array) -> Problem:
-    """Return problems with the weights of places (N, size), of those of the start where there is no place."""
+    """Return problems whose noise weights are those at the points (N, size), or at `start` if a point is not finite."""
     return with_station_noise(problem, np.where(np.isfinite(x).all(-1, keepdims=True), x, start))
 
 
-# General tools on the same data: SciPy's least squares from a guess, the plain lift of ranges.
+# General tools on the same data: SciPy's least squares from a guess, and the lifted relaxation of ranges.
 
 
 def least_squares(problem: Problem, start: Array, limit: int = _EVALUATIONS) -> Fix:
-    """Return the fixes of `scipy.optimize.least_squares` with exact derivatives, one by one.
+    """Return the fixes of `scipy.optimize.least_squares` with exact derivatives, problem by problem.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems without constraints.
-    start : array (N, size)
-        Where each begins.
-    limit : int
-        Evaluations at most.
-
-    Returns
-    -------
-    Fix
-        Judged like a refined one; what did not converge has the status of its ending.
+    `problem` is a flat batch of N problems without constraints, `start` are vectors (N, size), and `limit` is the
+    greatest number of evaluations. The fixes are judged like refined ones; a failed problem has the status of the
+    failure.
     """
     from scipy import optimize
 
@@ -228,7 +195,7 @@ def least_squares(problem: Problem, start: Array, limit: int = _EVALUATIONS) -> 
                 end = optimize.least_squares(residual, pool[i, 0], jacobian, method="lm", max_nfev=limit)
             except ValueError:  # values that are not finite, or fewer rows than unknowns
                 continue
-            pool[i, 0], cost[i, 0] = end.x, 2.0 * end.cost  # SciPy's cost has a half in front
+            pool[i, 0], cost[i, 0] = end.x, 2.0 * end.cost  # the cost of SciPy is half the sum of squares
             code[i, 0] = Status.OK if end.status > 0 else Status.MAX_ITERATIONS
             count("scipy", int(end.nfev))
     stage = Stage("scipy", f"{len(pool)} problems", perf_counter() - began)
@@ -238,9 +205,9 @@ def least_squares(problem: Problem, start: Array, limit: int = _EVALUATIONS) -> 
 def whiten_one(
     one: Problem, tell: Callable[[float], None]
 ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """Return residual (m,) and Jacobian (m, size) of one problem in units of the standard deviation, for SciPy.
+    """Return two functions for SciPy: residual (m,) and Jacobian (m, size) of one problem, in standard deviations.
 
-    What is known beforehand adds a residual for each unknown that it is of. `tell` hears the cost of each residual.
+    Each unknown with a prior adds a residual. The residual function passes its cost to `tell`.
     """
     white, (slope, level) = whiten(one.noise, one.weight), _prior_rows(one)
 
@@ -262,7 +229,7 @@ def _prior_rows(one: Problem) -> tuple[Array, Array]:
     layout, rows, levels = one.layout, [np.zeros((0, one.layout.size))], [np.zeros(0)]
     for name, mean, precision in prior_parts(one):
         slot, shared = layout.find(name)
-        # One problem: what batch or epochs there are have length one.
+        # There is one problem, so leading axes have length one.
         middle, root = mean.reshape(slot.size), np.linalg.cholesky(precision.reshape(slot.size, slot.size))
         for k in range(1 if shared else layout.epochs):
             first = slot.start + (0 if shared else layout.n_shared + k * layout.n_local)
@@ -272,12 +239,9 @@ def _prior_rows(one: Problem) -> tuple[Array, Array]:
 
 
 def lifted_sdp(problem: Problem) -> Fix:
-    """Return the points of the order-1 lift of ranges, unrefined; nowhere for rows that are not sums of ranges.
+    """Return the unrefined points of the order-1 lift of ranges; NaN points if rows are not sums of ranges.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems of one epoch with one static target.
+    `problem` is a flat batch of N problems of one epoch with one static target.
 
     References
     ----------
@@ -293,6 +257,7 @@ def lifted_sdp(problem: Problem) -> Fix:
         centre, scale = spread_of(problem)
 
         def relax(i: int) -> None:
+            """Solve the relaxation of problem i."""
             K, z = _linear(problem.take(np.array([i])), float(scale[i]))
             stations = np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))
             found = lifted_ranges(K, z, (stations[i, 0] - centre[i]) / scale[i])
@@ -312,22 +277,22 @@ def _linear(one: Problem, scale: float) -> tuple[Array, Array]:
             if sign:
                 K[start + np.arange(rows.count), index] += sign
         start += rows.count
-    # In units of the scale, as the stations are: whitening takes both to numbers of order one.
+    # Values are in units of the scale, like the stations: whitening gives numbers of order one.
     stacked = np.concatenate([K, one.observed[0][:, None] / scale], axis=1)
     white = np.concatenate([w.apply(stacked[None])[0] for w in whiten(one.noise, one.weight)])
     return white[:, :-1] * scale, white[:, -1] * scale
 
 
-# Networks: from random places, and from the convex start.
+# Networks: from random positions, and from the convex start.
 
 
 def at_random(count: int) -> Callable[[Network, int], NetworkResult]:
-    """Return what refines so many networks of random places, all in the spread that the arrivals tell."""
+    """Return a method that refines `count` networks of random positions, spread as the arrivals indicate."""
     return lambda network, seed: refined(network, starts_of(likelihood(network), seed).random(count))
 
 
 def by_nuclear_norm(network: Network, seed: int) -> NetworkResult:
-    """Return what the times of emission of least truncated nuclear norm lead to; nothing where it does not apply.
+    """Return the network refined from the emission times of least truncated nuclear norm, if the norm applies.
 
     References
     ----------
@@ -352,16 +317,16 @@ def by_nuclear_norm(network: Network, seed: int) -> NetworkResult:
 
 
 def only_networks(drawn: DrawnCase, start: Array) -> Fix:
-    """Stand for the fixes of a baseline that has none."""
-    raise InvalidProblem("this baseline serves networks alone", "baseline", "give [[network]] tables")
+    """Raise InvalidProblem: this baseline has no fixes."""
+    raise InvalidProblem("this baseline solves networks only", "baseline", "give [[network]] tables")
 
 
-# The table.
+# Table of baselines.
 
 
 @dataclass(frozen=True, slots=True)
 class Baseline:
-    """Something to compare with.
+    """Method to compare with.
 
     Parameters
     ----------
@@ -370,15 +335,15 @@ class Baseline:
     summary : str
         One line for listings.
     guess : bool
-        Whether it begins at the start.
+        Whether it needs a start.
     slow : bool
-        Whether it solves one by one.
+        Whether it solves problems one by one.
     reference : bool
-        Whether it knows the truth: it judges the others, and nobody competes with it.
+        Whether it knows the truth: it judges the other methods and is not ranked.
     method : str
-        The method of optloc that it runs from its start, where it is one.
+        Name of the method of optloc that it runs from its start; empty for other baselines.
     networks : callable, optional
-        ``Networks -> tuple of Found``, where it finds networks, too.
+        ``Networks -> tuple of NetworkResult``, if it also solves networks.
     """
 
     run: Callable[[DrawnCase, Array], Fix]
@@ -391,6 +356,8 @@ class Baseline:
 
 
 def _iterate(method: str) -> Callable[[DrawnCase, Array], Fix]:
+    """Return a baseline function that runs a method of optloc from a start."""
+
     def run(drawn: DrawnCase, start: Array) -> Fix:
         from optloc.solvers import solve
 
@@ -400,11 +367,12 @@ def _iterate(method: str) -> Callable[[DrawnCase, Array], Fix]:
 
 
 def _truth(drawn: DrawnCase, start: Array) -> Fix:
+    """Return the fixes of damped least squares from the truth."""
     return _iterate("lsr")(drawn, drawn.truth)
 
 
 def _printed(drawn: DrawnCase, start: Array) -> Fix:
-    """Return the undamped iteration with the residual's sign as the paper prints it."""
+    """Return the undamped iteration with the sign of the residual as printed in the paper."""
     from optloc.lab.papers.kinematic import taylor
 
     size = drawn.problem.dimension
@@ -414,18 +382,19 @@ def _printed(drawn: DrawnCase, start: Array) -> Fix:
 
 
 def _original(steps: Callable[[Problem, Array], Array]) -> Callable[[DrawnCase, Array], Fix]:
-    """Return the method of a paper; it claims whatever it arrives at."""
+    """Return the method of a paper, which claims every finite point as an answer."""
     return lambda drawn, start: claim(drawn.problem, start, steps(drawn.problem, start))
 
 
 def _network(summary: str, refine: Callable[[Network, int], NetworkResult]) -> Baseline:
+    """Return a baseline for networks only, which refines them one by one."""
     return Baseline(only_networks, summary, guess=False, slow=True, networks=each(refine))
 
 
 _OWN = {
     "truth": Baseline(
         _truth,
-        "damped least squares from the truth: the best that any start can lead to",
+        "damped least squares from the truth: the best result that a start can have",
         guess=False,
         reference=True,
         networks=from_truth,
@@ -433,10 +402,10 @@ _OWN = {
     "gauss-newton": Baseline(_iterate("lsr"), "damped least squares from a guess", method="lsr"),
     "taylor": Baseline(
         _iterate("taylor"),
-        "plain undamped Taylor iteration from a guess (Foy 1976), as in the papers",
+        "undamped Taylor iteration from a guess (Foy 1976), as in the papers",
         method="taylor",
     ),
-    "taylor-printed": Baseline(_printed, "the same with the sign of equations 8 and 15 of the paper `kinematic`"),
+    "taylor-printed": Baseline(_printed, "taylor with the sign of equations 8 and 15 of the paper `kinematic`"),
     "single-step": Baseline(
         _original(single_step), "one linearised step from a guess, as in the update of the paper `angles`"
     ),
@@ -460,8 +429,10 @@ _OWN = {
         "no missing arrival",
         by_nuclear_norm,
     ),
-    "one-random": _network("networks: least squares from one network of random places", at_random(1)),
-    "ten-random": _network("networks: the best of least squares from ten networks of random places", at_random(10)),
+    "one-random": _network("networks: least squares from one network of random positions", at_random(1)),
+    "ten-random": _network(
+        "networks: the best result of least squares from ten networks of random positions", at_random(10)
+    ),
 }
 
 BASELINES: Registry[Baseline] = Registry("optloc.baselines", lambda value: isinstance(value, Baseline), _OWN)

@@ -1,6 +1,6 @@
-"""The design of a study: cases times methods are cells; some trials of a cell, a chunk, are a task and a file.
+"""Experimental design of a study: a cell is a case with a method, and a chunk is some trials of a cell.
 
-A case is one geometry at one noise level with one set of swept values.
+A case is one geometry at one noise level with one set of swept values. A chunk is one task and one part file.
 """
 
 from __future__ import annotations
@@ -41,17 +41,18 @@ from optloc.problem import (
     variances,
 )
 
-# Trials of a chunk, whose part should take seconds: less, and files and tasks cost as much as fixes; more, and a run
-# that is stopped loses minutes. A fast fix takes about 0.1 ms with everything beside it (a million in two minutes is
-# what tests/benchmarks/test_study.py asks), a slow one 1 to 100 ms. Other values are another design: a study that has
-# begun would not go on.
+# Most trials of a chunk, for fast and for slow methods: a part should take seconds. In shorter parts, files and tasks
+# take as long as fixes; with longer parts, a stopped run loses minutes. A fast fix takes about 0.1 ms with all overhead
+# (tests/benchmarks/test_study.py requires a million in two minutes), a slow one 1 to 100 ms. Other values make another
+# design, so existing studies could not continue.
 _FAST, _SLOW = 10_000, 250
-# Fewest trials of a chunk of a slow and of a fast method; the latter is a block of draws, which is drawn whole.
+# Fewest trials of a chunk of a slow and of a fast method. The latter is the largest block of draws, as a block is
+# always drawn whole.
 _LEAST, _LEAST_FAST = 10, 500
-# Measurements of a chunk: large problems have fewer trials in it, twenty times fewer where they are solved one by one.
+# Most measurements of a chunk: large problems have fewer trials in it, and twenty times fewer if solved one by one.
 _NUMBERS, _SLOWER = 100_000, 20
-# Chunks of a cell at least, if they do not become too small: so many workers share it.
-_SHARES = 8
+# Chunks of a cell, unless they become too small: this number of workers can share a cell.
+_LEAST_CHUNKS = 8
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Cell:
     case : Case or NetworkCase
         Geometry, truth, noise.
     method : StudyMethod
-        What solves it.
+        Method that solves the case.
     """
 
     case: Case | NetworkCase
@@ -71,12 +72,12 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """Return 16 hexadecimal digits that name it."""
+        """Return 16 hexadecimal digits that identify the cell."""
         return hashlib.blake2b(f"{self.case.key} {self.method.identity}".encode(), digest_size=8).hexdigest()
 
     @property
     def stretch(self) -> int:
-        """Return how many trials make a chunk: as many as take seconds, but so few that several workers get some."""
+        """Return the number of trials of a chunk: it takes seconds, and several workers can share the cell."""
         method, case = self.method, self.case
         if method.chunk is not None:
             return method.chunk
@@ -84,19 +85,19 @@ class Cell:
             (_SLOW, _NUMBERS // _SLOWER, _LEAST) if method.slow else (_FAST, _NUMBERS, _LEAST_FAST)
         )
         most = max(_LEAST, min(longest, numbers // case.numbers))
-        return int(np.clip(-(-case.trials // _SHARES), min(least, most), most))
+        return int(np.clip(-(-case.trials // _LEAST_CHUNKS), min(least, most), most))
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Some trials of a cell: what one task computes, and one part file holds.
+    """Some trials of a cell: one task computes them, and one part file holds them.
 
     Parameters
     ----------
     cell : Cell
-        Their cell.
+        Cell of the trials.
     first, count : int
-        Numbers of the trials.
+        Number of the first trial, and number of trials.
     """
 
     cell: Cell
@@ -105,7 +106,7 @@ class Chunk:
 
     @property
     def key(self) -> str:
-        """Return the name of its part file, without ending."""
+        """Return the name of the part file, without its suffix."""
         return f"{self.cell.key}-{self.first:09d}-{self.count}"
 
 
@@ -116,13 +117,13 @@ class StudyDesign:
     Parameters
     ----------
     study : StudyFile
-        Its file.
+        Content of the study file.
     text : str
-        The text of the file.
+        Text of the study file.
     cells : tuple of Cell
         In the order of the file.
     folder : str
-        Where its problem files are.
+        Folder of the problem files.
     """
 
     study: StudyFile
@@ -137,7 +138,7 @@ class StudyDesign:
             [Chunk(cell, first, min(n, cell.case.trials - first)) for first in range(0, cell.case.trials, n)]
             for cell, n in ((cell, cell.stretch) for cell in self.cells)
         ]
-        # A study that is stopped early has something of every cell, so its report shows all methods.
+        # If a study is stopped early, each cell has some trials, so the report shows all methods.
         for turn in range(max(len(chunks) for chunks in cut)):
             yield from (chunks[turn] for chunks in cut if turn < len(chunks))
 
@@ -148,13 +149,13 @@ class StudyDesign:
 
     @property
     def fingerprint(self) -> str:
-        """Return hexadecimal digits that are equal for equal data and methods, whatever the remarks of the file."""
-        # Remarks, titles and the order of keys do not count: the folder of the same study is continued.
+        """Return hexadecimal digits that identify the data and the methods; remarks in the file do not change them."""
+        # Without remarks, titles and the order of keys, so that a study continues in its folder after such edits.
         return _digest(f"{cell.key}:{cell.case.trials}:{cell.stretch}" for cell in self.cells)
 
     @property
     def data(self) -> str:
-        """Return hexadecimal digits that are equal for equal data, whatever the methods."""
+        """Return hexadecimal digits that identify the data; methods do not change them."""
         return _digest(dict.fromkeys(f"{cell.case.key}:{cell.case.trials}" for cell in self.cells))
 
 
@@ -171,7 +172,7 @@ def shipped() -> dict[str, Traversable]:
     return dict(sorted(found.items()))
 
 
-# Cases whose problems are all held in memory, and part files of a folder: more are a slip, and take days to begin.
+# Most cases, whose problems are all in memory, and most part files of a folder. Larger numbers are typing errors.
 _CASES, _PARTS = 10_000, 1_000_000
 
 
@@ -185,14 +186,14 @@ def design_of(
     file : Path
         A TOML file with ``format = 1``.
     trials, seed : int, optional
-        In the place of those of the file; `trials` also in that of single scenarios.
+        Replace the values of the file; `trials` also replaces the values of single scenarios.
     more : sequence of StudyMethod
-        Methods beside those of the file.
+        Methods in addition to the methods of the file.
 
     Raises
     ------
     InvalidProblem
-        Naming the file, the scenario or the method, and what cannot be right.
+        If the file is invalid; the message names the file, the scenario or the method, and the error.
     """
     if file.suffix == "" and not file.exists():
         known = shipped()
@@ -213,7 +214,7 @@ def design_of_text(
     seed: int | None = None,
     more: Sequence[StudyMethod] = (),
 ) -> StudyDesign:
-    """Return the design of the text of a study file; `folder` is where its problem files are."""
+    """Return the design of a study file's text; `source` names it in messages, `folder` contains its problem files."""
     study = validated(StudyFile, parse_toml(text, source), source)
     new = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     study = study.model_copy(update=new)
@@ -221,13 +222,13 @@ def design_of_text(
         methods = [method for i, table in enumerate(study.method) for method in methods_of(table, i + 1)]
         methods += more
         _one_kind(study, methods)
-        # What the command line says holds for scenarios that have a number of their own, too.
-        own = {} if trials is None else {"trials": None}
+        # Trials of the command line also replace the numbers of single scenarios.
+        override = {} if trials is None else {"trials": None}
         cases: list[Case | NetworkCase] = []
         for scenario in study.scenario:
-            cases += cases_of(scenario.model_copy(update=own), folder, study.seed, study.trials)
+            cases += cases_of(scenario.model_copy(update=override), folder, study.seed, study.trials)
         for network in study.network:
-            cases += network_cases(network.model_copy(update=own), study.seed, study.trials)
+            cases += network_cases(network.model_copy(update=override), study.seed, study.trials)
     except InvalidProblem as error:
         where = ", ".join(part for part in (source, error.where) if part)
         raise InvalidProblem(error.what, where, error.advice) from None
@@ -235,8 +236,8 @@ def design_of_text(
     if parts <= _PARTS:
         parts = sum(-(-case.trials // Cell(case, method).stretch) for case in cases for method in methods)
     if parts > _PARTS:
-        advice = "ask for fewer trials or cases, or let tasks be larger: chunk in [[method]]"
-        raise InvalidProblem(f"the study has {parts} parts, {_PARTS} at most", source, advice)
+        advice = "use fewer trials or cases, or a larger chunk in [[method]]"
+        raise InvalidProblem(f"the study has {parts} parts, more than {_PARTS}", source, advice)
     _distinct([method.name for method in methods], source, "method")
     _distinct([table.name for table in study.scenario], source, "scenario")
     _distinct([table.name for table in study.network], source, "network")
@@ -246,43 +247,33 @@ def design_of_text(
 
 
 def _one_kind(study: StudyFile, methods: list[StudyMethod]) -> None:
-    """Refuse studies of nothing, of scenarios and networks at once, and methods that do not serve what is studied."""
+    """Raise InvalidProblem unless there are either scenarios or networks, and every method can solve them."""
     if bool(study.scenario) == bool(study.network):
-        what = "there are both scenarios and networks" if study.scenario else "there is nothing to study"
+        what = "there are both scenarios and networks" if study.scenario else "there is no scenario and no network"
         raise InvalidProblem(what, "[[scenario]]", "give either [[scenario]] or [[network]] tables")
     for method in methods:
         if study.network and not method.networked:
             advice = 'use method = "calibrate", or a baseline of networks: optloc list baselines'
-            raise InvalidProblem("it finds no networks", f"method {method.name!r}", advice)
+            raise InvalidProblem("it cannot solve networks", f"method {method.name!r}", advice)
         if study.scenario and not method.fixes:
-            raise InvalidProblem("it serves networks alone", f"method {method.name!r}", "give [[network]] tables")
+            raise InvalidProblem("it solves networks only", f"method {method.name!r}", "give [[network]] tables")
 
 
 def _distinct(names: list[str], source: str, what: str) -> None:
+    """Raise InvalidProblem if two tables have the same name."""
     twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
-        raise InvalidProblem(f"there are two {what}s {twice[0]!r}", source, f"give each {what} a name of its own")
+        raise InvalidProblem(f"there are two {what}s {twice[0]!r}", source, f"give each {what} a different name")
 
 
 # From a scenario to its cases.
 
 
 def cases_of(table: ScenarioTable, folder: Path, seed: int, trials: int) -> Iterator[Case]:
-    """Yield the cases of a scenario: swept values outside, noise levels inside.
+    """Yield the cases of a scenario: swept values in the outer loop, noise levels in the inner one.
 
-    Parameters
-    ----------
-    table : ScenarioTable
-        The scenario.
-    folder : Path
-        Where its problem file is.
-    seed, trials : int
-        Of the study.
-
-    Raises
-    ------
-    InvalidProblem
-        Naming the scenario and what cannot be right.
+    `folder` contains its problem file; `seed` and `trials` are the values of the study. Raise InvalidProblem with the
+    name of the scenario if it is invalid.
     """
     where = f"scenario {table.name!r}"
     for swept, chosen in _sweep(table, where):
@@ -297,19 +288,9 @@ def cases_of(table: ScenarioTable, folder: Path, seed: int, trials: int) -> Iter
 
 
 def network_cases(table: NetworkTable, seed: int, trials: int) -> Iterator[NetworkCase]:
-    """Yield the cases of networks: swept values outside, noise levels inside.
+    """Yield the cases of a table of networks: swept values in the outer loop, noise levels in the inner one.
 
-    Parameters
-    ----------
-    table : NetworkTable
-        The networks.
-    seed, trials : int
-        Of the study.
-
-    Raises
-    ------
-    InvalidProblem
-        Naming the network and what cannot be right.
+    `seed` and `trials` are the values of the study. Raise InvalidProblem with the name of the network if it is invalid.
     """
     where = f"network {table.name!r}"
     for swept, chosen in _sweep(table, where):
@@ -324,16 +305,19 @@ _Table = TypeVar("_Table", ScenarioTable, NetworkTable)
 
 
 def _sweep(table: _Table, where: str) -> Iterator[tuple[dict[str, Any], _Table]]:
+    """Yield the swept values and the table with these values, for each combination of the lists."""
     for name, values in table.sweep.items():
         if not values or name in ("name", "sweep", "noise", "trials"):
             what = "has no values" if not values else "cannot be swept"
-            raise InvalidProblem(f"{name!r} {what}", join(where, "sweep"), "give a list; noise has levels of its own")
+            raise InvalidProblem(
+                f"{name!r} {what}", join(where, "sweep"), "give a list of values; noise levels are in 'noise'"
+            )
     if (count := prod(map(len, table.sweep.values()))) > _CASES:
-        what = f"its lists make {count} cases, {_CASES} at most"
+        what = f"its lists make {count} cases, more than {_CASES}"
         raise InvalidProblem(what, join(where, "sweep"), "sweep fewer values, or write several studies")
     for chosen in product(*table.sweep.values()):
         swept = dict(zip(table.sweep, chosen, strict=True))
-        # Swept values are put into what the file says and read again, so that they are checked like written ones.
+        # Swept values are put into the table of the file, which is then validated again like a written one.
         data = table.model_dump(exclude_unset=True, exclude={"sweep"})
         for name, value in swept.items():
             *path, last = name.split(".")
@@ -341,12 +325,13 @@ def _sweep(table: _Table, where: str) -> Iterator[tuple[dict[str, Any], _Table]]
             for part in path:
                 at = at.setdefault(part, {})
                 if not isinstance(at, dict):
-                    raise InvalidProblem(f"{name!r} names no key", join(where, "sweep"), "write table.key")
+                    raise InvalidProblem(f"there is no key {name!r}", join(where, "sweep"), "write table.key")
             at[last] = value
         yield swept, validated(type(table), data, where) if swept else table
 
 
 def _template(table: ScenarioTable, folder: Path, where: str, seed: int) -> Problem:
+    """Return the problem of a scenario without measurements, from its file or its layout."""
     if (table.problem is None) == (table.layout is None):
         raise InvalidProblem("a scenario has one geometry", where, "give either problem or [scenario.layout]")
     if table.layout is not None:
@@ -365,23 +350,24 @@ def _template(table: ScenarioTable, folder: Path, where: str, seed: int) -> Prob
 
 
 def _lay(table: ScenarioTable, where: str, seed: int) -> Problem:
-    """Return the problem of a layout with noise of one, in which only the stations of a trial are still to be put."""
+    """Return the problem of a layout with noise of one; only random stations still have to be drawn for each trial."""
     layout = table.layout
     assert layout is not None
     where, s = join(where, "layout"), layout.stations
-    # Frozen stations are a function of seed, number and dimension: scenarios that share these share their stations.
+    # Frozen stations depend on seed, number and dimension only: scenarios that share these share their stations.
     rng = np.random.default_rng([seed, s, layout.dimension])
     pairs = list(combinations(range(s), 2)) if layout.pairs == "all" else [(0, i) for i in range(1, s)]
     rows = []
     for kind in layout.kinds:
         model = kind_model(kind, join(where, "kinds"))
         if model.stations == 0 or model.velocity:
-            what = f"{kind!r} needs more than stations at rest and a target"
+            what = f"a layout has fixed stations only, which do not measure {kind!r}"
             raise InvalidProblem(what, join(where, "kinds"), "write a problem file, and name it in 'problem'")
         if model.stations == 2 and s < 2:
             raise InvalidProblem(f"{kind!r} needs two stations", join(where, "stations"), "give more")
         a, b = (np.arange(s), None) if model.stations == 1 else (np.array([p[1] for p in pairs]), [p[0] for p in pairs])
-        # Differences share the arrival at a station, and with it half their variance, unless the file says otherwise.
+        # Differences share the arrival at a station, and so half of their variance, unless the file makes them
+        # independent.
         shared = model.stations == 2 and model.ranges is not None and not layout.independent
         rows.append(measured(kind, a=a, b=b, arrival_sigma=1.0) if shared else measured(kind, a=a, b=b, sigma=1.0))
     survey = None if layout.survey is None else metres([layout.survey], join(where, "survey"))[0] ** 2
@@ -392,17 +378,17 @@ def _lay(table: ScenarioTable, where: str, seed: int) -> Problem:
 
 
 def _check(problem: Problem, table: ScenarioTable, where: str) -> None:
-    """Refuse what has no single position to compare, and truths, biases and errors that do not fit."""
-    # A trial is one problem: epochs that share no unknown would be trials of their own, without a number.
+    """Raise InvalidProblem unless one position is sought, and truth, biases and errors fit the problem."""
+    # A trial is one problem. Epochs that share no unknown would be separate trials without a number.
     if separable(problem):
-        what = f"its {problem.epochs} epochs are problems of their own"
-        raise InvalidProblem(what, where, "leave one epoch in the file: the trials are draws of it")
+        what = f"its {problem.epochs} epochs are separate problems"
+        raise InvalidProblem(what, where, "keep one epoch in the file: every trial simulates it")
     sought = [motion for motion in problem.motions if motion.known is None]
     if len(sought) != 1 or sought[0].span != "run":
-        raise InvalidProblem(f"{len(sought)} targets are sought", where, "give one static or moving target")
+        raise InvalidProblem(f"it has {len(sought)} unknown targets", where, "give one static or moving target")
     moving = sought[0].order > 0
     if not moving and (table.truth.speed is not None or table.truth.velocity is not None):
-        raise InvalidProblem("its target does not move", join(where, "truth"), "leave the velocity out")
+        raise InvalidProblem("its target does not move", join(where, "truth"), "remove the velocity")
     check_truth(table.truth, problem.frame, problem.dimension, join(where, "truth"))
     known = [bias.name for bias in problem.biases]
     for name in table.bias:
@@ -428,23 +414,23 @@ def _noise(problem: Problem, level: Level, from_file: bool, where: str) -> tuple
         odd = min(set(level) ^ set(kinds))
         raise InvalidProblem(f"the levels do not fit the kinds: {odd!r}", where, f"name {', '.join(kinds)}")
     wanted = {kind: sigma_of(kind, amount, where) for kind, amount in level.items()}
-    # Rows are scaled to the level, so correlations stay as the file or the layout has them.
-    own = np.sqrt(variances(problem.noise, problem.count))
+    # Only standard deviations change: the correlations of the file or the layout stay.
+    present = np.sqrt(variances(problem.noise, problem.count))
     sigma = np.concatenate([np.full(rows.count, wanted[rows.kind]) for rows in problem.rows])
     unit = SI_UNIT[MODELS[kinds[0]].quantity]  # type: ignore[index]  # models hold known quantities only
-    return _scale(problem.noise, sigma / own), wanted[kinds[0]], unit
+    return _scale(problem.noise, sigma / present), wanted[kinds[0]], unit
 
 
 def _scale(noise: Noise, factor: Array) -> Noise:
-    """Return noise whose rows have standard deviations times a factor (m,)."""
+    """Return noise whose standard deviations are multiplied by a factor (m,), one for each row."""
     blocks = []
     for block in noise.blocks:
-        own = factor[block.row]
-        blocks.append(Block(block.row, block.covariance * own[:, :, None] * own[:, None, :]))
+        size = factor[block.row]
+        blocks.append(Block(block.row, block.covariance * size[:, :, None] * size[:, None, :]))
     return Noise(tuple(blocks))
 
 
 def workers() -> int:
-    """Return how many processes this machine can run at a time."""
-    # Processors that this process may use: containers and schedulers leave it fewer than the machine has.
+    """Return the number of processes that this machine can run at a time."""
+    # Containers and schedulers may allow fewer processors than the machine has.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

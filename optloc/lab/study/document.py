@@ -1,4 +1,4 @@
-"""What a study file may say, as tables from which its JSON schema is derived."""
+"""Content of a study file, as tables from which its JSON schema is derived."""
 
 from __future__ import annotations
 
@@ -12,53 +12,53 @@ from optloc.models import MODELS
 from optloc.problem import Amount, InvalidProblem
 
 Level = float | str | dict[str, Amount]
-"""A factor on the noise of a file, the standard deviation of every row, or that of every kind."""
+"""A factor on the noise of a file, the standard deviation of every row, or the standard deviation of each kind."""
 
-# Names stand in every row, in titles of figures and in legends: one line at most.
+# Names appear in every row, in titles of figures and in legends: one line at most.
 Name = Annotated[str, Field(min_length=1, max_length=120)]
 
 
-# Limits of counts catch slips before hours are spent: more stations than any array has, more trials than the nine
-# digits of a part's name can number.
+# Limits of counts catch typing errors before hours are spent: no array has more stations, and the nine digits in the
+# name of a part number no more trials.
 class _DesignTable(BaseModel):
-    """A table of the file; keys that it does not know are refused."""
+    """A table of the file; unknown keys are rejected."""
 
-    # Strict: a number in quotes is text with a unit, and a misspelt key must not be a default in silence.
+    # Strict: a number in quotes is text with a unit, and a misspelt key must not become a default without a message.
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
 
 class LayoutTable(_DesignTable):
-    """Stations placed by rule, and who measures what; lengths are amounts."""
+    """Stations placed by a rule, and their measurements; lengths are amounts."""
 
     stations: int = Field(default=6, ge=1, le=1000)
     """Number of stations."""
     dimension: Literal[2, 3] = 3
     """Dimension of the positions."""
     placement: Literal["random", "frozen", "ring", "star", "given"] = "random"
-    """Random in the box anew in every trial; drawn once; on an ellipse in the box; the same with the first station in
-    the middle; or as `places` says."""
+    """Random in the box, drawn in every trial; frozen: drawn once; ring: on an ellipse in the box; star: a ring with
+    the first station in the middle; given: at `places`."""
     box: list[Amount] = Field(default=["10 km", "10 km", "6 km"], min_length=2, max_length=3)
     """Widths of the box around the origin."""
     places: list[list[float]] | None = None
     """Positions of the stations, metres."""
     kinds: list[str] = Field(default=["tdoa"], min_length=1)
-    """Measurement kinds: of one station at every station, of two at the pairs."""
+    """Measurement kinds. Kinds of one station have a row at every station, kinds of two at every pair."""
     pairs: Literal["first", "all"] = "first"
     """Pairs of stations: all against the first, or every pair."""
     independent: bool = False
-    """Whether differences of one station are independent; by default they share the error of its arrival."""
+    """Whether differences with a common station are independent; by default they share the error of its arrival."""
     survey: Amount | None = None
-    """Standard deviation of each coordinate of the stations' positions, drawn anew in every trial; None: exact."""
+    """Standard deviation of each coordinate of the stations' positions, drawn in every trial; None: exact."""
 
 
 class TruthTable(_DesignTable):
-    """Where the target is; lengths are amounts."""
+    """Position and velocity of the target; lengths are amounts."""
 
     kind: Literal["fixed", "box", "shell", "hull", "area"]
-    """At one place; in a box; in all directions from the stations' centre; inside their hull; in a rectangle of
-    latitude and longitude."""
+    """Fixed: one position; box: in a box; shell: in all directions from the stations' centre; hull: inside their hull;
+    area: in a rectangle of latitude and longitude."""
     at: list[Amount] | None = None
     """Fixed: coordinates in the frame."""
     at_deg: list[float] | None = None
@@ -66,9 +66,9 @@ class TruthTable(_DesignTable):
     centre: list[Amount] | None = None
     """Box: its centre; the stations' centre by default."""
     box: list[Amount] | None = None
-    """Box: its widths; along east, north and up on Earth."""
+    """Box: its widths; on Earth along east, north and up."""
     distance: list[Amount] | None = Field(default=None, min_length=2, max_length=2)
-    """Shell: least and greatest distance from the stations' centre, equally likely between."""
+    """Shell: least and greatest distance from the stations' centre; the distance is uniform between them."""
     elevation_deg: list[float] | None = Field(default=None, min_length=2, max_length=2)
     """Shell: least and greatest elevation of the direction; all directions by default."""
     lat_deg: list[float] | None = Field(default=None, min_length=2, max_length=2)
@@ -80,25 +80,26 @@ class TruthTable(_DesignTable):
     speed: Amount | None = None
     """Speed of a moving target in a random direction; zero by default."""
     velocity: list[Amount] | None = None
-    """Velocity of a moving target, in the place of `speed`."""
+    """Velocity of a moving target, instead of `speed`."""
 
 
 class OutlierTable(_DesignTable):
     """Gross errors of single stations."""
 
     share: float = Field(gt=0.0, le=1.0)
-    """Probability that a station is off in a trial."""
+    """Probability that a station has a gross error in a trial."""
     size: Amount | dict[str, Amount]
-    """How far off: of all kinds, or of each. A difference takes the error of its second station with the other sign."""
+    """Size of the error, for all kinds or for each. A difference takes the error of its second station with the other
+    sign."""
     late: bool = False
-    """Whether stations are off in one direction only, as blocked paths make arrivals late; by default in either."""
+    """Whether all errors are positive, as a blocked path makes an arrival late; by default the sign is random."""
 
 
 class ErrorTable(_DesignTable):
-    """What the measurements suffer and no method is told."""
+    """Errors in the measurements that no method has a model of."""
 
     offset: Amount | dict[str, Amount] | None = None
-    """Standard deviation of a constant error of each station, drawn in every trial: of all kinds, or of each."""
+    """Standard deviation of a constant error of each station, drawn in every trial: for all kinds, or for each."""
     outliers: OutlierTable | None = None
     """Gross errors of a share of the stations."""
 
@@ -111,25 +112,25 @@ class ScenarioTable(_DesignTable):
     problem: str | None = None
     """Problem file, relative to the study file, or the name of a shipped one: stations, rows, biases, constraints."""
     layout: LayoutTable | None = None
-    """Stations placed by rule, in the place of a file."""
+    """Stations placed by a rule, instead of a problem file."""
     truth: TruthTable
-    """Where the target is."""
+    """Position and velocity of the target."""
     noise: list[Level] = Field(default=[1.0], min_length=1)
-    """Noise levels: "10 m" is the standard deviation of every row; { tdoa = "10 m", azimuth = "5 mrad" } names kinds;
-    a bare number is a factor on the noise of the problem file."""
+    """Noise levels: "10 m" is the standard deviation of every row; { tdoa = "10 m", azimuth = "5 mrad" } names kinds; a
+    bare number is a factor on the noise of the problem file."""
     bias: dict[str, Amount | list[Amount]] = Field(default_factory=dict)
-    """True values of the biases of the file: one for each member, or the standard deviation of a draw in every trial.
-    By default their prior means."""
+    """True values of the biases of the file: a list with one value for each member, or the standard deviation of a draw
+    in every trial. By default the prior means."""
     error: ErrorTable = ErrorTable()
     """Errors that are not modelled."""
     sweep: dict[str, list[Any]] = Field(default_factory=dict)
     """Values of other keys of this table, by dotted names such as "layout.stations": every combination is a case."""
     trials: int | None = Field(default=None, ge=1, le=100_000_000)
-    """Number of trials, in the place of the study's."""
+    """Number of trials, instead of the study's number."""
 
 
 class NetworkTable(_DesignTable):
-    """Stations, clocks and pulses that are unknown together, drawn anew in every trial; lengths are amounts."""
+    """Networks of unknown stations, clocks and pulses, drawn in every trial; lengths are amounts."""
 
     name: Name
     """Its name in tables."""
@@ -138,50 +139,50 @@ class NetworkTable(_DesignTable):
     pulses: int = Field(default=30, ge=1, le=100_000)
     """Number of pulses."""
     dimension: Literal[2, 3] = 3
-    """Of space."""
+    """Dimension of the positions."""
     box: list[Amount] = Field(default=["20 m", "20 m", "6 m"], min_length=2, max_length=3)
-    """Widths of the box in which the stations are."""
+    """Widths of the box that contains the stations."""
     around: list[Amount] | None = Field(default=None, min_length=2, max_length=3)
-    """Widths of the box, with the same centre, in which the pulses are; that of the stations by default."""
+    """Widths of the box that contains the pulses, with the same centre; by default the box of the stations."""
     emission: Amount = "200 m"
-    """Width in which times of emission are, times the speed of propagation."""
+    """Width of the interval of emission times, times the propagation speed."""
     synchronised: bool = True
-    """Whether the stations share a clock, and methods know it."""
+    """Whether the stations share one clock; methods know whether they do."""
     clocks: Amount = "10 m"
-    """Width in which the clocks of stations are that do not."""
+    """Width of the interval of station clocks, times the propagation speed, if the stations are not synchronised."""
     missing: float = Field(default=0.0, ge=0.0, lt=1.0)
-    """Share of the arrivals that are missing; each pulse keeps as many as it has unknowns, and two more."""
+    """Share of the arrivals that are missing; each pulse keeps at least two arrivals more than it has unknowns."""
     outliers: OutlierTable | None = None
-    """Gross errors of a share of the arrivals, which no method is told."""
+    """Gross errors of a share of the arrivals; no method has a model of them."""
     noise: list[Amount] = Field(default=["3 cm"], min_length=1)
     """Standard deviations of an arrival."""
     sweep: dict[str, list[Any]] = Field(default_factory=dict)
     """Values of other keys of this table, by dotted names such as "pulses": every combination is a case."""
     trials: int | None = Field(default=None, ge=1, le=100_000_000)
-    """Number of trials, in the place of the study's."""
+    """Number of trials, instead of the study's number."""
 
 
 class MethodTable(_DesignTable):
-    """How the problems are solved. A list in `method`, `baseline` or `solver` stands for one method each."""
+    """Methods that solve the problems. A list in `method`, `baseline` or `solver` makes one method of each member."""
 
     name: Name | None = None
-    """Its name in tables; made of the rest by default."""
+    """Name in tables; by default made of the other keys."""
     method: str | list[str] | None = None
-    """"auto", or stages joined by "+", see `optloc list methods`; "calibrate" of networks."""
+    """"auto", or stages joined by "+", see `optloc list methods`; "calibrate" for networks."""
     baseline: str | list[str] | None = None
-    """Something to compare with, in the place of a method; see `optloc list baselines`."""
+    """Baseline to compare with, instead of a method; see `optloc list baselines`."""
     solver: str | list[str] | None = None
-    """Back end of the conic or nonlinear programs; see `optloc list solvers`."""
+    """Solver of the conic or nonlinear programs; see `optloc list solvers`."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """Settings of that back end, such as a time limit or a tolerance."""
+    """Settings of the solver, such as a time limit or a tolerance."""
     start: Literal["centre", "truth", "box"] = "centre"
-    """Where a baseline that needs a guess begins: at the stations' centre, at the truth, or anywhere in a box."""
+    """Start of a baseline that needs a guess: at the stations' centre, at the truth, or at random in a box."""
     width: Amount = "100 km"
-    """Width of that box around the stations' centre."""
+    """Width of this box around the stations' centre."""
     batch: int | None = Field(default=None, ge=1)
-    """Fixes in one call; by default as many as a chunk has. 1: each is timed by itself."""
+    """Fixes in one call; by default all fixes of a chunk. With 1, each fix is timed separately."""
     chunk: int | None = Field(default=None, ge=1, le=1_000_000)
-    """Trials of one task; by default so many that it takes seconds."""
+    """Trials of one task; by default a number that takes seconds."""
 
 
 class StudyFile(_DesignTable):
@@ -190,19 +191,19 @@ class StudyFile(_DesignTable):
     format: Literal[1]
     """Version of the format."""
     name: Name
-    """What the study is called."""
+    """Name of the study."""
     title: str | None = None
-    """What it asks, in one line."""
+    """Question of the study, in one line."""
     note: str | None = None
-    """How to read its results."""
+    """Advice on how to read the results."""
     seed: int = Field(default=0, ge=0, lt=2**64)
-    """Decides all draws."""
+    """Seed of all random numbers."""
     trials: int = Field(default=1000, ge=1, le=100_000_000)
     """Trials of each scenario at each noise level."""
     scenario: list[ScenarioTable] = Field(default_factory=list)
-    """What is fixed from known stations."""
+    """Problems of positions from known stations."""
     network: list[NetworkTable] = Field(default_factory=list)
-    """What is calibrated. A study has either scenarios or networks, as no method serves both."""
+    """Networks to calibrate. A study has either scenarios or networks, as no method solves both."""
     method: list[MethodTable] = Field(min_length=1)
 
 
@@ -215,11 +216,11 @@ def study_schema() -> dict[str, Any]:
 
 
 def sigma_of(kind: str, amount: Amount, where: str) -> float:
-    """Return a standard deviation of rows of a kind in SI units; of ratios in decibels, at a ratio of one."""
+    """Return a standard deviation of rows of a kind in SI units; decibels are converted at a ratio of one."""
     quantity = MODELS[kind].quantity
     units = Units(quantity)  # type: ignore[arg-type]  # models hold known quantities only
     number, unit = units.amount(amount, None if isinstance(amount, str) else units.conversion(None, where), where)
-    # A decibel is a share of the ratio, so its deviation depends on the ratio: one, where nothing is nearer.
+    # A decibel is a share of the ratio, so the deviation depends on the ratio: one is the middle of the scale.
     value = float(unit.sigma_to_si(number, np.ones(()))) if unit.logarithmic else abs(unit.factor) * number
     if not value > 0.0:
         raise InvalidProblem(f"{amount!r} is not positive", where, "give a positive standard deviation")

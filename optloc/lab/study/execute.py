@@ -1,7 +1,7 @@
-"""Run a study into its folder: methods in processes apart, on this machine, a Dask cluster or Ray, through joblib.
+"""Execution of a study into its output folder, on this machine, a Dask cluster or Ray, through joblib.
 
-Whoever executes, a method runs in a process of its own that is watched over (`Apart`): it has a limit of time and of
-memory, what it answers is checked there, and it ends with the process that began it, however that ends.
+With every executor, each method runs in a separate worker process (`Apart`). The worker has limits of time and memory,
+its replies are checked, and it ends with the process that started it.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from optloc.lab.study.worker_process import WorkerPool
 from optloc.problem import InvalidProblem, nearest, plugins
 
 CONNECT = 10.0
-"""Seconds to wait for a scheduler: one on the same network answers in less than one; people wait for no more."""
+"""Seconds to wait for a scheduler: one on the same network replies in less than one second."""
 
 TASK_LIMIT = 600.0
-"""Seconds that a task may take where nobody says otherwise: it should take seconds, of the shipped studies the longest
-takes half of one, and compiling everything on a machine that has not yet done so takes a minute."""
-# A week: no wait on any system can be so long that numbers overflow.
+"""Default time limit of a task, seconds. A task should take seconds; the longest of the shipped studies takes half a
+second. On a new machine, compilation takes another minute."""
+# Seconds. A week: longer waits may overflow on some systems.
 _LONGEST = 604_800.0
 
 Tell = Callable[[int, dict[str, int]], None]
@@ -40,18 +40,18 @@ Tell = Callable[[int, dict[str, int]], None]
 
 @dataclass(frozen=True, slots=True)
 class Executor:
-    """Who computes.
+    """Choice of an executor and its settings.
 
     Parameters
     ----------
     name : str
         A key of `EXECUTORS`.
     jobs : int, optional
-        Processes; all processors by default. A cluster that exists decides itself.
+        Number of processes; all processors by default. A running cluster ignores it.
     address : str, optional
-        Of a Dask scheduler ("tcp://host:8786") or a Ray cluster; by default a local one is begun.
+        Address of a Dask scheduler ("tcp://host:8786") or a Ray cluster; by default a local one is started.
     limit : float
-        Seconds that a task may take.
+        Time limit of a task, seconds.
     """
 
     name: str = "processes"
@@ -61,49 +61,49 @@ class Executor:
 
 
 def executor(name: str, jobs: int | None = None, address: str | None = None, limit: float = TASK_LIMIT) -> Executor:
-    """Return an executor; raise InvalidProblem for an unknown one, or an address or a limit that cannot be."""
+    """Return an executor; raise InvalidProblem for an unknown name, a useless address or an invalid limit."""
     if name not in EXECUTORS:
         raise InvalidProblem(f"unknown executor {name!r}", "--executor", nearest(name, list(EXECUTORS)))
     if address is not None and not EXECUTORS[name].scheduler:
         raise InvalidProblem(f"{name} has no scheduler", "--scheduler", "add --executor dask")
     if not 0.0 < limit <= _LONGEST:
-        raise InvalidProblem(f"a task cannot take {limit:g} s", "--task-limit", f"give seconds, {_LONGEST:g} at most")
+        raise InvalidProblem(f"the limit {limit:g} s is out of range", "--task-limit", f"give 0 to {_LONGEST:g} s")
     return Executor(name, jobs, address, limit)
 
 
 def run_design(
     design: StudyDesign, folder: Path, by: Executor, tell: Tell | None = None, say: Callable[[str], None] = warn
 ) -> Progress:
-    """Compute what is missing of a study, and return how far it is.
+    """Compute the missing parts of a study, and return its progress.
 
     Parameters
     ----------
     design : StudyDesign
         The study.
     folder : Path
-        Its output folder: new, or begun by the same study and the same version.
+        Its output folder: new, or from the same study and the same version of optloc.
     by : Executor
-        Who computes.
+        Executor of the tasks.
     tell : callable, optional
-        Hears of every part, and first of those that were there.
+        Called after every part, and first with the existing parts.
     say : callable
-        Hears sentences about parts that were damaged and are made again.
+        Called with a sentence for each damaged part, which is then computed again.
 
     Raises
     ------
     InvalidProblem
-        Where the folder belongs to another study, holds other data or cannot be written; finished parts are kept.
+        If the folder belongs to another study, contains other data or cannot be written; finished parts are kept.
     """
     with locked(folder):
-        # From here to the end nobody else writes: what is counted as finished stays so.
+        # The lock excludes other writers, so finished parts stay finished.
         manifest = begin(design, folder)
         done = finished_parts(folder, manifest, say)
         known = known_data(design, folder, done)
         if tell is not None and done:
-            had = progress(folder)
-            tell(had.rows, had.counts)
-        left = [chunk for chunk in design.chunks if chunk.key not in done]
-        with closing(compute_all(left, by)) as parts:
+            existing = progress(folder)
+            tell(existing.rows, existing.counts)
+        missing = [chunk for chunk in design.chunks if chunk.key not in done]
+        with closing(compute_all(missing, by)) as parts:
             for part in parts:
                 note_data(known, part.table, folder)
                 store(folder, part)
@@ -115,20 +115,21 @@ def run_design(
 def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[TrialPart]:
     """Yield the parts of chunks as they are finished.
 
-    A chunk whose process died is computed again in another. If that dies too, or where a chunk is over its time, halves
-    are tried down to the single trial that is to blame, which then has the status `died` or `timeout`.
+    If the process of a chunk dies, the chunk is computed again in another process. If this process dies too, or if the
+    chunk exceeds its time limit, the chunk is halved until a single failing trial remains. This trial gets the status
+    `died` or `timeout`.
 
     Parameters
     ----------
     chunks : iterable of Chunk
-        What is to be done.
+        The tasks.
     by : Executor
-        Who does it.
+        Executor of the tasks.
 
     Raises
     ------
     InvalidProblem
-        Where the executor is not installed, its scheduler cannot be reached, or no process can be begun.
+        If the executor is not installed, its scheduler cannot be reached, or no process can be started.
     """
     work = _Work(chunks, by.limit)
     if not work.left:
@@ -139,19 +140,21 @@ def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[TrialPart]:
                 for found in _parallel(work.hand_out(), begun):
                     yield from work.take(found)
             except begun.deaths:
-                # A cluster lost a worker again and again: what it had is computed here, and the others there.
+                # A cluster has lost several workers. The chunks that they had are computed here, the others on the
+                # cluster.
                 for task in list(work.out.values()):
                     yield from work.take(here.compute(task.chunk, by.limit))
 
 
 def _parallel(tasks: Iterator[tuple[Chunk, float]], begun: Begun) -> Iterator[TrialPart | Lost]:
+    """Yield the results of tasks as joblib completes them."""
     from joblib import Parallel, delayed, parallel_config
 
     with parallel_config(**begun.options), catch_warnings():
-        # What was computed when a run was stopped is computed again: nobody needs to hear of that.
+        # If a run is stopped, joblib warns about tasks without a receiver; they are computed again later.
         filterwarnings("ignore", "[0-9]+ tasks", UserWarning)
         if begun.streams:
-            # One chunk a task, two for each worker in hand: none waits for its next, and few are lost when a run stops.
+            # One chunk a task, two tasks for each worker: no worker waits, and a stopped run loses few chunks.
             run = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")
             yield from run(delayed(begun.work)(*task) for task in tasks)
             return
@@ -159,18 +162,19 @@ def _parallel(tasks: Iterator[tuple[Chunk, float]], begun: Begun) -> Iterator[Tr
             yield from Parallel(batch_size=1)(delayed(begun.work)(*task) for task in some)
 
 
-# What is left of the chunks of a run, and what becomes of those that came to grief.
+# Remaining chunks of a run, and the treatment of chunks that failed.
 
-# A cell may cost four limits of time beyond its work, and a death a sixteenth of one: enough to find the one trial of
-# ten thousand at which a method hangs (3.1 limits), or four at which it dies; one that always does is left soon.
+# A cell may lose four time limits beyond its work, and a death counts as a sixteenth of one. This is enough to find
+# among ten thousand trials one trial at which a method hangs (3.1 limits), or four at which it dies. A method that
+# always fails is given up early.
 _PATIENCE, _DEATH = 4.0, 1 / 16
-# A part of a chunk has its share of the limit, but not less than an eighth, and time for what is built once.
+# A part of a chunk has its share of the time limit, but at least an eighth, and at least 10 s for compilation.
 _LEAST, _BUILD = 1 / 8, 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """Some trials of a chunk of the design; `again` where its process has died once."""
+    """Some trials of a chunk (`whole`) of the design; `again` is True after one death of its process."""
 
     chunk: Chunk
     whole: Chunk
@@ -178,11 +182,12 @@ class _Task:
 
     @property
     def share(self) -> float:
+        """Return the share of the time limit of the whole chunk."""
         return max(self.chunk.count / self.whole.count, _LEAST)
 
 
 class _Work:
-    """The tasks that are left and out, the parts of chunks that were halved, and what each cell has cost."""
+    """Waiting tasks, running tasks, parts of halved chunks, and the lost time of each cell."""
 
     def __init__(self, chunks: Iterable[Chunk], limit: float) -> None:
         self.left = deque(_Task(chunk, chunk) for chunk in chunks)
@@ -193,14 +198,14 @@ class _Work:
         self._given_up: dict[str, Lost] = {}
 
     def hand_out(self) -> Iterator[tuple[Chunk, float]]:
-        """Yield chunks with the seconds that they may take: none where their cell has cost too much."""
+        """Yield chunks with their time limits in seconds; the limit is 0 if their cell was given up."""
         while self.left:
             task = self.left.popleft()
             self.out[task.chunk.key] = task
             yield task.chunk, self._seconds(task)
 
     def take(self, found: TrialPart | Lost) -> Iterator[TrialPart]:
-        """Yield the part of a chunk of the design where it is complete with what was found."""
+        """Yield the part of a chunk of the design if this result completes the chunk."""
         task = self.out.pop(found.key)
         part = self._judge(task, found) if isinstance(found, Lost) else found
         if part is None:
@@ -209,21 +214,22 @@ class _Work:
         parts.append(part)
         if sum(len(some.table) for some in parts) == task.whole.count:
             del self._parts[task.whole.key]
-            # Names of parts are in the order of their trials.
+            # Keys of parts sort in the order of their trials.
             yield part if len(parts) == 1 else join_parts(task.whole, sorted(parts, key=lambda some: some.key))
 
     def _judge(self, task: _Task, lost: Lost) -> TrialPart | None:
-        """Return the part of a task that was lost, or None and have it tried again, whole or in halves."""
+        """Return the part of a failed task, or put the task back, whole or in halves, and return None."""
         chunk, cell = task.chunk, task.chunk.cell.key
         if cell not in self._given_up:
             self._cost[cell] = self._cost.get(cell, 0.0) + (task.share if lost.status == LATE else _DEATH)
             if self._cost[cell] >= _PATIENCE:
-                reason = f"given up, since too much of it was lost in this scenario; the last time {lost.reason}"
+                reason = f"given up after too many failures in this scenario; last failure: {lost.reason}"
                 self._given_up[cell] = replace(lost, reason=reason)
         if cell in self._given_up:
             return part_of_lost(chunk, self._given_up[cell])
         if lost.status == DIED and not task.again:
-            # Perhaps the machine was short of memory, or somebody killed it: halves would be solved in other batches.
+            # The machine may have been short of memory, or a user killed the process. First the whole chunk is tried
+            # again, because halves would be solved in other batches.
             self.left.append(replace(task, again=True))
         elif chunk.count == 1:
             return part_of_lost(chunk, lost)
@@ -234,28 +240,29 @@ class _Work:
         return None
 
     def _seconds(self, task: _Task) -> float:
+        """Return the time limit of a task in seconds; 0 if its cell was given up."""
         if task.chunk.cell.key in self._given_up:
             return 0.0
         return min(self._limit, max(task.share * self._limit, _BUILD))
 
 
-# The executors: how each begins, and which exceptions say that a worker died.
+# Executors: how each starts, and the exceptions that report the death of a worker.
 
 
 @dataclass(frozen=True, slots=True)
 class Begun:
-    """An executor that is ready.
+    """A running executor.
 
     Parameters
     ----------
     options : dict
-        Of joblib.
+        Options of joblib.
     work : callable
-        ``(chunk, seconds) -> Part or Lost``: what its workers do.
+        ``(chunk, seconds) -> TrialPart or Lost``: the function that workers run.
     deaths : tuple of exception types
-        Those that say that a worker died.
+        Exceptions that report the death of a worker.
     streams : bool
-        Whether it gives each part when it is finished; otherwise it takes lists, a few chunks a processor at a time.
+        Whether it returns each part when it is finished; otherwise it takes lists of a few chunks a processor.
     """
 
     options: dict[str, Any]
@@ -270,20 +277,22 @@ def _pool() -> WorkerPool:
 
 
 def beside(names: Sequence[str], chunk: Chunk, seconds: float) -> TrialPart | Lost:
-    """Compute a chunk beside a worker of a cluster, with the plugins of the process that runs the study."""
+    """Compute a chunk in a process next to a cluster's worker, with the plugins of the process that runs the study."""
     return _pool().compute(chunk, seconds, names)
 
 
 @contextmanager
 def _processes(by: Executor) -> Iterator[Begun]:
+    """Yield an executor of worker processes on this machine."""
     jobs = by.jobs or workers()
-    # Its workers are threads: each waits for a process apart.
+    # The workers of joblib are threads: each waits for a worker process.
     with closing(WorkerPool(jobs)) as pool:
         yield Begun({"backend": "threading", "n_jobs": jobs}, pool.compute)
 
 
 @contextmanager
 def _dask(by: Executor) -> Iterator[Begun]:
+    """Yield an executor on a Dask cluster; start a local cluster if there is no address."""
     try:
         from distributed import Client, KilledWorker, LocalCluster
     except ImportError:
@@ -293,7 +302,7 @@ def _dask(by: Executor) -> Iterator[Begun]:
             with _deaf():
                 place: Any = by.address
                 if place is None:
-                    # No page of statistics, and no warnings of workers that are lost on purpose when it ends.
+                    # Without a page of statistics, and without warnings about workers that end with the cluster.
                     own = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
                     place = stack.enter_context(LocalCluster(n_workers=by.jobs or workers(), **own))
                 client = stack.enter_context(Client(place, timeout=CONNECT))
@@ -308,11 +317,11 @@ def _dask(by: Executor) -> Iterator[Begun]:
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """Have processes that are begun meanwhile, and what they begin, not hear Ctrl-C, which waits for this one."""
-    if not hasattr(signal, "pthread_sigmask"):  # on a system where each is told apart
+    """Block Ctrl-C in all processes that start inside this context: Ctrl-C is for this process only."""
+    if not hasattr(signal, "pthread_sigmask"):  # a system where Ctrl-C does not reach child processes
         yield
         return
-    resource_tracker.ensure_running()  # it would unblock what is blocked here
+    resource_tracker.ensure_running()  # otherwise it would unblock the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -322,6 +331,7 @@ def _deaf() -> Iterator[None]:
 
 @contextmanager
 def _ray(by: Executor) -> Iterator[Begun]:
+    """Yield an executor on a Ray cluster; start a local cluster if there is no address."""
     try:
         import ray
         from ray.util.joblib import register_ray
@@ -349,21 +359,21 @@ def _ray(by: Executor) -> Iterator[Begun]:
 def _unreachable(by: Executor, error: BaseException) -> InvalidProblem:
     first = (str(error) or type(error).__name__).splitlines()[0]
     what = f"the scheduler cannot be reached ({first})"
-    return InvalidProblem(what, by.address or by.name, "start it, or check the address; what is finished is kept")
+    return InvalidProblem(what, by.address or by.name, "start it, or check the address; finished parts are kept")
 
 
 @dataclass(frozen=True, slots=True)
 class ExecutorEntry:
-    """A way to compute.
+    """Entry of the table of executors.
 
     Parameters
     ----------
     begin : callable
-        ``(Executor) -> context manager`` of what has begun.
+        ``(Executor) -> context manager`` of the running executor.
     summary : str
         One line for listings.
     scheduler : bool
-        Whether it may be one that exists, at an address.
+        Whether it can use a running scheduler at an address.
     """
 
     begin: Callable[[Executor], AbstractContextManager[Begun]]
@@ -373,7 +383,7 @@ class ExecutorEntry:
 
 EXECUTORS: dict[str, ExecutorEntry] = {
     "processes": ExecutorEntry(_processes, "processes of this machine; the default"),
-    "dask": ExecutorEntry(_dask, "a Dask cluster that exists (--scheduler), or a local one", scheduler=True),
-    "ray": ExecutorEntry(_ray, "a Ray cluster that exists (--scheduler), or a local one", scheduler=True),
+    "dask": ExecutorEntry(_dask, "a running Dask cluster (--scheduler), or a local one", scheduler=True),
+    "ray": ExecutorEntry(_ray, "a running Ray cluster (--scheduler), or a local one", scheduler=True),
 }
 """Executors by name."""

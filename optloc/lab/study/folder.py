@@ -1,4 +1,7 @@
-"""The output folder of a study: a manifest and part files that appear whole or not at all, named by what they hold."""
+"""Output folder of a study: a manifest and part files, each with a digest of its content in its name.
+
+Each part file is written completely or not at all. A stopped study continues from the parts in its folder.
+"""
 
 from __future__ import annotations
 
@@ -25,44 +28,44 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-# Another format is refused; other columns or another version of optloc are too, whatever the format.
+# Folders of another format are rejected, and so are other columns or another version of optloc.
 MANIFEST = "manifest.json"
 FORMAT = 2
 _LOCK = ".lock"
 
 
-# Statuses of trials without a position whose reasons are shown: back ends and methods are their cause.
+# Statuses without a position whose reasons are shown, because solvers and methods cause them.
 EXPLAINED = (*FAILED, Status.NUMERICAL.label, Status.UNAVAILABLE.label)
 
 
 @dataclass(frozen=True, slots=True)
 class StudyManifest:
-    """What an output folder holds.
+    """Description of an output folder.
 
     Parameters
     ----------
     name, title, note : str
-        Of the study.
+        From the study file.
     text : str
-        Its file.
+        Text of the study file.
     seed : int
-        Of the study.
+        Seed of the study.
     fingerprint : str
-        Of the design.
+        Digest of the design.
     version : str
-        Version of optloc that computes it.
+        Version of optloc that computes the parts.
     columns : tuple of str
-        Columns of its parts.
+        Columns of the parts.
     chunks : dict of str to int
-        Keys of the chunks of the design and their rows.
+        Keys of the chunks of the design and their numbers of rows.
     created : str
-        When it was begun, UTC.
+        Time of the first run, UTC.
     machine, versions : str
-        Where it was begun and with what.
+        Machine of the first run, and versions of libraries.
     folder : str
-        Where its problem files are; empty where that is not known.
+        Folder of the problem files; empty if unknown.
     data : str
-        Of the data that all its methods see; empty where that is not known.
+        Digest of the data of all methods; empty if unknown.
     methods : dict of str to str
         Names of the methods by the keys of their cells.
     """
@@ -90,7 +93,7 @@ class StudyManifest:
 
 
 def manifest_of(design: StudyDesign) -> StudyManifest:
-    """Return the manifest of a design that is about to begin."""
+    """Return the manifest of a new design."""
     study = design.study
     return StudyManifest(
         study.name,
@@ -112,9 +115,9 @@ def manifest_of(design: StudyDesign) -> StudyManifest:
 
 
 def joined(found: StudyManifest, wanted: StudyManifest) -> StudyManifest | None:
-    """Return the manifest of a folder that gets the methods of a design, too; None where the data are others.
+    """Return the manifest of a folder with the methods of another design added; None if the data differ.
 
-    What was computed stays, but for methods that the design has by the same name: those are as the design says now.
+    Existing parts are kept. But if the new design has a method of the same name, its parts replace the old parts.
     """
     if not found.data or found.data != wanted.data:
         return None
@@ -125,20 +128,20 @@ def joined(found: StudyManifest, wanted: StudyManifest) -> StudyManifest | None:
 
 
 def read_manifest(folder: Path) -> StudyManifest:
-    """Return the manifest of an output folder; raise InvalidProblem where it is none."""
+    """Return the manifest of an output folder; raise InvalidProblem if there is no valid one."""
     from pydantic import TypeAdapter, ValidationError
 
     path = folder / MANIFEST
     if not path.exists():
-        what = "the folder holds no study" if folder.is_dir() else "there is no such folder"
+        what = "the folder contains no study" if folder.is_dir() else "there is no such folder"
         raise InvalidProblem(what, str(folder), "name the folder that 'optloc study run' wrote")
     try:
-        # Not as a document, whose budget is smaller: a study may have a million chunks.
+        # Read without the limits of a document: a study may have a million chunks.
         data = json_of(read_bytes(path).decode(), str(path))
     except (InvalidProblem, ValueError) as error:
         raise InvalidProblem(f"the manifest cannot be read ({error})", str(path), "run the study again") from None
     if not isinstance(data, dict) or data.pop("format", None) != FORMAT:
-        raise InvalidProblem("the manifest is of another format", str(path), "write to another folder")
+        raise InvalidProblem("the manifest has another format", str(path), "write to another folder")
     try:
         return TypeAdapter(StudyManifest).validate_python(data)
     except ValidationError:
@@ -146,7 +149,7 @@ def read_manifest(folder: Path) -> StudyManifest:
 
 
 def design_of_manifest(manifest: StudyManifest) -> StudyDesign | None:
-    """Return the design of a study from its manifest, None where a problem file cannot be read any more."""
+    """Return the design of a study from its manifest; None if a problem file is missing or invalid."""
     try:
         return design_of_text(manifest.text, manifest.name, Path(manifest.folder or "."), seed=manifest.seed)
     except InvalidProblem:
@@ -154,21 +157,21 @@ def design_of_manifest(manifest: StudyManifest) -> StudyDesign | None:
 
 
 def references(design: StudyDesign | None) -> set[str]:
-    """Return the names of the methods that begin at the truth, with which nobody competes."""
-    # A method that was added to the folder has the name of its baseline, and is in no design.
+    """Return the names of the methods that start at the truth; they are not ranked."""
+    # A baseline that was added to the folder keeps its name, but the design of the manifest does not contain it.
     known = {name for name, baseline in BASELINES.items() if baseline.reference}
     return known | ({cell.method.name for cell in design.cells if cell.method.reference} if design else set())
 
 
 def begin(design: StudyDesign, folder: Path) -> StudyManifest:
-    """Return the manifest of a folder for a design, written where it is new; call it while the folder is `locked`.
+    """Return the manifest of a folder for a design, and write it if it is new; call it while the folder is `locked`.
 
-    A folder of the same data by other methods gets those of the design, too: see `joined`.
+    If the folder has the same data with other methods, the methods of the design are added, see `joined`.
 
     Raises
     ------
     InvalidProblem
-        Where the folder cannot be written, or belongs to another study or another version of optloc.
+        If the folder cannot be written, or belongs to another study or another version of optloc.
     """
     wanted = manifest_of(design)
     before, found = None, wanted
@@ -177,7 +180,7 @@ def begin(design: StudyDesign, folder: Path) -> StudyManifest:
         same = before.fingerprint == wanted.fingerprint and wanted.chunks.keys() <= before.chunks.keys()
         found = before if same else joined(before, wanted) or wanted
         if found is wanted:
-            what = f"the folder holds another study ({before.name!r}, or other trials, seed or settings)"
+            what = f"the folder contains another study ({before.name!r}, or other trials, seed or settings)"
             raise InvalidProblem(what, str(folder), "choose another folder with --out")
         if (found.version, found.columns) != (wanted.version, wanted.columns):
             what = f"the folder was written by optloc {found.version}, and this is {wanted.version}"
@@ -197,15 +200,15 @@ def begin(design: StudyDesign, folder: Path) -> StudyManifest:
     return found
 
 
-_KEPT = "make room or choose another place; what is finished is kept, and the same command goes on from there"
+_KEPT = "free space or choose another folder; finished parts are kept, and the same command continues"
 
 
 def _unwritable(path: Path, error: OSError) -> InvalidProblem:
-    return InvalidProblem(f"the place cannot be written ({error.strerror or error})", str(path), _KEPT)
+    return InvalidProblem(f"the folder cannot be written ({error.strerror or error})", str(path), _KEPT)
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write a file, whole or not at all; raise InvalidProblem where that fails."""
+    """Write a file completely or not at all; raise InvalidProblem if this fails."""
     try:
         with written(path) as place:
             place.write_bytes(content)
@@ -214,7 +217,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def _renew(path: Path, content: bytes) -> None:
-    """Replace a file of the folder's own: it was read here, and nobody needs to force that."""
+    """Replace a file that optloc wrote to the folder, so no option --force is needed."""
     scratch = path.with_name(f".optloc-{path.name}")
     _write(scratch, content)
     try:
@@ -224,13 +227,13 @@ def _renew(path: Path, content: bytes) -> None:
 
 
 def _clean(folder: Path) -> None:
-    """Remove what a run that was killed left half written."""
+    """Remove incomplete files of a killed run."""
     for scratch in [*folder.glob(".optloc-*"), *(folder / "parts").glob(".*")]:
         scratch.unlink(missing_ok=True)
 
 
 def store(folder: Path, part: TrialPart) -> None:
-    """Write a part; raise InvalidProblem where that fails."""
+    """Write a part; raise InvalidProblem if this fails."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -241,32 +244,33 @@ def store(folder: Path, part: TrialPart) -> None:
 
 
 def _digest(content: bytes) -> str:
-    """Return 16 hexadecimal digits of a file's content: a name tells damage, and needs no second file to do so."""
+    """Return 16 hexadecimal digits of a file's content; in the file name, they reveal damage without a second file."""
     return hashlib.blake2b(content, digest_size=8).hexdigest()
 
 
 def part_files(folder: Path) -> dict[str, Path]:
-    """Return the part files of a study that are there by their chunks, in the order of their names."""
+    """Return the existing part files of a study by the keys of their chunks, sorted by name."""
     known = read_manifest(folder).chunks
     found = {path.name.partition(".")[0]: path for path in sorted((folder / "parts").glob("[!.]*.parquet"))}
     return {key: path for key, path in found.items() if key in known}
 
 
 def read_part(path: Path, columns: Sequence[str] | None = None) -> Any:
-    """Return the Arrow table of a part file; raise InvalidProblem where it is not what was written."""
+    """Return the Arrow table of a part file; raise InvalidProblem if its content has changed."""
     from pyarrow import ArrowException, parquet
 
     try:
         if path.name.split(".")[1:-1] == [_digest(read_bytes(path))] and _is_part(parquet.read_schema(path), columns):
-            # Not from bytes of Python: threads of Arrow that free such while the interpreter ends abort the process.
+            # Not from bytes of Python: the process aborts if threads of Arrow free such bytes while the interpreter
+            # ends.
             return parquet.read_table(path, columns=columns, partitioning=None)
     except (InvalidProblem, OSError, ArrowException):
         pass
-    raise InvalidProblem("the part is damaged", str(path), "run the study again, and it is made again")
+    raise InvalidProblem("the part is damaged", str(path), "run the study again to replace it")
 
 
 def _is_whole(path: Path, rows: int) -> bool:
-    """Return whether a part file has all its columns and so many rows."""
+    """Return whether a part file has all columns and `rows` rows."""
     from pyarrow import parquet
 
     try:
@@ -276,34 +280,22 @@ def _is_whole(path: Path, rows: int) -> bool:
 
 
 def _is_part(found: Any, columns: Sequence[str] | None) -> bool:
-    """Return whether a file has the columns of a part, or some of them, with their types."""
+    """Return whether a file has these columns of a part (all for None), with their types."""
     wanted = arrow_schema()
     names = wanted.names if columns is None else columns
     return all(found.get_field_index(name) >= 0 and found.field(name).type == wanted.field(name).type for name in names)
 
 
 def finished_parts(folder: Path, manifest: StudyManifest, say: Callable[[str], None]) -> dict[str, Path]:
-    """Return the part files of finished chunks.
+    """Return the part files of finished chunks by key, and remove damaged ones.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the study.
-    manifest : StudyManifest
-        Of the folder.
-    say : callable
-        Hears a sentence about every part that was damaged; it is removed.
-
-    Raises
-    ------
-    InvalidProblem
-        Where a damaged part cannot be removed.
+    `say` is called with a sentence for each damaged part. Raise InvalidProblem if a damaged part cannot be removed.
     """
     done = part_files(folder)
     for key, path in list(done.items()):
         if not _is_whole(path, manifest.chunks[key]):
             del done[key]
-            say(f"{path}: the part is damaged, and is made again")
+            say(f"{path}: the part is damaged, and is computed again")
             try:
                 path.unlink(missing_ok=True)
             except OSError as error:
@@ -312,21 +304,21 @@ def finished_parts(folder: Path, manifest: StudyManifest, say: Callable[[str], N
 
 
 def note_data(known: dict[str, str], table: Any, folder: Path) -> None:
-    """Add the data of the blocks of trials in a table to those that are known.
+    """Add the digests of the blocks of trials in a table to the known ones.
 
     Parameters
     ----------
     known : dict of str to str
-        Digests of blocks of data by their seeds.
+        Digests of blocks of data by their seeds; the function adds to it.
     table : pyarrow.Table
         Rows with the columns `seed` and `data`.
     folder : Path
-        Of the study.
+        Output folder of the study, for messages.
 
     Raises
     ------
     InvalidProblem
-        Where a block has other data than are known of it: methods would be compared on different measurements.
+        If a block has two different digests: methods would be compared on different measurements.
     """
     found = (
         table.select(["seed", "data"])
@@ -336,18 +328,18 @@ def note_data(known: dict[str, str], table: Any, folder: Path) -> None:
     )
     for row in found:
         if known.setdefault(row["seed"], row["data"]) != row["data"]:
-            what = f"parts of the study hold different data for the same trials (those of the seed {row['seed']})"
-            advice = "choose another folder with --out, and compute all of it with one version of optloc and numpy"
+            what = f"parts of the study contain different data for the same trials (seed {row['seed']})"
+            advice = "choose another folder with --out, and use one version of optloc and numpy for all parts"
             raise InvalidProblem(what, str(folder), advice)
 
 
 def known_data(design: StudyDesign, folder: Path, done: dict[str, Path]) -> dict[str, str]:
-    """Return the digests of the blocks of finished chunks, whose part files are given, by their seeds.
+    """Return the digests of the blocks of finished chunks by their seeds; `done` are their part files.
 
     Raises
     ------
     InvalidProblem
-        Where they contradict each other, or what is drawn here for the first finished trial of a case.
+        If parts contradict each other, or a new simulation of the first finished trial of a case gives other data.
     """
     known: dict[str, str] = {}
     first = {chunk.cell.case.key: chunk for chunk in reversed(list(design.chunks)) if chunk.key in done}
@@ -356,28 +348,28 @@ def known_data(design: StudyDesign, folder: Path, done: dict[str, Path]) -> dict
     for chunk in first.values():
         drawn = chunk.cell.case.draw(chunk.first, 1)
         if known.get(drawn.seed[0]) != drawn.digest[0]:
-            what = f"its finished trials of {chunk.cell.case.where} hold other data than are drawn here"
-            advice = "choose another folder with --out, or go on with the versions that the manifest names"
+            what = f"its finished trials of {chunk.cell.case.where} differ from a new simulation"
+            advice = "choose another folder with --out, or use the versions that the manifest names"
             raise InvalidProblem(what, str(folder), advice)
     return known
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Make and hold a folder, so that two runs do not write to it; the lock goes with the process, however it ends.
+    """Create a folder and lock it against other runs; the lock ends with the process.
 
     Raises
     ------
     InvalidProblem
-        Where another run holds it, it cannot be written, or it holds something else than a study.
+        If another run has the lock, the folder cannot be written, or it contains other files than a study.
     """
     try:
-        # A folder of somebody else is left as it is.
+        # Leave a folder with other files unchanged.
         if folder.is_dir() and not {MANIFEST, _LOCK} & (names := {path.name for path in folder.iterdir()}) and names:
             advice = "choose another with --out"
-            raise InvalidProblem("the folder is not empty, and holds no study", str(folder), advice)
+            raise InvalidProblem("the folder is not empty, and contains no study", str(folder), advice)
         folder.mkdir(parents=True, exist_ok=True)
-        # Opened for writing: file systems of a network lock nothing else.
+        # Open for writing: network file systems do not lock other files.
         file = (folder / _LOCK).open("ab")
     except OSError as error:
         raise _unwritable(folder, error) from None
@@ -393,28 +385,28 @@ def locked(folder: Path) -> Iterator[None]:
         yield
 
 
-# How far a study is.
+# Progress of a study.
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a study is.
+    """Progress of a study.
 
     Parameters
     ----------
     manifest : StudyManifest
-        Of its folder.
+        Manifest of its folder.
     done, chunks : int
-        Finished chunks, and those of the design.
+        Numbers of finished chunks and of all chunks.
     rows : int
-        Finished rows.
+        Number of finished rows.
     counts : dict of str to int
-        How many of them have which status.
+        Number of rows by status.
     methods : dict of (str, str) to int
-        How many rows of which method have which status.
+        Number of rows by method and status.
     failures : dict of (str, str) to str
-        Why a trial of a method has no fix, by statuses whose reason says it: of the study, of a back end that failed,
-        of a method that does not start such rows.
+        Reason of the first trial without a fix, by method and status. Reasons are given for failures of the study, of a
+        solver, or of a method that does not support the rows.
     """
 
     manifest: StudyManifest
@@ -427,12 +419,12 @@ class Progress:
 
     @property
     def complete(self) -> bool:
-        """Return whether nothing is left to do."""
+        """Return whether all chunks are finished."""
         return self.done == self.chunks
 
 
 def progress(folder: Path) -> Progress:
-    """Return how far the study of a folder is; raise InvalidProblem where it holds none."""
+    """Return the progress of the study in a folder; raise InvalidProblem if the folder has no study."""
     import pyarrow.compute as pc
 
     manifest = read_manifest(folder)
@@ -440,51 +432,51 @@ def progress(folder: Path) -> Progress:
     methods: Counter[tuple[str, str]] = Counter()
     failures: dict[tuple[str, str], str] = {}
     for path in files.values():
-        # Three columns of fifty, so that looking does not slow down a run of millions of rows.
+        # Three columns of fifty, so that this does not slow down a run of millions of rows.
         table = read_part(path, ["method", "status", "reason"])
         for row in table.group_by(["method", "status"], use_threads=False).aggregate([([], "count_all")]).to_pylist():
             method, status = str(row["method"]), str(row["status"])
             methods[method, status] += int(row["count_all"])
             if status in EXPLAINED and (method, status) not in failures:
-                own = pc.and_(pc.equal(table["method"], method), pc.equal(table["status"], status))
-                failures[method, status] = str(table["reason"].filter(own)[0])
+                selected = pc.and_(pc.equal(table["method"], method), pc.equal(table["status"], status))
+                failures[method, status] = str(table["reason"].filter(selected)[0])
     counts: Counter[str] = Counter()
     for (_, status), count in methods.items():
         counts[status] += count
     return Progress(manifest, len(files), len(manifest.chunks), counts.total(), dict(counts), dict(methods), failures)
 
 
-# Read the parts of a study as one table; the columns are described in `optloc.lab.study.trial`.
+# Tables of all parts of a study; `optloc.lab.study.trial` describes the columns.
 
 SORTED = ("scenario", "sweep", "noise", "method", "key", "trial")
 
 
 def read_arrow(folder: Path, columns: Sequence[str] | None = None) -> Any:
-    """Return the Arrow table of all parts of a study, sorted, so that it does not depend on their order.
+    """Return the Arrow table of all parts of a study, sorted, so that it does not depend on the order of parts.
 
     Parameters
     ----------
     folder : Path
         Output folder of a study.
     columns : sequence of str, optional
-        Columns to read; all by default. The column `gap` is added where cost, data and trial are among them.
+        Columns to read; all by default. The column `gap` is added if cost, data and trial are among them.
 
     Raises
     ------
     InvalidProblem
-        Where the folder holds no study, or a part is damaged.
+        If the folder has no study, or a part is damaged.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
 
     schema = arrow_schema()
     wanted = [c.name for c in COLUMNS] if columns is None else [c.name for c in COLUMNS if c.name in set(columns)]
-    # What sorts must be read, though it may not be wanted.
+    # Read the columns of the sort key even if they are not wanted.
     read = list(dict.fromkeys([*wanted, *SORTED]))
     parts = [read_part(path, read) for path in part_files(folder).values()]
     empty = pa.schema([schema.field(name) for name in read]).empty_table()
     table = pa.concat_tables([empty, *(part.cast(empty.schema) for part in parts)]).unify_dictionaries()
-    # Texts sort by themselves, not by their numbers in the dictionary, which depend on the order of parts.
+    # Sort by text, because its numbers in the dictionary depend on the order of parts.
     plain = {name: pc.cast(table[name], pa.string()) if _text(table, name) else table[name] for name in SORTED}
     table = table.take(pc.sort_indices(pa.table(plain), [(name, "ascending") for name in SORTED]))
     table = table.select(wanted).combine_chunks()

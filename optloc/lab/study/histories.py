@@ -1,9 +1,9 @@
-"""Convergence histories: the cost along the way of a method, against evaluations of it and against iterations.
+"""Convergence histories: the cost along the iterations of a method, against evaluations and against iterations.
 
-Two kinds of methods tell it. A minimizer of others is given the cost, and every evaluation is kept. Least squares of
-optloc and nonlinear solvers of CasADi are run again and again, stopped after 0, 1, 2 ... iterations: from the same
-start by the same arithmetic, so that where each run stops is where the whole one has been. Starts in closed form,
-proofs and machine code that does all in one call have no cost on their way, and a sentence says so.
+Histories exist for two kinds of methods. An external minimizer calls the cost, and every value is recorded. Least
+squares of optloc and nonlinear solvers of CasADi are run again and again, and stopped after 0, 1, 2 ... iterations.
+They repeat the same arithmetic from the same start, so the ends of the short runs are the points of the long run.
+Starts in closed form, proofs and machine code that does everything in one call have no history; a remark reports this.
 """
 
 from __future__ import annotations
@@ -44,26 +44,26 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COUNTS = {"evaluations": "evaluations of the cost", "iterations": "iterations"}
-"""What a way is counted in, columns of the table, and what axes call them."""
+"""Counts of a history: columns of the table, and labels of axes."""
 
-# Methods that follow a problem file where nobody names one: the usual way in, and three that need a start.
-_USUAL = ("gtrs+lsr", "gauss-newton", "scipy", "ipopt")
-# Iterations after which a run is stopped: each of the first thirty, far more than a way down takes that is well begun,
-# then steps of a tenth, so that one that creeps to a limit of two hundred costs fifty runs.
-_EACH, _FARTHER = 30, 1.1
-# Steps tried at most, those of the stages of that name.
+# Default methods for a problem file: the usual method, and three that need a start.
+_DEFAULT_METHODS = ("gtrs+lsr", "gauss-newton", "scipy", "ipopt")
+# Iterations after which a run is stopped: each of the first thirty, which is more than a well-started method needs.
+# Then in steps of a tenth, so that a slow run to a limit of two hundred costs fifty runs.
+_EVERY_ITERATION, _GROWTH = 30, 1.1
+# Most steps, the same as in the stages `lsr` and `taylor`.
 _DAMPED, _PLAIN = 100, 50
 
 
 class ConvergenceTrace(NamedTuple):
-    """The way of a method on one trial, point by point.
+    """History of a method on one trial, point by point.
 
     Parameters
     ----------
     cost : array (q,)
-        Cost there; of several candidates the least.
+        Cost at each point; with several candidates the least.
     evaluations, iterations : array (q,)
-        How many were made by then, of all candidates and of each; NaN where they are not counted.
+        Numbers up to the point: evaluations of all candidates, iterations of each. NaN if they are not counted.
     """
 
     cost: Array
@@ -73,20 +73,20 @@ class ConvergenceTrace(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Trials:
-    """Trials that methods are followed on.
+    """Trials and methods of which histories are wanted.
 
     Parameters
     ----------
     title : str
-        Which trials.
+        Title of the trials.
     drawn : DrawnCase
         The trials (n).
     methods : tuple of StudyMethod
-        Who is followed.
+        The methods.
     least : array (n,)
-        Least cost that is known of each trial.
+        Least known cost of each trial.
     remarks : tuple of str
-        Sentences about methods that are missing.
+        Sentences about missing methods.
     """
 
     title: str
@@ -98,18 +98,18 @@ class Trials:
 
 @dataclass(frozen=True, slots=True)
 class Histories:
-    """How methods came down.
+    """Convergence histories of methods.
 
     Parameters
     ----------
     title : str
-        Which trials.
+        Title of the trials.
     frame : DataFrame
-        Columns: method, trial, evaluations, iterations, cost, best (least so far), above (that less the least known).
+        Columns: method, trial, evaluations, iterations, cost, best (least so far), above (best less the least known).
     methods : tuple of str
-        Those that tell their way, in order.
+        Methods with a history, in order.
     remarks : tuple of str
-        Sentences about those that do not, or not all of it.
+        Sentences about methods without a complete history.
     """
 
     title: str
@@ -124,17 +124,18 @@ def histories(asked: Trials) -> Histories:
     Raises
     ------
     InvalidProblem
-        For trials whose costs along a way cannot be compared: with constraints, or weights that depend on the place;
-        and where no method tells its way.
+        If no method has a history, or the costs of a history cannot be compared: with constraints, or with noise
+        weights that depend on the position.
     """
     import pandas as pd
 
     problem = asked.drawn.problem
     if problem.constraints:
-        raise InvalidProblem("a cost does not tell how constraints are met", asked.title, "leave the constraints out")
+        what = "a cost does not show whether constraints are met"
+        raise InvalidProblem(what, asked.title, "remove the constraints")
     if depends_on_place(problem):
-        what = "the weights of its rows depend on the place, so costs along a way cannot be compared"
-        raise InvalidProblem(what, asked.title, "leave the errors of the stations out")
+        what = "the noise weights depend on the position, so costs of a history cannot be compared"
+        raise InvalidProblem(what, asked.title, "remove the errors of the stations")
     ways, remarks = {}, list(asked.remarks)
     for method in asked.methods:
         found, remark = trace_of(method, asked.drawn)
@@ -143,8 +144,8 @@ def histories(asked: Trials) -> Histories:
         if any(len(way.cost) for way in found):
             ways[method.name] = found
     if not ways:
-        why = remarks[0] if remarks else "there is none"
-        raise InvalidProblem(f"no method tells its way ({why})", asked.title, "name a minimizer with --method")
+        why = remarks[0] if remarks else "there is no method"
+        raise InvalidProblem(f"no method has a history ({why})", asked.title, "name a minimizer with --method")
     least = np.array(asked.least, dtype=float)
     for found in ways.values():
         least = np.fmin(least, [np.min(way.cost, initial=np.inf) for way in found])
@@ -153,20 +154,21 @@ def histories(asked: Trials) -> Histories:
 
 
 def _rows(method: str, trial: int, way: ConvergenceTrace, least: float) -> pd.DataFrame:
+    """Return the history of one trial as rows of the table."""
     import pandas as pd
 
     best = np.minimum.accumulate(way.cost)
-    # Behind the least cost there is rounding alone.
+    # A negative difference is a rounding error.
     above = np.maximum(best - least, 0.0)
     counts = {"evaluations": way.evaluations, "iterations": way.iterations}
     return pd.DataFrame({"method": method, "trial": trial, **counts, "cost": way.cost, "best": best, "above": above})
 
 
-# What they say: medians and quartiles over the trials.
+# Medians and quartiles of histories over the trials.
 
 
 def band(found: Histories, method: str, by: str, at: Array) -> Array:
-    """Return the quartiles (3, q) over trials of the best cost so far, above the least known, after so many counts.
+    """Return the quartiles (3, q) over trials of the best cost so far, above the least known, at the counts `at`.
 
     Parameters
     ----------
@@ -177,29 +179,30 @@ def band(found: Histories, method: str, by: str, at: Array) -> Array:
     by : str
         A key of `COUNTS`.
     at : array (q,)
-        Counts. A way that has ended stays where it is, one that has not begun is infinitely high.
+        Counts. A history keeps its last cost after its end, and is infinite before its start.
     """
     rows = found.frame[found.frame["method"] == method]
     levels = []
     for _, way in rows.groupby("trial", sort=True):
         reached = np.searchsorted(way[by].to_numpy(dtype=float), at, side="right")
         levels.append(np.concatenate([[np.inf], way["above"].to_numpy(dtype=float)])[reached])
-    # Without interpolation: between a way that has begun and one that has not there is no number.
+    # Without interpolation, because costs before the start of a history are infinite.
     return np.asarray(np.quantile(np.stack(levels), (0.25, 0.5, 0.75), axis=0, method="inverted_cdf"))
 
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """How a method came within an accuracy.
+    """Number of trials in which a method reaches an accuracy, and the work to reach it.
 
     Parameters
     ----------
     method : str
         The method.
     trials, reached : int
-        How many trials, and in how many it came within the accuracy of the least known cost.
+        Number of trials, and number of those that come within the accuracy of the least known cost.
     evaluations, iterations : tuple of float, optional
-        Quartiles over all trials of how many it took; infinite where fewer trials came there, None where not counted.
+        Quartiles over all trials of the counts up to there; infinite for trials that do not reach it, None if not
+        counted.
     """
 
     method: str
@@ -210,7 +213,7 @@ class Reach:
 
 
 def reach(found: Histories, tau: float) -> list[Reach]:
-    """Return how each method came within an accuracy `tau` of the least known cost."""
+    """Return for each method the number of trials within `tau` of the least known cost, and the work to get there."""
     check_accuracy(tau)
     out = []
     for name in found.methods:
@@ -230,46 +233,50 @@ def reach(found: Histories, tau: float) -> list[Reach]:
     return out
 
 
-# One method on some trials.
+# History of one method on some trials.
 
 
 def trace_of(method: StudyMethod, drawn: DrawnCase) -> tuple[list[ConvergenceTrace], str]:
-    """Return the way of a method on each trial, empty where it tells none, and what it does not tell in words."""
+    """Return the history of a method on each trial, empty if it has no history, and a remark about missing parts."""
     if method.baseline is None:
         assert method.method is not None
-        return _by_stopping(Pipeline.parse(method.method), drawn.problem, None, _choice(method))
+        return _record_stopped_runs(Pipeline.parse(method.method), drawn.problem, None, _choice(method))
     baseline = baseline_of(method.baseline)
     start = start_of(method.start, method.width, drawn)
     if not baseline.method:
-        return _by_listening(baseline, drawn, start)
-    return _by_stopping(Pipeline.parse(baseline.method), drawn.problem, start, _choice(method))
+        return _record_evaluations(baseline, drawn, start)
+    return _record_stopped_runs(Pipeline.parse(baseline.method), drawn.problem, start, _choice(method))
 
 
 def _choice(method: StudyMethod) -> Choice:
-    """Return the nonlinear solver of a method; IPOPT is what stages take by themselves."""
+    """Return the nonlinear solver of a method; IPOPT is the default of the stages."""
     named = method.solver if method.solver and "max_iter" in SETTINGS.get(method.solver, {}) else "ipopt"
     return Choice("nonlinear", named, method.settings if named == method.solver else {})
 
 
-def _by_listening(baseline: Baseline, drawn: DrawnCase, start: Array) -> tuple[list[ConvergenceTrace], str]:
+def _record_evaluations(baseline: Baseline, drawn: DrawnCase, start: Array) -> tuple[list[ConvergenceTrace], str]:
+    """Return the costs that an external minimizer evaluates, trial by trial, and a remark."""
     ways, failed = [], ""
     for i in range(len(start)):
         kept: list[float] = []
         with listening(lambda _, cost, kept=kept: kept.append(cost)), np.errstate(all="ignore"):  # type: ignore[misc]
             try:
                 baseline.run(drawn.part(i, 1), start[i : i + 1])
-            except (Exception, SystemExit) as error:  # noqa: BLE001  (what it asked for until then is its way)
+            except (Exception, SystemExit) as error:  # noqa: BLE001  (the history ends before the error)
                 failed = f"{type(error).__name__}: {error}".splitlines()[0]
-        # What is no number is above everything.
+        # NaN counts as worse than every number.
         cost = np.nan_to_num(np.array(kept), nan=np.inf)
         ways.append(ConvergenceTrace(cost, np.arange(1.0, len(cost) + 1.0), np.full(len(cost), np.nan)))
     if not any(len(way.cost) for way in ways):
-        return ways, "it asks for no cost on its way" + (f" ({failed})" if failed else "")
-    return ways, f"it ended with an error in some trial ({failed})" if failed else ""
+        return ways, "it evaluates no cost" + (f" ({failed})" if failed else "")
+    return ways, f"it ended with an error in at least one trial ({failed})" if failed else ""
 
 
 class _Steps(NamedTuple):
-    """Candidates (m,) on their way: cost (q, m) after counts (q,), how many each took, and whether one is one cost."""
+    """Costs (q, m) of m candidates after the counts `at` (q,), and the iterations (m,) of each.
+
+    `counted` is True if each iteration is one evaluation of the cost.
+    """
 
     at: Array
     cost: Array
@@ -277,9 +284,10 @@ class _Steps(NamedTuple):
     counted: bool
 
 
-def _by_stopping(
+def _record_stopped_runs(
     method: Pipeline, problem: Problem, start: Array | None, choice: Choice
 ) -> tuple[list[ConvergenceTrace], str]:
+    """Return the costs of runs that stop after growing numbers of iterations, and a remark."""
     words, n = list(method.words), problem.batch_shape[0]
     pool = None if start is None else begin(problem, start)
     known = {word for formulation in FORMULATIONS.values() for word in formulation.starts}
@@ -287,41 +295,42 @@ def _by_stopping(
         pool = SOLVERS[words[0]].run(problem, None)
         words = words[1:]
     if pool is None:
-        return [_nowhere()] * n, f"{words[0]} has no cost on its way"
+        return [_empty_trace()] * n, f"{words[0]} has no history"
     parts: list[list[ConvergenceTrace]] = []
-    while words and words[0] in _FOLLOWED and (steps := _FOLLOWED[words[0]](problem, pool, choice)) is not None:
-        parts.append(_ways(n, pool, steps))
+    while words and words[0] in _STAGES and (steps := _STAGES[words[0]](problem, pool, choice)) is not None:
+        parts.append(_traces(n, pool, steps))
         pool = SOLVERS[words.pop(0)].run(problem, pool)
     if not parts and start is not None:
-        return [_nowhere()] * n, f"{words[0]} has no cost on its way here"
+        return [_empty_trace()] * n, f"{words[0]} has no history for this problem"
     if not parts:  # a start in closed form
-        parts.append(_ways(n, pool, _stay(problem, pool)))
+        parts.append(_traces(n, pool, _no_steps(problem, pool)))
     ways = [_joined([part[i] for part in parts]) for i in range(n)]
-    rest = "+".join(words) + (" and what takes over from it" if words and method.then else "")
+    rest = "+".join(words) + (" and its fallback" if words and method.then else "")
     if rest:
-        return ways, f"shown until {rest}, which has no cost on its way"
-    # In a study the same is one call of machine code, which begins where it likes.
-    return ways, "shown stage by stage; machine code that does both at once has no cost on its way" * shortcut(method)
+        return ways, f"shown until {rest}, which has no history"
+    # In a study the same method is one call of machine code, which may choose another start.
+    return ways, "shown stage by stage; machine code that runs both stages at once has no history" * shortcut(method)
 
 
-def _nowhere() -> ConvergenceTrace:
+def _empty_trace() -> ConvergenceTrace:
+    """Return an empty history."""
     return ConvergenceTrace(*(np.zeros(0) for _ in ConvergenceTrace._fields))
 
 
-def _ways(n: int, pool: Pool, steps: _Steps) -> list[ConvergenceTrace]:
-    """Return the way of each trial: of its candidates, which go side by side, the best one at each count."""
+def _traces(n: int, pool: Pool, steps: _Steps) -> list[ConvergenceTrace]:
+    """Return the history of each trial: at each count, the best of its candidates, which run in parallel."""
     item, _ = pool.occupied
     out = []
     for i in range(n):
-        own = item == i
-        if not own.any():
-            out.append(_nowhere())
+        members = item == i
+        if not members.any():
+            out.append(_empty_trace())
             continue
-        most = steps.took[own].max()
+        most = steps.took[members].max()
         last = int(np.searchsorted(steps.at, most)) + 1
-        at, cost = np.minimum(steps.at[:last], most), np.nan_to_num(steps.cost[:last, own], nan=np.inf)
-        # Each step tried is one evaluation, and so is the start of each candidate.
-        made = 1.0 + np.minimum(at[:, None], steps.took[own])
+        at, cost = np.minimum(steps.at[:last], most), np.nan_to_num(steps.cost[:last, members], nan=np.inf)
+        # Each step is one evaluation, and so is the start of each candidate.
+        made = 1.0 + np.minimum(at[:, None], steps.took[members])
         out.append(
             ConvergenceTrace(cost.min(1), made.sum(1) if steps.counted else np.full(last, np.nan), at.astype(float))
         )
@@ -329,7 +338,7 @@ def _ways(n: int, pool: Pool, steps: _Steps) -> list[ConvergenceTrace]:
 
 
 def _joined(parts: Sequence[ConvergenceTrace]) -> ConvergenceTrace:
-    """Return ways one behind the other as one."""
+    """Return consecutive histories joined to one."""
     out = parts[0]
     for more in parts[1:]:
         before = [values[-1] if len(values) else 0.0 for values in out[1:]]
@@ -339,14 +348,16 @@ def _joined(parts: Sequence[ConvergenceTrace]) -> ConvergenceTrace:
 
 
 def _counts(most: int) -> Array:
-    """Return the counts after which a run is stopped, the last one `most`."""
-    farther = _EACH * _FARTHER ** np.arange(1, 2 + max(0, int(np.log(max(most, 1) / _EACH) / np.log(_FARTHER))))
-    found = np.union1d(np.arange(_EACH + 1), farther.astype(int))
+    """Return the counts after which a run is stopped; the last count is `most`."""
+    later = _EVERY_ITERATION * _GROWTH ** np.arange(
+        1, 2 + max(0, int(np.log(max(most, 1) / _EVERY_ITERATION) / np.log(_GROWTH)))
+    )
+    found = np.union1d(np.arange(_EVERY_ITERATION + 1), later.astype(int))
     return np.append(found[found < most], most)
 
 
-def _stay(problem: Problem, pool: Pool) -> _Steps:
-    """Return candidates that go nowhere."""
+def _no_steps(problem: Problem, pool: Pool) -> _Steps:
+    """Return the steps of candidates that do not move."""
     item, slot = pool.occupied
     cost = _cost(problem.take(item), pool.x[item, slot])
     return _Steps(np.zeros(1, dtype=int), cost[None], np.zeros(len(item), dtype=int), counted=True)
@@ -358,7 +369,7 @@ def _cost(problem: Problem, x: Array) -> Array:
 
 
 def _least_squares(problem: Problem, pool: Pool, choice: Choice, *, damped: bool, limit: int) -> _Steps:
-    """Return the way of damped Gauss-Newton steps, or of plain ones: each is one evaluation with derivatives."""
+    """Return the history of damped or plain Gauss-Newton steps: each step is one evaluation with derivatives."""
     item, slot = pool.occupied
     x = pool.x[item, slot]
     run = partial(refine, problem, x, item=item, damped=damped)
@@ -369,9 +380,9 @@ def _least_squares(problem: Problem, pool: Pool, choice: Choice, *, damped: bool
 
 
 def _nonlinear(problem: Problem, pool: Pool, choice: Choice) -> _Steps | None:
-    """Return the way of IPOPT, or of another solver of CasADi: an iteration may try several points on a line.
+    """Return the history of IPOPT or another solver of CasADi, whose iteration may evaluate several points on a line.
 
-    Of long runs it solves averages of blocks, whose costs are others: None.
+    Return None for long runs: there it solves averages of blocks, whose costs differ.
     """
     item, slot = pool.occupied
     part = problem.take(item)
@@ -381,7 +392,7 @@ def _nonlinear(problem: Problem, pool: Pool, choice: Choice) -> _Steps | None:
         limited = choice.settings if limit is None else {**choice.settings, "max_iter": limit}
         with using(Choice("nonlinear", choice.name, limited)), counting() as tally:
             x = SOLVERS["nlp"].run(part, start).x[:, 0]
-        # Where least squares has the last word, costs are those of another problem until then.
+        # If least squares follows, the solver minimises the cost of another problem; evaluate the cost of this one.
         return _cost(part, x), [count if name == choice.name else -1 for name, count in tally]
 
     _, took = stop(None)
@@ -392,61 +403,63 @@ def _nonlinear(problem: Problem, pool: Pool, choice: Choice) -> _Steps | None:
     return _Steps(at, np.stack(cost), np.array(took), counted=False)
 
 
-_Follow = Callable[[Problem, Pool, Choice], _Steps | None]
-_FOLLOWED: dict[str, _Follow] = {
+_Recorder = Callable[[Problem, Pool, Choice], _Steps | None]
+_STAGES: dict[str, _Recorder] = {
     "lsr": partial(_least_squares, damped=True, limit=_DAMPED),
     "taylor": partial(_least_squares, damped=False, limit=_PLAIN),
     "nlp": _nonlinear,
 }
 
 
-# From a study's folder, or a problem file, to its trials.
+# Trials of a study's folder or of a problem file.
 
 
 def trials_of(
     place: Path, names: Sequence[str], count: int, case: str | None = None, noise: str | None = None
 ) -> Trials:
-    """Return what is asked of a study's folder, or of the epochs of a problem file.
+    """Return trials and methods from a study's folder, or from the epochs of a problem file.
 
     Parameters
     ----------
     place : Path
         Output folder of a study, or a problem file.
     names : sequence of str
-        Methods beside those of the study, as `optloc.lab.study.methods.added` takes them; of a file all.
+        Methods as `optloc.lab.study.methods.added` takes them. They are added to the methods of a study; a problem
+        file has no other methods.
     count : int
-        Trials at most: the first ones.
+        Most trials, from the first on.
     case, noise : str, optional
-        Which trials of a study; the first case and the first noise level by default.
+        Case and noise level of a study; by default the first case and the first level.
 
     Raises
     ------
     InvalidProblem
-        For a folder or a file that cannot be read, and for what it does not hold.
+        If a folder or a file cannot be read, or does not have the case.
     """
     return _of_study(place, names, count, case, noise) if place.is_dir() else _of_file(place, names, count)
 
 
 def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, noise: str | None) -> Trials:
+    """Return trials and methods of a study for one case and noise level."""
     manifest = read_manifest(folder)
     design = design_of_manifest(manifest)
     if design is None:
-        raise InvalidProblem("a problem file of the study cannot be read any more", str(folder), "put it back")
+        raise InvalidProblem("a problem file of the study is missing or invalid", str(folder), "restore it")
     cells: dict[str, dict[str, Case | NetworkCase]] = {}
     for cell in design.cells:
-        own = cells.setdefault(case_label(cell.case.table.name, cell.case.sweep), {})
-        own.setdefault(noise_text(cell.case.label), cell.case)
+        levels = cells.setdefault(case_label(cell.case.table.name, cell.case.sweep), {})
+        levels.setdefault(noise_text(cell.case.label), cell.case)
     title = _chosen(case, cells, "case")
     level = _chosen(noise, cells[title], "noise")
-    wanted = cells[title][level]
-    if isinstance(wanted, NetworkCase):
-        raise InvalidProblem(f"{title} is of networks, which have no histories", str(folder), "name a case of fixes")
-    drawn, least = _known(folder, wanted, count)
+    chosen = cells[title][level]
+    if isinstance(chosen, NetworkCase):
+        raise InvalidProblem(f"{title} has networks, which have no histories", str(folder), "choose another case")
+    drawn, least = _known(folder, chosen, count)
     methods = {cell.method.name: cell.method for cell in design.cells if not cell.method.reference}
     methods |= {method.name: method for method in added(names)}
     known = {*methods, *(cell.method.name for cell in design.cells)}
     missing = tuple(
-        f"{name}: it was added to the folder; name it with --method, and it is followed"
+        f"{name}: the method was added to the folder; name it with --method to include it"
         for name in dict.fromkeys(manifest.methods.values())
         if name not in known
     )
@@ -454,6 +467,7 @@ def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, 
 
 
 def _chosen(word: str | None, known: Mapping[str, object], what: str) -> str:
+    """Return the wanted name, by default the first name; raise InvalidProblem if it is unknown."""
     names = list(known)
     if word is None:
         return names[0]
@@ -463,36 +477,37 @@ def _chosen(word: str | None, known: Mapping[str, object], what: str) -> str:
 
 
 def _known(folder: Path, case: Case, count: int) -> tuple[DrawnCase, Array]:
-    """Return the first trials of a case, and the least cost that the study knows of each."""
+    """Return the first trials of a case, and the least known cost of each in the study."""
     rows = read_frame(folder, "scenario sweep noise_label trial data cost cost_truth".split())
     rows = rows[
         (rows["scenario"] == case.table.name) & (rows["sweep"] == case.sweep) & (rows["noise_label"] == case.label)
     ]
     if not len(rows):
-        raise InvalidProblem("nothing of this case is finished yet", str(folder), "run the study")
+        raise InvalidProblem("this case has no finished part yet", str(folder), "run the study")
     rows = rows.assign(least=np.fmin(rows["cost"] - rows["gap"], rows["cost_truth"]))
     by_trial = rows.groupby("trial", sort=True).agg(data=("data", "first"), least=("least", "min"))[:count]
     if list(by_trial.index) != list(range(len(by_trial))):
-        raise InvalidProblem("its first trials are not all there yet", str(folder), "wait until it is complete")
+        raise InvalidProblem("its first trials are not all finished yet", str(folder), "wait until it is complete")
     drawn = draw(case, 0, len(by_trial))
     if drawn.digest != tuple(map(str, by_trial["data"])):
-        what = "the study holds other data than are drawn here"
+        what = "the data of the study differ from a new simulation"
         raise InvalidProblem(what, str(folder), "use the versions that its manifest names, or run it again")
     return drawn, by_trial["least"].to_numpy(dtype=float)
 
 
 def _of_file(file: Path, names: Sequence[str], count: int) -> Trials:
+    """Return the epochs of a problem file as trials, with the cost of their fixes as least known cost."""
     loaded = read(file)
     problem = by_epoch(loaded.problem).flat() if separable(loaded.problem) else loaded.problem.flat()
     kept = np.arange(min(count, problem.batch_shape[0]))
     problem, n = problem.take(kept), len(kept)
     places = [slot.name for slot in problem.layout.shared if slot.name.partition("[")[0] == "position"]
     if len(places) != 1:
-        what = f"{len(places)} positions are sought"
-        raise InvalidProblem(what, str(file), "give one target, static or of one motion for the whole run")
-    # A place beside the stations' centre, always the same, where methods begin that need a start.
+        what = f"it has {len(places)} unknown positions"
+        raise InvalidProblem(what, str(file), "give one target, static or with one motion for the whole run")
+    # A fixed point near the stations' centre, for methods that need a start.
     wild = np.random.default_rng(0).uniform(-0.5, 0.5, (n, problem.dimension))
     nothing = np.full((n, problem.layout.size), np.nan)
     drawn = DrawnCase(problem, nothing, wild, ("",) * n, ("",) * n, np.zeros(n, dtype=int), places[0])
     least = solve(problem).cost
-    return Trials(loaded.title or file.name, drawn, tuple(added(names or _USUAL)), np.asarray(least))
+    return Trials(loaded.title or file.name, drawn, tuple(added(names or _DEFAULT_METHODS)), np.asarray(least))

@@ -1,4 +1,4 @@
-"""The leaderboard of the public test set as a page of Markdown: who is right how often, how fast, and on which data."""
+"""Leaderboard of the public test set as a page of Markdown: shares of right answers, times, and the test data."""
 
 from __future__ import annotations
 
@@ -16,23 +16,18 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SET = "bench"
-"""Name of the shipped study that is the test set."""
+"""Name of the shipped study that contains the test set."""
 
 _JUDGE = "truth"
 
 
 def page(folder: Path, design: StudyDesign) -> str:
-    """Return the leaderboard of a folder as Markdown.
+    """Return the leaderboard as Markdown.
 
-    Parameters
-    ----------
-    folder : Path
-        Output folder of a run of the test set.
-    design : StudyDesign
-        Its design: tells which data these are.
+    `folder` is the output folder of a run of the test set; `design` is the design of that run.
     """
     rows, manifest = judged(read_frame(folder, COLUMNS)), read_manifest(folder)
-    # The judge knows the truth: it is compared with nobody.
+    # The baseline "truth" starts at the true position and judges the others, so it is not ranked.
     ranked = rows[rows["method"].astype(str) != _JUDGE]
     lines = ["---", "orphan: true", "---", "", "<!-- table -->", "", _about(manifest, design), ""]
     lines += [*_ranks(ranked), "", "Share of right answers by scene, %:", "", *_by_case(ranked)]
@@ -40,6 +35,7 @@ def page(folder: Path, design: StudyDesign) -> str:
 
 
 def _about(manifest: StudyManifest, design: StudyDesign) -> str:
+    """Return a line with version, date, test set, seed and machine."""
     return (
         f"optloc {manifest.version}, {manifest.created[:10]}, test set {design.data[:16]}, seed {manifest.seed}, "
         f"{design.cells[0].case.trials} trials a scene; {manifest.machine}."
@@ -47,6 +43,7 @@ def _about(manifest: StudyManifest, design: StudyDesign) -> str:
 
 
 def _ranks(rows: pd.DataFrame) -> list[str]:
+    """Return the lines of the ranking as a Markdown table."""
     order = methods(rows)
     first = order[0]
     alone = dict.fromkeys(order, 0)
@@ -59,17 +56,18 @@ def _ranks(rows: pd.DataFrame) -> list[str]:
         "|---:|---|---:|---:|---:|---:|---:|",
     ]
     for place, name in enumerate(order, 1):
-        own = rows[rows["method"].astype(str) == name]
-        count = len(own)
-        low, high = wilson(float(own["right"].sum()), float(count))
-        duel = "" if name == first else f"{alone[name]} : {other[name]}"
-        shares = f"{100 * own['right'].mean():.2f} | {100 * float(low):.2f} to {100 * float(high):.2f}"
-        wrong, time = 100 * own["wrong"].mean(), 1e3 * float(np.median(own["seconds"]))
-        lines.append(f"| {place} | {_cell(name)} | {shares} | {wrong:.2f} | {time:.3g} | {duel} |")
+        part = rows[rows["method"].astype(str) == name]
+        count = len(part)
+        low, high = wilson(float(part["right"].sum()), float(count))
+        comparison = "" if name == first else f"{alone[name]} : {other[name]}"
+        shares = f"{100 * part['right'].mean():.2f} | {100 * float(low):.2f} to {100 * float(high):.2f}"
+        wrong, time = 100 * part["wrong"].mean(), 1e3 * float(np.median(part["seconds"]))
+        lines.append(f"| {place} | {_cell(name)} | {shares} | {wrong:.2f} | {time:.3g} | {comparison} |")
     return lines
 
 
 def _by_case(rows: pd.DataFrame) -> list[str]:
+    """Return the lines of a Markdown table: share of right answers by scene and method."""
     order = methods(rows)
     wide = rows.pivot_table(index="case", columns="method", values="right", aggfunc="mean", observed=True)
     lines = [f"| scene | {' | '.join(map(_cell, order))} |", f"|---|{'---:|' * len(order)}"]
@@ -79,5 +77,5 @@ def _by_case(rows: pd.DataFrame) -> list[str]:
 
 
 def _cell(text: str) -> str:
-    """Return text as a cell of a table: names come from whoever ran the set."""
+    """Return text as a table cell of Markdown, escaped because names of methods come from users."""
     return "".join(f"\\{c}" if c in "\\|`*_<>[]" else c for c in text)

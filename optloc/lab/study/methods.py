@@ -1,6 +1,6 @@
-"""How problems of a study are solved: methods of a study file as data, the back ends they may ask for, one call.
+"""Methods of a study: their tables in the study file, the solver settings that a file may make, and their calls.
 
-A method is one of optloc's or a baseline; nothing in a study knows one by its name.
+A method is a method of optloc or a baseline. No code of a study depends on the name of a method.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from optloc.lab.study.simulation import DrawnCase
 from optloc.problem import ANSWERED, Array, Certificate, Fix, InvalidProblem, Status, nearest
 from optloc.solvers import backend_kind, backends, kind_of, version_of
 
-# Back ends stand in a module of their own; studies know them from here.
+# Solvers are defined in another module; studies import them from here.
 __all__ = [
     "SETTINGS",
     "MethodRun",
@@ -43,26 +43,26 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class StudyMethod:
-    """One way to solve.
+    """Method of a study.
 
     Parameters
     ----------
     name : str
-        As tables show it.
+        Name in tables.
     method, baseline : str, optional
-        What solves: one of both.
+        Method of optloc or baseline; one of them is None.
     solver : str
-        Back end of its programs; empty: its own.
+        Solver of its programs; empty: the default.
     settings : dict
-        Of the back end.
+        Settings of the solver.
     start : str
-        Where a baseline that needs a guess begins.
+        Start of a baseline that needs a guess.
     width : float
         Width of the box of random starts, metres.
     batch, chunk : int, optional
-        Fixes in a call, and in a task.
+        Number of fixes in a call, and of trials in a task.
     code : str
-        Digest of the file that a baseline of a plugin is written in; empty of optloc's own.
+        Digest of the source file of a plugin's baseline; empty for optloc's baselines.
     """
 
     name: str
@@ -78,8 +78,8 @@ class StudyMethod:
 
     @property
     def identity(self) -> str:
-        """Return what decides the answers, as text."""
-        # Not the chunk: it decides how the work is cut, and the fingerprint of a design has that.
+        """Return the settings that decide the answers, as text."""
+        # Without the chunk: it divides the work, and is part of the fingerprint of the design.
         settings = json.dumps(self.settings, sort_keys=True)
         parts = (self.name, self.method, self.baseline, self.solver, settings, self.start, self.width, self.batch)
         return json.dumps((*parts, self.code) if self.code else parts)
@@ -98,21 +98,21 @@ class StudyMethod:
 
     @property
     def networked(self) -> bool:
-        """Return whether it finds networks."""
+        """Return whether the method solves networks."""
         if self.baseline is not None:
             return baseline_of(self.baseline).networks is not None
         return self.method == CALIBRATE
 
     @property
     def fixes(self) -> bool:
-        """Return whether it fixes targets."""
+        """Return whether the method fixes targets."""
         if self.baseline is not None:
             return baseline_of(self.baseline).run is not only_networks
         return self.method != CALIBRATE
 
     @property
     def reference(self) -> bool:
-        """Return whether it knows the truth, so that it judges the others and is not ranked."""
+        """Return whether the method knows the truth: it then judges the others and is not ranked."""
         if self.baseline is None:
             return False
         known = baseline_of(self.baseline)
@@ -122,26 +122,16 @@ class StudyMethod:
 def methods_of(table: MethodTable, number: int) -> Iterator[StudyMethod]:
     """Yield the methods of a table: one for each combination of its lists.
 
-    Parameters
-    ----------
-    table : MethodTable
-        The table.
-    number : int
-        Its place in the file, from 1.
-
-    Raises
-    ------
-    InvalidProblem
-        For an unknown method, baseline or solver, naming the nearest, a solver that is not installed, or a setting that
-        a file must not make.
+    `number` is the place of the table in the file, from 1. Raise InvalidProblem for an unknown method, baseline or
+    solver, a solver that is not installed, or a setting that a file may not make.
     """
     where = f"[[method]] {number}" if table.name is None else f"method {table.name!r}"
     if (table.method is None) == (table.baseline is None):
-        raise InvalidProblem("a method is one thing", where, "give either method or baseline")
+        raise InvalidProblem("it needs one method or one baseline", where, "give either method or baseline")
     solvers: list[str | None] = [*_list(table.solver)] or [None]
     names = _list(table.method) or _list(table.baseline)
     if not names:
-        raise InvalidProblem("its list of methods is empty", where, "name one, or leave the table out")
+        raise InvalidProblem("its list of methods is empty", where, "name one, or remove the table")
     for name, solver in product(names, solvers):
         if table.method is not None:
             from optloc.solvers import Method as Pipeline
@@ -156,7 +146,7 @@ def methods_of(table: MethodTable, number: int) -> Iterator[StudyMethod]:
             backend_kind(solver, join(where, "solver"))
             check_settings(solver, table.settings, join(where, "settings"))
         elif table.settings:
-            raise InvalidProblem("settings belong to a solver", join(where, "settings"), "name it in 'solver'")
+            raise InvalidProblem("settings need a solver", join(where, "settings"), "name it in 'solver'")
         yield StudyMethod(
             _name(table, name, solver, len(names) * len(solvers)),
             None if table.method is None else name,
@@ -172,17 +162,10 @@ def methods_of(table: MethodTable, number: int) -> Iterator[StudyMethod]:
 
 
 def added(names: Sequence[str]) -> list[StudyMethod]:
-    """Return methods that the user names beside those of a file.
+    """Return methods that the user names in addition to the methods of a file.
 
-    Parameters
-    ----------
-    names : sequence of str
-        A method such as gtrs+lsr, a baseline, or a function to load: FILE.py:FUNCTION or MODULE:FUNCTION.
-
-    Raises
-    ------
-    InvalidProblem
-        For an unknown method, and for a function that cannot be loaded.
+    Each name is a method such as gtrs+lsr, a baseline, or a function to load: FILE.py:FUNCTION or MODULE:FUNCTION.
+    Raise InvalidProblem for an unknown method, or a function that cannot be loaded.
     """
     found = []
     for name in names:
@@ -200,7 +183,8 @@ def _list(value: str | list[str] | None) -> list[str]:
 
 
 def _name(table: MethodTable, name: str, solver: str | None, count: int) -> str:
-    # The name says what distinguishes it: settings do not, so methods that differ by them only need names of their own.
+    """Return the name of a method in tables."""
+    # The default name does not contain settings, so methods that differ only by settings need a name in the file.
     guess = table.baseline is not None and BASELINES[name].guess
     words = [name, *([f"from the {table.start}"] if guess else []), *([f"({solver})"] if solver else [])]
     made = " ".join(words)
@@ -211,7 +195,7 @@ def _name(table: MethodTable, name: str, solver: str | None, count: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class MethodRun:
-    """What a call gave.
+    """Result of one call of a method.
 
     Parameters
     ----------
@@ -222,11 +206,11 @@ class MethodRun:
     processor : float
         Processor time of the call, of all its threads, seconds.
     evaluations : array (n,)
-        Evaluations of the cost of each trial; NaN where nobody counts them.
+        Evaluations of the cost of each trial; NaN if the method does not count them.
     iterations : float
-        Iterations of all its solvers and refinements; NaN where nothing was counted.
+        Iterations of all its solvers and refinements; NaN if none are counted.
     used : bool
-        Whether the back end that was asked for has solved anything; True where none was asked for.
+        Whether the requested solver has solved a program; True if no solver was requested.
     """
 
     fix: Fix | tuple[NetworkResult, ...]
@@ -237,24 +221,18 @@ class MethodRun:
     used: bool
 
 
-class Nonsense(Exception):  # noqa: N818  (a word for what it is, as all of them)
-    """What a method returned is no answer to its trials."""
+class Nonsense(Exception):  # noqa: N818  (the name describes an answer)
+    """Raised if a method returns an invalid answer."""
 
 
 def run(method: StudyMethod, drawn: DrawnCase | Networks) -> MethodRun:
-    """Return the fixes of trials by a method, with the back end and the settings that it asks for.
-
-    Raises
-    ------
-    Nonsense
-        Where what the method returned is no fix of these trials.
-    """
+    """Return the fixes of trials by a method, with its solver and settings; raise Nonsense for invalid fixes."""
     from optloc.solvers import Choice, counting, using
 
     choice = None
     if method.solver:
         choice = Choice(kind_of(method.solver), method.solver, method.settings)
-    # What a method does about rounding and division is its own affair, and ends with it.
+    # A method may change the floating-point error handling; the context restores it.
     asked = np.zeros(len(drawn.seed))
     with using(choice), counting() as tally, listening(lambda trial, _: _add(asked, trial)), np.errstate():
         began, busy = perf_counter(), process_time()
@@ -272,37 +250,38 @@ def _add(counts: Array, trial: int) -> None:
 
 
 def require_program(method: StudyMethod, found: MethodRun) -> None:
-    """Raise InvalidProblem where the back end that was asked for has solved nothing."""
-    # A method that never asks the back end would be measured under its name.
+    """Raise InvalidProblem if the requested solver has solved no program."""
+    # Otherwise the study would report results of another solver under its name.
     if not found.used:
         what = f"{method.method or method.baseline} has no program that {method.solver} solves"
-        raise InvalidProblem(what, f"method {method.name!r}", "leave the solver out, or use a stage such as sdp or nlp")
+        raise InvalidProblem(what, f"method {method.name!r}", "remove the solver, or use a stage such as sdp or nlp")
 
 
 def _solved(method: StudyMethod, drawn: DrawnCase | Networks) -> Any:
+    """Return the fixes of drawn trials, or the results for drawn networks."""
     if isinstance(drawn, Networks):
         finds = calibrated if method.baseline is None else baseline_of(method.baseline).networks
-        assert finds is not None  # `design_of_text` refuses other methods
+        assert finds is not None  # `design_of_text` rejects other methods
         return finds(drawn)
     if method.baseline is not None:
         return baseline_of(method.baseline).run(drawn, start_of(method.start, method.width, drawn))
     from optloc.solvers import solve
 
     assert method.method is not None
-    # Of a method that only starts the estimate itself is measured.
+    # refine=False: for a method that only starts, the start itself is scored.
     fix = solve(drawn.problem, method.method, refine=False)
-    # A batch of one has no axis of its own.
+    # A batch of one has no batch axis.
     return fix if fix.shape else fix.flat()
 
 
-# Share of the variances by which rounding may make a covariance unsymmetric or negative: half of the digits.
+# Largest asymmetry or negative eigenvalue of a covariance from rounding, relative to the variances: half of the digits.
 _ROUNDING = 1e-8
 
 
 def _check(fix: Any, drawn: DrawnCase) -> None:
-    """Raise Nonsense where something is no fix of trials: its type, its shapes and kinds of numbers, its answers."""
+    """Raise Nonsense if a value is not a valid fix of the trials: type, shapes, kinds of numbers or answers."""
     if not isinstance(fix, Fix):
-        raise Nonsense(f"it returned {type(fix).__name__} in the place of a fix")
+        raise Nonsense(f"it returned {type(fix).__name__} instead of a fix")
     n, size = drawn.truth.shape
     shared, others = drawn.problem.layout.n_shared, np.shape(fix.alternatives.gap)[-1:]
     wanted: dict[str, tuple[Any, tuple[int, ...], str]] = {
@@ -320,26 +299,26 @@ def _check(fix: Any, drawn: DrawnCase) -> None:
     for name, (value, shape, kinds) in wanted.items():
         if not isinstance(value, np.ndarray) or value.shape != shape or value.dtype.kind not in kinds:
             what = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
-            raise Nonsense(f"its {name} is {what}, and not an array {shape} of kind {kinds!r}")
+            raise Nonsense(f"its {name} is {what}, not an array {shape} of kind {kinds!r}")
     if not all(isinstance(one, Certificate) for one in fix.certificates):
-        raise Nonsense("its certificates are none")
+        raise Nonsense("its certificates are invalid")
     if not all(0 <= code < len(Status) for code in fix.code):
         raise Nonsense("its status is unknown")
-    # A run to infinity has no place.
+    # An unbounded answer has no finite position.
     kept = np.isin(fix.code, [status for status in ANSWERED if status is not Status.UNBOUNDED])
     _check_answers(fix.x[kept, :shared], fix.cov[kept])
 
 
 def _check_answers(x: Array, cov: Array) -> None:
-    """Raise Nonsense where answers (n, p) are not finite, or their covariances (n, p, p) are none."""
+    """Raise Nonsense if answers (n, p) are not finite, or their covariances (n, p, p) are invalid."""
     if not np.isfinite(x).all():
-        raise Nonsense("its status has an answer, and its estimate is not finite")
+        raise Nonsense("its status claims an answer, but its estimate is not finite")
     if not np.isfinite(cov).all():
-        raise Nonsense("its status has an answer, and its covariance is not finite")
+        raise Nonsense("its status claims an answer, but its covariance is not finite")
     variance = np.diagonal(cov, axis1=-2, axis2=-1)
     if (variance < 0.0).any():
         raise Nonsense("its covariance has negative variances")
-    # In units of each deviation, so that metres and radians count alike; what is known has none.
+    # In units of each standard deviation, so that metres and radians compare; known parameters have none.
     scale = np.sqrt(variance)
     scale = np.where(scale > 0.0, scale, 1.0)
     relative = cov / scale[:, :, None] / scale[:, None, :]
@@ -349,20 +328,20 @@ def _check_answers(x: Array, cov: Array) -> None:
         raise Nonsense("its covariance is not positive semidefinite")
 
 
-# Settings of back ends. A study file comes from anybody: it may say how hard a solver tries, and nothing else. Options
-# that name files, libraries, compilers or callbacks are no settings here, and what is not in the table is out of reach.
+# Settings of solvers. A study file may come from an untrusted source, so it may only set the effort of a solver.
+# Options that name files, libraries, compilers or callbacks are not in the table, and cannot be set.
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A number, or a yes or no, that a study file may give to a back end.
+    """A number or a boolean that a study file may set for a solver.
 
     Parameters
     ----------
     kind : type
         bool, int or float.
     least, most : float
-        Ends of what is taken; of no meaning for bool.
+        Ends of the allowed range; not used for bool.
     """
 
     kind: type[bool | int | float]
@@ -370,20 +349,20 @@ class Setting:
     most: float = 1.0
 
     def __str__(self) -> str:
-        """Return what is taken, in words."""
+        """Return the allowed values in words."""
         if self.kind is bool:
             return "true or false"
         return f"{'a whole number' if self.kind is int else 'a number'} from {self.least:g} to {self.most:g}"
 
     def takes(self, value: object) -> bool:
-        """Return whether a value is of its kind and in its range; a whole number is a number too."""
+        """Return whether a value has the right kind and is in the range; a float also accepts an int."""
         if isinstance(value, bool) or self.kind is bool:
             return isinstance(value, bool) and self.kind is bool
         whole = isinstance(value, int) or (self.kind is float and isinstance(value, float))
         return whole and self.least <= float(value) <= self.most  # type: ignore[arg-type]  # a number by now
 
 
-# Tolerances below the precision of numbers make every solve fail; a billion iterations, or a day, are no limit.
+# Tolerances below the precision of floats make every solve fail. A limit of a billion iterations or a day is no limit.
 _TOLERANCE, _COUNT, _SECONDS = Setting(float, 1e-16, 1.0), Setting(int, 1, 1e9), Setting(float, 1e-3, 86_400.0)
 _FACTOR, _SIZE, _SWITCH = Setting(float, 0.0, 1.0), Setting(float, 0.0, 1e12), Setting(bool)
 _SQP = {"max_iter": _COUNT, "min_iter": _COUNT, "tol_pr": _TOLERANCE, "tol_du": _TOLERANCE}
@@ -424,15 +403,17 @@ SETTINGS: dict[str, dict[str, Setting]] = {
     "feasiblesqpmethod": {**_SQP, "max_inner_iter": _COUNT, "feas_tol": _TOLERANCE, "optim_tol": _TOLERANCE},
     "sleqp": {"max_iter": _COUNT, "max_wall_time": _SECONDS},
 }
-"""What a study file may set, by back end; of those that are missing nothing."""
+"""Settings that a study file may make, by solver; a solver that is missing has none."""
 
 
 def check_settings(solver: str, settings: dict[str, Any], where: str) -> None:
-    """Raise InvalidProblem for settings that a file must not make of a back end: unknown or out of range."""
+    """Raise InvalidProblem for solver settings that a file may not make: unknown or out of range."""
     known = SETTINGS.get(solver, {})
     for name, value in settings.items():
         if name not in known:
-            advice = f"a study may set {', '.join(sorted(known))}" if known else "a study sets nothing of this solver"
-            raise InvalidProblem(f"{name!r} is no setting of {solver} that a file may make", where, advice)
+            advice = (
+                f"a study may set {', '.join(sorted(known))}" if known else "a study has no settings of this solver"
+            )
+            raise InvalidProblem(f"a study may not set {name!r} of {solver}", where, advice)
         if not known[name].takes(value):
-            raise InvalidProblem(f"{name} is {value!r}", where, f"it takes {known[name]}")
+            raise InvalidProblem(f"{name} is {value!r}", where, f"give {known[name]}")

@@ -1,6 +1,6 @@
-"""Minimizers of others in a study: a function of a cost and a start, by its place on the command line, in no table.
+"""External minimizers in a study: functions of a cost and a start, loaded from a file or a module of the user.
 
-A study file cannot name one: only what the user has loaded as a plugin is found.
+A study file cannot name a minimizer: only plugins that the user has loaded are found.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from optloc.lab.study.simulation import DrawnCase
 from optloc.problem import Array, Fix, InvalidProblem, Problem, load_plugin, nearest, plugin_module, whiten
 
 Cost = Callable[[Array], tuple[float, Array]]
-"""Returns the maximum-likelihood cost at a vector (size,) and its gradient (size,); SI units."""
+"""Function from a vector (size,) to the maximum-likelihood cost and its gradient (size,); SI units."""
 
 
 @dataclass(frozen=True, slots=True)
 class Minimizer:
-    """Fixes of a function that minimises, one by one.
+    """Baseline of a function that minimises a cost, problem by problem.
 
     Parameters
     ----------
     function : callable of (Cost, array (size,))
-        Returns the vector (size,) where it ends, as ``scipy.optimize.minimize(cost, start, jac=True).x`` does.
+        Returns the final vector (size,), as ``scipy.optimize.minimize(cost, start, jac=True).x`` does.
     """
 
     function: Callable[[Cost, Array], Array]
 
     def __call__(self, drawn: DrawnCase, start: Array) -> Fix:
-        """Return the fixes; they claim to be answers wherever they are finite, and the study judges them."""
+        """Return the fixes: all finite ones claim to be answers, and the study judges them."""
         x = np.array(start, dtype=float)
         for _ in range(weighings(drawn.problem)):
             plain = weighed_at(drawn.problem, x, start)
@@ -46,28 +46,29 @@ class Minimizer:
 
 
 def cost_of(one: Problem, tell: Callable[[float], None] = lambda _: None) -> Cost:
-    """Return the cost of a flat batch of one problem with its gradient; `tell` hears of each evaluation."""
+    """Return the cost with gradient of a flat batch of one problem; `tell` is called with each cost."""
     equations = _equations(one)
 
     def cost(x: Array) -> tuple[float, Array]:
         at = equations(np.array(x, dtype=float)[None])
         value = float(at.cost[0])
         tell(value)
-        # The normal equations hold minus half the gradient.
+        # The normal equations contain minus half the gradient.
         return value, -2.0 * np.concatenate([at.shared_vector[0], at.local_vector[0].ravel()])
 
     return cost
 
 
 def _equations(one: Problem) -> Callable[[Array], Normal]:
-    """Return what maps a vector (1, size) to the normal equations of one problem there, priors included.
+    """Return a function from a vector (1, size) to the normal equations of one problem, with priors.
 
-    By machine code, for what is timed is the minimizer: one evaluation after the other takes numpy six times as long.
+    It uses machine code, because the time of the minimizer is measured: in NumPy single evaluations take six times
+    longer.
     """
     from optloc.engine import normal_at, normal_block
 
     white, alone = whiten(one.noise, one.weight), np.zeros(1, dtype=np.int64)
-    # A minimizer asks many times: that is worth waiting for.
+    # A minimizer evaluates the cost many times, so it is worth waiting for the compiled code.
     packed = pack(one, white) if may_use_code(normal_block, FEW + 1) and not walks(one) else None
     if packed is None:
         return lambda x: equations_at(one, x, white)
@@ -75,12 +76,9 @@ def _equations(one: Problem) -> Callable[[Array], Normal]:
 
 
 def load_minimizer(name: str) -> None:
-    """Load ``FILE.py:FUNCTION`` or ``MODULE:FUNCTION``, which the user names, so that `baseline_of` finds it.
+    """Load ``FILE.py:FUNCTION`` or ``MODULE:FUNCTION`` of the user, so that `baseline_of` finds the function.
 
-    Raises
-    ------
-    InvalidProblem
-        Where there is no such file, module or function.
+    Raise InvalidProblem if the file, the module or the function does not exist.
     """
     place, _, _ = name.rpartition(":")
     load_plugin(place)
@@ -88,12 +86,9 @@ def load_minimizer(name: str) -> None:
 
 
 def baseline_of(name: str) -> Baseline:
-    """Return a baseline by its name, or a function of a plugin that is loaded as one.
+    """Return a baseline by its name, or a function of a loaded plugin as a baseline.
 
-    Raises
-    ------
-    InvalidProblem
-        For an unknown name, and for a function of a file or a module that nobody has loaded.
+    Raise InvalidProblem for an unknown name, or a function of a file or module that is not loaded.
     """
     if name in BASELINES:
         return BASELINES[name]
@@ -112,9 +107,9 @@ def baseline_of(name: str) -> Baseline:
 
 
 def code_of(name: str) -> str:
-    """Return a digest of the file that a baseline of a plugin is written in; empty of optloc's own.
+    """Return a digest of the source file of a plugin's baseline; empty for optloc's baselines.
 
-    A method whose file has changed is another one: what was computed by the old one is not its result.
+    A method with a changed file is another method: results of the old file do not belong to it.
     """
     run = baseline_of(name).run
     function = run.function if isinstance(run, Minimizer) else run

@@ -1,6 +1,6 @@
-"""Studies of networks: stations, clocks and pulses drawn together, found by a method, and compared with the truth.
+"""Studies of networks: simulation of stations, clocks and pulses, solution by a method, and comparison with the truth.
 
-Networks are known up to a rigid motion and a reflection: errors are those that are left after the best one.
+Networks are known up to a rigid motion and a reflection, so errors are measured after the best alignment.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from optloc.sites.calibration.likelihood import NetworkEstimate, likelihood, tog
 from optloc.sites.calibration.network import Network, network_of
 
 CALIBRATE = "calibrate"
-"""The method of networks."""
+"""Name of the method of optloc for networks."""
 
-# Rows that a pulse keeps beyond its unknowns, however many are missing: with fewer it tells a network nothing.
+# Rows that each pulse keeps beyond its number of unknowns: with fewer it does not constrain the network.
 _SPARE = 2
-# Share of the largest eigenvalue of a covariance below which one is that of the frame.
+# Eigenvalues of a covariance below this share of the largest belong to the frame.
 _FRAME = 1e-9
 
 
 @dataclass(frozen=True)
 class NetworkCase:
-    """What all trials of one data cell of networks share; it holds data only, so that it travels to workers.
+    """Common data of all trials of a case of networks, without functions, so that it can be sent to workers.
 
     Parameters
     ----------
     table : NetworkTable
-        The table with its swept values in place.
+        The table with its swept values inserted.
     sweep : str
         The swept values as JSON.
     label : str
-        The noise level as it is written.
+        The noise level as written in the file.
     level : float
-        The same, metres.
+        The noise level, metres.
     seed : int
-        Of the study.
+        Seed of the study.
     trials : int
         Number of trials.
     """
@@ -60,18 +60,18 @@ class NetworkCase:
 
     @cached_property
     def key(self) -> str:
-        """Return what the data of a trial depend on beside its number, as 16 hexadecimal digits."""
+        """Return 16 hexadecimal digits that identify the data of all trials."""
         text = self.table.model_dump_json(exclude={"noise", "sweep", "trials"})
         return hashlib.blake2b(f"{self.seed} {self.label} {self.sweep} {text}".encode(), digest_size=8).hexdigest()
 
     @property
     def where(self) -> str:
-        """Return the place that complaints name."""
+        """Return the location that error messages name."""
         return f"network {self.table.name!r}"
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Return the columns that all trials share."""
+        """Return the columns of the table that all trials share."""
         table = self.table
         rows = table.stations * table.pulses
         sizes = {"dimension": table.dimension, "stations": table.stations, "rows": rows, "epochs": table.pulses}
@@ -83,7 +83,7 @@ class NetworkCase:
         return self.table.stations * self.table.pulses
 
     def draw(self, first: int, count: int) -> Networks:
-        """Return trials `first` to ``first + count``; they do not depend on what else is drawn."""
+        """Return trials `first` to ``first + count``; they do not depend on other draws."""
         drawn = [_trial(self, number) for number in range(first, first + count)]
         seed = tuple(f"{self.seed}:{self.key}:{number}" for number in range(first, first + count))
         digest = tuple(_digest(self, network) for network, _, _ in drawn)
@@ -93,18 +93,18 @@ class NetworkCase:
 
 @dataclass(frozen=True, slots=True)
 class Networks:
-    """Trials of a case.
+    """Simulated trials of a case of networks.
 
     Parameters
     ----------
     networks : tuple of n Network
-        As methods get them.
+        The networks that methods solve.
     truth : NetworkEstimate
-        The n true ones.
+        The n true networks.
     seed, digest : tuple of n str
-        Names of the trials' seeds, and what was drawn.
+        Names of the trials' seeds, and digests of the drawn numbers.
     bad : int array (n,)
-        How many arrivals have a gross error.
+        Number of arrivals with a gross error.
     """
 
     networks: tuple[Network, ...]
@@ -114,14 +114,14 @@ class Networks:
     bad: Array
 
     def part(self, first: int, count: int) -> Networks:
-        """Return some of the trials."""
+        """Return `count` trials from the trial `first` on."""
         kept = slice(first, first + count)
         truth = self.truth.take(kept)
         return Networks(self.networks[kept], truth, self.seed[kept], self.digest[kept], self.bad[kept])
 
 
 def check_network(table: NetworkTable, where: str) -> None:
-    """Refuse amounts that cannot be read, or that do not fit each other."""
+    """Raise InvalidProblem for amounts that are invalid or do not fit each other."""
     for key in ("box", "around"):
         if (given := getattr(table, key)) is not None and len(given) < table.dimension:
             what = f"{len(given)} widths do not fit {table.dimension} dimensions"
@@ -141,6 +141,7 @@ def noise_of(level: Amount, where: str) -> float:
 
 
 def _lengths(table: NetworkTable, key: str, where: str) -> Array:
+    """Return the lengths of a key of the table as an array in metres; raise InvalidProblem if negative."""
     given = getattr(table, key)
     values = given if isinstance(given, list) else [] if given is None else [given]
     lengths = np.array([Units("length").plain(value, "m", join(where, key)) for value in values])
@@ -150,16 +151,18 @@ def _lengths(table: NetworkTable, key: str, where: str) -> Array:
 
 
 def _size(table: NetworkTable, where: str) -> float:
+    """Return the size of gross errors in metres."""
     assert table.outliers is not None
     size, place = table.outliers.size, join(where, "outliers.size")
     if isinstance(size, dict):
-        raise InvalidProblem("networks have arrivals alone", place, 'write one length, such as "4 m"')
+        raise InvalidProblem("networks have arrivals only", place, 'write one length, such as "4 m"')
     return Units("length").plain(size, "m", place)
 
 
 def _trial(case: NetworkCase, number: int) -> tuple[Network, NetworkEstimate, int]:
-    """Return one network, its true values and how many of its arrivals have a gross error."""
-    # A seed sequence mixes words of 32 bits; what is placed, measured and left out do not shift one another.
+    """Return one network, its true values and the number of its arrivals with a gross error."""
+    # A seed sequence mixes words of 32 bits. Positions, noise and gross errors have separate streams: a change of one
+    # does not shift the others.
     key = [int(case.key[:8], 16), int(case.key[8:], 16)]
     words = np.random.SeedSequence([case.seed, *key], spawn_key=(number,)).spawn(3)
     place, noise, flaws = (np.random.default_rng(word) for word in words)
@@ -185,37 +188,38 @@ def _trial(case: NetworkCase, number: int) -> tuple[Network, NetworkEstimate, in
 
 
 def _digest(case: NetworkCase, network: Network) -> str:
+    """Return 16 hexadecimal digits that identify the drawn arrivals."""
     made = hashlib.blake2b(case.key.encode(), digest_size=8)
     for array in (network.z, network.sigma):
         made.update(np.ascontiguousarray(array).tobytes())
     return made.hexdigest()
 
 
-# What methods find.
+# Results of methods.
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkResult:
-    """What a method made of one network.
+    """Result of a method for one network.
 
     Parameters
     ----------
     status : Status
-        Its verdict; `OK` of a baseline, which claims whatever it arrives at.
+        Status of the result; a baseline claims `OK` for every result.
     reason : str
-        What speaks against it.
+        Reason of another status.
     stations, clocks : array (M, d), (M,)
-        NaN where there is no network.
+        Positions and clock offsets, metres; NaN without a result.
     covariance : array (P, P)
-        Of these, in the frame of all stations; NaN where there is none.
+        Covariance of both, in the frame of all stations; NaN without one.
     cost : float
-        Of the likelihood.
+        Cost of the likelihood.
     dof : int
         Degrees of freedom.
     proof : str
-        As of a `Calibration`.
+        Proof as in a `Calibration`.
     others : tuple of arrays (M, d)
-        Stations of other networks that it lists.
+        Stations of the other networks that it lists, metres.
     """
 
     status: Status
@@ -230,11 +234,12 @@ class NetworkResult:
 
 
 def calibrated(networks: Networks) -> tuple[NetworkResult, ...]:
-    """Return what `optloc.calibrate` finds of each network."""
+    """Return the results of `optloc.calibrate` for each network."""
     return tuple(_of_calibration(calibrate(network)) for network in networks.networks)
 
 
 def _of_calibration(found: Calibration) -> NetworkResult:
+    """Return a calibration as the result of a method."""
     reason = found.findings[0] if found.findings else ""
     others = tuple(one.stations for one in found.alternatives)
     values = (found.stations, found.clocks, found.covariance, found.cost, found.dof)
@@ -242,14 +247,9 @@ def _of_calibration(found: Calibration) -> NetworkResult:
 
 
 def refined(network: Network, starts: NetworkEstimate) -> NetworkResult:
-    """Return the cheapest minimum that estimates lead to, claimed whatever it is.
+    """Return the cheapest minimum that is reached from several starts, claimed as an answer.
 
-    Parameters
-    ----------
-    network : Network
-        What was measured.
-    starts : NetworkEstimate
-        S estimates; with none there is no network.
+    `starts` are S estimates; without any, the result has no network.
     """
     m, d = network.stations, network.dimension
     p = m * d + (0 if network.synchronised else m)
@@ -264,7 +264,7 @@ def refined(network: Network, starts: NetworkEstimate) -> NetworkResult:
     covariance, free = _covariance(network, at)
     dof = network.rows - network.unknowns + free
     if not np.isfinite(covariance).all():
-        words = "More than the frame is open."
+        words = "The arrivals do not determine the network, apart from its frame."
         return NetworkResult(
             Status.SINGULAR_GEOMETRY, words, at.stations[0], at.clocks[0], covariance, np.nanmin(cost), dof
         )
@@ -272,19 +272,19 @@ def refined(network: Network, starts: NetworkEstimate) -> NetworkResult:
 
 
 def _covariance(network: Network, at: NetworkEstimate) -> tuple[Array, int]:
-    """Return the covariance of an estimate in the frame of all stations, NaN where there is none, and what is free."""
-    told = determined(likelihood(network), at)
-    p, free = told.jacobian.shape[1], told.free.shape[1]
-    if not told.open.shape[1]:
+    """Return the covariance of an estimate in the frame of all stations, NaN if singular, and the frame's freedoms."""
+    frame = determined(likelihood(network), at)
+    p, free = frame.jacobian.shape[1], frame.free.shape[1]
+    if not frame.open.shape[1]:
         try:
-            return told.covariance(told.free.T), free
+            return frame.covariance(frame.free.T), free
         except np.linalg.LinAlgError:
             pass
     return np.full((p, p), np.nan), free
 
 
 def each(refine: Callable[[Network, int], NetworkResult]) -> Callable[[Networks], tuple[NetworkResult, ...]]:
-    """Return what finds the networks of trials one by one, by a function of one and a seed of its own."""
+    """Return a function that applies `refine` to each network, with a separate seed."""
 
     def run(networks: Networks) -> tuple[NetworkResult, ...]:
         seeds = [int(digest, 16) for digest in networks.digest]
@@ -294,16 +294,16 @@ def each(refine: Callable[[Network, int], NetworkResult]) -> Callable[[Networks]
 
 
 def from_truth(networks: Networks) -> tuple[NetworkResult, ...]:
-    """Return where the likelihood leads from the truth: the judge of the others."""
+    """Return the minima of the likelihood from the truth, which judge the other methods."""
     return tuple(refined(one, networks.truth.take(slice(i, i + 1))) for i, one in enumerate(networks.networks))
 
 
-# What is written about them.
+# Columns of the table.
 
 
 @dataclass(frozen=True, slots=True)
 class KnownNetworks:
-    """What holds for trials whatever the method.
+    """Data of trials that do not depend on the method.
 
     Parameters
     ----------
@@ -320,7 +320,7 @@ class KnownNetworks:
     cost: Array
 
     def part(self, first: int, count: int) -> KnownNetworks:
-        """Return what holds for some of the trials."""
+        """Return the data of `count` trials from the trial `first` on."""
         kept = slice(first, first + count)
         return KnownNetworks(self.drawn.part(first, count), self.bound[kept], self.cost[kept])
 
@@ -333,7 +333,7 @@ def known_networks(drawn: Networks) -> KnownNetworks:
 
 
 def true_columns(known: KnownNetworks) -> dict[str, Any]:
-    """Return the columns that do not depend on the method; a network has no one target."""
+    """Return the columns that do not depend on the method; the columns of a single target are NaN."""
     nowhere = dict.fromkeys((f"truth_{axis}" for axis in "xyz"), np.nan)
     spread = [_spread(bound, network) for bound, network in zip(known.bound, known.drawn.networks, strict=True)]
     own = {"outliers": known.drawn.bad, "cost_truth": known.cost, "crlb_velocity": np.nan}
@@ -341,7 +341,7 @@ def true_columns(known: KnownNetworks) -> dict[str, Any]:
 
 
 def _spread(covariance: Array, network: Network) -> tuple[float, float]:
-    """Return the root mean square deviation of a station's place, and of a clock, metres."""
+    """Return the root mean square deviation of a station's position and of a clock, metres."""
     m, d = network.stations, network.dimension
     variance = np.diag(covariance)
     clocks = float(np.sqrt(variance[m * d :].mean())) if not network.synchronised else np.nan
@@ -349,7 +349,7 @@ def _spread(covariance: Array, network: Network) -> tuple[float, float]:
 
 
 def found_columns(known: KnownNetworks, found: tuple[NetworkResult, ...]) -> dict[str, Any]:
-    """Return the columns of what a method found of n networks."""
+    """Return the columns of the results of a method for n networks."""
     truth = [known.drawn.truth.take(slice(i, i + 1)) for i in range(len(found))]
     rows = [_row(*one) for one in zip(found, known.drawn.networks, truth, known.bound, strict=True)]
     values: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in rows[0]}
@@ -359,9 +359,10 @@ def found_columns(known: KnownNetworks, found: tuple[NetworkResult, ...]) -> dic
 
 
 def _row(one: NetworkResult, network: Network, truth: NetworkEstimate, bound: Array) -> dict[str, Any]:
+    """Return the columns of the result for one network."""
     error = distances_apart(one.stations, truth.stations[0])
     size, located = error.size, bool(np.isfinite(one.stations).all())
-    # in the frame of what was found, as its covariance is
+    # in the frame of the result, like its covariance
     own = distances_apart(truth.stations[0], one.stations)
     return {
         "status": one.status.label,
@@ -382,7 +383,7 @@ def _row(one: NetworkResult, network: Network, truth: NetworkEstimate, bound: Ar
 
 
 def distances_apart(places: Array, truth: Array) -> Array:
-    """Return what is left between places (m, d) and the truth after the best rigid motion and reflection.
+    """Return the differences (m, d) between positions and the truth after the best rigid motion and reflection, metres.
 
     P. H. Schoenemann, "A generalized solution of the orthogonal Procrustes problem", Psychometrika 31 (1966).
     """

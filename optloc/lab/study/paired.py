@@ -1,6 +1,6 @@
-"""Two methods on the same trials: who is right where the other is not, and by how much errors and times differ.
+"""Comparison of two methods on the same trials: right answers of only one method, differences of errors and times.
 
-All tests and intervals are exact: they assume that trials are independent, and nothing of how numbers are distributed.
+All tests and intervals are exact: they assume that trials are independent, and make no assumption on distributions.
 
 Sources: Q. McNemar, "Note on the sampling error of the difference between correlated proportions", Psychometrika 12
 (1947); H. A. David and H. N. Nagaraja, Order Statistics, 3rd ed., section 7.1 (2003), for the interval of a median.
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LEVEL = 0.95
-"""Probability with which an interval holds what it is of."""
+"""Probability with which an interval contains its value."""
 
 _TRIAL = ["data", "trial"]
 
 
 class Median(NamedTuple):
-    """The median of differences, its interval, and the probability of such signs if either were as likely."""
+    """Median of differences, its interval, and the p-value of the signs if both signs are equally likely."""
 
     value: float
     low: float
@@ -35,26 +35,26 @@ class Median(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """What the same trials say of a method and another one.
+    """Comparison of a method with another method on the same trials.
 
     Parameters
     ----------
     case, noise : str
-        Which trials.
+        Case and noise level of the trials.
     method, against : str
-        Who is compared with whom.
+        The method, and the other method.
     trials : int
-        How many both have solved.
+        Number of trials that both have run.
     alone, other_alone : int
-        Trials in which only the method, and only the other one, is right.
+        Trials in which only the method, or only the other method, is right.
     share, low, high : float
-        Of those, the share of the method, and its interval: above one half it is the better one.
+        Share of `alone` in these trials, and its interval. Above one half the method is better.
     p : float
-        Probability of such a share, or one farther from one half, if both were as good.
+        Probability of such a share, or one farther from one half, if both methods are equally good.
     error : Median
-        Error less that of the other one, metres, where both have a position.
+        Error less the error of the other method, metres, over trials in which both have a position.
     time : Median
-        Time over that of the other one; its interval is that of the logarithms.
+        Time over the time of the other method; the interval is computed from logarithms.
     """
 
     case: str
@@ -73,14 +73,15 @@ class Pair:
 
 
 def median_of(differences: Array) -> Median:
-    """Return the median of differences (n,) with an interval between two of them; infinite where they are too few."""
+    """Return the median of differences (n,) with its interval; the interval is infinite if there are too few."""
     from scipy.stats import binom, binomtest
 
     values = np.sort(differences[np.isfinite(differences)])
     n = len(values)
     if not n:
         return Median(*[float("nan")] * 4)
-    # The k-th smallest and the k-th largest hold the median but for twice the probability of less than k signs.
+    # The k-th smallest and the k-th largest enclose the median, except with twice the probability of fewer than k
+    # signs.
     k = int(binom.ppf((1.0 - LEVEL) / 2.0, n, 0.5))
     low, high = (values[k - 1], values[n - k]) if k else (-np.inf, np.inf)
     above, below = int((values > 0.0).sum()), int((values < 0.0).sum())
@@ -89,19 +90,10 @@ def median_of(differences: Array) -> Median:
 
 
 def paired(frame: pd.DataFrame, against: str) -> list[Pair]:
-    """Return every other method against one, in every case at every noise level.
+    """Return the comparison of every other method with the method `against`, in every case at every noise level.
 
-    Parameters
-    ----------
-    frame : DataFrame
-        Judged rows of a study, see `optloc.lab.study.summary.judged`.
-    against : str
-        Name of the method that the others are compared with.
-
-    Raises
-    ------
-    InvalidProblem
-        Where no method has this name.
+    `frame` are judged rows of a study, see `optloc.lab.study.summary.judged`.
+    Raise InvalidProblem if no method has this name.
     """
     names = [str(name) for name in frame["method"].unique()]
     if against not in names:
@@ -117,6 +109,7 @@ def paired(frame: pd.DataFrame, against: str) -> list[Pair]:
 
 
 def _pair(both: pd.DataFrame, case: str, noise: str, method: str, against: str) -> Pair:
+    """Return the comparison of two methods over the trials that both have run."""
     from scipy.stats import binomtest
 
     right, other = (both[name].to_numpy(dtype=bool) for name in ("right", "right_other"))

@@ -1,8 +1,8 @@
-"""Profiles of a study's methods: which share of the trials each solves, to an accuracy, within so much work.
+"""Data and performance profiles of a study's methods: shares of trials solved to an accuracy within a given work.
 
-Moré and Wild ask for a share of the descent from a start that all solvers have. Methods that need no start have none,
-and the cost of a fix has a unit: one is the square of a standard deviation. So a trial is solved here where the cost
-exceeds the least that is known by tau at most: the point is then within sqrt(tau) standard deviations of the minimum.
+Moré and Wild require a share of the descent from a start that all solvers have in common. Methods without a start have
+no descent. But the cost of a fix has a unit: one is the square of a standard deviation. So here a trial is solved if
+the cost exceeds the least known by at most tau. The point is then within sqrt(tau) standard deviations of the minimum.
 
 Sources: J. J. Moré and S. M. Wild, "Benchmarking derivative-free optimization algorithms", SIAM J. Optim. 20 (2009),
 for data profiles; E. D. Dolan and J. J. Moré, "Benchmarking optimization software with performance profiles",
@@ -25,40 +25,40 @@ if TYPE_CHECKING:
 
 
 TAU = 1e-3
-"""Cost above the least known with which a trial counts as solved: 0.03 standard deviations."""
+"""A trial is solved at this cost above the least known, or less: 0.03 standard deviations."""
 
 RATIOS = (1.0, 2.0, 10.0)
-"""Multiples of the least work of any method for which tables say the share that is solved."""
+"""Multiples of the least work of any method; tables give the share that is solved within each."""
 
 WORK = {"processor": "processor time of a fix (s)", "evaluations": "evaluations of the cost"}
-"""Units of work, columns of a study's table, and what axes call them."""
+"""Units of work: columns of a study's table, and labels of axes."""
 
-# Clocks count nanoseconds at best: a time of zero is one below that.
+# Clocks resolve nanoseconds at best, so a time of zero is less.
 _LEAST = 1e-9
-# Points of a curve in files: more than a picture shows apart.
+# Points of a curve in files: more than a picture resolves.
 _POINTS = 200
 
 
 @dataclass(frozen=True, slots=True)
 class Profiles:
-    """What methods solve, and what it takes them.
+    """Trials that methods solve, and their work.
 
     Parameters
     ----------
     tau : float
-        Cost above the least known with which a trial counts as solved.
+        A trial is solved at this cost above the least known, or less.
     work : str
         A key of `WORK`.
     methods : tuple of str
-        The most solved first, the quicker first among equals.
+        Sorted by the number of solved trials, then by work.
     silent : tuple of str
-        Methods that do not tell this work.
+        Methods that do not count this work.
     spent : array (methods, n)
         Work on each trial.
     solved : bool array (methods, n)
-        Whether it is solved.
+        Whether the trial is solved.
     total : int
-        All trials, also those that some method has not seen.
+        Number of all trials, also of those that some method did not run.
     """
 
     tau: float
@@ -71,7 +71,7 @@ class Profiles:
 
     @property
     def budgets(self) -> Array:
-        """Return the work (q,) at which the data profile of some method rises, thinned; it ends at the largest."""
+        """Return the work (q,) at which the data profile of some method rises, thinned out; the largest is kept."""
         found = np.unique(self.spent[self.solved])
         at = np.unique(np.linspace(0, len(found) - 1, min(_POINTS, len(found))).astype(int))
         return np.asarray(found[at])
@@ -87,18 +87,18 @@ class Profiles:
 
 @dataclass(frozen=True, slots=True)
 class SolvedShare:
-    """What a method solves.
+    """Solved trials of one method.
 
     Parameters
     ----------
     method : str
         The method.
     trials, solved : int
-        How many trials, and how many are solved.
+        Number of trials, and number of solved ones.
     within : dict of float to float
-        By multiples of the least work on each trial: the share solved with so much.
+        Share solved within multiples of the least work on each trial, by multiple.
     median : float
-        Work on a trial that is solved, the middle one.
+        Median work on a solved trial.
     """
 
     method: str
@@ -109,41 +109,41 @@ class SolvedShare:
 
 
 def profiles(frame: pd.DataFrame, *, tau: float = TAU, work: str = "processor", out: Collection[str] = ()) -> Profiles:
-    """Return the profiles of a study's methods over the trials that all of them have seen.
+    """Return the profiles of a study's methods over the trials that all of them ran.
 
     Parameters
     ----------
     frame : DataFrame
         Rows with the columns `optloc.lab.study.summary.COLUMNS` and `gap`.
     tau : float
-        Cost above the least known, of all methods and of the truth, with which a trial counts as solved, whatever
-        the status: profiles ask what was reached, not what was said of it.
+        A trial is solved at this cost above the least known, of all methods and of the truth, or less. The status does
+        not matter.
     work : str
         A key of `WORK`.
     out : collection of str
-        Methods that do not compete: those that know the truth.
+        Methods to leave out, because they know the truth.
 
     Raises
     ------
     InvalidProblem
-        For an accuracy that is not positive, an unknown work, and where no method tells it.
+        If the accuracy is not positive, the work is unknown, or no method counts it.
     """
     check_accuracy(tau)
     if work not in WORK:
         raise InvalidProblem(f"there is no work {work!r}", "--work", nearest(work, list(WORK)))
     rivals = frame[~frame["method"].astype(str).isin(out)]
     if not len(rivals):
-        raise InvalidProblem("no method competes", "profiles", "run the study by a method that does not know the truth")
+        raise InvalidProblem("all methods know the truth", "profiles", "add a method that does not know the truth")
     above, rounding = above_least(rivals)
     with np.errstate(invalid="ignore"):
         rows = rivals.assign(solved=above <= tau + rounding, work=rivals[work].clip(lower=_LEAST))
     known = rows.groupby(rows["method"].astype(str))["work"].count()
     methods = [str(name) for name in known.index[known > 0]]
     if not methods:
-        raise InvalidProblem(f"no method of the study tells its {work}", "--work", "ask for processor")
-    # Of a trial that came to grief nobody knows the work: it is not solved, whatever it took.
-    told = rows[rows["method"].astype(str).isin(methods)].fillna({"work": np.inf})
-    spent, solved, total = instances(told, methods, "work", "solved")
+        raise InvalidProblem(f"no method of the study counts {work}", "--work", "use --work processor")
+    # The work of a failed trial is unknown; the trial counts as not solved.
+    counted = rows[rows["method"].astype(str).isin(methods)].fillna({"work": np.inf})
+    spent, solved, total = instances(counted, methods, "work", "solved")
     solved &= np.isfinite(spent)
     order = sorted(range(len(methods)), key=lambda i: (-int(solved[i].sum()), _median(spent[i][solved[i]]), methods[i]))
     silent = tuple(str(name) for name in known.index[known == 0])
@@ -151,7 +151,7 @@ def profiles(frame: pd.DataFrame, *, tau: float = TAU, work: str = "processor", 
 
 
 def check_accuracy(tau: float) -> None:
-    """Raise InvalidProblem for an accuracy that nothing or everything would meet."""
+    """Raise InvalidProblem for an accuracy that is not positive and finite."""
     if not 0.0 < tau < np.inf:
         raise InvalidProblem(f"the accuracy {tau:g} is not positive and finite", "--tau", "give a cost such as 1e-3")
 
@@ -164,14 +164,14 @@ def data_profile(spent: Array, solved: Array, budgets: Array) -> Array:
     spent : array (methods, n)
         Work on each problem.
     solved : bool array (methods, n)
-        Where the method found what was sought; elsewhere its work does not matter.
+        Whether the method solved the problem; otherwise its work does not matter.
     budgets : array (q,)
         Work, in the unit of `spent`.
 
     Returns
     -------
     array (methods, q)
-        Shares of all n problems, those among them that no method solves; NaN of none.
+        Shares of all n problems, including those that no method solves; NaN for n = 0.
     """
     if not spent.shape[-1]:
         return np.full((len(spent), len(budgets)), np.nan)
@@ -180,7 +180,7 @@ def data_profile(spent: Array, solved: Array, budgets: Array) -> Array:
 
 
 def shares(found: Profiles) -> list[SolvedShare]:
-    """Return what each method solves within multiples of the least work of any method."""
+    """Return the shares that each method solves within multiples of the least work of any method."""
     within = found.performance(np.array(RATIOS))
     return [
         SolvedShare(

@@ -1,6 +1,7 @@
-"""The trials of a case: where stations and target are, what errors rows suffer; a function of seed, case and number.
+"""Simulation of the trials of a case: stations, target and measurement errors, as a function of seed, case and number.
 
-Trials are drawn in blocks, one seed each, so that no trial depends on which others are drawn, where, or in what order.
+Trials are drawn in blocks with one seed each. So a trial does not depend on other trials, on the machine or on the
+order of computation.
 """
 
 from __future__ import annotations
@@ -20,30 +21,31 @@ from optloc.problem import Amount, Array, Bias, Frame, InvalidProblem, Problem, 
 
 Rng = np.random.Generator
 
-# Both decide which seed a trial has: other values draw other data, and studies that began before cannot go on. A block
-# is large enough that arrays and not Python draw it, and small enough (25 000 numbers, 200 kB) that a chunk which wants
-# a few of its trials does not pay for many; 500 trials are also the least that a chunk of a fast method has.
+# Numbers and trials of a block at most. Both decide the seed of a trial: with other values the data differ, and earlier
+# studies could not continue. A block is large enough that NumPy draws it in one step. It is small enough (25 000
+# numbers, 200 kB) that a chunk with few of its trials draws little in vain. 500 trials are also the least of a chunk of
+# a fast method.
 _NUMBERS, _MOST = 25_000, 500
 
 
 @dataclass(frozen=True)
 class Case:
-    """What all trials of one data cell share; it holds data only, so that it travels to workers.
+    """Common data of all trials of a case, without functions, so that it can be sent to workers.
 
     Parameters
     ----------
     table : ScenarioTable
-        The scenario with its swept values in place.
+        The scenario with its swept values inserted.
     sweep : str
         The swept values as JSON.
     label, unit : str
-        The noise level as it is written, and the unit of `level`.
+        The noise level as written in the file, and the unit of `level`.
     level : float
         The noise level as a number.
     template : Problem
         Stations, rows and noise; the measurements are NaN.
     seed : int
-        Of the study.
+        Seed of the study.
     trials : int
         Number of trials.
     """
@@ -59,8 +61,9 @@ class Case:
 
     @cached_property
     def key(self) -> str:
-        """Return what the data of a trial depend on beside its number, as 16 hexadecimal digits."""
-        # The level and the swept values are in it as text, trials not at all: more of them go on where fewer ended.
+        """Return 16 hexadecimal digits that identify the data of all trials."""
+        # The level and the swept values are included as text. The number of trials is not, so that a study with more
+        # trials can continue one with fewer.
         problem, text = self.template, self.table.model_dump_json(exclude={"noise", "sweep", "trials"})
         made = hashlib.blake2b(f"{self.seed} {self.label} {self.sweep} {text} {problem.frame}".encode(), digest_size=8)
         made.update(repr(problem.structure).encode())
@@ -78,7 +81,7 @@ class Case:
 
     @property
     def where(self) -> str:
-        """Return the place that complaints name."""
+        """Return the location that error messages name."""
         return f"scenario {self.table.name!r}"
 
     @property
@@ -88,7 +91,7 @@ class Case:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Return the columns that all trials share."""
+        """Return the columns of the table that all trials share."""
         problem = self.template
         sizes = {"dimension": problem.dimension, "stations": problem.stations.count, "rows": problem.count}
         return {"kinds": "+".join(rows.kind for rows in problem.rows), **sizes, "epochs": problem.epochs}
@@ -99,7 +102,7 @@ class Case:
 
     @property
     def state(self) -> tuple[str, ...]:
-        """Return the names of position, velocity and acceleration of the target that is sought."""
+        """Return the names of position, velocity and acceleration of the unknown target."""
         motions = self.template.motions
         i = next(i for i, motion in enumerate(motions) if motion.known is None)
         return state_names(i, len(motions), motions[i].order)
@@ -107,24 +110,24 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class DrawnCase:
-    """Trials of a case.
+    """Simulated trials of a case.
 
     Parameters
     ----------
     problem : Problem
-        As methods get it, with leading axis (n,).
+        The problem that methods solve, with leading axis (n,).
     truth : array (n, size)
-        True parameter vectors in the order of its layout.
+        True parameter vectors in the order of the problem's layout.
     wild : array (n, d)
-        A place in the unit cube around zero for each: where methods begin that need a guess.
+        A random point of each trial in the unit cube around zero: the start of methods that need a guess.
     seed : tuple of n str
         Names of the seeds of the trials' blocks.
     digest : tuple of n str
-        Digests of the blocks: what was drawn in them, where the seed only says what should be.
+        Digests of the drawn numbers of the blocks. A seed decides the numbers, a digest verifies them.
     bad : int array (n,)
-        How many stations have a gross error.
+        Number of stations with a gross error.
     position : str
-        Name of the position that is sought.
+        Name of the unknown position.
     """
 
     problem: Problem
@@ -136,7 +139,7 @@ class DrawnCase:
     position: str = "position"
 
     def part(self, first: int, count: int) -> DrawnCase:
-        """Return some of the trials."""
+        """Return `count` trials from the trial `first` on."""
         kept = slice(first, first + count)
         return replace(
             self,
@@ -146,20 +149,12 @@ class DrawnCase:
 
 
 def block_size(case: Case) -> int:
-    """Return how many trials one seed decides."""
+    """Return the number of trials in a block, which share one seed."""
     return int(np.clip(_NUMBERS // case.numbers, 1, _MOST))
 
 
 def draw(case: Case, first: int, count: int) -> DrawnCase:
-    """Return trials `first` to ``first + count`` of a case; they do not depend on what else is drawn.
-
-    Parameters
-    ----------
-    case : Case
-        Geometry, truth, noise.
-    first, count : int
-        Numbers of the trials.
-    """
+    """Return trials `first` to ``first + count`` of a case; they do not depend on other draws."""
     size = block_size(case)
     blocks = range(first // size, -(-(first + count) // size))
     parts = [_block(case, number, size) for number in blocks]
@@ -175,8 +170,9 @@ def draw(case: Case, first: int, count: int) -> DrawnCase:
 
 
 def _digest(case: Case, block: tuple[Array, ...]) -> str:
-    """Return 16 hexadecimal digits that are equal where all that was drawn for a block is, bit for bit."""
-    # The key says what is not drawn: noise, weights, frame. Without it, equal measurements of other noise were equal.
+    """Return 16 hexadecimal digits that are equal for blocks whose drawn numbers are equal, bit for bit."""
+    # The key covers noise, weights and frame, which are not drawn. Otherwise equal measurements of different noise
+    # would have equal digests.
     made = hashlib.blake2b(case.key.encode(), digest_size=8)
     for array in block:
         made.update(np.ascontiguousarray(array).tobytes())
@@ -184,15 +180,15 @@ def _digest(case: Case, block: tuple[Array, ...]) -> str:
 
 
 def _block(case: Case, number: int, size: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Return stations, truth, wild places, measurements and numbers of stations that are off, of one block."""
+    """Return stations, truth, starting points, measurements and numbers of bad stations of a block of `size` trials."""
     # A seed sequence mixes words of 32 bits.
     key = [int(case.key[:8], 16), int(case.key[8:], 16)]
-    # Streams: what is placed, what is measured, where guesses begin and how clocks walk do not shift one another.
+    # Separate streams for geometry, noise, guesses and clock steps: a change of one does not shift the others.
     geometry, noise, guess, steps = np.random.SeedSequence([case.seed, *key], spawn_key=(number,)).spawn(4)
     rng, problem, table = np.random.default_rng(geometry), case.template, case.table
     stations = np.broadcast_to(problem.stations.position.mean(0), (size, *problem.stations.position.shape[-2:]))
     if table.layout is not None:
-        if table.layout.placement != "frozen":  # the template holds the one draw of frozen ones
+        if table.layout.placement != "frozen":  # the template contains the frozen stations
             stations = place_stations(table.layout, case.where, rng, size)
         problem = _at(problem, stations)
     real, flaws = add_injected_errors(problem, table, case.where)
@@ -212,14 +208,14 @@ def _block(case: Case, number: int, size: int) -> tuple[Array, Array, Array, Arr
 
 
 def _at(problem: Problem, stations: Array) -> Problem:
-    """Return a problem with stations (n, s, d), the same in all its epochs."""
+    """Return the problem with stations (n, s, d), the same in all its epochs."""
     return replace(problem, stations=replace(problem.stations, position=stations[:, None]))
 
 
 def _vector(problem: Problem, values: dict[str, Array], size: int, steps: np.random.SeedSequence) -> Array:
-    """Return parameter vectors (size, n) with named values; what has none is zero, unknowns of single epochs too.
+    """Return parameter vectors (size, n) with the named values; other unknowns are zero, also unknowns of epochs.
 
-    Walks begin at their values and go on by steps that are drawn.
+    Walks start at their values and add random steps.
     """
     layout = problem.layout
     vectors = np.zeros((size, layout.size))
@@ -237,30 +233,16 @@ def _length(problem: Problem, name: str) -> int:
 
 
 def metres(values: list[Amount], where: str, count: int | None = None) -> Array:
-    """Return amounts of length as an array; raise InvalidProblem where their number is not `count`."""
+    """Return amounts of length as an array in metres; raise InvalidProblem if their number is not `count`."""
     if count is not None and len(values) != count:
         raise InvalidProblem(f"{len(values)} numbers do not fit {count} dimensions", where, "give one for each")
     return np.array([Units("length").plain(value, "m", where) for value in values])
 
 
 def place_stations(layout: LayoutTable, where: str, rng: Rng, count: int) -> Array:
-    """Return the stations of trials.
+    """Return the stations of `count` trials by the rule of a layout, (count, s, d) in metres.
 
-    Parameters
-    ----------
-    layout : LayoutTable
-        The rule.
-    where : str
-        Place to name.
-    rng : Generator
-        Used where they are random.
-    count : int
-        Number of draws.
-
-    Returns
-    -------
-    array (count, s, d)
-        Metres; of rules without a draw all are equal.
+    Rules without a draw return equal stations for all trials. `where` is the location for error messages.
     """
     s, d = layout.stations, layout.dimension
     if layout.placement == "given":
@@ -270,26 +252,28 @@ def place_stations(layout: LayoutTable, where: str, rng: Rng, count: int) -> Arr
         return rng.uniform(-0.5, 0.5, (count, s, d)) * box
     centre = int(layout.placement == "star")
     angle = 2.0 * np.pi * np.arange(s - centre) / max(s - centre, 1)
-    # In space stations are high and low in turn: a plane ring would leave the sign of the height open.
+    # In three dimensions stations are alternately high and low: a plane ring would leave the sign of the height open.
     unit = np.stack([arrays.cos(angle), arrays.sin(angle), 1.0 - 2.0 * (np.arange(s - centre) % 2)], -1)[:, :d]
     ring = np.concatenate([np.zeros((centre, d)), 0.5 * unit * box])
     return np.broadcast_to(ring, (count, s, d))
 
 
 def _given(layout: LayoutTable, where: str) -> Array:
+    """Return the stations (s, d) of a layout with given positions, metres."""
     place = join(where, "places")
     if layout.places is None or len(layout.places) != layout.stations:
         found = 0 if layout.places is None else len(layout.places)
         raise InvalidProblem(f"{found} places do not fit {layout.stations} stations", place, "give one for each")
     if any(len(point) != layout.dimension for point in layout.places):
-        raise InvalidProblem(f"a place has not {layout.dimension} coordinates", place, "give metres")
+        raise InvalidProblem(f"a place needs {layout.dimension} coordinates", place, "give metres")
     return np.array(layout.places, dtype=float)
 
 
-# Targets: a kind of truth is a function ``(table, frame, stations (n, s, d), place to name, rng) -> positions (n, d)``.
+# Targets: each kind of truth is a function ``(table, frame, stations (n, s, d), location, rng) -> positions (n, d)``.
 
 
 def _fixed(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    """Return the same position for all trials, (n, d) in metres."""
     count, d = len(stations), stations.shape[-1]
     if truth.at is not None:
         return np.broadcast_to(metres(truth.at, join(where, "at"), d), (count, d))
@@ -301,6 +285,7 @@ def _fixed(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rn
 
 
 def _in_box(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    """Return uniform positions (n, d) in a box, metres."""
     (count, _, d), centre = stations.shape, stations.mean(1)
     assert truth.box is not None
     box = metres(truth.box, join(where, "box"), d)
@@ -309,6 +294,7 @@ def _in_box(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: R
 
 
 def _in_shell(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    """Return positions (n, d) in random directions and distances from the stations' centre, metres."""
     (count, _, d), centre = stations.shape, stations.mean(1)
     assert truth.distance is not None
     low, high = metres(truth.distance, join(where, "distance"))
@@ -317,12 +303,14 @@ def _in_shell(truth: TruthTable, frame: Frame, stations: Array, where: str, rng:
 
 
 def _in_hull(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
-    # Even over the weights, not over the volume: in every hull there is a place, however flat it is.
+    """Return random positions (n, d) in the hull of the stations, metres."""
+    # Uniform over the weights, not over the volume: this works for every hull, even a flat one.
     share = rng.dirichlet(np.ones(stations.shape[1]), len(stations))
     return np.asarray((share[..., None] * stations).sum(1))
 
 
 def _in_area(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    """Return positions (n, 3) at uniform latitudes and longitudes, metres in the frame."""
     count = len(stations)
     spans = [np.array(span) for span in (truth.lat_deg, truth.lon_deg) if span]
     lat, lon = (np.radians(rng.uniform(span[0], span[1], count)) for span in spans)
@@ -331,25 +319,25 @@ def _in_area(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: 
 
 
 def _turn(frame: Frame, at: Array, local: Array) -> Array:
-    """Return vectors (count, d) along east, north and up at points as vectors of the frame."""
+    """Return vectors (count, d) along east, north and up at the points `at` as vectors of the frame."""
     return arrays.product(local, frame.enu_axes(at)) if frame.geodetic else local
 
 
 def _directions(truth: TruthTable, d: int, count: int, rng: Rng) -> Array:
-    """Return unit vectors (count, d), even on the circle, the sphere or a band of elevations of it."""
+    """Return unit vectors (count, d), uniform on the circle, on the sphere or on a band of elevations."""
     azimuth = rng.uniform(0.0, 2.0 * np.pi, count)
     flat = np.stack([arrays.cos(azimuth), arrays.sin(azimuth)], axis=-1)
     if d == 2:
         return flat
     low, high = truth.elevation_deg or (-90.0, 90.0)
-    # Archimedes: areas of a sphere are even in the sine of the elevation, not in the elevation.
+    # Archimedes: the area of a sphere is uniform in the sine of the elevation.
     lowest, highest = arrays.sin(np.radians([low, high]))
     sine = rng.uniform(lowest, highest, count)
     return np.concatenate([flat * np.sqrt(1.0 - sine[:, None] ** 2), sine[:, None]], axis=-1)
 
 
 class _Truth(NamedTuple):
-    """A kind of truth: keys of the table that it must have, keys that it may have, and its positions."""
+    """A kind of truth: its required keys, its optional keys, and the function that draws its positions."""
 
     needed: tuple[str, ...]
     more: tuple[str, ...]
@@ -367,51 +355,35 @@ _ANY = {"kind", "speed", "velocity"}
 
 
 def place_targets(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
-    """Return true positions of targets.
+    """Return the true positions (count, d) of targets, metres in the frame, for stations (count, s, d) in metres.
 
-    Parameters
-    ----------
-    truth : TruthTable
-        The rule.
-    frame : Frame
-        Of the positions.
-    stations : array (count, s, d)
-        Stations of each trial, metres.
-    where : str
-        Place to name.
-    rng : Generator
-        Used where the place is random.
-
-    Returns
-    -------
-    array (count, d)
-        Metres in the frame.
+    `where` is the location for error messages.
     """
     return _TRUTHS[truth.kind].place(truth, frame, stations, where, rng)
 
 
 def check_truth(truth: TruthTable, frame: Frame, dimension: int, where: str) -> None:
-    """Refuse a truth whose keys do not belong to its kind, or that the frame cannot hold."""
+    """Raise InvalidProblem if a truth has keys of another kind, or does not fit the frame."""
     needed, more, _ = _TRUTHS[truth.kind]
     foreign = sorted(truth.model_fields_set - _ANY - {*needed, *more})
     if foreign:
-        advice = f"it takes {', '.join(needed + more)}" if needed + more else "it takes none"
+        advice = f"use {', '.join(needed + more)}" if needed + more else "remove it"
         raise InvalidProblem(f"a truth of kind {truth.kind!r} has no key {foreign[0]!r}", where, advice)
     for key in needed:
         if getattr(truth, key) is None:
             raise InvalidProblem(f"a truth of kind {truth.kind!r} needs the key {key!r}", where, "add it")
     if truth.kind == "fixed" and (truth.at is None) == (truth.at_deg is None):
-        raise InvalidProblem("a fixed truth has one place", where, "give at, or at_deg on Earth")
+        raise InvalidProblem("a fixed truth needs one position", where, "give at, or at_deg on Earth")
     if (truth.at_deg is not None or truth.kind == "area") and not (frame.geodetic and dimension == 3):
         advice = "give a frame of the Earth, or metres"
         raise InvalidProblem("latitude and longitude need a frame on Earth in three dimensions", where, advice)
     _check_spans(truth, where)
-    # Amounts that cannot be read complain here, before anything is computed; stations anywhere will do.
+    # A trial draw reports invalid amounts before any computation; the positions of the stations do not matter.
     place_targets(truth, frame, np.ones((1, 2, dimension)), where, np.random.default_rng(0))
 
 
 def _check_spans(truth: TruthTable, where: str) -> None:
-    """Refuse what is drawn between a least and a greatest value that are the other way round, or not on the sphere."""
+    """Raise InvalidProblem if a least value exceeds its greatest value, or an angle is beyond the sphere."""
     degrees = {"elevation_deg": 90.0, "lat_deg": 90.0, "lon_deg": 360.0}
     for key, limit in {"distance": np.inf, **degrees}.items():
         given = getattr(truth, key)
@@ -430,20 +402,20 @@ def _velocities(truth: TruthTable, dimension: int, where: str, rng: Rng, count: 
     units = Units("speed")
     if truth.velocity is not None:
         if len(truth.velocity) != dimension:
-            raise InvalidProblem(f"the velocity has not {dimension} components", join(where, "velocity"), "give each")
+            raise InvalidProblem(f"the velocity needs {dimension} components", join(where, "velocity"), "give each")
         given = [units.plain(value, "m/s", join(where, "velocity")) for value in truth.velocity]
         return np.broadcast_to(np.array(given), (count, dimension))
     way = rng.standard_normal((count, dimension))
-    # The direction is drawn even for speed zero, so that a sweep of speeds keeps all else.
+    # The direction is drawn even for speed zero, so that a sweep of speeds does not change the other draws.
     speed = 0.0 if truth.speed is None else units.plain(truth.speed, "m/s", join(where, "speed"))
     return np.asarray(speed * way / np.linalg.norm(way, axis=-1, keepdims=True))
 
 
-# Errors: biases of the file, which methods may know of; flaws, which no method is told.
+# Errors: biases of the file, which methods may estimate, and injected errors, which no method has a model of.
 
 
 def _biases(case: Case, bias: Bias, rng: Rng, size: int) -> Array:
-    """Return true values (size, q) of a bias of the file."""
+    """Return true values (size, q) of a bias of the file, in SI units."""
     q = _length(case.template, bias.name)
     mean = np.broadcast_to(np.ravel(bias.mean), (q,))
     given = case.table.bias.get(bias.name)
@@ -473,16 +445,16 @@ def _amount(case: Case, bias: Bias, value: Amount, where: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class InjectedError:
-    """Errors of the stations in rows of one kind: constant ones of every station, or gross ones of a few.
+    """Errors of the stations in rows of one kind: constant errors of every station, or gross errors of a few.
 
     Parameters
     ----------
     name : str
         Name of the unknown that holds them.
     size : float
-        Their standard deviation; of gross ones how large they are.
+        Standard deviation of constant errors, or size of gross errors, in SI units.
     share : float, optional
-        Probability that a station has a gross error; None: every station has a small one.
+        Probability that a station has a gross error; None for constant errors.
     late : bool
         Whether gross errors are positive.
     """
@@ -496,21 +468,10 @@ class InjectedError:
 def add_injected_errors(
     problem: Problem, table: ScenarioTable, where: str
 ) -> tuple[Problem, tuple[InjectedError, ...]]:
-    """Return the problem as it really is, with the errors that no method is told, and what they are.
+    """Return the problem with errors that no method has a model of, and the list of these errors.
 
-    Parameters
-    ----------
-    problem : Problem
-        As methods get it.
-    table : ScenarioTable
-        The scenario.
-    where : str
-        Its place, for complaints.
-
-    Raises
-    ------
-    InvalidProblem
-        For a kind that the problem lacks, or a size that is not positive.
+    `problem` is the problem that methods solve; `where` is the location of the scenario for error messages. Raise
+    InvalidProblem for a kind that the problem lacks, or a size that is not positive.
     """
     place, found = join(where, "error"), []
     offset, outliers = table.error.offset, table.error.outliers
@@ -533,15 +494,15 @@ def _sizes(problem: Problem, given: Amount | dict[str, Amount], where: str) -> d
     named = given if isinstance(given, dict) else dict.fromkeys(kinds, given)
     for kind in named:
         if kind not in kinds:
-            raise InvalidProblem(f"no rows are of kind {kind!r}", where, nearest(kind, kinds))
+            raise InvalidProblem(f"the problem has no rows of kind {kind!r}", where, nearest(kind, kinds))
     return {kind: sigma_of(kind, amount, where) for kind, amount in named.items()}
 
 
 def _draw_errors(flaws: tuple[InjectedError, ...], lengths: dict[str, int], rng: Rng, size: int) -> dict[str, Array]:
-    """Return the errors (size, stations) of each flaw, which has so many stations."""
+    """Return the injected errors (size, stations) by name, SI units; `lengths` are the numbers of stations by name."""
     small = [flaw for flaw in flaws if flaw.share is None]
     drawn: dict[str, Array] = {f.name: f.size * rng.standard_normal((size, lengths[f.name])) for f in small}
-    # One chance and one sign for each station: one that is off is off in all kinds, and in the same direction.
+    # One chance and one sign for each station: a bad station is bad in all kinds, and in the same direction.
     most = max(lengths.values(), default=0)
     chance, sign = rng.random((size, most)), np.where(rng.random((size, most)) < 0.5, -1.0, 1.0)
     for flaw in flaws:

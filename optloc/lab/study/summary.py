@@ -1,4 +1,4 @@
-"""What a study found, cell by cell and method by method."""
+"""Statistics of a finished study, cell by cell and method by method."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 
 SLACK = 0.01
-"""Costs that differ by less are equal: a tenth of a standard deviation."""
+"""Costs with a smaller difference are equal: a tenth of a standard deviation."""
 
-# Costs of a million and more agree to rounding of their sums only.
+# Costs of a million and more have rounding errors above SLACK; the relative error of their sums is smaller.
 _RELATIVE = 1e-9
 
 PROVEN = "global"
-"""Proof that claims that no better point exists anywhere."""
+"""Proof that no better point exists anywhere."""
 
 COLUMNS = tuple(
     "key data scenario method solver noise noise_unit noise_label sweep kinds rows stations dimension trial status "
@@ -37,11 +37,11 @@ COLUMNS = tuple(
 CASE = ("scenario", "sweep")
 
 _PENALTY = 10.0
-"""Slowest times of the study that a failure costs, as PAR10 counts in solver competitions."""
+"""Cost of a failure in multiples of the slowest time of the study, as in the score PAR10 of solver competitions."""
 
 
 def judged(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of a study with what they are worth.
+    """Return the rows of a study with judgements.
 
     Parameters
     ----------
@@ -51,16 +51,20 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        With `above` (cost less the lowest known: of all methods and of the truth), `right` (answered, and no better
-        point is known), `wrong` (status ok, though a better point is known), `false` (a proof of globality that a
-        better point refutes), and `case` (scenario and swept values as text).
+        The rows with five more columns:
+
+        - `above`: cost less the lowest known cost, of all methods and of the truth;
+        - `right`: answered, and no better point is known;
+        - `wrong`: status ok, but a better point is known;
+        - `false`: a global proof that a better point refutes;
+        - `case`: scenario and swept values as text.
     """
     import pandas as pd
 
     above, rounding = above_least(frame)
     answered = frame["answered"].to_numpy(dtype=bool)
     with np.errstate(invalid="ignore"):
-        # A row without a cost is not the best of anything: NaN counts as worse.
+        # A row without a cost is not the best: NaN counts as worse.
         better = ~(above <= SLACK + rounding)
     pairs = frame[list(CASE)].astype(str)
     names = {(a, b): case_label(a, b) for a, b in pairs.drop_duplicates().itertuples(index=False, name=None)}
@@ -75,16 +79,16 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def above_least(frame: pd.DataFrame) -> tuple[Array, Array]:
-    """Return the costs less the lowest known (n,), and how much of that may be rounding (n,)."""
+    """Return the costs less the lowest known (n,), and the possible rounding errors of these differences (n,)."""
     cost, gap, truth = (frame[name].to_numpy(dtype=float) for name in ("cost", "gap", "cost_truth"))
-    # The truth is a point like any other: what costs more than it is not the minimum.
+    # The truth also counts: a point with a higher cost is not the minimum.
     best = np.fmin(cost - gap, truth)
     return cost - best, _RELATIVE * np.abs(best)
 
 
 def _natural(text: str) -> list[tuple[bool, float, str]]:
-    """Return a key by which texts are sorted as people do: 8 before 25."""
-    # Split at numbers, odd parts are numbers: 0.0 for text keeps the tuples comparable.
+    """Return a key that sorts numbers in texts by value: 8 before 25."""
+    # After the split, odd parts are numbers; 0.0 for text keeps the tuples comparable.
     parts = re.split(r"(\d+\.?\d*)", text)
     return [(i % 2 == 0, 0.0 if i % 2 == 0 else float(part), part) for i, part in enumerate(parts)]
 
@@ -105,7 +109,7 @@ def _text(value: Any) -> str:
 
 
 def noise_text(label: str) -> str:
-    """Return a noise level as text: the label, or one that names kinds without its braces."""
+    """Return a noise level as text: its label, without braces if it names kinds."""
     try:
         value = json.loads(label)
     except ValueError:
@@ -114,7 +118,9 @@ def noise_text(label: str) -> str:
 
 
 def cells(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return one row for each case, noise level and method of judged rows, in the order of `levels` and `methods`.
+    """Return one row for each case, noise level and method of judged rows, sorted in this order.
+
+    Methods are in the order of `methods`.
 
     Returns
     -------
@@ -142,12 +148,13 @@ def cells(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _cell(part: pd.DataFrame) -> dict[str, Any]:
+    """Return the statistics of the rows of one cell."""
     chosen = accuracy_rows(part)
     error, bound, off = (part[n].to_numpy(dtype=float)[chosen] for n in ("error", "crlb", "deviation"))
     ratio, half = over_bound(error, bound)
     seconds = part["seconds"].to_numpy(dtype=float)
     nees = part["nees"].to_numpy(dtype=float)[chosen] / float(part["dimension"].iloc[0])
-    # A singular bound says that no error is too large there: such trials count for errors, not for bounds.
+    # With a singular bound no error is too large: such trials count for errors, not for bounds.
     good = np.isfinite(bound)
     return {
         "rows": int(part["rows"].iloc[0]),
@@ -171,7 +178,7 @@ def _cell(part: pd.DataFrame) -> dict[str, Any]:
 
 
 def by_status(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return how often each method gave each status, and how many of these fixes had a better point beside them.
+    """Return the number of fixes by method and status, and how many of them have a better known point.
 
     Parameters
     ----------
@@ -181,9 +188,9 @@ def by_status(frame: pd.DataFrame) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        One row for each method (in the order of `methods`) and status (`ok` first, then the most frequent first), with
-        the columns method and status and the counts trials, right, better (a better point is known) and wrong (that,
-        and the status is ok). Without a cost there is no point to compare: such trials are not right, and not better.
+        One row for each method (in the order of `methods`) and status (`ok` first, then the most frequent first). The
+        columns are method, status, and the counts trials, right, better (a better point is known) and wrong (better,
+        and the status is ok). Trials without a cost are neither right nor better.
     """
     above, rounding = above_least(frame)
     with np.errstate(invalid="ignore"):
@@ -198,7 +205,7 @@ def by_status(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def accuracy_rows(part: pd.DataFrame) -> Array:
-    """Return which rows of a method say how accurate it is: its answers, or all its positions if it claims none."""
+    """Return a mask of the rows that measure a method's accuracy: its answers or, without any, all its positions."""
     answered = part["answered"].to_numpy(dtype=bool)
     return answered if answered.any() else part["located"].to_numpy(dtype=bool)
 
@@ -211,8 +218,8 @@ def _quantile(values: Array, share: float) -> float:
 def methods(frame: pd.DataFrame) -> list[str]:
     """Return the methods, those with the most right answers first.
 
-    Among equals a method without any position is last, so that a solver that gives up at once is not the best; then the
-    faster ones come first.
+    If shares are equal, a method without any position is last, so that a solver that fails at once is not the best.
+    Then the faster ones come first.
     """
     grouped = frame.groupby("method", observed=True, sort=True)
     found = grouped.agg(right=("right", "mean"), located=("located", "any"), t=("seconds", "median"))
@@ -223,7 +230,7 @@ def methods(frame: pd.DataFrame) -> list[str]:
 def instances(
     frame: pd.DataFrame, order: list[str], work: str = "seconds", success: str = "right"
 ) -> tuple[Array, Array, int]:
-    """Return work and successes of the instances (one trial of one cell of data) that every method has seen.
+    """Return work and successes of the instances (one trial of one cell of data) that every method has run.
 
     Parameters
     ----------
@@ -232,31 +239,31 @@ def instances(
     order : list of str
         Methods.
     work, success : str
-        Columns: what each trial took, and whether the method found what was sought.
+        Columns of the work of a trial, and of its success.
 
     Returns
     -------
     times : array (methods, n)
-        Seconds, or whatever the work is counted in.
+        Values of the column `work`.
     solved : bool array (methods, n)
-        Whether the answer is right.
+        Values of the column `success`.
     total : int
-        All instances of the study, also those that some method has not seen.
+        Number of all instances of the study, also of those that some method has not run.
     """
     numbers, names = frame["data"].astype(str), frame["method"].astype(str)
     wide = frame.assign(data=numbers, method=names).pivot_table(
         index=["data", "trial"], columns="method", values=[work, success], aggfunc="first"
     )
-    # A study that still runs has trials that one method has seen and another has not.
+    # In an unfinished study, some methods have not run all trials yet.
     common = wide.dropna()
     times, solved = (np.stack([common[what][name] for name in order]) for what in (work, success))
     return times.astype(float), solved.astype(bool), len(wide)
 
 
 def ranking(frame: pd.DataFrame, order: list[str], shift: float) -> pd.DataFrame:
-    """Return the methods ranked by the shifted geometric mean of their times, slow where they fail.
+    """Return the methods ranked by the shifted geometric mean of their times, with a penalty for failures.
 
-    A failure counts as ten times the slowest time of any method, so that being quickly wrong is not rewarded.
+    A failure counts as ten times the slowest time of any method, so that fast wrong answers are not rewarded.
 
     Returns
     -------
@@ -282,14 +289,14 @@ def ranking(frame: pd.DataFrame, order: list[str], shift: float) -> pd.DataFrame
     return table.sort_values("mean", kind="stable", ignore_index=True)
 
 
-# Two studies side by side, cell by cell.
+# Comparison of two studies, cell by cell.
 
 CELL = ("scenario", "sweep", "noise_label", "method")
 
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """What one study has in a cell.
+    """Statistics of one study in a cell.
 
     Parameters
     ----------
@@ -298,7 +305,7 @@ class Side:
     answered : float
         Share with an answer.
     rmse, bound : float
-        Root mean square error of the answers and of the Cramer-Rao bound there, metres.
+        Root mean square error of the answers and of their Cramer-Rao bounds, metres.
     seconds : float
         Median time of a fix.
     """
@@ -325,7 +332,7 @@ class Difference:
     identical : bool
         Whether their values are equal bit for bit.
     z : float
-        Difference of the shares of answers in standard deviations; NaN where both are certain.
+        Difference of the shares of answers in standard deviations; NaN if both shares are 0 or both are 1.
     """
 
     cell: tuple[str, ...]
@@ -337,12 +344,9 @@ class Difference:
 
 
 def compared(one: Path, two: Path) -> list[Difference]:
-    """Return the cells that two studies have in common, by their names.
+    """Return the differences in the cells that two studies have in common, by their names.
 
-    Raises
-    ------
-    InvalidProblem
-        Where a folder holds no study, or they have no cell in common.
+    Raise InvalidProblem if a folder has no study, or if there is no common cell.
     """
     frames = [dict(iter(read_frame(folder).groupby(list(CELL), observed=True, sort=False))) for folder in (one, two)]
     common = [cell for cell in frames[0] if cell in frames[1]]
@@ -353,11 +357,12 @@ def compared(one: Path, two: Path) -> list[Difference]:
 
 
 def _difference(cell: tuple[str, ...], a: pd.DataFrame, b: pd.DataFrame) -> Difference:
-    # Not the seed, which says what should have been drawn, but a digest of what was; of the trials that both have.
+    """Return the difference of two studies in a cell with the rows a and b."""
+    # Compare the digest of the drawn numbers, not the seed; only in the trials that both have.
     both = a[["trial", "data"]].merge(b[["trial", "data"]], on="trial")
     same_data = bool(len(both)) and bool((both["data_x"].astype(str) == both["data_y"].astype(str)).all())
     one, two = _side(a), _side(b)
-    # Two shares with one variance, that of both together: the usual test of their difference.
+    # Pooled variance of the two shares: the usual test of their difference.
     pooled = (one.answered * one.rows + two.answered * two.rows) / (one.rows + two.rows)
     spread = np.sqrt(pooled * (1.0 - pooled) * (1.0 / one.rows + 1.0 / two.rows))
     z = (two.answered - one.answered) / spread if spread > 0.0 else np.nan
@@ -365,6 +370,7 @@ def _difference(cell: tuple[str, ...], a: pd.DataFrame, b: pd.DataFrame) -> Diff
 
 
 def _identical(a: pd.DataFrame, b: pd.DataFrame) -> bool:
+    """Return whether the columns of values are equal bit for bit."""
     if len(a) != len(b):
         return False
     names = list(VALUES)
@@ -374,13 +380,14 @@ def _identical(a: pd.DataFrame, b: pd.DataFrame) -> bool:
 
 
 def _side(frame: pd.DataFrame) -> Side:
+    """Return the statistics of one study in a cell."""
     answered = frame["answered"].to_numpy(dtype=bool)
     error, bound = (frame[name].to_numpy(dtype=float)[answered] for name in ("error", "crlb"))
     rmse, limit = (float(np.sqrt(np.mean(v**2))) if len(v) else np.nan for v in (error, bound[np.isfinite(bound)]))
     return Side(len(frame), float(answered.mean()), rmse, limit, float(frame["seconds"].median()))
 
 
-# Statistics that judge methods: shares with intervals, errors against the bound, profiles, shifted means.
+# Statistics of methods: shares with intervals, errors against the bound, profiles, shifted means.
 
 LEVEL = 0.95
 """Confidence of all intervals, as is usual; `_NORMAL` is its quantile of the normal distribution."""
@@ -388,7 +395,7 @@ LEVEL = 0.95
 _NORMAL = 1.96
 
 _CURVE = 200
-"""Points of a distribution: more than a figure of 500 pixels shows apart, and a page holds hundreds of curves."""
+"""Points of a distribution: more than a figure of 500 pixels resolves, and a page has hundreds of curves."""
 
 
 def wilson(hits: Array | float, count: Array | float, level: float = LEVEL) -> tuple[Array, Array]:
@@ -397,7 +404,7 @@ def wilson(hits: Array | float, count: Array | float, level: float = LEVEL) -> t
     Parameters
     ----------
     hits, count : array (...)
-        How many of how many; NaN comes back where there are none.
+        Number of hits, and number of trials; the result is NaN for no trials.
     level : float
         Confidence.
 
@@ -420,12 +427,12 @@ def wilson(hits: Array | float, count: Array | float, level: float = LEVEL) -> t
         width = z * np.sqrt(share * (1.0 - share) / n + z**2 / (4.0 * n**2))
         scale = 1.0 + z**2 / n
         low, high = (middle - width) / scale, (middle + width) / scale
-    # At the ends the formula is exact, but rounding is not.
+    # At the ends, remove rounding errors: the formula is exact there.
     return np.where(k <= 0.0, np.where(n > 0.0, 0.0, np.nan), low), np.where((k >= n) & (n > 0.0), 1.0, high)
 
 
 def clopper_pearson(hits: Array | float, count: Array | float, level: float = LEVEL) -> tuple[Array, Array]:
-    """Return the exact interval of shares, which never covers less than its level; arguments as `wilson`.
+    """Return the exact interval of shares, whose coverage is at least its level; arguments as `wilson`.
 
     References
     ----------
@@ -442,7 +449,7 @@ def clopper_pearson(hits: Array | float, count: Array | float, level: float = LE
 
 
 def over_bound(error: Array, bound: Array) -> tuple[float, float]:
-    """Return the root mean square error over that of the bound, and the half width of its 95 % interval.
+    """Return the root mean square error over the root mean square bound, and the half width of its 95 % interval.
 
     Parameters
     ----------
@@ -452,7 +459,7 @@ def over_bound(error: Array, bound: Array) -> tuple[float, float]:
     Returns
     -------
     ratio, half : float
-        NaN where no pair counts; the half width is that of the delta method, NaN of a single pair.
+        NaN without a finite pair. The half width is from the delta method, and NaN for a single pair.
     """
     good = np.isfinite(error) & np.isfinite(bound)
     count = int(good.sum())
@@ -461,15 +468,15 @@ def over_bound(error: Array, bound: Array) -> tuple[float, float]:
     squares = error[good] ** 2 / np.mean(bound[good] ** 2)
     ratio = float(np.sqrt(squares.mean()))
     spread = float(squares.std(ddof=1)) if count > 1 else float("nan")
-    # The error of a root is half that of its square over the root; one that is zero, which only noise of zero gives,
-    # must not divide.
+    # The error of a root is half the error of its square over the root. The maximum avoids a division by zero, which
+    # occurs only for noise of zero.
     return ratio, _NORMAL * spread / (2.0 * max(ratio, np.finfo(float).tiny) * np.sqrt(count))
 
 
 def shifted_mean(times: Array, shift: float) -> float:
-    """Return the shifted geometric mean exp(mean(log(t + s))) - s of times; NaN of none.
+    """Return the shifted geometric mean exp(mean(log(t + s))) - s of times, seconds; NaN without times.
 
-    Large times count less than in a mean, and times far below the shift are all alike.
+    Large times count less than in a mean, and times far below the shift all count the same.
 
     References
     ----------
@@ -487,14 +494,14 @@ def performance_profile(times: Array, solved: Array, ratios: Array) -> Array:
     times : array (methods, n)
         Seconds.
     solved : bool array (methods, n)
-        Where the method found what was sought; elsewhere its time does not matter.
+        Whether the method solved the instance; otherwise its time does not matter.
     ratios : array (q,)
         Multiples of the time of the fastest method that solved the instance.
 
     Returns
     -------
     array (methods, q)
-        Shares of all n instances, those among them that no method solves.
+        Shares of all n instances, including those that no method solves.
 
     References
     ----------
@@ -515,16 +522,16 @@ def distribution(values: Array, count: int, points: int = _CURVE) -> tuple[Array
     Parameters
     ----------
     values : array (n,)
-        What is not finite is left out of the curve, but not out of the count.
+        Values that are not finite are left out of the curve, but not out of the count.
     count : int
-        Trials, so that the curve ends at the share of those that have a value.
+        Number of trials; the curve ends at the share of trials with a finite value.
     points : int
         Most points of the curve; the least and the greatest value are among them.
 
     Returns
     -------
     x, share : array (q,)
-        Values in order and the share of trials that are not above them.
+        Sorted values, and the share of trials that do not exceed them.
     """
     ordered = np.sort(values[np.isfinite(values)])
     if not len(ordered):

@@ -1,6 +1,6 @@
-"""A trial from its data to its row: solved by a method, scored against truth and bound, one row of documented columns.
+"""One trial from simulated data to a row of the table: solution, errors against truth and bound, documented columns.
 
-The rows of a chunk are one Arrow table: a function of the chunk alone, wherever it runs.
+The rows of a chunk are one Arrow table. The table depends on the chunk only, not on the machine.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from optloc.lab.study.networks import (
 from optloc.lab.study.simulation import Case, DrawnCase
 from optloc.problem import PROOFS, Array, Fix, Problem, Status
 
-# The long table of a study, one row for each trial of each method: columns, units and meaning in one place.
+# The table of a study has one row for each trial of each method; here are its columns, their units and meanings.
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,12 +45,12 @@ class Column:
     kind : "category", "int", "float" or "bool"
         Category: text, dictionary encoded.
     unit : str
-        SI unit; empty where there is none.
+        SI unit; empty for columns without a unit.
     meaning : str
         One sentence.
     value : bool
-        Whether it is the same, bit for bit, whenever and on whatever executor the study runs; False for times, the
-        machine and the versions.
+        Whether its values are equal, bit for bit, in every run on every executor; False for times, machine and
+        versions.
     """
 
     name: str
@@ -62,15 +62,15 @@ class Column:
 
 COLUMNS: tuple[Column, ...] = (
     Column("key", "category", "", "Cell: a scenario at one noise level and one set of swept values, with one method."),
-    Column("data", "category", "", "Digest of what was drawn: equal data and trial mean equal measurements."),
+    Column("data", "category", "", "Digest of the simulated data: equal data and trial mean equal measurements."),
     Column("scenario", "category", "", "Name of the scenario."),
     Column("method", "category", "", "Name of the method as tables show it; different settings have different names."),
-    Column("solver", "category", "", "Back end that was asked for, for instance SCS; empty: the method's own."),
+    Column("solver", "category", "", "Requested solver, for instance SCS; empty: the default of the method."),
     Column(
         "noise", "float", "", "Noise level in the unit `noise_unit`: deviation of a row of the first kind, or factor."
     ),
-    Column("noise_unit", "category", "", "m, m/s, rad or 1; x where levels are factors on the noise of a file."),
-    Column("noise_label", "category", "", "The level as the study file writes it."),
+    Column("noise_unit", "category", "", "m, m/s, rad or 1; x if levels are factors on the noise of a file."),
+    Column("noise_label", "category", "", "The level as written in the study file."),
     Column("sweep", "category", "", "Swept values as a JSON object of name and value; {} without a sweep."),
     Column("kinds", "category", "", "Measurement kinds of the scenario, joined by +."),
     Column("dimension", "int", "", "2 or 3."),
@@ -83,13 +83,13 @@ COLUMNS: tuple[Column, ...] = (
         "status",
         "category",
         "",
-        "Label of the status, for instance ok; without a fix: 'died' of an error or with its process, 'timeout' over "
-        "the time limit of tasks, 'invalid' for an answer that is none.",
+        "Label of the status, for instance ok; without a fix: 'died' (an error or the end of its process), 'timeout' "
+        "(over the time limit of tasks) or 'invalid' (an invalid answer).",
     ),
-    Column("answered", "bool", "", "Whether the status has a position with a covariance, whatever stands against it."),
+    Column("answered", "bool", "", "Whether the status has a position with a covariance, with or without findings."),
     Column("reason", "category", "", "Sentence that belongs to the status."),
     Column("located", "bool", "", "Whether there is a finite position at all, refined or not."),
-    Column("outliers", "int", "", "Number of stations, in a network of arrivals, with a gross error."),
+    Column("outliers", "int", "", "Number of stations with a gross error; in a network, number of arrivals."),
     Column("rejected", "int", "", "Number of rows to which the method gives less than half their weight."),
     Column("truth_x", "float", "m", "True position of the target, metres in the frame."),
     Column("truth_y", "float", "m", "As truth_x."),
@@ -103,16 +103,16 @@ COLUMNS: tuple[Column, ...] = (
         "m",
         "Distance of the estimate from the truth; of a network, rms of its stations after the best rigid motion.",
     ),
-    Column("error_nearest", "float", "m", "The same of the nearest of the estimate and its alternatives."),
-    Column("error_velocity", "float", "m/s", "Length of the velocity's error; NaN where the target stands."),
-    Column("error_bias", "float", "m", "Root mean square error of the biases in metres; NaN without such."),
+    Column("error_nearest", "float", "m", "The least error of the estimate and its alternatives."),
+    Column("error_velocity", "float", "m/s", "Length of the velocity's error; NaN for a static target."),
+    Column("error_bias", "float", "m", "Root mean square error of the biases in metres; NaN without any."),
     Column(
         "crlb",
         "float",
         "m",
         "Root of the trace of the position's Cramer-Rao bound at the truth; of a network, rms of its stations.",
     ),
-    Column("crlb_velocity", "float", "m/s", "The same of the velocity."),
+    Column("crlb_velocity", "float", "m/s", "Root of the trace of the velocity's Cramer-Rao bound at the truth."),
     Column("crlb_bias", "float", "m", "Root mean square bound of the biases in metres."),
     Column(
         "deviation", "float", "1", "Error in units of the bound: sqrt(e' B^-1 e), B the position's bound at the truth."
@@ -127,60 +127,58 @@ COLUMNS: tuple[Column, ...] = (
         "nees",
         "float",
         "1",
-        "e' C^-1 e with the claimed covariance C; its expectation is `dimension` (of networks scaled to it).",
+        "e' C^-1 e with the claimed covariance C; its expectation is `dimension`; for networks it is scaled to this.",
     ),
     Column(
         "cost",
         "float",
         "1",
-        "Maximum-likelihood cost at the estimate, also of estimates that were not refined; NaN where it breaks a "
-        "constraint.",
+        "Maximum-likelihood cost at the estimate, refined or not; NaN if the estimate violates a constraint.",
     ),
-    Column("cost_truth", "float", "1", "The same cost at the truth (unknowns of single epochs at their best)."),
+    Column("cost_truth", "float", "1", "Likelihood cost at the truth, minimised over unknowns of single epochs."),
     Column("dof", "int", "", "Degrees of freedom of the cost."),
     Column("alternatives", "int", "", "Number of other minima, or networks, that the fix lists."),
     Column("proof", "category", "", "Proof of the certificate: global, region, local, blockwise or unknown."),
     Column("certificate", "category", "", "Method of the certificate."),
     Column("bound", "float", "1", "Certified lower bound of the cost; NaN without one."),
     Column(
-        "iterations", "float", "1", "Iterations of solver and refinement, mean over the fixes of one call; NaN unknown."
+        "iterations",
+        "float",
+        "1",
+        "Iterations of solver and refinement, mean over the fixes of a call; NaN if unknown.",
     ),
-    Column(
-        "evaluations", "float", "1", "Evaluations of the cost that a minimizer asked for; NaN where none are counted."
-    ),
-    Column(
-        "seconds", "float", "s", "Time of the solution: that of the call over the number of its fixes.", value=False
-    ),
+    Column("evaluations", "float", "1", "Evaluations of the cost by an external minimizer; NaN if not counted."),
+    Column("seconds", "float", "s", "Time of the call, divided by the number of its fixes.", value=False),
     Column(
         "processor",
         "float",
         "s",
-        "The same of processor time, of all threads of the process: whatever else the machine does.",
+        "Processor time of all threads of the process, divided likewise; other programs do not change it.",
         value=False,
     ),
     Column(
         "build",
         "float",
         "s",
-        "Time of the first fix of its kind in its process, before the others: compilation "
-        "and canonicalisation; 0 where that had been done.",
+        "Time of the first fix of the cell in its process, with compilation and canonicalisation; 0 if the process "
+        "has solved the cell before.",
         value=False,
     ),
     Column("batch", "int", "", "Number of fixes in the call."),
-    Column("chunk", "category", "", "Chunk of the design that holds the row."),
+    Column("chunk", "category", "", "Chunk of the design that contains the row."),
     Column("machine", "category", "", "Processor, number of cores and system of the worker.", value=False),
     Column("versions", "category", "", "Versions of optloc, Python and the libraries, as text.", value=False),
 )
 """Columns of every part file, in this order."""
 
 GAP = Column("gap", "float", "1", "Cost less the lowest cost that any method of the study found for the same data.")
-"""Added when all parts are read: it needs all methods."""
+"""Added when all parts are read, because it needs all methods."""
 
 FAILED = DIED, LATE, INVALID = "died", "timeout", "invalid"
-"""Statuses of a trial that has no fix: an error or the end of its process, its time limit, an answer that is none."""
+"""Statuses of a trial without a fix: an error or a dead process, a time limit, an invalid answer."""
 
 VALUES: tuple[str, ...] = tuple(column.name for column in COLUMNS if column.value)
-"""Columns that are equal bit for bit on one machine, whatever the executor."""
+"""Columns that are equal bit for bit on one machine, with every executor."""
 
 
 @cache
@@ -199,21 +197,21 @@ def arrow_schema() -> Any:
     )
 
 
-# A chunk is drawn, solved and written down.
+# Draw and solve a chunk, and write its rows.
 
 
 @dataclass(frozen=True, slots=True)
 class TrialPart:
-    """What a chunk gave.
+    """Rows of a finished chunk.
 
     Parameters
     ----------
     key : str
-        Of the chunk.
+        Key of the chunk.
     table : pyarrow.Table
         Its rows.
     counts : dict of str to int
-        How many rows have which status.
+        Number of rows by status.
     """
 
     key: str
@@ -223,16 +221,16 @@ class TrialPart:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """What came of a chunk that gave no part.
+    """Record of a chunk that could not be computed.
 
     Parameters
     ----------
     key : str
-        Of the chunk.
+        Key of the chunk.
     status : str
         `DIED` or `LATE`.
     reason : str
-        How it ended.
+        Reason of the failure.
     """
 
     key: str
@@ -243,28 +241,28 @@ class Lost:
 Values = dict[str, Any]
 """Columns of some trials: arrays (n,), or one value for all."""
 
-# Characters of a reason: it stands in every row, and a library may put a matrix into its complaint.
+# Characters of a reason: every row has one, and the message of a library may contain a matrix.
 _WORDS = 200
 
-# Cells of which this process has solved a trial: what is compiled or canonicalised once is not timed with the others.
+# Cells of which this process has solved a trial: compilation and canonicalisation are not timed with other trials.
 _warm: set[tuple[str, str]] = set()
 
 
 def compute(chunk: Chunk) -> TrialPart:
     """Return the rows of a chunk.
 
-    Numerical libraries work on one thread inside, so that the last digit does not depend on where it runs.
+    Numerical libraries use one thread, so that the last digit does not depend on the machine.
 
     Raises
     ------
     InvalidProblem
-        Where the method solves nothing with the back end that was asked for.
+        If the requested solver solves no program of the method.
     MemoryError
-        Where there is not enough. Whatever else a method raises becomes the status of a row.
+        If the memory is not sufficient. All other exceptions of a method become the status of a row.
     """
     from threadpoolctl import threadpool_limits
 
-    # Sums of BLAS depend on how many threads share them.
+    # Sums of BLAS depend on the number of threads.
     with threadpool_limits(1):
         drawn = chunk.cell.case.draw(chunk.first, chunk.count)
         build = _warm_up(chunk.cell, drawn)
@@ -275,24 +273,24 @@ def compute(chunk: Chunk) -> TrialPart:
             for first in range(0, chunk.count, size)
             for part in _solve_in_halves(chunk.cell, known, first, min(size, chunk.count - first))
         ]
-    # A trial that failed has no column that only fixes have: what every stretch has is kept.
+    # A failed trial lacks some columns, so only the columns of all parts are kept.
     shared = [name for name in parts[0][1] if all(name in values for _, values in parts)]
     found = {name: np.concatenate([_spread(values[name], count) for count, values in parts]) for name in shared}
     return _part(chunk, known, found, build)
 
 
 def _warm_up(cell: Cell, drawn: DrawnCase | Networks) -> float:
-    """Solve one trial where that was not done in this process, and return how long it took."""
+    """Solve one trial if this process has not done so yet, and return the time in seconds."""
     key = (cell.case.key, cell.method.identity)
     if key in _warm:
         return 0.0
     began = perf_counter()
     try:
         found = run(cell.method, drawn.part(0, 1))
-    except (Exception, SystemExit):  # noqa: BLE001  (it comes again with its row)
+    except (Exception, SystemExit):  # noqa: BLE001  (the row of the trial reports the error)
         return 0.0
     require_program(cell.method, found)
-    # Only where it went well: a failure may come before what is slow.
+    # Only after a success: a failure may come before the slow part.
     _warm.add(key)
     return perf_counter() - began
 
@@ -300,11 +298,11 @@ def _warm_up(cell: Cell, drawn: DrawnCase | Networks) -> float:
 def _solve_in_halves(
     cell: Cell, known: KnownTrials | KnownNetworks, first: int, count: int
 ) -> list[tuple[int, Values]]:
-    """Return the values of some trials; where the call fails, halves are tried until the one trial is found."""
+    """Return the values of some trials; if the call fails, solve halves until only failing trials fail."""
     try:
         return [(count, _solve(cell, known.part(first, count)))]
     except MemoryError:
-        # Perhaps of one that was here before: another process decides.
+        # The cause may be an earlier chunk, so another process tries again.
         raise
     except Nonsense as error:
         status, reason = INVALID, str(error)
@@ -317,6 +315,7 @@ def _solve_in_halves(
 
 
 def _solve(cell: Cell, known: KnownTrials | KnownNetworks) -> Values:
+    """Return the values of the trials, solved in one call."""
     count = len(known.drawn.seed)
     found = run(cell.method, known.drawn)
     values = fix_values(cell.case, known, found.fix)
@@ -325,7 +324,7 @@ def _solve(cell: Cell, known: KnownTrials | KnownNetworks) -> Values:
 
 
 def _failure(status: str, reason: str) -> Values:
-    """Return the values of a trial that failed."""
+    """Return the values of a failed trial."""
     values: Values = {column.name: np.nan for column in COLUMNS if column.kind == "float"}
     values |= {"status": status, "reason": reason[:_WORDS], "answered": False, "located": False}
     values |= dict.fromkeys(("dof", "alternatives", "rejected"), 0)
@@ -333,13 +332,13 @@ def _failure(status: str, reason: str) -> Values:
 
 
 def part_of_lost(chunk: Chunk, lost: Lost) -> TrialPart:
-    """Return the part of a chunk whose trials all have the status of what came of it."""
+    """Return the part of a lost chunk: all its trials have the status of the loss."""
     found = {name: _spread(value, chunk.count) for name, value in _failure(lost.status, lost.reason).items()}
     return _part(chunk, known_of(chunk.cell.case.draw(chunk.first, chunk.count)), found, 0.0)
 
 
 def join_parts(chunk: Chunk, parts: list[TrialPart]) -> TrialPart:
-    """Return the parts of a chunk's pieces as one."""
+    """Return the parts of the pieces of a chunk joined to one part."""
     import pyarrow as pa
 
     table = pa.concat_tables([part.table for part in parts]).unify_dictionaries().combine_chunks()
@@ -356,18 +355,18 @@ def _spread(value: Any, count: int) -> Any:
     """Return a value as an array (count,)."""
     if isinstance(value, np.ndarray):
         return value
-    # Filled by assignment: a list is one value for each, a text the same for all.
+    # Assignment treats a list as one value for each trial, and a text as one value for all.
     out = np.empty(count, dtype=object if isinstance(value, str | list) else None)
     out[:] = value
     return out
 
 
 def _part(chunk: Chunk, known: KnownTrials | KnownNetworks, found: Values, build: float) -> TrialPart:
-    """Return the Arrow table of a chunk, whose fixes have the values found."""
+    """Return the part of a chunk as an Arrow table with the values `found`."""
     import pyarrow as pa
 
     case, method, n = chunk.cell.case, chunk.cell.method, chunk.count
-    # In this order: a trial that failed has NaN for every number, but its truth and its bound are known.
+    # In this order: a failed trial has NaN for all numbers, but its truth and its bound are known.
     values = found | truth_values(case, known)
     values |= {
         "key": chunk.cell.key,
@@ -397,7 +396,7 @@ _NUMBERS = {"int": np.int64, "float": np.float64, "bool": np.bool_}
 
 
 def _arrow(column: Column, value: Any, count: int) -> Any:
-    """Return a column (count,) as an Arrow array; one text for all is written once."""
+    """Return a column (count,) as an Arrow array; a text for all rows is stored once."""
     import pyarrow as pa
 
     if column.kind != "category":
@@ -407,15 +406,15 @@ def _arrow(column: Column, value: Any, count: int) -> Any:
     return pa.array(value, pa.string()).dictionary_encode()
 
 
-# What is written about fixes: errors against truth and bound, consistency, cost, certificate.
+# Columns of fixes: errors against truth and bound, consistency, cost, certificate.
 
-# Share of its weight below which a row counts as rejected: what `COLUMNS` says.
+# A row counts as rejected below this share of its weight, as `COLUMNS` states.
 _REJECTED = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class KnownTrials:
-    """What holds for trials whatever the method.
+    """Data of trials that do not depend on the method.
 
     Parameters
     ----------
@@ -432,7 +431,7 @@ class KnownTrials:
     cost: Array
 
     def part(self, first: int, count: int) -> KnownTrials:
-        """Return what holds for some of the trials; of all of them it is the same object, nothing is copied."""
+        """Return the data of `count` trials from the trial `first` on; all trials are the same object, not a copy."""
         if (first, count) == (0, len(self.drawn.truth)):
             return self
         kept = slice(first, first + count)
@@ -473,11 +472,11 @@ def truth_values(case: Case | NetworkCase, known: KnownTrials | KnownNetworks) -
 def fix_values(
     case: Case | NetworkCase, known: KnownTrials | KnownNetworks, fix: Fix | tuple[NetworkResult, ...]
 ) -> Values:
-    """Return the columns of fixes (n,) of trials, or of networks found."""
+    """Return the columns of fixes (n,) of trials, or of networks."""
     if isinstance(known, KnownNetworks):
         assert isinstance(fix, tuple)
         return found_columns(known, fix)
-    assert isinstance(case, Case) and isinstance(fix, Fix)  # noqa: PT018  (what a case of scenarios has)
+    assert isinstance(case, Case) and isinstance(fix, Fix)  # noqa: PT018  (the types that belong to a scenario)
     problem, truth, names = known.drawn.problem, known.drawn.truth, case.state
     size = len(truth)
     x = np.where(np.isfinite(fix.x).all(-1, keepdims=True), fix.x, np.nan)
@@ -501,7 +500,7 @@ def fix_values(
     values["error_velocity"] = np.linalg.norm(_take(problem, x - truth, names[1]), axis=-1) if moving else np.nan
     entries = _lengths(problem)
     values["error_bias"] = np.sqrt(((x - truth)[:, entries] ** 2).mean(-1)) if len(entries) else np.nan
-    # Codes index the labels: members of Status are numbered from zero.
+    # Codes index the labels, because members of Status are numbered from zero.
     labels = np.array([status.label for status in Status], dtype=object)
     values |= {"status": labels[fix.code], "reason": fix.reason}
     claims = fix.claims
@@ -525,7 +524,7 @@ def _block(problem: Problem, matrix: Array, name: str) -> Array:
 
 
 def _lengths(problem: Problem) -> Array:
-    """Return the entries of the shared unknowns that are biases in metres."""
+    """Return the indices of the shared unknowns that are biases in metres."""
     # Clock offsets, not scales or boresights: errors of other units cannot be averaged with them.
     found = [np.arange(s.start, s.start + s.size) for s in problem.layout.shared if s.members and s.unit == "m"]
     return np.concatenate([*found, np.zeros(0, dtype=np.int64)])
@@ -537,17 +536,18 @@ def _root_trace(matrix: Array) -> Array:
 
 
 def _squared(error: Array, matrix: Array) -> Array:
-    """Return e' M^-1 e (n,); NaN where there is no error or no regular matrix."""
+    """Return e' M^-1 e (n,); NaN if the error is missing or the matrix is singular."""
     usable = np.asarray(np.isfinite(matrix).all((-1, -2)) & np.isfinite(error).all(-1))
-    # A batch is solved at once: items without a matrix get one, and lose the result.
+    # The batch is solved at once: items without a matrix get the identity, and their result is discarded.
     kept = np.where(usable[:, None, None], matrix, np.eye(matrix.shape[-1]))
     solved, ok = linalg.solve(kept, np.where(usable[:, None], error, 0.0)[..., None])
     return np.asarray(np.where(usable & ok, (error * solved[..., 0]).sum(-1), np.nan))
 
 
 def _nearest(problem: Problem, fix: Fix, truth: Array, name: str, error: Array) -> Array:
+    """Return the least error (n,) of each estimate and its alternatives, metres."""
     best = np.linalg.norm(error, axis=-1)
-    # Where two minima fit, it matters whether the right one is listed at all.
+    # If two minima fit, the list should contain the right one.
     for i in range(fix.alternatives.x.shape[1]):
         with np.errstate(invalid="ignore"):
             best = np.fmin(best, np.linalg.norm(_take(problem, fix.alternatives.x[:, i] - truth, name), axis=-1))
@@ -555,8 +555,8 @@ def _nearest(problem: Problem, fix: Fix, truth: Array, name: str, error: Array) 
 
 
 def _cost(problem: Problem, fix: Fix, x: Array) -> Array:
-    """Return the cost of every estimate, that of unrefined ones evaluated here."""
-    # Starts and relaxations carry no cost; only that of the likelihood makes methods comparable.
+    """Return the cost of every estimate; costs of unrefined estimates are computed here."""
+    # Starts and relaxations have no cost, and only the cost of the likelihood makes methods comparable.
     cost = np.where(np.isfinite(fix.cost), fix.cost, np.nan)
     items = np.flatnonzero(~np.isfinite(cost) & np.isfinite(x).all(-1))
     if len(items):
@@ -567,7 +567,7 @@ def _cost(problem: Problem, fix: Fix, x: Array) -> Array:
 
 
 def _admitted(problem: Problem, x: Array, cost: Array) -> Array:
-    """Return costs (n,) at vectors x (n, size), NaN where these break a constraint: nobody asked for less there."""
+    """Return costs (n,) at vectors x (n, size), with NaN where x violates a constraint: such points do not compete."""
     if not problem.constraints:
         return cost
     items = np.flatnonzero(np.isfinite(x).all(-1))
@@ -576,12 +576,12 @@ def _admitted(problem: Problem, x: Array, cost: Array) -> Array:
     return out
 
 
-# Where it was computed, and with what.
+# Machine and versions.
 
 
 @cache
 def versions() -> str:
-    """Return the versions of optloc, Python and the libraries that decide numbers, as one line."""
+    """Return the versions of optloc, Python and the libraries that affect numbers, as one line."""
     names = ("optloc", "numpy", "scipy", "numba", "cvxpy", "clarabel", "casadi", "pyarrow")
     return "; ".join([f"Python {platform.python_version()}", *(f"{name} {version_of(name)}" for name in names)])
 

@@ -1,7 +1,7 @@
-"""A process apart, in which the methods of a study run: watched over, held to limits, ended with who began it.
+"""Worker process for the methods of a study: it has limits of time and memory, and it ends with its parent process.
 
-It is begun without multiprocessing, which would run the caller's script again, and which lets the daemonic workers of a
-cluster begin none.
+The parent starts the worker without multiprocessing. multiprocessing would run the script of the caller again, and it
+does not let daemonic workers of a cluster start processes.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from optloc.lab.study.design import Chunk
 from optloc.lab.study.trial import DIED, LATE, Lost, TrialPart, compute
 from optloc.problem import InvalidProblem, load_plugin, plugins
 
-# Seconds: to begin, half of one where a processor is free; without a task, after which it ends, as nobody tells a
-# cluster that a study is over; between the end of its pipe and its own, which says how it ended.
-_START, _IDLE, _MOMENT = 120.0, 60.0, 0.2
-# Workers times threads would be more than the processors, and each thread of BLAS reserves memory.
+# Seconds. To start a worker: half a second if a processor is free. Until an idle worker ends, because a cluster does
+# not signal the end of a study. Between the end of the pipe and the end of the process, which has the exit code.
+_START, _IDLE, _END_WAIT = 120.0, 60.0, 0.2
+# Workers times threads would exceed the processors, and each thread of BLAS reserves memory.
 _ONE = ("OPTLOC", "OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM", "NUMEXPR_NUM", "NUMBA_NUM")
-# From its beginning the system kills its group where the other end of its pipe is closed, or written to. A thread that
-# waits for that does so everywhere, but not while machine code holds the interpreter.
+# From the start on, the system kills the worker's group when the parent closes its end of the pipe or writes to it. A
+# thread that waits for this works on every system, but not while machine code holds the interpreter.
 _BEGIN = """
 import contextlib, os, pickle, select, signal, sys
 def die_with(file, on):
@@ -47,11 +47,11 @@ pickle.loads(run)(die_with)
 
 
 class WorkerProcess:
-    """A process apart that computes chunks, one at a time; what it begins ends with it."""
+    """Worker process that computes one chunk at a time; all processes that it starts end with it."""
 
     def __init__(self) -> None:
-        # -P: nothing is imported from the current folder, unless this process does that, too. A session of its own:
-        # Ctrl-C is for this process, which ends it.
+        # -P: the worker imports nothing from the current folder, unless this process does so too. It has a session of
+        # its own, because Ctrl-C is for this process, which then ends the worker.
         self._process = subprocess.Popen(  # noqa: S603  (this interpreter, and a text of this file)
             [sys.executable, "-P", "-c", _BEGIN],
             stdin=subprocess.PIPE,
@@ -62,21 +62,21 @@ class WorkerProcess:
         self._ended, self._pipes = Lock(), Lock()
 
     def lives(self) -> bool:
-        """Return whether it can be asked."""
+        """Return whether the process is alive and accepts messages."""
         return self._process.poll() is None
 
     def ask(self, message: object, seconds: float) -> Any:
-        """Return the answer to a message; raise TimeoutError after so many seconds, EOFError where the process ends."""
+        """Return the reply to a message; raise TimeoutError after `seconds`, or EOFError if the process ends."""
         answer: SimpleQueue[Any] = SimpleQueue()
 
         def exchange() -> None:
-            # In a thread: pipes have no time limit on every system.
+            # In a thread, because pipes have no time limit on some systems.
             assert self._process.stdin is not None
             assert self._process.stdout is not None
             found = None
-            with self._pipes, suppress(Exception):  # whatever a process that ends leaves in its pipe
+            with self._pipes, suppress(Exception):  # a process that ends may leave an incomplete message
                 _send(self._process.stdin, message)
-                found = pickle.load(self._process.stdout)  # noqa: S301  (of a process of our own)
+                found = pickle.load(self._process.stdout)  # noqa: S301  (the sender is our worker)
             answer.put(found)
 
         Thread(target=exchange, daemon=True).start()
@@ -86,21 +86,21 @@ class WorkerProcess:
             self.end()
             raise TimeoutError from None
         if found is None:
-            raise EOFError(self.end(_MOMENT))
+            raise EOFError(self.end(_END_WAIT))
         return found
 
     def end(self, seconds: float = 0.0) -> str:
-        """End the process, after some seconds, with all that it began, whatever it does, and return how it ended."""
+        """Kill the process and its children, after at most `seconds`, and return its exit code as text."""
         with self._ended:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(seconds)
-            # Its group lives on where what it began has not ended; some systems have none.
+            # Its group continues while a child process runs; some systems have no groups.
             with suppress(AttributeError, ProcessLookupError, PermissionError):
                 os.killpg(self._process.pid, signal.SIGKILL)
             self._process.kill()
             code = self._process.wait()
-        # A copy of it that left its group may hold the other ends.
-        if self._pipes.acquire(timeout=_MOMENT):
+        # A forked copy that left the group may hold the other ends of the pipes.
+        if self._pipes.acquire(timeout=_END_WAIT):
             with suppress(OSError), self._process:
                 self._pipes.release()
         how = f"exit code {code}" if code >= 0 else f"signal {-code} ({signal.strsignal(-code)})"
@@ -113,12 +113,12 @@ def _send(file: IO[bytes], message: object) -> None:
 
 
 class WorkerPool:
-    """Processes apart: begun when they are needed, and others where they died.
+    """Worker processes of this machine, started on demand and replaced if they die.
 
     Parameters
     ----------
     count : int
-        How many share the machine.
+        Number of workers that share the memory of the machine.
     """
 
     def __init__(self, count: int) -> None:
@@ -127,36 +127,37 @@ class WorkerPool:
         self._idle: list[WorkerProcess] = []
 
     def compute(self, chunk: Chunk, seconds: float, names: Sequence[str] | None = None) -> TrialPart | Lost:
-        """Return the part of a chunk, computed in a process apart, or what came of it in so many seconds.
+        """Return the part of a chunk, computed in a worker, or a `Lost` that records the reason of the failure.
 
         Parameters
         ----------
         chunk : Chunk
-            What is to be done.
+            Trials to compute.
         seconds : float
-            Its limit; 0: it is not tried.
+            Time limit; with 0 the chunk is not tried.
         names : sequence of str, optional
-            Plugins that are loaded first; those of this process by default.
+            Plugins that the worker loads first; by default the plugins of this process.
 
         Raises
         ------
         InvalidProblem
-            Where the method cannot be run at all, or no process can be begun.
+            If the method cannot run at all, or no worker can be started.
         """
         if not seconds:
             return Lost(chunk.key, LATE, "not tried")
         apart = self._take()
         try:
-            # Pickled twice: who listens need not import what belongs to the chunk, and plugins come before it.
+            # Pickled twice: the receiving thread need not import the modules of the chunk, and plugins are loaded
+            # before the chunk.
             message = (chunk.key, tuple(plugins() if names is None else names), pickle.dumps(chunk))
             found = apart.ask(pickle.dumps(message), seconds)
             if isinstance(found, InvalidProblem):
                 raise found
             if isinstance(found, TrialPart) and (found.key, len(found.table)) == (chunk.key, chunk.count):
                 return found
-            # A process without memory, or one that answers something else, is of no use to others.
+            # A process that is out of memory or sends an invalid reply is not used again.
             apart.end()
-            return found if isinstance(found, Lost) else Lost(chunk.key, DIED, "its process answered something else")
+            return found if isinstance(found, Lost) else Lost(chunk.key, DIED, "its process sent an invalid reply")
         except TimeoutError:
             return Lost(chunk.key, LATE, f"it took more than {seconds:g} s")
         except EOFError as error:
@@ -166,14 +167,14 @@ class WorkerPool:
                 (self._idle.append if apart.lives() else self._all.discard)(apart)
 
     def close(self) -> None:
-        """End all processes."""
+        """End all workers."""
         with self._lock:
-            self._closed, left = True, list(self._all)
-        for apart in left:
+            self._closed, processes = True, list(self._all)
+        for apart in processes:
             apart.end()
 
     def _take(self, *, again: bool = True) -> WorkerProcess:
-        """Return a process that waits, or another."""
+        """Return an idle worker, or a new one."""
         with self._lock:
             while self._idle:
                 if (apart := self._idle.pop()).lives():
@@ -182,36 +183,37 @@ class WorkerPool:
         try:
             return self._begin()
         except (EOFError, TimeoutError) as error:
-            # Once somebody may have killed it; twice, nothing can be computed here.
+            # Another program may have killed the worker once. After a second failure nothing can be computed here.
             if again:
                 return self._take(again=False)
-            advice = "what it said stands above; check the installation, and the memory that is left"
-            raise InvalidProblem(f"no process can be begun ({error})", sys.executable, advice) from None
+            advice = "read its output above; check the installation and the free memory"
+            raise InvalidProblem(f"no process can be started ({error})", sys.executable, advice) from None
 
     def _begin(self) -> WorkerProcess:
+        """Start a process, send it the import path and the server function, and return it when it is ready."""
         with self._lock:
             if self._closed:
-                raise InvalidProblem("the run was stopped", "study", "the same command goes on")
+                raise InvalidProblem("the run was stopped", "study", "run the same command to continue")
             self._all.add(apart := WorkerProcess())
-        # What runs there is found when the path is that of this process.
+        # With the path of this process the worker finds the same modules.
         apart.ask(([str(place) for place in sys.path], pickle.dumps(partial(serve, self._memory))), _START)
         return apart
 
 
-# What methods may take of the memory of a machine, if all processes do so; and bytes that each may use at least:
-# libraries alone reserve 2e9.
+# Share of the machine's memory that all workers may use together. Least bytes of each worker: libraries alone reserve
+# 2e9.
 _MEMORY, _LEAST_MEMORY = 0.8, 4 << 30
 
 
 def memory_of(count: int) -> int | None:
-    """Return the bytes that each of so many processes of this machine may use; None where that is not known."""
+    """Return the bytes that each of `count` workers of this machine may use; None if the memory is unknown."""
     if not hasattr(os, "sysconf"):
         return None
     return max(_LEAST_MEMORY, int(_MEMORY * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / count))
 
 
 def restrain(memory: int | None) -> None:
-    """Limit the memory of this process, have it leave no core, and be the first to go where memory is short."""
+    """Limit the memory (bytes) of this process, which leaves no core file and ends first if memory is short."""
     with suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -222,13 +224,14 @@ def restrain(memory: int | None) -> None:
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
 
-# What runs in the process apart.
+# Code that runs in the worker.
 
 
 def serve(memory: int | None, die_with: Callable[[IO[bytes], bool], None]) -> NoReturn:
-    """Compute the chunks that come in at standard input, one by one, and answer at standard output, until it closes."""
+    """Compute chunks from standard input one by one, and write replies to standard output, until the input closes."""
     restrain(memory)
-    # A method may read and print what it likes. First, lest a pipe's copy takes the place of closed standard error.
+    # A method may read and print, so standard streams go to the null device. This comes first: otherwise a copy of a
+    # pipe could take the place of a closed standard error.
     nowhere, own, line = os.open(os.devnull, os.O_RDWR), os.getpid(), SimpleQueue[bytes]()
     tasks, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     for number in range(3):
@@ -238,7 +241,7 @@ def serve(memory: int | None, die_with: Callable[[IO[bytes], bool], None]) -> No
     try:
         while True:
             if os.getpid() != own:
-                os._exit(0)  # a method forked, and its copy has arrived here, too
+                os._exit(0)  # a method forked, and its copy has returned here too
             die_with(tasks, False)
             _send(answers, found)
             key, names, packed = pickle.loads(line.get(timeout=_IDLE))  # noqa: S301
@@ -248,14 +251,14 @@ def serve(memory: int | None, die_with: Callable[[IO[bytes], bool], None]) -> No
                 found = compute(pickle.loads(packed))  # noqa: S301
             except InvalidProblem as error:
                 found = error
-            except Exception as error:  # noqa: BLE001  (short of memory, most of all)
+            except Exception as error:  # noqa: BLE001  (most often out of memory)
                 found = Lost(key, DIED, f"{type(error).__name__}: {error}")
     finally:
         _end()
 
 
 def _listen(tasks: IO[bytes], line: SimpleQueue[bytes], die_with: Callable[[IO[bytes], bool], None]) -> None:
-    """Pass on what comes in; where nothing can come any more, who sent it has ended, and so does this process."""
+    """Put incoming messages into the queue; if the pipe closes, the parent has ended, so end this process."""
     try:
         while True:
             message = pickle.load(tasks)  # noqa: S301
@@ -266,7 +269,7 @@ def _listen(tasks: IO[bytes], line: SimpleQueue[bytes], die_with: Callable[[IO[b
 
 
 def _end() -> NoReturn:
-    """End this process and its group, whatever threads it has."""
+    """End this process and its group, with all threads."""
     if hasattr(os, "killpg"):
         os.killpg(os.getpgrp(), signal.SIGKILL)
     os._exit(1)

@@ -21,10 +21,10 @@ RUN = CliRunner()
         (["run", "nowhere.toml"], "no such file"),
         (["run", "groa", "--executor", "procesess"], "did you mean 'processes'"),
         (["run", "groa", "--executor", "in-process"], "unknown executor 'in-process'"),
-        (["run", "groa", "--task-limit", "0"], "a task cannot take 0 s"),
-        (["run", "groa", "--task-limit", "nan"], "a task cannot take nan s"),
-        (["status", "."], "holds no study"),
-        (["compare", ".", "."], "holds no study"),
+        (["run", "groa", "--task-limit", "0"], "the limit 0 s is out of range"),
+        (["run", "groa", "--task-limit", "nan"], "the limit nan s is out of range"),
+        (["status", "."], "contains no study"),
+        (["compare", ".", "."], "contains no study"),
     ],
 )
 def test_bad_commands_are_one_sentence(arguments, words, tmp_path, monkeypatch):

@@ -59,7 +59,7 @@ def plaza(folder, ranges="t_s,beacon,range_m\n0.0,5,1.0\n"):
 def test_missing_and_changed_files_are_named(tmp_path):
     place = plaza(tmp_path)
     found = hashlib.sha256((place / "ranges.csv").read_bytes()).hexdigest()[:12]
-    with pytest.raises(InvalidProblem, match=rf"ranges\.csv: this is not the file that is meant: .* {found}"):
+    with pytest.raises(InvalidProblem, match=rf"ranges\.csv: this is a different file: .* {found}"):
         datasets.load("plaza", folder=tmp_path)
     with pytest.raises(InvalidProblem, match=r"stations\.csv: there is no such file"):
         datasets.load("plaza", folder=tmp_path, verify=False)

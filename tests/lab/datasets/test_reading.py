@@ -20,7 +20,7 @@ def test_the_folder_is_the_one_that_is_named_or_that_of_the_variable(tmp_path, m
 def test_a_file_is_checked_by_its_sum(tmp_path):
     (tmp_path / "a.csv").write_bytes(b"x_m\n1\n")
     check_files(tmp_path, {"a.csv": hashlib.sha256(b"x_m\n1\n").hexdigest()})
-    with pytest.raises(InvalidProblem, match=r"a\.csv: this is not the file that is meant"):
+    with pytest.raises(InvalidProblem, match=r"a\.csv: this is a different file"):
         check_files(tmp_path, {"a.csv": hashlib.sha256(b"x_m\n2\n").hexdigest()})
 
 

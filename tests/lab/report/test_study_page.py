@@ -269,7 +269,7 @@ def test_a_study_that_is_not_finished_says_so(site, tmp_path):
 def test_bad_places_are_sentences(site, tmp_path):
     empty = tmp_path / "empty"
     begin(design_of(site.with_suffix(".toml")), empty)
-    with pytest.raises(InvalidProblem, match="nothing of the study is finished yet"):
+    with pytest.raises(InvalidProblem, match="the study has no finished part yet"):
         write_report(empty)
     (tmp_path / "file").write_text("")
     with pytest.raises(InvalidProblem, match="cannot be made"):

@@ -25,26 +25,31 @@ BAD = {
     "two methods": ('"gtrs+lsr"', '"gtrs+lsr"\nbaseline = "taylor"', "give either method or baseline"),
     "solver": ('"gtrs+lsr"', '"sdp"\nsolver = "SCZ"', "unknown solver 'SCZ'; did you mean 'SCS'"),
     "licence": ('"gtrs+lsr"', '"gtrs+nlp"\nsolver = "snopt"', "the solver 'snopt' is not installed"),
-    "settings": ('"gtrs+lsr"', '"gtrs+lsr"\nsettings = { eps = 1 }', "settings belong to a solver"),
+    "settings": ('"gtrs+lsr"', '"gtrs+lsr"\nsettings = { eps = 1 }', "settings need a solver"),
     **{
         f"hostile {i}": ('"gtrs+lsr"', f'"{method}"\nsolver = "{solver}"\nsettings = {{ {hostile} }}', words)
         for i, (method, solver, hostile, words) in enumerate(
             [
-                ("gtrs+nlp", "sqpmethod", 'jit = true, compiler = "shell"', "'jit' is no setting of sqpmethod"),
-                ("gtrs+nlp", "sqpmethod", 'jit_options = { compiler = "true; cc" }', "'jit_options' is no setting"),
-                ("gtrs+nlp", "ipopt", 'output_file = "stray.txt"', "'output_file' is no setting of ipopt"),
-                ("gtrs+nlp", "ipopt", 'option_file_name = "stray.opt"', "'option_file_name' is no setting"),
-                ("gtrs+nlp", "ipopt", 'linear_solver = "ma27"', "'linear_solver' is no setting of ipopt"),
-                ("sdp", "SCS", 'write_data_filename = "stray"', "'write_data_filename' is no setting of SCS"),
+                ("gtrs+nlp", "sqpmethod", 'jit = true, compiler = "shell"', "a study may not set 'jit' of sqpmethod"),
+                (
+                    "gtrs+nlp",
+                    "sqpmethod",
+                    'jit_options = { compiler = "true; cc" }',
+                    "a study may not set 'jit_options'",
+                ),
+                ("gtrs+nlp", "ipopt", 'output_file = "stray.txt"', "a study may not set 'output_file' of ipopt"),
+                ("gtrs+nlp", "ipopt", 'option_file_name = "stray.opt"', "a study may not set 'option_file_name'"),
+                ("gtrs+nlp", "ipopt", 'linear_solver = "ma27"', "a study may not set 'linear_solver' of ipopt"),
+                ("sdp", "SCS", 'write_data_filename = "stray"', "a study may not set 'write_data_filename' of SCS"),
                 ("sdp", "SCS", 'log_csv_filename = "stray.csv"', "a study may set acceleration_interval"),
-                ("sdp", "CLARABEL", 'direct_solve_method = "pardiso"', "'direct_solve_method' is no setting"),
+                ("sdp", "CLARABEL", 'direct_solve_method = "pardiso"', "a study may not set 'direct_solve_method'"),
                 ("sdp", "SCS", "max_iters = -1", "max_iters is -1"),
-                ("sdp", "SCS", "max_iters = 2.5", "it takes a whole number from 1 to 1e+09"),
+                ("sdp", "SCS", "max_iters = 2.5", "give a whole number from 1 to 1e+09"),
                 ("sdp", "SCS", 'eps_abs = "1e-3"', "eps_abs is '1e-3'"),
                 ("sdp", "SCS", "eps_abs = nan", "eps_abs is nan"),
-                ("sdp", "SCS", "normalize = 1", "it takes true or false"),
+                ("sdp", "SCS", "normalize = 1", "give true or false"),
                 ("sdp", "SCS", "eps_abs = true", "eps_abs is True"),
-                ("gtrs+nlp", "fatrop", "max_iter = 3", "a study sets nothing of this solver"),
+                ("gtrs+nlp", "fatrop", "max_iter = 3", "no settings of this solver"),
             ]
         )
     },

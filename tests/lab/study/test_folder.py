@@ -50,7 +50,7 @@ def test_a_full_disk_is_a_sentence_and_the_same_command_goes_on(whole, tmp_path,
         return move(source, target)
 
     monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(InvalidProblem, match=r"No space left on device.*goes on from there"):
+    with pytest.raises(InvalidProblem, match=r"No space left on device.*the same command continues"):
         run_design(design(QUICK), out, HERE)
     monkeypatch.undo()
     assert progress(out).done == 3  # the first file is the manifest
@@ -97,7 +97,7 @@ def test_damaged_parts_are_named_and_computed_again(whole, tmp_path):
     (out / "parts" / ".left.1").write_bytes(b"half")
     victim = next(iter(part_files(out).values()))
     victim.write_bytes(victim.read_bytes()[:100])
-    with pytest.warns(UserWarning, match=f"{victim.name}: the part is damaged, and is made again"):
+    with pytest.warns(UserWarning, match=f"{victim.name}: the part is damaged, and is computed again"):
         assert run_design(design(QUICK), out, HERE).complete
     assert len(told) == len(ways)
     assert not (out / "parts" / ".left.1").exists()
@@ -106,7 +106,7 @@ def test_damaged_parts_are_named_and_computed_again(whole, tmp_path):
 
 @pytest.mark.parametrize(("old", "new"), [("seed = 5", "seed = 6"), ("3 m", "4 m"), ("trials = 60", "trials = 61")])
 def test_the_folder_of_another_study_is_refused(old, new, whole):
-    with pytest.raises(InvalidProblem, match="holds another study"):
+    with pytest.raises(InvalidProblem, match="contains another study"):
         run_design(design(QUICK.replace(old, new)), whole, HERE)
     assert progress(whole).complete
 
@@ -126,9 +126,9 @@ def test_the_folder_of_another_version_is_refused(whole, tmp_path):
 
 def test_folders_that_hold_no_study(tmp_path):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InvalidProblem, match="holds no study"):
+    with pytest.raises(InvalidProblem, match="contains no study"):
         run_design(design(QUICK), tmp_path, HERE)
-    with pytest.raises(InvalidProblem, match="holds no study"):
+    with pytest.raises(InvalidProblem, match="contains no study"):
         progress(tmp_path)
     with pytest.raises(InvalidProblem, match="cannot be written"):
         run_design(design(QUICK), tmp_path / "file" / "out", HERE)
@@ -216,7 +216,7 @@ def test_a_study_does_not_go_on_with_other_data(whole, tmp_path, elsewhere):
     shutil.copytree(whole, out)
     victim = sorted((out / "parts").glob("*.parquet"))[1]
     victim.unlink()
-    with pytest.raises(InvalidProblem, match=r"finished trials of scenario '.*' hold other data than are drawn here"):
+    with pytest.raises(InvalidProblem, match=r"finished trials of scenario '.*' differ from a new simulation"):
         run_design(design(QUICK), out, HERE)
     assert not victim.exists()
 
@@ -231,7 +231,7 @@ def test_parts_that_contradict_each_other_are_refused(whole, tmp_path):
     part.unlink()
     key = part.name.partition(".")[0]
     store(out, TrialPart(key, table.set_column(column, table.schema.field(column), other), {}))
-    with pytest.raises(InvalidProblem, match="hold different data for the same trials"):
+    with pytest.raises(InvalidProblem, match="contain different data for the same trials"):
         run_design(design(QUICK), out, HERE)
 
 
@@ -250,7 +250,7 @@ def test_a_part_with_other_data_is_not_stored(tmp_path, monkeypatch):
                 yield compute(chunk)
 
     monkeypatch.setattr(execute, "compute_all", strays)
-    with pytest.raises(InvalidProblem, match="hold different data for the same trials"):
+    with pytest.raises(InvalidProblem, match="contain different data for the same trials"):
         run_design(made, tmp_path / "out", HERE)
     assert progress(tmp_path / "out").done >= 1
 

@@ -104,7 +104,7 @@ def test_what_a_minimizer_asked_for_stays_when_it_breaks_and_no_number_is_above_
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("suspects", "no cost on its way"), ("cauchy", "no cost"), ("single-step", "no cost"), ("auto", "until certify")],
+    [("suspects", "no history"), ("cauchy", "no history"), ("single-step", "no cost"), ("auto", "until certify")],
 )
 def test_who_does_not_tell_is_said_in_words(name, words):
     found, remark = ways(name)
@@ -176,11 +176,11 @@ def test_what_cannot_be_followed_is_a_sentence(folder, tmp_path):
     held = held.replace('["toa"]', '["azimuth"]').replace(flown, flown.replace("3 m", "1 deg"))
     drawn = draw(design(held).cells[2].case, 0, 2)
     asked = trials_of(folder, [], 2)
-    with pytest.raises(InvalidProblem, match="depend on the place"):
+    with pytest.raises(InvalidProblem, match="depend on the position"):
         histories(type(asked)("t", drawn, asked.methods, asked.least))
     with pytest.raises(InvalidProblem):
         trials_of(tmp_path, [], 3)
-    with pytest.raises(InvalidProblem, match="no method tells its way"):
+    with pytest.raises(InvalidProblem, match="no method has a history"):
         histories(type(asked)("t", DRAWN.part(0, 2), tuple(added(["suspects"])), asked.least))
     with pytest.raises(InvalidProblem, match="is not positive"):
         reach(HAND, float("nan"))

@@ -172,5 +172,5 @@ def test_ctrl_c_is_one_sentence_and_ends_everybody(options, group, tmp_path):
         _, said = run.communicate(timeout=60)
         assert run.returncode == 130, said
         assert said.count("\n") == 1, said
-        assert "goes on from there" in said
+        assert "run the same command to continue" in said
         assert not orphans(out)

@@ -74,7 +74,7 @@ def test_what_is_there_stays_whatever_is_asked_for_next(folder, mine):
         run_design(design(FEW, more=added(more)), folder, HERE, lambda rows, _: told.append(rows))
     assert told == [60, 60]
     assert progress(folder).complete
-    with pytest.raises(InvalidProblem, match="holds another study"):
+    with pytest.raises(InvalidProblem, match="contains another study"):
         run_design(design(FEW.replace("seed = 5", "seed = 6")), folder, HERE)
 
 

@@ -92,8 +92,8 @@ def test_profiles_count_trials_that_nobody_solves_and_only_those_that_all_have_s
         ({"tau": 0.0}, "is not positive"),
         ({"tau": float("nan")}, "is not positive"),
         ({"work": "procesor"}, "did you mean 'processor'"),
-        ({"work": "evaluations"}, "no method of the study tells"),
-        ({"out": ["a", "b"]}, "no method competes"),
+        ({"work": "evaluations"}, "no method of the study counts"),
+        ({"out": ["a", "b"]}, "all methods know the truth"),
     ],
 )
 def test_what_has_no_profile_is_a_sentence(options, words):

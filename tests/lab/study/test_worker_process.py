@@ -209,7 +209,7 @@ def test_of_many_trials_one_is_to_blame(way, tmp_path, monkeypatch):
 
 def test_a_process_that_cannot_begin_is_a_sentence_and_stores_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(worker_process, "_BEGIN", "import sys; sys.exit(7)")
-    with pytest.raises(InvalidProblem, match=r"no process can be begun \(its process ended with exit code 7\)"):
+    with pytest.raises(InvalidProblem, match=r"no process can be started \(its process ended with exit code 7\)"):
         run_design(design(), tmp_path / "out", executor("processes", 1))
     assert not list((tmp_path / "out" / "parts").iterdir())
 
