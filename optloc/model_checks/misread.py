@@ -1,4 +1,7 @@
-"""Values that were read wrongly: units off by a thousand or by the speed of light, signs, compass bearings."""
+"""Detection of misread values: units wrong by a thousand or by the speed of light, signs, compass bearings.
+
+If the values do not fit as they are read, other readings of the values are fitted and compared.
+"""
 
 from __future__ import annotations
 
@@ -21,35 +24,28 @@ from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.noise import Block, Noise, variances
 from optloc.problem.problem import Problem
 
-# Probability of the chi-square test below which the values as they stand do not fit, that of the status `misfit`; and
-# from which they fit once read otherwise.
+# Chi-square probability below which the values do not fit as they are read, equal to the limit of the status `misfit`;
+# and the probability above which they fit with another reading.
 _MISFIT, _FITS = 1e-4, 1e-3
-# Probability, over all readings together, that values without any meaning pass under one of them.
+# Probability, over all readings together, that random values fit with one of the readings.
 _CHANCE = 1e-3
-# Standard deviations by which a value is beyond what is possible.
+# Number of standard deviations beyond which a value is impossible.
 _BEYOND = 6.0
-# Epochs of a run that are read otherwise: what all rows share shows in a few.
+# Number of epochs of a run that are tested: an error of all rows is visible in a few epochs.
 _EPOCHS = 5
-# Readings that are told where several fit.
+# Largest number of reported readings if several fit.
 _TOLD = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Another way to read the values of some kinds: ``z -> shift + factor * z``.
+    """Another interpretation of the values of some kinds: ``z -> shift + factor * z``.
 
-    Parameters
-    ----------
-    cause : str
-        As of `Advice`.
-    kinds : tuple of str
-        Whose values.
-    factor, shift : float
-        SI units and radians.
-    seen, advice : str
-        Sentences.
-    toml : str
-        Keys of ``[[measurements]]``.
+    - cause: keyword, as in `Advice`.
+    - kinds: kinds of the values.
+    - factor, shift: in SI units and radians.
+    - seen, advice: sentences, as in `Advice`.
+    - toml: keys of ``[[measurements]]``.
     """
 
     cause: str
@@ -62,17 +58,13 @@ class Reading:
 
 
 def advise_on_values(problem: Problem, x: Array) -> Iterator[Advice]:
-    """Yield how values were perhaps meant that do not fit as they were read.
+    """Yield advice about values that do not fit as they are read, but fit with another unit, sign or convention.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of one problem or run, whose rows that are present are finite.
-    x : array (1, size)
-        Its fix; NaN where there is none.
+    `problem` is a flat batch of one problem or run with finite values in its present rows. `x` (1, size) is its fix;
+    NaN if there is no fix.
     """
     batch = by_epoch(problem).flat() if separable(problem) else problem
-    # the first epochs with redundancy
+    # use the first epochs with redundancy
     items = np.flatnonzero(degrees_of_freedom(batch) > 0)[:_EPOCHS]
     wrong = list(_impossible(problem))
     if len(items) and one_place(batch):
@@ -81,14 +73,14 @@ def advise_on_values(problem: Problem, x: Array) -> Iterator[Advice]:
         refuted, free = _is_refuted(own, start if start is None else start[items])
         if wrong or refuted:
             held = [] if wrong or free < _FITS else [_without_constraints(own, free)]
-            # what no reading explains is said all the same
+            # impossible values are reported even if no reading explains them
             yield from held or list(_explaining(own)) or wrong
             return
     yield from wrong
 
 
 def _is_refuted(problem: Problem, start: Array | None) -> tuple[bool, float]:
-    """Return whether the values as they stand do not fit any place that is found, and the p-value free of bounds."""
+    """Return whether the values fit no position, and the p-value of the best position without constraints."""
     near = np.inf if start is None or not np.isfinite(start).all() else float(descend(problem, start)[1].sum())
     if _p(problem, near) >= _MISFIT:
         return False, 1.0
@@ -96,11 +88,11 @@ def _is_refuted(problem: Problem, start: Array | None) -> tuple[bool, float]:
 
 
 def _fit(problem: Problem, start: Array | None = None) -> float:
-    """Return the chi-square probability of the best place that is found; equalities are met, other bounds not."""
+    """Return the chi-square probability of the best position; equalities hold, other bounds are ignored."""
     free = fit_anywhere(replace(problem, constraints=()), start)
     cost = float(free.cost.sum())
     if _p(problem, cost) >= _MISFIT and exact(problem):
-        # equalities take most of the time: only what fits without them is asked to meet them
+        # equalities take most of the time: apply them only if the values fit without them
         cost = float(descend(problem, free.x)[1].sum())
     return _p(problem, cost)
 
@@ -112,17 +104,17 @@ def _without_constraints(problem: Problem, p: float) -> Advice:
 
 
 def _p(problem: Problem, cost: float) -> float:
-    """Return the chi-square probability of a batch as a whole; zero where no fit was found or nothing can be tested."""
+    """Return the chi-square probability of a whole batch; zero if no fit was found or nothing can be tested."""
     p = float(tail_probability(np.array([cost]), np.array([degrees_of_freedom(problem).sum()]))[0])
     return p if np.isfinite(p) else 0.0
 
 
 def _explaining(problem: Problem) -> Iterator[Advice]:
-    """Yield the readings under which values fit that would not by chance, the most probable first."""
+    """Yield the readings with a good fit that is unlikely by chance, the most probable reading first."""
     tried = list(_readings(problem))
     found = []
     for one in tried:
-        # noise that is stated in a unit of its own keeps its size
+        # noise that is stated in a separate unit keeps its size
         scaled, stated = _read(problem, one, False), _read(problem, one, True)
         able = [other for other in (scaled, stated) if _by_chance(other) * 2.0 * len(tried) <= _CHANCE]
         if not able or _is_impossible(able[0]):
@@ -130,12 +122,12 @@ def _explaining(problem: Problem) -> Iterator[Advice]:
         p = max(_fit(other) for other in able)
         if p >= _FITS:
             found.append((p, one))
-    # feet and nanoseconds are so alike that both may pass: the better fit comes first
+    # feet and nanoseconds are so similar that both may fit: the better fit comes first
     for p, one in sorted(found, key=lambda each: -each[0])[:_TOLD]:
         yield Advice(one.cause, f"{one.seen} (p = {p:.2g})", one.advice, one.toml)
 
 
-# How values may be read.
+# Possible readings of the values.
 
 
 def _readings(problem: Problem) -> Iterator[Reading]:
@@ -152,7 +144,7 @@ def _readings(problem: Problem) -> Iterator[Reading]:
 
 
 def _length_units(kinds: tuple[str, ...]) -> Iterator[Reading]:
-    """Yield lengths times every ratio of two units, the SI unit first."""
+    """Yield readings of lengths for the ratio of every two units, the SI unit first."""
     table = {name: size * (SPEED_OF_LIGHT if name in _TIMES else 1.0) for name, size in UNITS["length"].items()}
     what = " and ".join(kinds)
     seen_before: list[float] = []
@@ -171,11 +163,11 @@ def _length_units(kinds: tuple[str, ...]) -> Iterator[Reading]:
 
 
 _TIMES = ("s", "ms", "us", "ns", "ps")
-# Units that files say, first that which they say by saying nothing, and units that are meant: feet by those who leave
-# the unit out, thousands by those who take the wrong prefix, times by those who forget the speed of light.
+# Units that a file states, first the unit without a statement; and units that may be meant. Feet occur if the unit is
+# not stated, thousands if the prefix is wrong, and times if the speed of light is missing.
 _SAID = ("m", "s", "ns")
 _MEANT = ("m", "km", "mm", "ft", "s", "ms", "us", "ns")
-# Pairs of units that a sentence names.
+# Largest number of pairs of units in a sentence.
 _SHOWN = 3
 
 
@@ -184,7 +176,7 @@ def _either(pairs: list[str]) -> str:
 
 
 def _angle_readings(kinds: tuple[str, ...]) -> Iterator[Reading]:
-    """Yield azimuths of a compass or looking back, and angles in the other unit."""
+    """Yield readings as compass azimuths, as opposite azimuths, and as angles in the other unit."""
     bearings = tuple(kind for kind in kinds if kind == "azimuth")
     turned = np.pi / 2
     if bearings:
@@ -207,7 +199,7 @@ def _angle_readings(kinds: tuple[str, ...]) -> Iterator[Reading]:
 
 
 def _read(problem: Problem, reading: Reading, stated: bool) -> Problem:
-    """Return the problem with values read otherwise; `stated`: the noise has a unit of its own, and stays."""
+    """Return the problem with another reading of the values. If `stated`, the noise has a separate unit and stays."""
     size = np.ones(problem.count)
     rows = []
     for block, start in zip(problem.rows, problem.starts, strict=True):
@@ -226,18 +218,18 @@ def _read_rows(rows: Rows, reading: Reading) -> Rows:
     return replace(rows, z=z if MODELS[rows.kind].period is None else wrap(z))
 
 
-# What cannot be, and what may be by chance.
+# Impossible values, and fits by chance.
 
 
 def _reach(problem: Problem) -> float:
-    """Return the greatest distance between stations, to within a factor of two, metres."""
+    """Return the largest distance between stations to within a factor of two, m."""
     return 2.0 * float(np.max(centre_and_spread(problem.stations.places)[1]))
 
 
 def _by_chance(problem: Problem) -> float:
-    """Return the probability that values without meaning fit: each spare one within four sigma of where it could be.
+    """Return the probability that random values fit: each redundant value within four sigma of its prediction.
 
-    Lengths could be anywhere within the array, angles anywhere on the circle.
+    Random lengths are anywhere within the array, random angles anywhere on the circle.
     """
     sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count).max(0)
     room = np.concatenate(
@@ -248,7 +240,7 @@ def _by_chance(problem: Problem) -> float:
 
 
 def _beyond(problem: Problem) -> Iterator[tuple[Rows, int, float]]:
-    """Yield kind, row and limit of differences larger than the distance of their stations, and negative ranges."""
+    """Yield rows, number and limit (m) of differences above the distance of their stations, and of negative ranges."""
     sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count)
     observed, weight = (np.reshape(a, (-1, problem.count)) for a in (problem.observed, problem.weight))
     position = problem.stations.position
@@ -269,7 +261,7 @@ def _beyond(problem: Problem) -> Iterator[tuple[Rows, int, float]]:
 
 
 def _is_biased(problem: Problem, part: slice) -> bool:
-    """Return whether a bias of the problem may take rows beyond what is possible."""
+    """Return whether a bias of the problem can move the rows beyond the possible values."""
     return any(((bias.row >= part.start) & (bias.row < part.stop)).any() for bias in problem.biases)
 
 
@@ -278,7 +270,7 @@ def _is_impossible(problem: Problem) -> bool:
 
 
 def _impossible(problem: Problem) -> Iterator[Advice]:
-    """Yield the first value that no place could have, and how many there are."""
+    """Yield advice about the first value that no position can have, and the number of other impossible values."""
     found = list(_beyond(problem))
     if not found:
         return

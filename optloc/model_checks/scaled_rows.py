@@ -1,8 +1,8 @@
-"""The cost over the position of rows with unknown scales, as a sum of squares, near by and infinitely far away.
+"""Cost over the position for rows with unknown scales, as a sum of squares, at any distance and at infinity.
 
 At a fixed position the rows are linear in all other unknowns. The column of an unknown scale is as long as the ranges.
-Far away normal equations lose the digits of this column that differ from the column of an emission time. This module
-projects the rows instead, and it subtracts nothing from a cost.
+For a distant position, normal equations lose the digits in which this column differs from the column of an emission
+time. This module projects the rows instead, and it subtracts nothing from a cost.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from optloc.problem.problem import Problem
 # Least share of a column that must remain after projection. Rounding leaves a hundredth of this share; ranges at ten
 # million spreads leave 1e-7.
 _EXPLAINED = 1e-13
-# Least scale error of ranges: the wave has no speed, and below it the wave would run backwards. Of levels: power would
-# grow with the distance.
+# Lower bound of the scale error of ranges and of levels. For ranges, the wave has no speed at the bound, and below it
+# the wave would run backwards. For levels, power would increase with the distance.
 _STILL = -1.0
-# Greatest exponent of a candidate: it grows with the distance, and differences of logarithms keep seven digits here.
-# Beyond, their rounding explains rows.
+# Largest exponent of a candidate: it increases with the distance, and differences of logarithms keep seven digits here.
+# Beyond it, their rounding explains rows.
 _STEEP = 1e9
 # Thickness of coplanar stations, as a share of their width: rounding of coordinates.
 _FLAT = 1e-9
@@ -91,17 +91,11 @@ def profile_by_rows(problem: Problem, x: Array, at: Array, passes: int) -> tuple
 
 
 def cost_beyond_speed(problem: Problem, x: Array) -> Array:
-    """Return the least cost (N,) of waves whose distance and unknown factor grow together, or infinity.
+    """Return the lowest cost (N,) of waves whose distance and unknown factor increase together, or infinity.
 
-    Stations in a plane of space, or on a line of the plane, see a wave from straight above as a paraboloid. Its bend
-    and tilt stay finite if the factor grows with the distance. A prior on the factor makes such waves expensive.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems of one position.
-    x : array (N, size)
-        Fixes.
+    Stations in a plane of space, or on a line of the plane, receive a wave from straight above as a paraboloid. Its
+    bend and tilt stay finite if the factor increases with the distance. A prior on the factor gives these waves a high
+    cost. `problem` is a flat batch of N problems with one position, and `x` (N, size) are fixes.
     """
     out, free = np.full(len(x), np.inf), _without_prior(problem)
     if problem.constraints or not len(free):
