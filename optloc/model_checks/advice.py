@@ -61,7 +61,9 @@ def advise(problem: Problem, fix: Fix | None = None) -> Any:
         return advise_at(problem, np.full((1, problem.layout.size), np.nan) if fix is None else fix.x)
     flat, out = problem.flat(), np.empty(int(np.prod(shape)), dtype=object)
     if fix is not None and fix.shape != shape:
-        raise InvalidProblem(f"fixes of shape {fix.shape} for problems of shape {shape}", "fix", "give its own")
+        raise InvalidProblem(
+            f"fixes of shape {fix.shape} for problems of shape {shape}", "fix", "give one fix per problem"
+        )
     x = np.full((len(out), problem.layout.size), np.nan) if fix is None else fix.flat().x
     for i in range(len(out)):
         out[i] = advise_at(flat.take(np.array([i])), x[i])
@@ -123,7 +125,7 @@ def explained(problem: Problem, fix: Fix) -> Problem | None:
 def explained_at(problem: Problem, x: Array) -> Problem | None:
     """Return the result of `explained` for a parameter vector with the shapes of `advise_at`."""
     if problem.batch_shape:
-        raise InvalidProblem("there are several problems", "explained", "take them one by one")
+        raise InvalidProblem("a batch of problems was given", "explained", "call it for each problem")
     part, x = _shortened(*_without_unknown(problem.flat(), _joined(problem, np.asarray(x))))
     told = explain_misfit(part, x)
     if not told:
@@ -163,7 +165,9 @@ def _joined(problem: Problem, x: Array) -> Array:
     if x.size == layout.size and x.ndim < 3 and not (separable(problem) and len(x) == problem.epochs > 1):
         return x.reshape(1, -1)
     if not separable(problem) or x.shape != (problem.epochs, by_epoch(problem).layout.size):
-        raise InvalidProblem(f"a fix of shape {x.shape} is not of this problem", "fix", "give the fix of this problem")
+        raise InvalidProblem(
+            f"a fix of shape {x.shape} does not belong to this problem", "fix", "give the fix of this problem"
+        )
     own = by_epoch(problem).layout
     parts = [own.take(x, slot.name).reshape(problem.epochs, -1) for slot in layout.local]
     return np.concatenate(parts, axis=1).reshape(1, -1)
@@ -221,10 +225,10 @@ def _tell(problem: Problem, one: Explained) -> Advice:
     seen = f"{what} of {whose}{rows} of {value} {unit}{when} would explain {better}: p = {one.p_after:.2g}"
     seen += f" with it, {one.p_before:.2g} without"
     if kind == "step":
-        return Advice("step", seen, "cut the run there, or give the rows from then on another station name")
+        return Advice("step", seen, "split the run there, or give the later rows another station name")
     if kind == "burst":
-        return Advice("burst", seen, "leave these rows out, or fix with the method 'robust'")
-    return Advice(kind, seen, "look at that channel; model it until then", _lines(problem, one))
+        return Advice("burst", seen, "remove these rows, or use the method 'robust'")
+    return Advice(kind, seen, "check this channel; until then, model the error", _lines(problem, one))
 
 
 def _size(problem: Problem, one: Explained) -> tuple[str, str]:

@@ -202,10 +202,12 @@ def distance_from_plane(problem: Problem, fix: Fix, level: float = 0.95) -> tupl
     flat, x = problem.flat(), fix.flat().x
     if problem.constraints or not is_coplanar(flat).all():
         raise InvalidProblem(
-            "the sides of no plane fit alike", "problem", "give ranges of stations in one plane, without constraints"
+            "the stations have no plane of symmetry",
+            "problem",
+            "give ranges of stations in one plane, without constraints",
         )
     if not np.isfinite(x).all():
-        raise InvalidProblem("there is no position that an interval could be about", "fix", "see its status for why")
+        raise InvalidProblem("the fix has no position", "fix", "see its status for the reason")
     across = Across.of(flat)
     at = across.to_plane(x)
     _, cost = across.profile(at, at[:, across.part.stop - 1])

@@ -72,7 +72,7 @@ def determined(problem: Problem, fix: Fix) -> Determined:
     """
     if fix.shape != () or int(np.prod(problem.batch_shape)) != 1:
         advice = "take one fix of a batch: `problem.flat().take([i])` and `fix.flat()[i]`"
-        raise InvalidProblem("this describes one fix, and these are several", "fix", advice)
+        raise InvalidProblem("several fixes were given, not one", "fix", advice)
     # in a batch, the weights of a fix with fewer rows are padded
     flat = problem.flat().with_rows(weight=fix.weights[None, : problem.count])
     words = str(fix.reason[()] or "")

@@ -84,8 +84,8 @@ def batch_of(problem: Problem) -> Problem:
     problem = replace(problem, stations=problem.stations.with_noise())
     flat = (by_epoch(problem) if separable(problem) else problem).flat()
     if flat.count > _LARGEST and flat.epochs > 1:
-        what = f"{flat.count} rows share unknowns"
-        raise InvalidProblem(what, "noise", f"use at most {_LARGEST}, or epochs that are fixed one by one")
+        what = f"{flat.count} rows share unknowns, too many for variance components"
+        raise InvalidProblem(what, "noise", f"use at most {_LARGEST}, or epochs that share no unknowns")
     return flat
 
 

@@ -127,8 +127,8 @@ def influences(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()
         If a bias is a random walk: rows of one epoch then have information about the next epoch.
     """
     if walks(problem):
-        what = f"the walk {walks(problem)[0].name!r} ties each epoch to the next, and errors are weighed epoch by epoch"
-        raise InvalidProblem(what, "biases", "fix with a loss such as 'huber', or let the bias be a spline")
+        what = f"the walk {walks(problem)[0].name!r} correlates epochs, but errors are estimated epoch by epoch"
+        raise InvalidProblem(what, "biases", "use a loss such as 'huber', or make the bias a spline")
     layout, size = problem.layout, len(x)
     numbers = [j for j, p in enumerate(problem.priors) if j not in dropped and layout.find(p.name)[1]]
     problem = replace(problem, priors=tuple(p for j, p in enumerate(problem.priors) if j not in dropped))

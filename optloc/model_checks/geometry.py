@@ -76,12 +76,12 @@ def _count_rows(problem: Problem) -> Iterator[Advice]:
     where = f"{count} of {k} epochs {'has' if count == 1 else 'have'}" if k > 1 else "the rows have"
     if least < 0:
         seen = f"{where} {-least} measurement{'s' if least < -1 else ''} fewer than unknowns"
-        yield Advice("redundancy", seen, "add rows, or state what is known: a height, a bias, a prior")
+        yield Advice("redundancy", seen, "add rows, or state known quantities: a height, a bias, a prior")
     elif least == 0:
-        seen = f"{where} no redundancy: every set of values fits, a wrong one as well"
-        yield Advice("redundancy", seen, "add a row, better two: one shows that something is wrong, two show what")
+        seen = f"{where} no redundancy: all values fit, even wrong values"
+        yield Advice("redundancy", seen, "add a row, or better two: one row detects an error, two rows identify it")
     else:
-        seen = f"{where} a redundancy of 1: an error would be noticed, and nobody could say which row has it"
+        seen = f"{where} a redundancy of 1: an error is detectable, but the wrong row is not identifiable"
         yield Advice("redundancy", seen, "add a row")
 
 
@@ -140,16 +140,17 @@ def _see_mirror(problem: Problem, x: Array) -> Iterator[Advice]:
         return
     if d == 3 and flat[1]:
         axis = _spell(shape.axes[:, -1])
-        seen = f"the stations stand on one line along {axis}: a turn about it changes no measurement"
+        seen = f"the stations are on one line along {axis}: a rotation about it changes no measurement"
         yield Advice("line", seen, "add a station off the line, or a bearing or height")
     elif flat[0]:
         name = "plane" if d == 3 else "line"
-        seen = f"the stations stand {'in one plane' if d == 3 else 'on one line'} within the noise ({_off(shape)})"
-        seen += f": every place has a mirror image on the other side of the {name} that fits as well"
+        seen = f"the stations are {'in one plane' if d == 3 else 'on one line'} within the noise ({_off(shape)})"
+        seen += f": every position has a mirror image across the {name} that fits equally well"
         yield Advice(name, seen, _say_side(problem, shape)[0], _say_side(problem, shape)[1])
     elif _mirror_fits(problem, shape, x):
         name = "plane" if d == 3 else "line"
-        seen = f"the mirror image of the fix in the best {name} of the stations ({_off(shape)}) fits about as well"
+        seen = f"the mirror image of the fix in the best-fitting {name} of the stations ({_off(shape)})"
+        seen += " fits almost equally well"
         yield Advice("mirror", seen, _say_side(problem, shape)[0], _say_side(problem, shape)[1])
 
 
@@ -208,19 +209,19 @@ def _mirror_fits(problem: Problem, shape: _Shape, x: Array) -> bool:
 def _say_side(problem: Problem, shape: _Shape) -> tuple[str, str]:
     """Return advice on how to decide between the sides of the plane, and the lines of a problem file for it."""
     if problem.constraints:
-        return "see whether a constraint decides between the two; or add a station off it, a bearing or a height", ""
+        return "check if a constraint excludes one of the two, or add a station off it, a bearing or a height", ""
     normal = shape.axes[:, 0]
     if problem.frame.geodetic:
-        advice = "say that the target is above ground, `--above-ground`, if that is known; or add a station off it"
+        advice = "if the target is above ground, use `--above-ground`; or add a station off it"
         return f"{advice}, a bearing or a height", '[[constraints]]\nkind = "above-ground"\n'
     axis = int(np.argmax(np.abs(normal)))
     if abs(normal[axis]) < _ALONG:
-        return "add a station off it, a bearing, or a constraint that the target meets on one side alone", ""
+        return "add a station off it, a bearing, or a constraint that excludes one side", ""
     # only the user can know the side: the lines select the upper side
     low = ["-inf"] * problem.dimension
     low[axis] = f"{float(shape.centre[axis]):.6g}"
     high, bound = ["inf"] * problem.dimension, ",".join(low)
-    advice = f"say on which side the target is, here {'xyz'[axis]} above {low[axis]} m: "
+    advice = f"state the side of the target, here {'xyz'[axis]} above {low[axis]} m: "
     advice += f"`--box={bound}:{','.join(high)}`; or add a station off it or a bearing"
     box = f'[[constraints]]\nkind = "box"\nmin = [{", ".join(low)}]\nmax = [{", ".join(high)}]\n'
     return advice, box

@@ -135,9 +135,9 @@ def check_kinds(by: str | Sequence[str]) -> tuple[GroupKind, ...]:
     wanted = (by,) if isinstance(by, str) else tuple(by)
     for name in wanted:
         if name not in KINDS:
-            raise InvalidProblem(f"nothing is grouped by {name!r}", "by", nearest(str(name), KINDS))
+            raise InvalidProblem(f"unknown kind of group {name!r}", "by", nearest(str(name), KINDS))
     if not wanted:
-        raise InvalidProblem("nobody is suspected", "by", f"name some of {', '.join(KINDS)}")
+        raise InvalidProblem("no kind of group is given", "by", f"name at least one of {', '.join(KINDS)}")
     return tuple(kind for kind in KINDS if kind in wanted)
 
 

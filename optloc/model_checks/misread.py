@@ -99,8 +99,8 @@ def _fit(problem: Problem, start: Array | None = None) -> float:
 
 def _without_constraints(problem: Problem, p: float) -> Advice:
     names = violation_names(problem)
-    seen = f"the values fit without the constraints ({names}; p = {p:.2g}), and no place that was found meets both"
-    return Advice("constraint", seen, "check their values, and heights for being above the ellipsoid, not the sea")
+    seen = f"the values fit without the constraints ({names}; p = {p:.2g}), but no position was found that meets both"
+    return Advice("constraint", seen, "check their values; heights must be above the ellipsoid, not above the sea")
 
 
 def _p(problem: Problem, cost: float) -> float:
@@ -136,7 +136,7 @@ def _readings(problem: Problem) -> Iterator[Reading]:
     for kind in lengths:
         if MODELS[kind].ranges == (1, -1):
             seen = f"the {kind} values fit with the opposite sign"
-            advice = "say which station is farther where the number is positive (leave the key out if it is there)"
+            advice = "state which station is farther if the number is positive (remove the key if it is there)"
             yield Reading("sign", (kind,), -1.0, 0.0, seen, advice, 'positive = "b-farther"\n')
     for group in dict.fromkeys((lengths, *((kind,) for kind in lengths))):
         yield from _length_units(group) if group else ()
@@ -156,9 +156,9 @@ def _length_units(kinds: tuple[str, ...]) -> Iterator[Reading]:
             if ratio == 1.0:
                 continue
             seen_before.append(ratio)
-            seen = f"the {what} values fit as {meant} where {said} is said, {ratio:.4g} times as large"
+            seen = f"the {what} values fit in {meant} instead of the stated {said}, {ratio:.4g} times as large"
             pairs = [f"{a} for {b}" for b in table for a in table if abs(table[a] / table[b] / ratio - 1.0) < 1e-6]
-            advice = f"state their unit; by its size it may be {_either(pairs)}"
+            advice = f"state their unit; by the ratio it may be {_either(pairs)}"
             yield Reading("unit", kinds, ratio, 0.0, seen, advice, f'unit = "{meant}"\n')
 
 
@@ -180,20 +180,20 @@ def _angle_readings(kinds: tuple[str, ...]) -> Iterator[Reading]:
     bearings = tuple(kind for kind in kinds if kind == "azimuth")
     turned = np.pi / 2
     if bearings:
-        seen = "the azimuths do not meet as they are read, from east counter-clockwise or as stated, and they do as"
-        advice = "state the convention; where it is stated already, leave it out"
+        seen = "the azimuths do not intersect as read (from east counter-clockwise, or as stated), but they do as"
+        advice = "state the convention; if it is already stated, remove it"
         key = 'azimuth = "north-clockwise"\n'
         yield Reading("compass", bearings, -1.0, turned, f"{seen} compass bearings", advice, key)
-        seen = "the azimuths meet behind the stations: they point from the target to the station"
-        advice = "take half a turn off"
+        seen = "the azimuths intersect behind the stations: they point from the target to the station"
+        advice = "subtract half a turn"
         yield Reading("opposite", bearings, 1.0, np.pi, seen, advice, 'correction = "180 deg"\n')
     for said, meant, factor in (("rad", "deg", np.pi / 180.0), ("deg", "rad", 180.0 / np.pi)):
         if kinds:
-            seen = f"the {' and '.join(kinds)} values fit as {meant} where {said} is said"
+            seen = f"the {' and '.join(kinds)} values fit in {meant} instead of the stated {said}"
             key = f'unit = "{meant}"\n'
             yield Reading("unit", kinds, factor, 0.0, seen, "state their unit", key)
         if bearings and said == "rad":
-            seen = "the azimuths fit as compass bearings in degrees where radians from east are said"
+            seen = "the azimuths fit as compass bearings in degrees instead of the stated radians from east"
             both = f'{key}azimuth = "north-clockwise"\n'
             yield Reading("compass", bearings, -factor, turned, seen, "state unit and convention", both)
 
@@ -279,7 +279,9 @@ def _impossible(problem: Problem) -> Iterator[Advice]:
     more = f"; so are {len(found) - 1} more" if len(found) > 1 else ""
     if MODELS[rows.kind].ranges == (1, -1):
         seen = f"the {rows.kind} of {names[rows.a[i]]} and {names[rows.b[i]]} is {value:.4g} m"
-        seen += f", and the two stand {apart:.4g} m apart: no place is that much farther from one{more}"
+        seen += f", but the stations are {apart:.4g} m apart: no position has this difference{more}"
     else:
-        seen = f"the {rows.kind} at {names[rows.a[i]]} is {value:.4g} m, less than any place can have{more}"
-    yield Advice("impossible", seen, "check the unit of the values and of the stations, and the stations' places")
+        seen = f"the {rows.kind} at {names[rows.a[i]]} is {value:.4g} m, less than possible at any position{more}"
+    yield Advice(
+        "impossible", seen, "check the unit of the values and of the stations, and the positions of the stations"
+    )

@@ -81,17 +81,17 @@ class CommonLevel:
     @property
     def sentence(self) -> str:
         """Return the explanation as one sentence without its full stop; empty if no cause was found."""
-        accused = f"{self.accused} of {self.fixes} fixes accuse somebody"
+        accused = f"{self.accused} of {self.fixes} fixes do not fit"
         if self.suspect:
             parts = [
                 f"{f:.2g} times the stated one ({a:.2g} to {b:.2g}){f' in {kind} rows' if len(self.kinds) > 1 else ''}"
                 for kind, f, a, b in zip(self.kinds, self.factor, self.low, self.high, strict=True)
                 if f != 1.0
             ]
-            return f"the noise level is the suspect: {accused}, and {self.left} with {' and '.join(parts)}"
+            return f"the noise level is the suspect: {accused}, but only {self.left} with {' and '.join(parts)}"
         if self.alone:
             what = f"errors of {self.alone} are {self.size:.2g} times as large as stated"
-            return f"{accused}, and what is wrong is {self.alone}: {what}, or biased"
+            return f"{accused}, and the suspect is {self.alone}: {what}, or biased"
         return ""
 
     @property
@@ -300,12 +300,12 @@ class LateSignals:
         """Return the result as one sentence without its full stop; empty if no row is late."""
         if self.alike:
             size = f"{self.offset:.4g} ± {self.offset_error:.2g} m"
-            return f"all {self.alike} rows are late alike, by {size}: that looks like a bias, an offset per kind"
+            return f"all {self.alike} rows are late by the same {size}: model a bias, an offset per kind"
         if not self.share:
             return ""
         text = f"{100.0 * self.share:.2g} % of {self.count} rows are late, by {self.delay:.2g} sigma on average"
         stand = int(self.carried.sum())
-        return text + (f"; {stand} of {len(self.late)} fixes stand on late rows" if stand else "")
+        return text + (f"; {stand} of {len(self.late)} fixes depend on late rows" if stand else "")
 
 
 def late_signals_at(problem: Problem, kept: Array, x: Array) -> LateSignals:

@@ -147,7 +147,7 @@ class ShapeTest:
         return ShapeTest(self.problem.take(items), self.x[items], self.pull[items], self.part, self.face)
 
     def departs(self, moved: Array, sigmas: Array) -> Array:
-        """Return the largest departure (N,) over displacements (N, k, d) of given lengths (N, k) in standard deviations."""
+        """Return the largest departure (N,) over displacements (N, k, d) of lengths (N, k) in standard deviations."""
         most = max(1, _PART // max(1, moved.shape[1]))
         if len(moved) > most:
             parts = [slice(i, i + most) for i in range(0, len(moved), most)]

@@ -140,7 +140,7 @@ def fit(made: Elements, left: Array, single: Array) -> VarianceFit:
     group, none = number[made.of_effect], np.zeros(count, dtype=bool)
     if not (tested(made, np.ones(())).dof > 0).any():
         advice = "add rows, stations or known heights"
-        raise InvalidProblem("no fix has more rows than unknowns: nothing shows the noise", "noise", advice)
+        raise InvalidProblem("no fix has more rows than unknowns, so the noise cannot be estimated", "noise", advice)
     # One factor for all groups. If the data do not determine it, they determine no factor.
     alike = _maximise(made, np.minimum(group, 0), np.zeros(1), none[:1], np.zeros(1))
     begin = np.full(count, np.log(alike.variance[0]))
