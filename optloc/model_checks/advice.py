@@ -43,8 +43,7 @@ def advise(problem: Problem, fix: Fix | None = None) -> Any:
         One problem, a run, or a batch (...) of problems.
     fix : Fix, optional
         The fix of the problem, (k,) fixes of a run whose epochs share nothing, or the fixes of the batch. Without it,
-        the
-        check uses the geometry, and compares values with a new fit.
+        the check uses the geometry, and compares values with a new fit.
 
     Returns
     -------

@@ -50,8 +50,7 @@ class CommonLevel:
         Kinds of rows.
     factor, low, high : array (k,)
         Factor of the stated standard deviation of each kind and its interval of 95 %. The factor is 1 if the noise is
-        not
-        the suspect, or if only other kinds are.
+        not the suspect, or if only other kinds are.
     suspect : bool
         Whether the noise is the suspect.
     alone : str

@@ -120,7 +120,7 @@ def _assign(sets: Sets) -> Array:
 
     owner, number, wanted = [], [], []
     for target, own in enumerate(sets.score):
-        # The empty set is the first one and conflicts with no set: sets with a higher score are not needed.
+        # The empty set is the first set and conflicts with no set: sets with a higher score are not needed.
         better = np.flatnonzero(own < own[0])
         better = better[np.argsort(own[better], kind="stable")][:_RIVALS]
         numbers = np.concatenate([[0], better])
@@ -157,8 +157,7 @@ class Clutter:
         Probability that a target is detected in a channel, between 0 and 1, both excluded.
     density : float or mapping of str to float
         Mean number of false rows of a channel and scan per unit of the measurement (SI units or radians), for all kinds
-        or
-        by kind.
+        or by kind.
     width : float
         Half width of the gate of single rows, in standard deviations of the innovation.
     """
@@ -169,12 +168,12 @@ class Clutter:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.detection < 1.0:
-            what = f"a probability of detection of {self.detection}"
+            what = f"the probability of detection is {self.detection}"
             raise InvalidProblem(what, "detection", "give a number between 0 and 1")
         densities = self.density.values() if isinstance(self.density, Mapping) else (self.density,)
         if not all(np.isfinite(value) and value > 0.0 for value in densities):
             advice = "give the mean number of false rows of a channel and scan for each metre or radian, above 0"
-            raise InvalidProblem(f"a density of false rows of {self.density}", "density", advice)
+            raise InvalidProblem(f"the density of false rows is {self.density}", "density", advice)
         check_width(self.width)
 
     def of(self, scan: Problem) -> Array:
@@ -183,7 +182,9 @@ class Clutter:
         for block in scan.rows:
             density = self.density.get(block.kind) if isinstance(self.density, Mapping) else self.density
             if density is None:
-                raise InvalidProblem(f"no density of false {block.kind} rows is given", "density", "give one")
+                raise InvalidProblem(
+                    f"no density of false {block.kind} rows is given", "density", "add the kind to the mapping"
+                )
             values.append(np.full(block.count, float(density)))
         return np.concatenate(values)
 

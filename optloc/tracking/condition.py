@@ -68,7 +68,9 @@ class Recent:
     def sentence(self) -> str:
         """Return a sentence about the size of the innovations."""
         times = np.sqrt(self.share * self.most)
-        return f"the innovations of the last {len(self.scans)} scans are {times:.2g} times as large as stated"
+        return (
+            f"the innovations of the last {len(self.scans)} scans are {times:.2g} times as large as their stated sigmas"
+        )
 
     def judge(self, entry: Entry) -> Entry:
         """Return the entry of a scan; if its status is ok, the status that follows from the last scans replaces it."""
@@ -82,12 +84,12 @@ _RECENTLY = (
     Finding(
         Status.MISFIT,
         lambda recent: recent.lasting > _LASTING,
-        lambda recent: [f"errors that last for many scans are {recent.lasting:.2g} times as large as stated"],
+        lambda recent: [f"errors that last for many scans are {recent.lasting:.2g} times as large as the stated noise"],
     ),
     Finding(
         Status.AMBIGUOUS,
         lambda recent: recent.rivals,
-        lambda recent: [f"{recent.rivals} other state{'s' * (recent.rivals > 1)} of the start may be the right one"],
+        lambda recent: [f"{recent.rivals} other state{'s' * (recent.rivals > 1)} of the start may be the right state"],
     ),
 )
 """Findings about a scan from the scans before it."""

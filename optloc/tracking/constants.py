@@ -87,8 +87,8 @@ def _check(problem: Problem) -> None:
     # A bias that changes with time is not constant within a scan: its model would need the time.
     changing = next((bias for bias in problem.biases if form_of(bias).changes), None)
     if changing is not None:
-        what = f"the {changing.form} {changing.name!r} changes in time"
-        raise InvalidProblem(what, "track", "learn it first, then `with_known_bias`")
+        what = f"the {changing.form} {changing.name!r} changes with time"
+        raise InvalidProblem(what, "track", "estimate it first, then call `with_known_bias`")
 
 
 def _with_constants(dynamics: Dynamics, constants: int) -> Dynamics:

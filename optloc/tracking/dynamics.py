@@ -64,7 +64,7 @@ def polynomial(order: int, noise: float = 0.0) -> Dynamics:
     if order not in (0, 1, 2):
         raise InvalidProblem(f"a motion of order {order}", "order", "use 0, 1 or 2")
     if not (np.isfinite(noise) and noise >= 0.0):
-        raise InvalidProblem(f"process noise of {noise}", "noise", "give a standard deviation of at least 0")
+        raise InvalidProblem(f"the process noise is {noise}", "noise", "give a standard deviation of at least 0")
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
         return *_polynomial(order, noise, dt, d), np.zeros(mean.shape)
@@ -108,8 +108,7 @@ def current_statistical(time_constant: float, limit: float, floor: float = 0.0) 
         Seconds.
     limit : float
         Largest acceleration of an axis, m/s^2; three or four times the expected acceleration. Estimates near the limit
-        or
-        beyond it count as 5 % away from it, because the published variance is zero or unbounded there.
+        or beyond it count as 5 % away from it, because the published variance is zero or unbounded there.
     floor : float
         Smallest standard deviation of the acceleration, m/s^2.
 
@@ -121,7 +120,7 @@ def current_statistical(time_constant: float, limit: float, floor: float = 0.0) 
     alpha = 1.0 / _positive(time_constant, "time_constant")
     _positive(limit, "limit")
     if not (np.isfinite(floor) and floor >= 0.0):
-        raise InvalidProblem(f"a floor of {floor}", "floor", "give a standard deviation of at least 0")
+        raise InvalidProblem(f"the floor is {floor}", "floor", "give a standard deviation of at least 0")
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
         F, Q, u = correlated(alpha, dt)

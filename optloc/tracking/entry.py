@@ -23,12 +23,11 @@ class Rules:
         Rows more than this many standard deviations from the prediction are rejected; infinite for no gate.
     patience : int
         A track ends after this number of successive scans in which most rows were rejected. It also ends after four
-        times
-        this number of scans if half of the rows were rejected, or if the innovations are as large as in this case.
+        times this number of scans if half of the rows were rejected, or if the innovations are as large as in this
+        case.
     gap : float, optional
         Seconds without a valid row after which a track ends. Without this value, a track ends when the standard
-        deviation
-        of the predicted position exceeds both the spread of the stations and the range of the target.
+        deviation of the predicted position exceeds both the spread of the stations and the range of the target.
     speed, rate : float, optional
         Prior standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, for starts.
     starts : str
@@ -58,13 +57,11 @@ class Entry:
         Seconds.
     updated : Updated
         State after the scan, NIS and number of used rows; NaN before the first start. The covariance includes errors
-        that
-        last for many scans.
+        that last for many scans.
     code : Status
         Ok. Too few rows: no valid row, the state is only predicted. Rejected: most rows failed the gate or are not
-        finite.
-        Misfit: innovations or lasting errors are much larger than stated. Unbounded: the position is too uncertain.
-        Ambiguous: the start has alternatives. Numerical: the update failed.
+        finite. Misfit: innovations or lasting errors are much larger than stated. Unbounded: the position is too
+        uncertain. Ambiguous: the start has alternatives. Numerical: the update failed.
     rejected : int
         Number of rejected rows.
     event : "starting", "started", "restarted" or ""

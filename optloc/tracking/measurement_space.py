@@ -33,8 +33,8 @@ def lines(problem: Problem, order: int = 1, window: int | None = None) -> Track:
 
     At each epoch, a polynomial in time is fitted to every row of the epochs so far. Its present values are solved like
     the scan of one epoch, without a guess. The noise is averaged before any linearisation. But the measurements must be
-    close to the polynomial. Order 0 is the maximum-likelihood fix of a static target if one epoch has as many rows as
-    the position has coordinates.
+    close to the polynomial. Order 0 is the maximum-likelihood fix of a static target if one epoch has
+    at least one row per coordinate of the position.
 
     Parameters
     ----------
@@ -80,18 +80,18 @@ def lines(problem: Problem, order: int = 1, window: int | None = None) -> Track:
 
 def _check_lines(problem: Problem, order: int, window: int | None) -> None:
     if order not in (0, 1, 2):
-        raise InvalidProblem(f"a polynomial of order {order}", "order", "use 0, 1 or 2")
+        raise InvalidProblem(f"the order of the polynomial is {order}", "order", "use 0, 1 or 2")
     if problem.stations.position.shape[-3] > 1:
         raise InvalidProblem(
-            "the stations move", "lines", "their measurements bend even of a still target: use a filter"
+            "the stations move", "lines", "their measurements are no polynomials in time: use a filter"
         )
     if problem.constraints or problem.priors:
-        raise InvalidProblem("there are constraints or priors", "lines", "leave them out, or use a filter")
+        raise InvalidProblem("there are constraints or priors", "lines", "remove them, or use a filter")
     if problem.stations.errors:
         raise InvalidProblem("station positions or velocities have errors", "lines", "use a filter")
     if problem.epochs <= order or (window is not None and window <= order):
         raise InvalidProblem(
-            f"too few epochs for a polynomial of order {order}", "lines", "give more, or a wider window"
+            f"too few epochs for a polynomial of order {order}", "lines", "give more epochs, or a longer window"
         )
 
 
@@ -215,8 +215,7 @@ def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, f
     ----------
     problem : Problem
         Batch (...) of runs: range sums of one pair of static stations, azimuth and elevation at one of them, each once
-        per
-        epoch. An epoch without all three does not change the state.
+        per epoch. An epoch without all three does not change the state.
     restart : int, optional
         Number of epochs after which the recursion starts again; None for never.
     mean : int
@@ -287,8 +286,8 @@ def _check_smoothing(restart: int | None, mean: int, floor: float) -> None:
 def _receiver(problem: Problem) -> int:
     found = pair(problem)
     if found is None:
-        advice = "give range_sum of one pair of stations that stay, azimuth and elevation at one of them, once an epoch"
-        raise InvalidProblem("the rows are not those of one receiver and one illuminator", "simplified", advice)
+        advice = "give range_sum of one pair of static stations, azimuth and elevation at one of them, once per epoch"
+        raise InvalidProblem("the rows do not belong to one receiver and one illuminator", "simplified", advice)
     return found[0]
 
 

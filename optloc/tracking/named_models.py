@@ -34,11 +34,11 @@ class MotionModel:
 MOTIONS = {
     "cv": MotionModel(1.0, "constant velocity, driven by an acceleration", lambda noise, _: polynomial(1, noise)),
     "ca": MotionModel(1.0, "constant acceleration, driven by a jerk", lambda noise, _: polynomial(2, noise)),
-    "static": MotionModel(0.0, "a target that stays, driven by a velocity", lambda noise, _: polynomial(0, noise)),
-    "singer": MotionModel(1.0, "Singer's: an acceleration that lasts", lambda noise, memory: singer(memory, noise)),
+    "static": MotionModel(0.0, "a static target, driven by a velocity", lambda noise, _: polynomial(0, noise)),
+    "singer": MotionModel(1.0, "Singer: a correlated acceleration", lambda noise, memory: singer(memory, noise)),
     "csm": MotionModel(
         10.0,
-        "current statistical: Singer's about the present acceleration; the noise is its largest acceleration",
+        "current statistical: Singer about the present acceleration; the noise is the largest acceleration",
         lambda noise, memory: current_statistical(memory, noise),
     ),
 }

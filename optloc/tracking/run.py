@@ -84,8 +84,7 @@ def track(
     ------
     InvalidProblem
         If the model or the filter is unknown, the times do not increase, there are several targets, or the start does
-        not
-        fit. `optloc.tracking.alone` separates several targets.
+        not fit. `optloc.tracking.alone` separates several targets.
     """
     dynamics = motion_named(model) if isinstance(model, str) else model
     run = differences(problem) if problem.emitting else problem
@@ -123,8 +122,7 @@ def tracked(
     ------
     InvalidProblem
         If the filter is unknown, the times do not increase, the run has several targets, or the given state does not
-        fit
-        the dynamics or contradicts the first scan.
+        fit the dynamics or contradicts the first scan.
     """
     rule = filter_of(update)
     check_trackable(problem)
@@ -180,7 +178,7 @@ class _TrackRun:
         """Return the prepared run; `broken` (m,) marks rows that are not finite."""
         bad = np.bincount(problem.epoch[broken], minlength=problem.epochs).tolist()
         problem = with_height_rows(problem)
-        # An infinite gate would make NaN in the compiled code; the largest number has the same effect.
+        # An infinite gate would not reject rows with a NaN innovation; the largest number rejects only these.
         gate, how = min(rules.gate, float(np.finfo(float).max)), None
         if isinstance(rule, Filter):
             own = min(gate, rule.how.gate)
@@ -329,7 +327,7 @@ _FINDINGS = (
     Finding(
         Status.REJECTED,
         lambda t: t.rejected > t.count,
-        lambda t: [f"{t.rejected} of {t.rejected + t.count} rows were left out"],
+        lambda t: [f"{t.rejected} of {t.rejected + t.count} rows were rejected"],
     ),
     Finding(
         Status.NUMERICAL,
@@ -388,11 +386,11 @@ class Follower:
         """
         check_trackable(scan)
         if scan.batch_shape or scan.epochs != 1:
-            raise InvalidProblem("this is not a single scan", "track", "give one epoch after the other")
+            raise InvalidProblem("the problem is not a single scan", "track", "give one epoch per call")
         time = float(scan.times[0])
         if not time > self.last:
-            what = f"the scan at {time:.10g} s follows one at {self.last:.10g} s"
-            raise InvalidProblem(what, "times", "give scans in the order of time, and one for each time")
+            what = f"the scan at {time:.10g} s follows the scan at {self.last:.10g} s"
+            raise InvalidProblem(what, "times", "give scans in the order of time, one scan per time")
         run = [*self._waiting, scan]
         if len(run) < self._needed:
             self._waiting, self.last = run, time
@@ -404,7 +402,7 @@ class Follower:
         self._needed = 1
         try:
             for entry in stretch.entries(course, ends=len(run) >= _WAITING):
-                done.append(entry)  # entries before an undecided start are kept
+                done.append(entry)  # noqa: PERF402  # entries before an undecided start are kept
         except Undecided as undecided:
             self._needed = undecided.scans - len(done)
         self._course, self._waiting, self.last = course, run[len(done) :], time
@@ -422,18 +420,18 @@ def _clean(problem: Problem) -> tuple[Problem, Array]:
 
 def _check_run(problem: Problem) -> None:
     if problem.batch_shape:
-        raise InvalidProblem("there are several runs", "track", "take them one by one, or use `followed`")
+        raise InvalidProblem("a batch of runs was given", "track", "call it for each run, or use `followed`")
     steps = np.flatnonzero(~(np.diff(problem.times) > 0.0))
     if len(steps):
         one, two = problem.times[steps[0]], problem.times[steps[0] + 1]
-        what = f"the scan at {two:.10g} s follows one at {one:.10g} s"
-        raise InvalidProblem(what, "times", "sort the scans by time, and give one scan for each time")
+        what = f"the scan at {two:.10g} s follows the scan at {one:.10g} s"
+        raise InvalidProblem(what, "times", "sort the scans by time, and give one scan per time")
 
 
 def _check_start(start: State, problem: Problem, dynamics: Dynamics) -> None:
     check_state(start, (dynamics.order + 1) * problem.dimension)
     if start.time > problem.times[0]:
-        what = f"the state holds at {start.time:.10g} s, after the first scan at {problem.times[0]:.10g} s"
+        what = f"the state belongs to {start.time:.10g} s, after the first scan at {problem.times[0]:.10g} s"
         raise InvalidProblem(what, "start", "give the state at or before the first scan")
 
 
@@ -442,5 +440,5 @@ def _check_agrees(entry: Entry) -> None:
     p_value = tail_probability(entry.updated.nis, entry.updated.count)  # NaN without a row
     if entry.code == Status.REJECTED or p_value < _ABSURD:
         what = f"the initial state contradicts the first scan, at {entry.time:.10g} s"
-        advice = "correct it, make its standard deviation larger, or leave it out: a start needs no guess"
+        advice = "correct it, increase its standard deviation, or remove it: a start needs no guess"
         raise InvalidProblem(what, "start", advice)

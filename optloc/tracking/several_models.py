@@ -209,7 +209,9 @@ def _transition(transition: Array, count: int) -> Array:
     # Rows with three digits, such as 0.333, do not add up to one: they are refused, not scaled.
     if not good or not np.allclose(chain.sum(-1), 1.0, atol=1e-9):
         raise InvalidProblem(
-            f"the transition is no {count} x {count} table of probabilities", "transition", "let each row add up to one"
+            f"the transition is not a {count} x {count} table of probabilities",
+            "transition",
+            "make the sum of each row 1",
         )
     return chain
 
@@ -270,7 +272,7 @@ def _widened(done: Updated, n: int) -> tuple[Array, Array]:
 def check_models(models: Sequence[Dynamics]) -> None:
     """Raise InvalidProblem for an empty list of models."""
     if not models:
-        raise InvalidProblem("there are no models of motion", "models", "give at least one")
+        raise InvalidProblem("there are no models of motion", "models", "give at least one model")
 
 
 def resized(

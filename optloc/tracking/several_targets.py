@@ -112,8 +112,7 @@ class RowCandidates:
     ----------
     channels : Problem
         A run of one target with one row for each channel (kind and stations) and epoch. Its measurements are ignored,
-        and
-        it has no batch axes.
+        and it has no batch axes.
     z : array (..., m, c)
         Values measured in the channel of each row, SI units or radians; NaN if there are fewer than c values.
     """
@@ -165,11 +164,11 @@ def candidates(problem: Problem) -> RowCandidates:
 def _check(given: RowCandidates) -> RowCandidates:
     """Return candidates minus known corrections; raise InvalidProblem if they do not fit their channels."""
     if given.channels.batch_shape != ():
-        advice = "track runs with stations or noise of their own one by one"
+        advice = "track runs with different stations or noise separately"
         raise InvalidProblem("the channels have batch axes", "candidates", advice)
     if given.z.ndim < 2 or given.z.shape[-2] != given.channels.count or not given.z.shape[-1]:
-        what = f"candidates of shape {given.z.shape} for {given.channels.count} channels"
-        raise InvalidProblem(what, "candidates", "give (..., m, c), c at least 1")
+        what = f"the candidates have shape {given.z.shape}, but there are {given.channels.count} channels"
+        raise InvalidProblem(what, "candidates", "give shape (..., m, c) with c at least 1")
     correction = np.concatenate([block.correction for block in given.channels.rows])
     if not correction.any():
         return given
@@ -232,7 +231,7 @@ def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
         If no row is kept.
     """
     if not kept.any():
-        raise InvalidProblem("the target has no rows", "track", "name a target that was measured")
+        raise InvalidProblem("the target has no rows", "track", "select a target with measurements")
     epochs = np.unique(problem.epoch[kept])
     number = np.full(problem.epochs, -1)
     number[epochs] = np.arange(len(epochs))

@@ -1,4 +1,4 @@
-"""Initial states of tracks: a fix of one epoch, or of as many epochs as determine a velocity."""
+"""Initial states of tracks: a fix of one epoch, or of several epochs that determine a velocity."""
 
 from __future__ import annotations
 
@@ -126,7 +126,9 @@ def two_point(first: Fix, second: Fix, times: tuple[float, float]) -> State:
     # The error of the second fix is in both parts of the state, so its covariance correlates velocity and position.
     T = times[1] - times[0]
     if not T > 0.0:
-        raise InvalidProblem(f"fixes at {times[0]} and {times[1]} s", "times", "give the earlier fix first")
+        raise InvalidProblem(
+            f"the fixes at {times[0]} and {times[1]} s are not in order", "times", "give the earlier fix first"
+        )
     one, two = first.covariance(), second.covariance()
     mean = np.concatenate([second.position, (second.position - first.position) / T], axis=-1)
     upper = np.concatenate([two, two / T], axis=-1)
@@ -135,7 +137,7 @@ def two_point(first: Fix, second: Fix, times: tuple[float, float]) -> State:
 
 
 def counts(epochs: int, order: int, speed: float | None = None, rate: float | None = None) -> list[int]:
-    """Return the numbers of first epochs that a start tries, each larger by half than the one before; see `begun`."""
+    """Return the numbers of first epochs that a start tries, each half larger than the number before; see `begun`."""
     # With a prior of every rate, one epoch may be enough; otherwise a state of order q needs at least q + 1 scans.
     known = speed is not None and (order < 2 or rate is not None)
     count = 1 if order == 0 or known else order + 1
@@ -200,7 +202,7 @@ def with_height_rows(problem: Problem) -> Problem:
         return problem
     other = next((c for c in exact if c.kind != "height"), None)
     if other is not None:
-        advice = "give bounds, or solve the run as one problem"
+        advice = "replace it by bounds, or solve the run as one problem"
         raise InvalidProblem(f"the constraint {other.name!r} is an equality", "track", advice)
     heard = np.unique(problem.epoch[problem.weight > 0.0])
     m, none = len(heard), np.full(len(heard), -1)
@@ -241,7 +243,7 @@ class Beginning:
     rivals: tuple[Rival, ...] = ()
 
 
-class Undecided(Exception):  # not an error: more scans will follow
+class Undecided(Exception):  # noqa: N818  # no error: more scans follow
     """Raised if a start needs more scans than have arrived; `scans` is the necessary number of scans of the run."""
 
     def __init__(self, scans: int) -> None:
@@ -335,7 +337,7 @@ def begin(
         return replace(start, rivals=tuple(_rivals(posed, best)))
     if verdict == Status.CONTRADICTORY:  # these scans contradict each other; later scans may agree
         return Beginning(last, None, Status.REJECTED, Status.REJECTED, "the rows of the scans contradict each other")
-    reason = f"the scans that are left do not determine a state: {verdict.label}"
+    reason = f"the remaining scans do not determine a state: {verdict.label}"
     return Beginning(problem.epochs - 1, None, verdict, verdict, reason)
 
 
@@ -367,7 +369,7 @@ _FINDINGS = (
         lambda start: [f"the start has {start.others} alternative{'s' if start.others > 1 else ''}"],
     ),
     # the last possible reason
-    Finding(Status.CURVED, lambda start: True, lambda start: ["the covariance of the start does not cover"]),
+    Finding(Status.CURVED, lambda start: True, lambda start: ["the covariance of the start is not valid"]),
 )
 """Findings about a start with a doubtful state."""
 
@@ -440,4 +442,4 @@ def out_of_sight(problem: Problem, mean: Array, cov: Array) -> str:
     centre, spread = centre_and_spread(problem.stations.places.reshape(-1, d))
     if sigma <= max(_SPREADS * float(spread), _SHARE * float(np.linalg.norm(mean[:d] - centre))):
         return ""
-    return f"the position is uncertain by {sigma:.3g} m, and the stations are spread by {float(spread):.3g} m"
+    return f"the position is uncertain by {sigma:.3g} m, but the spread of the stations is {float(spread):.3g} m"

@@ -62,8 +62,7 @@ class Track:
         Log-likelihood of each scan given the prediction.
     code : int array (..., k)
         `Status` of each scan. Ok. Too few rows: no valid row, the state is only predicted. Rejected: rows failed the
-        gate
-        or are not finite. Numerical: the state is lost.
+        gate or are not finite. Numerical: the state is lost.
     dimension : int
         2 or 3.
     """
@@ -86,7 +85,7 @@ class Track:
     def velocity(self) -> Array:
         """Return the velocities (..., k, d), metres per second; raise InvalidProblem for a static target."""
         if self.mean.shape[-1] < 2 * self.dimension:
-            raise InvalidProblem("the state has no velocity", "velocity", "track with a moving model")
+            raise InvalidProblem("the state has no velocity", "velocity", "use a model of motion with velocity")
         return self.mean[..., self.dimension : 2 * self.dimension]
 
     def states(self, order: str) -> tuple[Array, Array]:
@@ -100,7 +99,7 @@ class Track:
         Raises
         ------
         InvalidProblem
-            If the state has no such component.
+            If the state has no component of this name.
         """
         return in_order(order, self.dimension, self.mean, self.cov)
 
@@ -284,7 +283,7 @@ def _keep(ahead: State) -> Updated:
 def collect(times: Array, steps: list[tuple[Updated, Array]], dimension: int) -> Track:
     """Return the updates and statuses of all scans as a track."""
     if not steps:
-        raise InvalidProblem("no scan is later than the start", "start", "start before the last scan")
+        raise InvalidProblem("no scan is later than the start", "start", "give a start before the last scan")
 
     def stacked(name: str, core: int) -> Array:
         return np.stack([getattr(done, name) for done, _ in steps], axis=-1 - core)
@@ -333,12 +332,14 @@ def scan_at(problem: Problem, k: int, order: int) -> Problem:
 def check_trackable(problem: Problem) -> None:
     """Raise InvalidProblem with advice if a tracker of one target cannot use the run."""
     if len(problem.motions) > 1:
-        raise InvalidProblem("there are several targets", "track", "track them one by one")
+        raise InvalidProblem("there are several targets", "track", "track each target separately")
     if problem.biases:
-        advice = "learn it first, then `with_known_bias`"
+        advice = "estimate it first, then call `with_known_bias`"
         raise InvalidProblem(f"the bias {problem.biases[0].name!r} is unknown", "track", advice)
     if problem.emitting:
-        raise InvalidProblem("emission times are unknown", "track", "take differences with `optloc.engine.reduce`")
+        raise InvalidProblem(
+            "emission times are unknown", "track", "convert to differences with `optloc.engine.reduce`"
+        )
     if problem.stations.unknown_for:
         raise InvalidProblem("station offsets are unknown", "stations", 'give their errors span = "noise"')
 
@@ -347,14 +348,14 @@ def check_state(state: State, n: int) -> None:
     """Raise InvalidProblem for a state of the wrong size, or with an invalid covariance."""
     if state.mean.shape[-1:] != (n,) or state.cov.shape[-2:] != (n, n):
         raise InvalidProblem(
-            f"a state of {state.mean.shape[-1]} numbers and a covariance of {state.cov.shape[-2:]} for {n} unknowns",
+            f"{n} unknowns, but a state of {state.mean.shape[-1]} numbers and a covariance {state.cov.shape[-2:]}",
             "start",
-            "give position, velocity and acceleration as the dynamics have them",
+            "give position, velocity and acceleration as in the dynamics",
         )
     if not (np.isfinite(state.mean).all() and np.isfinite(state.cov).all()):
-        raise InvalidProblem("the state is not finite", "start", "start from a fix that has an answer")
+        raise InvalidProblem("the state is not finite", "start", "start from a fix with an answer")
     if (np.linalg.eigvalsh(state.cov)[..., 0] < -_NEGATIVE * np.abs(state.cov).max((-1, -2))).any():
-        raise InvalidProblem("the covariance is not positive semidefinite", "start", "give a true covariance")
+        raise InvalidProblem("the covariance is not positive semidefinite", "start", "give a valid covariance")
 
 
 def status_of_scans(fix: Fix) -> Array:

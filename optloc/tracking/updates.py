@@ -394,4 +394,6 @@ def weights_within(scan: Problem, mean: Array, cov: Array, width: float) -> Arra
 def check_width(width: float) -> None:
     """Raise InvalidProblem if the width of a gate is not positive."""
     if not width > 0.0:
-        raise InvalidProblem(f"the gate is {width} wide", "width", "give a number of standard deviations above 0")
+        raise InvalidProblem(
+            f"the width of the gate is {width}", "width", "give a number of standard deviations above 0"
+        )

@@ -79,10 +79,8 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
     -------
     Track
         States at the scans given all scans. `nis` is the contribution of the rows of a scan to the chi-square of the
-        fit.
-        The status of a scan is the status of the fit (see `optloc.tracking.track.status_of_scans`), or too few rows for
-        a
-        scan without a row.
+        fit. The status of a scan is the status of the fit (see `optloc.tracking.track.status_of_scans`), or too few
+        rows for a scan without a row.
 
     Raises
     ------
