@@ -212,6 +212,7 @@ def _noun(one: Candidate) -> str:
 
 
 def _tell(problem: Problem, one: Explained) -> Advice:
+    """Return the advice about a systematic error: its form, channel, size, duration and p-values."""
     bias, who = one.candidate.bias, one.candidate
     value, unit = _size(problem, one)
     station = bias.members[0]

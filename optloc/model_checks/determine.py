@@ -267,6 +267,7 @@ def _ellipse(a: Array, b: Array, total: float) -> Array:
 
 
 def _across(along: Array) -> Array:
+    """Return a vector in the plane, rotated counter-clockwise by a right angle."""
     return np.array([-along[1], along[0]])
 
 

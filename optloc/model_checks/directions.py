@@ -263,6 +263,7 @@ def edge(view: View, start: tuple[Array, Array], ways: Array, least: float, rise
 
 
 def _root(cost: Array, least: float) -> Array:
+    """Return the square root of the rise of costs above the lowest cost, in standard deviations."""
     return np.sqrt(np.maximum(cost - least, 0.0))
 
 

@@ -108,6 +108,7 @@ def elements(problem: Problem, x: Array, by: By, common: By | None = None) -> El
 
 
 def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str, float]]) -> Elements:
+    """Return the elements of a part of a batch at the fixes x (n, size); `common` as in `elements`, with sigmas."""
     count, rows = len(x), problem.count
     present = np.broadcast_to(problem.weight > 0.0, (count, rows))
     residual, jacobian = _linearise(problem, x)
@@ -349,6 +350,7 @@ def ends_of(problem: Problem, by: By) -> Ends:
 
 
 def _ends(problem: Problem, kind: str, a: Array, b: Array, by: By) -> tuple[Array, Array]:
+    """Return the group names and signs (m, 2) of rows of one kind with the stations a and b (m,)."""
     name, sign = np.full((len(a), 2), "", dtype=object), np.zeros((len(a), 2))
     model = MODELS[kind]
     if by == "kind" or model.stations == 0:
@@ -381,6 +383,7 @@ def station_names(problem: Problem, kind: str) -> Array:
 
 
 def _suffix(problem: Problem, kind: str) -> str:
+    """Return the suffix " kind" of the names of groups if stations measure several kinds, else an empty text."""
     several = sum(MODELS[rows.kind].stations > 0 for rows in problem.rows) > 1
     return f" {kind}" if several else ""
 

@@ -184,6 +184,7 @@ def _is_flat(problem: Problem, shape: _Shape, axis: int) -> bool:
 
 
 def _off(shape: _Shape) -> str:
+    """Return a text with the RMS distance of the stations from their plane, and their extent."""
     off, size = float(np.sqrt((shape.height**2).mean())), float(shape.extent[-1])
     return f"{off if off > _ROUNDING * size else 0.0:.2g} m off it, over {size:.3g} m"
 
@@ -228,4 +229,5 @@ def _say_side(problem: Problem, shape: _Shape) -> tuple[str, str]:
 
 
 def _spell(vector: Array) -> str:
+    """Return a vector as text with two decimals."""
     return "(" + ", ".join(f"{v:.2f}" for v in vector) + ")"

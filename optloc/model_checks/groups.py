@@ -72,6 +72,7 @@ class _Columns:
 
     @classmethod
     def of(cls, problem: Problem) -> _Columns:
+        """Return the columns of all rows of a problem."""
         taken = [MODELS[rows.kind].stations for rows in problem.rows]
         none = [np.full(rows.count, -1) for rows in problem.rows]
         kind = [rows.kind for rows in problem.rows for _ in range(rows.count)]
@@ -170,6 +171,7 @@ def _sightings(columns: _Columns, present: Array) -> list[tuple[int, ...]]:
 
 
 def _row_name(problem: Problem, columns: _Columns, rows: tuple[int, ...]) -> str:
+    """Return the description of rows of the same stations: kinds, stations, target and epoch."""
     first, names = rows[0], problem.stations.names
     kinds = " and ".join(dict.fromkeys(columns.kind[i] for i in rows))
     stations = " and ".join(names[int(s)] for s in (columns.a[first], columns.b[first]) if s >= 0)
@@ -181,4 +183,5 @@ def _row_name(problem: Problem, columns: _Columns, rows: tuple[int, ...]) -> str
 
 
 def _numbers(inside: Array) -> tuple[int, ...]:
+    """Return the indices at which a mask is True."""
     return tuple(np.flatnonzero(inside).tolist())

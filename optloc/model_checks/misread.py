@@ -98,6 +98,7 @@ def _fit(problem: Problem, start: Array | None = None) -> float:
 
 
 def _without_constraints(problem: Problem, p: float) -> Advice:
+    """Return the advice for values that fit with probability p without constraints, but not with them."""
     names = violation_names(problem)
     seen = f"the values fit without the constraints ({names}; p = {p:.2g}), but no position was found that meets both"
     return Advice("constraint", seen, "check their values; heights must be above the ellipsoid, not above the sea")
@@ -131,6 +132,7 @@ def _explaining(problem: Problem) -> Iterator[Advice]:
 
 
 def _readings(problem: Problem) -> Iterator[Reading]:
+    """Yield all readings of the lengths and angles of a problem."""
     lengths = tuple(r.kind for r in problem.rows if MODELS[r.kind].quantity == "length" and MODELS[r.kind].stations)
     angles = tuple(r.kind for r in problem.rows if MODELS[r.kind].quantity == "angle")
     for kind in lengths:
@@ -172,6 +174,7 @@ _SHOWN = 3
 
 
 def _either(pairs: list[str]) -> str:
+    """Return the first few pairs of units as one text."""
     return " or ".join(pairs[:_SHOWN])
 
 
@@ -214,6 +217,7 @@ def _read(problem: Problem, reading: Reading, stated: bool) -> Problem:
 
 
 def _read_rows(rows: Rows, reading: Reading) -> Rows:
+    """Return rows with another reading of their values; angles are wrapped."""
     z = reading.shift + reading.factor * rows.z
     return replace(rows, z=z if MODELS[rows.kind].period is None else wrap(z))
 
@@ -266,6 +270,7 @@ def _is_biased(problem: Problem, part: slice) -> bool:
 
 
 def _is_impossible(problem: Problem) -> bool:
+    """Return whether a value is impossible at any position."""
     return next(_beyond(problem), None) is not None
 
 

@@ -203,6 +203,7 @@ def candidates(problem: Problem) -> tuple[Candidate, ...]:
 
 
 def _forms(problem: Problem, kind: str) -> Iterator[FormName]:
+    """Yield the forms of systematic errors that rows of a kind can have."""
     yield "offset"
     if MODELS[kind].period is None:  # an angle has no scale
         yield "scale"
@@ -212,6 +213,7 @@ def _forms(problem: Problem, kind: str) -> Iterator[FormName]:
 
 
 def _candidate(problem: Problem, form: FormName, per: Per, kind: str | None, station: str | None) -> Candidate:
+    """Return a candidate of a form for one station, or for all rows of a kind without a station."""
     members = None if station is None else (station,)
     names = problem.stations.names
     bias = family(problem.rows, names, f"{form} that is tested", per=per, form=form, kind=kind, members=members)

@@ -83,6 +83,7 @@ def followed_with_constants(problem: Problem, start: State, dynamics: Dynamics, 
 
 
 def _check(problem: Problem) -> None:
+    """Raise InvalidProblem if a tracker cannot use the run, or if a bias changes with time."""
     check_trackable(replace(problem, biases=()))
     # A bias that changes with time is not constant within a scan: its model would need the time.
     changing = next((bias for bias in problem.biases if form_of(bias).changes), None)

@@ -168,6 +168,7 @@ class _Recursion:
                 self.reset(cov)
 
     def _test_start(self, rows: _LastingRows, cov: Array) -> None:
+        """Estimate lasting errors from the residuals of a start; later iterations weight by the estimate."""
         H, R, D = rows.H, rows.R, rows.D
         gain = _solved(R, H @ cov).T
         left = np.eye(len(R)) - H @ gain

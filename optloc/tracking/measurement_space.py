@@ -79,6 +79,7 @@ def lines(problem: Problem, order: int = 1, window: int | None = None) -> Track:
 
 
 def _check_lines(problem: Problem, order: int, window: int | None) -> None:
+    """Raise InvalidProblem if polynomials of measurements do not apply to the run."""
     if order not in (0, 1, 2):
         raise InvalidProblem(f"the order of the polynomial is {order}", "order", "use 0, 1 or 2")
     if problem.stations.position.shape[-3] > 1:
@@ -275,6 +276,7 @@ class _SpaceState:
 
 
 def _check_smoothing(restart: int | None, mean: int, floor: float) -> None:
+    """Raise InvalidProblem for options of `simplified` out of range."""
     if restart is not None and restart < 1:
         raise InvalidProblem(f"restart is {restart}", "restart", "give a number of epochs, or None")
     if mean < 1:
@@ -284,6 +286,7 @@ def _check_smoothing(restart: int | None, mean: int, floor: float) -> None:
 
 
 def _receiver(problem: Problem) -> int:
+    """Return the number of the receiver of a bistatic pair; raise InvalidProblem for other rows."""
     found = pair(problem)
     if found is None:
         advice = "give range_sum of one pair of static stations, azimuth and elevation at one of them, once per epoch"
@@ -292,6 +295,7 @@ def _receiver(problem: Problem) -> int:
 
 
 def _choose(mask: Array, one: _SpaceState, other: _SpaceState) -> _SpaceState:
+    """Return the state `one` for problems in a mask (N,), and `other` for the rest."""
     return _SpaceState(
         np.where(mask[:, None], one.value, other.value),
         np.where(mask[:, None, None], one.cov, other.cov),
@@ -301,6 +305,7 @@ def _choose(mask: Array, one: _SpaceState, other: _SpaceState) -> _SpaceState:
 
 
 def _rows(scan: Problem) -> list[int]:
+    """Return the indices of range sum, azimuth and elevation in a scan."""
     kinds = [block.kind for block in scan.rows]
     return [kinds.index(kind) for kind in _KINDS]
 
@@ -362,6 +367,7 @@ def _restart(stretch: Problem, scan: Problem, home: int) -> _SpaceState:
 
 
 def _bistatic_track(problem: Problem, steps: list[tuple[Array, Array, Array, Array]]) -> Track:
+    """Return position, covariance, count and status of all scans as a track."""
     batch, k = problem.batch_shape, len(steps)
     mean, cov, count, code = (np.stack([step[i] for step in steps], axis=1) for i in range(4))
     none = np.zeros((*batch, k))

@@ -419,6 +419,7 @@ def _clean(problem: Problem) -> tuple[Problem, Array]:
 
 
 def _check_run(problem: Problem) -> None:
+    """Raise InvalidProblem for a batch of runs, or for times that do not increase."""
     if problem.batch_shape:
         raise InvalidProblem("a batch of runs was given", "track", "call it for each run, or use `followed`")
     steps = np.flatnonzero(~(np.diff(problem.times) > 0.0))
@@ -429,6 +430,7 @@ def _check_run(problem: Problem) -> None:
 
 
 def _check_start(start: State, problem: Problem, dynamics: Dynamics) -> None:
+    """Raise InvalidProblem for a given state that does not fit the model, or is after the first scan."""
     check_state(start, (dynamics.order + 1) * problem.dimension)
     if start.time > problem.times[0]:
         what = f"the state belongs to {start.time:.10g} s, after the first scan at {problem.times[0]:.10g} s"

@@ -154,6 +154,7 @@ def touched(problem: Problem) -> tuple[Array, Array]:
 
 @cache
 def _stay(n: int) -> Move:
+    """Return the prediction step for no elapsed time."""
     return Move(np.eye(n), np.zeros((n, n)), np.zeros(n))
 
 

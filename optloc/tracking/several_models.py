@@ -204,6 +204,7 @@ def mixed(states: Sequence[State], weight: Array, transition: Array) -> tuple[li
 
 
 def _transition(transition: Array, count: int) -> Array:
+    """Return the transition as an array (q, q); raise InvalidProblem if it is no table of probabilities."""
     chain = np.asarray(transition, dtype=float)
     good = chain.shape == (count, count) and bool(np.all(chain >= 0.0))
     # Rows with three digits, such as 0.333, do not add up to one: they are refused, not scaled.

@@ -192,6 +192,7 @@ def channels_of(problem: Problem) -> tuple[Array, list[Array]]:
 
 
 def _row(block: Rows, kept: Array) -> Rows:
+    """Return the kept rows of a block as channels, without measurements."""
     nan, none = np.full(len(kept), np.nan), np.zeros(len(kept), dtype=np.int64)
     sure = np.ones(len(kept))
     return Rows(block.kind, nan, block.a[kept], block.b[kept], block.epoch[kept], none, sure, np.zeros(len(kept)))
@@ -257,6 +258,7 @@ def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
 
 
 def _rows(block: Rows, own: Array, number: Array) -> Rows:
+    """Return the rows of one target from a block, with new epoch numbers."""
     picked = {name: getattr(block, name)[..., own] for name in ("z", "weight", "correction")}
     a, b = block.a[own], block.b[own]
     return replace(block, **picked, a=a, b=b, epoch=number[block.epoch[own]], target=np.zeros_like(a))

@@ -163,6 +163,7 @@ def first_fix(
 
 
 def _first(problem: Problem, count: int, order: int, speed: float | None, rate: float | None) -> Problem:
+    """Return the first epochs of a run as one problem, with priors of velocity and acceleration."""
     part = cut(problem, 0, count)
     d = problem.dimension
     priors = [

@@ -296,6 +296,7 @@ def joseph(H: Array, gain: Array, cov: Array) -> Array:
 
 
 def _gain(H: Array, cov: Array) -> Array:
+    """Return the Kalman gain (..., n, m) for whitened rows."""
     # With whitened rows, S is regular for any prior, even for an exactly known state.
     S = H @ cov @ np.swapaxes(H, -1, -2) + np.eye(H.shape[-2])
     solved, _ = linalg.solve(S, H @ cov)
@@ -303,6 +304,7 @@ def _gain(H: Array, cov: Array) -> Array:
 
 
 def _finish(white: White, cov: Array, mean: Array, after: Array) -> Updated:
+    """Return the updated state with its NIS and log-likelihood, from the rows at the prediction."""
     S = white.H @ cov @ np.swapaxes(white.H, -1, -2) + np.eye(white.H.shape[-2])
     # ln|2 pi S| of the rows as measured: the value of the whitened rows plus the logarithm of the whitening.
     lower, _ = linalg.factor(S)
