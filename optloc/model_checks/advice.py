@@ -22,10 +22,10 @@ from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 
 # Largest number of explanations of a misfit that are listed if several fit equally well.
-_SHOWN = 3
+_MAX_ERRORS = 3
 # Largest number of rows of a run that are tested: lasting errors are visible in them, and tests of all channels of more
 # rows take seconds.
-_ROWS = 2000
+_MAX_ROWS = 2000
 # Probability of the chi-square test below which the residuals are a misfit.
 _MISFIT = 0.01
 
@@ -85,7 +85,7 @@ def advise_at(problem: Problem, x: Array) -> tuple[Advice, ...]:
         x = fit_anywhere(problem).x
     # if another unit, sign or convention explains the values, no systematic error is needed
     read = any(one.cause not in ("impossible", "constraint") for one in values)
-    errors = [] if read else [_tell(problem, one) for one in explain_misfit(problem, x)[:_SHOWN]]
+    errors = [] if read else [_error_advice(problem, one) for one in explain_misfit(problem, x)[:_MAX_ERRORS]]
     return (*values, *errors, *found)
 
 
@@ -126,10 +126,10 @@ def explained_at(problem: Problem, x: Array) -> Problem | None:
     if problem.batch_shape:
         raise InvalidProblem("a batch of problems was given", "explained", "call it for each problem")
     part, x = _shortened(*_without_unknown(problem.flat(), _joined(problem, np.asarray(x))))
-    told = explain_misfit(part, x)
-    if not told:
+    explanations = explain_misfit(part, x)
+    if not explanations:
         return None
-    return replace(problem, biases=(*problem.biases, _whole(problem, told[0].candidate)))
+    return replace(problem, biases=(*problem.biases, _bias_of_run(problem, explanations[0].candidate)))
 
 
 def misfit_of(problem: Problem, x: Array) -> str:
@@ -138,15 +138,15 @@ def misfit_of(problem: Problem, x: Array) -> str:
     `problem` is a flat batch of one run.
     """
     part, x = _shortened(*_without_unknown(problem, x[None]))
-    told = explain_misfit(part, x)
-    if not told:
+    explanations = explain_misfit(part, x)
+    if not explanations:
         return "no error of a single station explains the misfit"
-    (value, unit), one = _size(part, told[0]), told[0]
+    (value, unit), one = _size(part, explanations[0]), explanations[0]
     article = _noun(one.candidate).split()[0]
     return f"{article} {one.candidate.name}, {value} {unit}, would explain it (p = {one.p_after:.2g})"
 
 
-def _whole(problem: Problem, one: Candidate) -> Bias:
+def _bias_of_run(problem: Problem, one: Candidate) -> Bias:
     """Return the bias of a candidate over all rows of a run; the test used only some of the rows."""
     members = (one.bias.members[0],) if one.per == "station" else None
     rows, names, kind = problem.rows, problem.stations.names, one.kind or None
@@ -177,9 +177,9 @@ def _shortened(problem: Problem, x: Array) -> tuple[Problem, Array]:
 
     Errors can grow with the run: its first epochs alone would not show a slow drift or an error that starts late.
     """
-    if problem.count <= _ROWS or problem.epochs == 1 or tied(problem):
+    if problem.count <= _MAX_ROWS or problem.epochs == 1 or tied(problem):
         return problem, x
-    kept = max(2, int(problem.epochs * _ROWS / problem.count))
+    kept = max(2, int(problem.epochs * _MAX_ROWS / problem.count))
     chosen = np.unique(np.linspace(0, problem.epochs - 1, kept).round().astype(int))
     chosen = chosen[np.isin(chosen, problem.epoch)]
     n, length = problem.layout.n_shared, problem.layout.n_local
@@ -211,7 +211,7 @@ def _noun(one: Candidate) -> str:
     return {"step": "a step", "burst": "a burst of errors"}.get(one.form) or form_of(one.bias).noun
 
 
-def _tell(problem: Problem, one: Explained) -> Advice:
+def _error_advice(problem: Problem, one: Explained) -> Advice:
     """Return the advice about a systematic error: its form, channel, size, duration and p-values."""
     bias, who = one.candidate.bias, one.candidate
     value, unit = _size(problem, one)

@@ -31,9 +31,9 @@ JOINED = quantile(REGION_LEVEL, 1)
 # Stations are coplanar if their distances from a plane are below a share of their spread, which is rounding of
 # coordinates. They are also coplanar below a share of the noise: such a distance changes a residual by a thousandth of
 # a standard deviation at most.
-_COPLANAR, _UNHEARD = 1e-9, 1e-3
+_COPLANAR, _NOISE_SHARE = 1e-9, 1e-3
 # Share of the spread of the stations that counts as zero distance: its square changes no significant digit of a range.
-_NONE = 1e-6
+_ZERO_DISTANCE = 1e-6
 # Largest number of steps. The cost is nearly quadratic in q, and most refinements take two steps.
 _STEPS = 100
 # Length of the last step in standard deviations, for a fix and for a point of a profile. For a fix it is far below any
@@ -41,7 +41,7 @@ _STEPS = 100
 _SETTLED, _PROFILED = 1e-7, 1e-2
 # The search for the end of the interval starts at this number of standard deviations of q; for a Gaussian the end is at
 # two.
-_FIRST = 2.5
+_FIRST_STEP = 2.5
 # Largest number of fourfold steps away from the plane: twelve steps lead to a million spreads of the stations.
 _FURTHER = 12
 # Largest number of steps towards an end of the interval, and the tolerance of the end in standard deviations.
@@ -89,7 +89,7 @@ class Across:
     @property
     def least(self) -> Array:
         """Return the distances (N,) that count as zero, m."""
-        return _NONE * self.size
+        return _ZERO_DISTANCE * self.size
 
     def to_plane(self, x: Array) -> Array:
         """Return vectors (N, size) with the position in plane coordinates, on the side with positive w."""
@@ -152,7 +152,7 @@ def is_coplanar(problem: Problem) -> Array:
     if not is_symmetric(problem):
         return np.zeros(count, dtype=bool)
     _, _, off, size = plane_of_stations(problem)
-    return np.broadcast_to(off <= np.maximum(_COPLANAR * size, _UNHEARD * _noise(problem)), (count,))
+    return np.broadcast_to(off <= np.maximum(_COPLANAR * size, _NOISE_SHARE * _noise(problem)), (count,))
 
 
 def _noise(problem: Problem) -> Array:
@@ -241,7 +241,7 @@ def interval_across(across: Across, x: Array, cost: Array, level: float = REGION
         least = across.least[apart] ** 2
         ends = (w[apart] ** 2, cost[apart], least, on_plane[apart])
         low[apart] = _crossing(across.take(apart), x[apart], rise, ends, w[apart] ** 2 - np.sqrt(rise) * sigma[apart])
-    far, there = _beyond(across, x, cost + rise, sigma)
+    far, there = _bracket(across, x, cost + rise, sigma)
     found, high = np.flatnonzero(np.isfinite(far)), np.full(len(x), np.inf)
     if len(found):
         ends = (w[found] ** 2, cost[found], far[found] ** 2, there[found])
@@ -258,10 +258,10 @@ def _spread_of_square(across: Across, x: Array) -> Array:
     return np.where(np.isfinite(sigma) & (sigma > 0.0), sigma, across.size**2)
 
 
-def _beyond(across: Across, x: Array, top: Array, sigma: Array) -> tuple[Array, Array]:
+def _bracket(across: Across, x: Array, top: Array, sigma: Array) -> tuple[Array, Array]:
     """Return distances (N,) whose profile cost exceeds a level (N,), and these costs; infinite without a crossing."""
     # one step is enough if the cost is quadratic in q
-    far = np.sqrt(x[:, across.part.stop - 1] ** 2 + _FIRST * sigma)
+    far = np.sqrt(x[:, across.part.stop - 1] ** 2 + _FIRST_STEP * sigma)
     reached, cost = across.profile(x, far)
     for _ in range(_FURTHER):
         within = cost <= top

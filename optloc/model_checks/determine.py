@@ -26,7 +26,7 @@ from optloc.problem.problem import Problem
 # Half width of a 95 % interval in standard deviations.
 _WIDE = float(np.sqrt(quantile(LEVEL, 1)))
 # Smallest redundancy for a direction: one unknown, the range, may be undetermined.
-_LEAST = -1
+_MIN_DOF = -1
 # Length of an infinite curve in baselines, and the number of its points, which is odd.
 _REACH, _POINTS = 10.0, 201
 # Cosine between an axis and the normal of a plane below which the axis is in the plane: rounding.
@@ -103,7 +103,7 @@ def _of_one(flat: Problem, dof: int) -> Determined:
     outside, (name, curve, numbers) = False, _curve(flat)
     if curve is not None:
         return Determined(view.centre, level, north, (), numbers, curve, name)
-    found = directions_of(view, level, dof < 0) if dof >= _LEAST else ()
+    found = directions_of(view, level, dof < 0) if dof >= _MIN_DOF else ()
     if dof >= 0 and not found:
         # between the stations any direction is possible: consider only targets outside their sphere
         found = directions_of(replace(view, most=1.0), level)

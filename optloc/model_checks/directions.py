@@ -30,7 +30,7 @@ INFINITY = 1e-6
 """Inverse range that counts as zero: wave fronts bend by 5e-7 of the spread, and derivatives keep four digits."""
 
 # Largest inverse range: a point closer to the centre has no direction.
-_NEAR = 1e3
+_LARGEST = 1e3
 # Numbers of directions of the grid search, about 28 degrees apart in space and 15 in the plane, and the inverse ranges
 # at each direction.
 _TRIED = {2: 24, 3: 50}
@@ -40,7 +40,7 @@ _REFINED, _STEPS = 16, 40
 # Number of steps at one point of an edge, where the start is close to the result.
 _FEW = 12
 # Steps end if the predicted decrease is below this share of the cost; the cost is compared with a quantile of several.
-_STILL = 1e-6
+_CONVERGED = 1e-6
 # Damping of the first step, relative to the diagonal.
 _DAMPING = 1e-3
 # Largest rotation of a step in radians: beyond it the linear model is not valid.
@@ -54,7 +54,7 @@ _CLOSE = 1e-2
 # Largest number of cones. More minima are points of a valley, which no cone describes.
 _CONES = 4
 # Inverse range close to the stations, where the cost may have another minimum.
-_BESIDE = 0.5
+_NEAR_STATIONS = 0.5
 # Largest angle to the edge of a cone in radians: beyond it the cone has no edge. Lunes of two mirror images reach it.
 _WIDEST = 0.999 * np.pi
 # Angle in radians and relative range within which two minima are equal.
@@ -63,7 +63,7 @@ _SAME = 1e-3
 # another cone.
 _ALIKE, _WITHIN = 1e-2, 0.97
 # Angle between points of a valley in radians: useful cones are not wider.
-_APART = 0.1
+_VALLEY_ANGLE = 0.1
 # Share of rays without an edge above which a cone has no edge. A lune between opposite images has some of these rays.
 _OPEN = 0.5
 
@@ -85,7 +85,7 @@ class View:
     centre: Array
     spread: float
     weighed: Array | None = None
-    most: float = _NEAR
+    most: float = _LARGEST
 
     @classmethod
     def of(cls, problem: Problem) -> View:
@@ -127,7 +127,7 @@ class View:
         damping, growth = np.full(len(u), _DAMPING), np.full(len(u), FIRST_GROWTH)
         for _ in range(steps):
             move, gain, ok = _step(information, vector, damping, self._free(free, v, vector))
-            if not (gain > _STILL * (1.0 + cost)).any():
+            if not (gain > _CONVERGED * (1.0 + cost)).any():
                 break
             there, v_there = self._moved(u, v, move)
             new, more, other = self.look(there, v_there)
@@ -154,7 +154,7 @@ class View:
 
     def best_range(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Return the best inverse ranges (q,) of directions (q, d) and their costs, from three starts."""
-        starts = np.concatenate([v, np.full(len(v), INFINITY), np.full(len(v), _BESIDE)])
+        starts = np.concatenate([v, np.full(len(v), INFINITY), np.full(len(v), _NEAR_STATIONS)])
         _, found, cost = self.descend(np.tile(u, (3, 1)), starts, False, True, _FEW)
         found, cost = found.reshape(3, -1), cost.reshape(3, -1)
         best = cost.argmin(0)[None]
@@ -271,7 +271,7 @@ def _first(view: View, u: Array, v: Array, ways: Array, wanted: Array) -> Array:
     """Return the angles (k,) of the edge of a Gaussian cone, in radians."""
     _, information, _ = view.look(u[None], np.atleast_1d(v))
     across = ways @ basis(u)
-    form = ((across @ _of_turns(information[0], float(v))) * across).sum(-1)
+    form = ((across @ _direction_information(information[0], float(v))) * across).sum(-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         guess = wanted / np.sqrt(form)
     return np.clip(np.where(np.isfinite(guess), guess, _TURN), 1e-9, _TURN)
@@ -362,14 +362,14 @@ def directions_of(view: View, level: Array, few: bool = False) -> tuple[Directio
         if cone is None or len(found) == _CONES:
             return ()
         found.append((cone, own))
-    return tuple(_ranged(view, cone, minima[np.array(items)], least, single) for cone, items in found)
+    return tuple(_with_range(view, cone, minima[np.array(items)], least, single) for cone, items in found)
 
 
 def _is_valley(u: Array) -> bool:
     """Return whether directions (k, d) contain more well separated directions than the largest number of cones."""
     kept = u[:1]
     for one in u[1:]:
-        if (kept @ one).max() < np.cos(_APART):
+        if (kept @ one).max() < np.cos(_VALLEY_ANGLE):
             kept = np.concatenate([kept, one[None]])
     return len(kept) > _CONES
 
@@ -393,7 +393,7 @@ def _cone(view: View, minima: DirectionMinima, i: int, rises: Array, level: Arra
         return None
     half = np.where(np.isnan(reach), _WIDEST, reach).reshape(2, -1).mean(0)
     # rays have equal angles in the metric of the ellipse, so that its tips are not cut off
-    ways = sides if len(u) == 2 else normalised(_around() * half @ across.T)
+    ways = sides if len(u) == 2 else normalised(_circle() * half @ across.T)
     k = len(ways)
     angle, edges = np.zeros((2, k)), np.tile(u, (2, k, 1))
     found = edge(view, (u, v), np.tile(ways, (usable.sum(), 1)), least, np.repeat(rises[usable], k))
@@ -411,16 +411,16 @@ def _cone(view: View, minima: DirectionMinima, i: int, rises: Array, level: Arra
 def _principal(view: View, u: Array, v: float) -> Array:
     """Return the principal axes (d, d - 1) of the information on a direction: unit vectors perpendicular to it."""
     _, information, _ = view.look(u[None], np.atleast_1d(v))
-    return np.asarray(basis(u) @ np.linalg.eigh(_of_turns(information[0], v))[1])
+    return np.asarray(basis(u) @ np.linalg.eigh(_direction_information(information[0], v))[1])
 
 
-def _around() -> Array:
+def _circle() -> Array:
     """Return unit vectors (k, 2) on the whole circle, counter-clockwise."""
     turn = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
     return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
 
 
-def _of_turns(information: Array, v: float) -> Array:
+def _direction_information(information: Array, v: float) -> Array:
     """Return the information (d - 1, d - 1) on rotations of a direction, with the inverse range eliminated."""
     turns = information[:-1, :-1]
     if v <= INFINITY or information[-1, -1] <= 0.0:
@@ -460,7 +460,7 @@ def _angles(u: Array, edges: Array, level: Array) -> tuple[tuple[float, float, f
     return (middle, *ends), (float(np.arcsin(np.clip(own[2], -1.0, 1.0))), low, high)
 
 
-def _ranged(view: View, cone: Direction, minima: DirectionMinima, least: float, rise: float) -> Direction:
+def _with_range(view: View, cone: Direction, minima: DirectionMinima, least: float, rise: float) -> Direction:
     """Return a cone with its range in m, from the inverse ranges of all minima in the cone."""
     near = minima[minima.cost <= least + rise]
     if not len(near.cost):
@@ -470,7 +470,7 @@ def _ranged(view: View, cone: Direction, minima: DirectionMinima, least: float, 
         best = near.v[near.cost.argmin()]
 
     def distance(v: float) -> float:
-        return np.inf if v <= INFINITY else 0.0 if v >= _NEAR else view.spread / v
+        return np.inf if v <= INFINITY else 0.0 if v >= _LARGEST else view.spread / v
 
     return replace(cone, range=(distance(float(best)), distance(high), distance(low)))
 
@@ -501,7 +501,7 @@ def extent_of(view: View, u: Array, v: float, least: float, rise: float) -> Arra
 
     def places(share: Array) -> tuple[Array, Array]:
         angle = np.clip(share * ways[:, 0], -np.pi, np.pi)
-        inverse = np.clip(v + share * ways[:, 1], INFINITY, _NEAR)
+        inverse = np.clip(v + share * ways[:, 1], INFINITY, _LARGEST)
         return np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * side, inverse
 
     def at(share: Array, _: Array) -> tuple[Array, Array]:

@@ -25,13 +25,13 @@ from optloc.problem.problem import Problem
 By = Literal["station", "pair", "kind"]
 GROUPINGS = ("station", "pair", "kind")
 # Two covariances are equal if they differ by less than this share of the largest entry: files contain rounded values.
-_FITS = 1e-6
+_ROUNDED = 1e-6
 # Largest number of rows of one problem: each m x m matrix then needs 32 MB.
-_LARGEST = 2000
+_MAX_ROWS = 2000
 # Number of problems that are linearised together: their matrices, most with tens of rows, then fit into memory.
-_PART = 2000
+_BATCH = 2000
 # Relative eigenvalue of the normal matrix of variances below which a combination of variances is not determined.
-_UNSEEN = 1e-10
+_RANK_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,13 +79,13 @@ def batch_of(problem: Problem) -> Problem:
     Raises
     ------
     InvalidProblem
-        If more rows share unknowns than `_LARGEST`.
+        If more rows share unknowns than `_MAX_ROWS`.
     """
     problem = replace(problem, stations=problem.stations.with_noise())
     flat = (by_epoch(problem) if separable(problem) else problem).flat()
-    if flat.count > _LARGEST and flat.epochs > 1:
+    if flat.count > _MAX_ROWS and flat.epochs > 1:
         what = f"{flat.count} rows share unknowns, too many for variance components"
-        raise InvalidProblem(what, "noise", f"use at most {_LARGEST}, or epochs that share no unknowns")
+        raise InvalidProblem(what, "noise", f"use at most {_MAX_ROWS}, or epochs that share no unknowns")
     return flat
 
 
@@ -100,8 +100,8 @@ def elements(problem: Problem, x: Array, by: By, common: By | None = None) -> El
     names = sorted({*ends.name.ravel().tolist()} - {""})
     size = typical_sigma(problem, common) if common else {}
     parts = []
-    for first in range(0, len(x), _PART):
-        items = np.arange(first, min(first + _PART, len(x)))
+    for first in range(0, len(x), _BATCH):
+        items = np.arange(first, min(first + _BATCH, len(x)))
         parts.append(_part(problem.take(items), x[items], by, (common, size)))
     more = sorted({name for part in parts for name in part.names} - set(names))
     return _join((*names, *more), parts)
@@ -453,7 +453,7 @@ def _arrivals(
         effect = np.concatenate(parts, axis=-1) * sigma[..., None, :]
         made = effect @ np.swapaxes(effect, -1, -2)
         size = np.abs(covariance).max()
-        if np.allclose(made, covariance, rtol=0.0, atol=_FITS * size):
+        if np.allclose(made, covariance, rtol=0.0, atol=_ROUNDED * size):
             return effect, np.broadcast_to(names, (len(row), len(names))), sigma
     return None
 
@@ -472,5 +472,5 @@ def _variances(parts: list[Array], covariance: Array) -> Array:
     merge = np.zeros((design.shape[-1], sum(widths)))
     merge[np.arange(widths[0]), np.arange(widths[0])] = 1.0
     merge[widths[0] :, widths[0] :] = 1.0
-    found = np.linalg.pinv(merge.T @ gram @ merge, rcond=_UNSEEN, hermitian=True) @ (right @ merge)[..., None]
+    found = np.linalg.pinv(merge.T @ gram @ merge, rcond=_RANK_TOLERANCE, hermitian=True) @ (right @ merge)[..., None]
     return np.asarray((merge @ found)[..., 0])

@@ -30,10 +30,10 @@ from optloc.problem.problem import Problem
 
 # A component of an error is determined if the diagonal of Q Q^+ is one there; a larger difference than this is not
 # rounding.
-_OPEN = 1e-6
+_UNDETERMINED = 1e-6
 # Eigenvalue of Q, in units of the weights, below which the other rows have no information; it exceeds the rounding of
 # zero.
-_NOTHING = 1e-9
+_ROUNDING = 1e-9
 # Largest number of rows and priors for a dense P: a sparse array takes more time there.
 _DENSE = 128
 # Probability of a chi-square tail near the underflow of floating-point numbers, with a margin for later operations.
@@ -80,7 +80,7 @@ class Influence:
         weight = np.asarray(self.precision.diagonal())[rows]
         scale = 1.0 / np.sqrt(np.where(weight > 0.0, weight, 1.0))
         values, vectors = np.linalg.eigh(self.block(rows) * scale[..., :, None] * scale[..., None, :])
-        kept = values > _NOTHING
+        kept = values > _ROUNDING
         lengths = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
         return np.asarray(scale[..., :, None] * vectors * lengths[..., None, :])
 
@@ -253,7 +253,7 @@ def errors(at: Influence, groups: Sequence[Group]) -> list[Error]:
     index = np.concatenate(rows)
     block, root = at.block(index), at.root(index)
     covariance = root @ root.T
-    known = np.abs(np.diagonal(covariance @ block) - 1.0) < _OPEN
+    known = np.abs(np.diagonal(covariance @ block) - 1.0) < _UNDETERMINED
     value, sigma = covariance @ at.pull[index], np.where(known, np.sqrt(np.diagonal(covariance)), np.inf)
     out = []
     for own in np.split(np.arange(len(index)), np.cumsum([len(one) for one in rows])[:-1]):
@@ -326,12 +326,14 @@ def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) ->
     work = flat if made is None else made.problem
     origin = tuple(np.arange(flat.count)[:, None]) if made is None else made.origin
     for one in suspects:
-        work = work.with_rows(weight=np.where(_touched(work, origin, one), 0.0, work.weight))
+        work = work.with_rows(weight=np.where(_rows_of_suspect(work, origin, one), 0.0, work.weight))
     at = influence(work, embed(flat.layout, work.layout, np.asarray(x, dtype=float)))
     channels = _channels(work)
     seen = np.array([at.block(rows).sum() for _, rows in channels])
-    told = np.array([at.block(rows).sum() > _NOTHING * at.precision[rows][:, rows].sum() for _, rows in channels])
-    least = np.where(told, NOTICEABLE / np.sqrt(np.where(told, seen, 1.0)), np.inf)
+    determined = np.array(
+        [at.block(rows).sum() > _ROUNDING * at.precision[rows][:, rows].sum() for _, rows in channels]
+    )
+    least = np.where(determined, NOTICEABLE / np.sqrt(np.where(determined, seen, 1.0)), np.inf)
     moved = np.stack([at.deviation @ at.shared[rows].sum(0) for _, rows in channels])
     places = [slot.start + i for slot in work.layout.shared if slot.name == "position" for i in range(slot.size)]
     pull = np.linalg.norm(moved[:, places], axis=-1)
@@ -340,7 +342,7 @@ def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) ->
     return Reliability(tuple(name for name, _ in channels), least, shift)
 
 
-def _touched(work: Problem, origin: Sequence[Array], suspect: Suspect) -> Array:
+def _rows_of_suspect(work: Problem, origin: Sequence[Array], suspect: Suspect) -> Array:
     """Return a mask (m,) of the rows of a suspect; the problem may have arrival times instead of differences."""
     if suspect.group == "station":
         a, b = (np.concatenate([getattr(rows, end) for rows in work.rows]) for end in "ab")

@@ -44,7 +44,7 @@ class Advice:
 
 # Limit of the chi-square that separates a position from its mirror image, if stations are not exactly in a plane. Below
 # the limit, the data separate no position from its image by three sigma.
-_TOLD = 9.0
+_SEPARATED = 9.0
 # Share of the extent of the stations that counts as zero with any noise: a micrometre per metre.
 _FLAT = 1e-6
 # Share of the extent of the stations that is rounding of their coordinates.
@@ -58,14 +58,14 @@ def advise_on_geometry(problem: Problem, x: Array) -> Iterator[Advice]:
 
     `problem` is a flat batch of one problem or run. `x` (1, size) is its fix; NaN if there is no fix.
     """
-    found = list(_count_rows(problem))
+    found = list(_redundancy_advice(problem))
     yield from found
     # with fewer rows than unknowns, more than two positions fit
     if not any("fewer" in one.seen for one in found):
-        yield from _see_mirror(problem, x)
+        yield from _mirror_advice(problem, x)
 
 
-def _count_rows(problem: Problem) -> Iterator[Advice]:
+def _redundancy_advice(problem: Problem) -> Iterator[Advice]:
     """Yield advice about the smallest redundancy of the epochs: an error may not be detectable, or not attributable."""
     alone = separable(problem)
     dof = np.ravel(degrees_of_freedom(by_epoch(problem) if alone else problem))
@@ -130,7 +130,7 @@ def _noise(problem: Problem) -> float:
     return float(own.min()) if len(own) else 0.0
 
 
-def _see_mirror(problem: Problem, x: Array) -> Iterator[Advice]:
+def _mirror_advice(problem: Problem, x: Array) -> Iterator[Advice]:
     """Yield advice if the stations are in a plane or on a line, or if the mirror image of a fix fits."""
     shape = _shape(problem)
     if shape is None or shape.extent[-1] == 0.0:
@@ -144,14 +144,16 @@ def _see_mirror(problem: Problem, x: Array) -> Iterator[Advice]:
         yield Advice("line", seen, "add a station off the line, or a bearing or height")
     elif flat[0]:
         name = "plane" if d == 3 else "line"
-        seen = f"the stations are {'in one plane' if d == 3 else 'on one line'} within the noise ({_off(shape)})"
-        seen += f": every position has a mirror image across the {name} that fits equally well"
-        yield Advice(name, seen, _say_side(problem, shape)[0], _say_side(problem, shape)[1])
+        seen = f"the stations are {'in one plane' if d == 3 else 'on one line'} within the noise"
+        seen += (
+            f" ({_describe_offset(shape)}): every position has a mirror image across the {name} that fits equally well"
+        )
+        yield Advice(name, seen, _side_advice(problem, shape)[0], _side_advice(problem, shape)[1])
     elif _mirror_fits(problem, shape, x):
         name = "plane" if d == 3 else "line"
-        seen = f"the mirror image of the fix in the best-fitting {name} of the stations ({_off(shape)})"
+        seen = f"the mirror image of the fix in the best-fitting {name} of the stations ({_describe_offset(shape)})"
         seen += " fits almost equally well"
-        yield Advice("mirror", seen, _say_side(problem, shape)[0], _say_side(problem, shape)[1])
+        yield Advice("mirror", seen, _side_advice(problem, shape)[0], _side_advice(problem, shape)[1])
 
 
 # Share of the normal in the gradient of an equality above which a mirror image violates the equality.
@@ -179,11 +181,11 @@ def _is_flat(problem: Problem, shape: _Shape, axis: int) -> bool:
     height = (shape.places - shape.centre) @ shape.axes[:, axis]
     # a mirror image changes a range by at most twice the height of the station
     noise = _noise(problem)
-    told = np.inf if noise == 0.0 else float(((2.0 * height / noise) ** 2).sum())
-    return bool(told < _TOLD or shape.extent[axis] < _FLAT * shape.extent[-1])
+    separation = np.inf if noise == 0.0 else float(((2.0 * height / noise) ** 2).sum())
+    return bool(separation < _SEPARATED or shape.extent[axis] < _FLAT * shape.extent[-1])
 
 
-def _off(shape: _Shape) -> str:
+def _describe_offset(shape: _Shape) -> str:
     """Return a text with the RMS distance of the stations from their plane, and their extent."""
     off, size = float(np.sqrt((shape.height**2).mean())), float(shape.extent[-1])
     return f"{off if off > _ROUNDING * size else 0.0:.2g} m off it, over {size:.3g} m"
@@ -203,11 +205,11 @@ def _mirror_fits(problem: Problem, shape: _Shape, x: Array) -> bool:
     inside = not problem.constraints or bool((violation(problem, both[1:]) <= 0.0).all())
     # the descent must stay on the other side, and not return to the plane
     return bool(
-        after[0] * after[1] < 0.0 and abs(after[1]) > 0.1 * abs(height) and cost[1] - cost[0] < _TOLD and inside
+        after[0] * after[1] < 0.0 and abs(after[1]) > 0.1 * abs(height) and cost[1] - cost[0] < _SEPARATED and inside
     )
 
 
-def _say_side(problem: Problem, shape: _Shape) -> tuple[str, str]:
+def _side_advice(problem: Problem, shape: _Shape) -> tuple[str, str]:
     """Return advice on how to decide between the sides of the plane, and the lines of a problem file for it."""
     if problem.constraints:
         return "check if a constraint excludes one of the two, or add a station off it, a bearing or a height", ""

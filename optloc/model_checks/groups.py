@@ -20,12 +20,12 @@ from optloc.problem.problem import Problem
 
 KINDS: tuple[GroupKind, ...] = ("station", "row", "prior", "offset")
 
-_ONE, _EACH = 9.0, 7.0
+_GROUP_PENALTY, _COMPONENT_PENALTY = 9.0, 7.0
 """Parts of the penalty of an exclusion: twice the logarithm of odds.
 
 The first part is for the group: odds of a hundred to one that a group has no error. The second part is for each
 component of its error: the error is anywhere within a hundred sigma, not at zero (100 / sqrt(2 pi))."""
-ROW_PRICE = _ONE + _EACH
+ROW_PRICE = _GROUP_PENALTY + _COMPONENT_PENALTY
 """Penalty for the exclusion of one row."""
 
 
@@ -51,7 +51,7 @@ class Group:
     @property
     def price(self) -> float:
         """Return the penalty: the decrease of the cost at which an error of this group is as likely as no error."""
-        return _ONE + _EACH * self.size
+        return _GROUP_PENALTY + _COMPONENT_PENALTY * self.size
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,11 +30,11 @@ _MISFIT, _FITS = 1e-4, 1e-3
 # Probability, over all readings together, that random values fit with one of the readings.
 _CHANCE = 1e-3
 # Number of standard deviations beyond which a value is impossible.
-_BEYOND = 6.0
+_IMPOSSIBLE_SIGMAS = 6.0
 # Number of epochs of a run that are tested: an error of all rows is visible in a few epochs.
 _EPOCHS = 5
 # Largest number of reported readings if several fit.
-_TOLD = 2
+_MAX_READINGS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ def advise_on_values(problem: Problem, x: Array) -> Iterator[Advice]:
     batch = by_epoch(problem).flat() if separable(problem) else problem
     # use the first epochs with redundancy
     items = np.flatnonzero(degrees_of_freedom(batch) > 0)[:_EPOCHS]
-    wrong = list(_impossible(problem))
+    wrong = list(_impossible_advice(problem))
     if len(items) and one_place(batch):
         own = batch.take(items)
         start = x if len(batch.weight) == len(x) and x.shape[-1] == batch.layout.size else None
@@ -74,7 +74,7 @@ def advise_on_values(problem: Problem, x: Array) -> Iterator[Advice]:
         if wrong or refuted:
             held = [] if wrong or free < _FITS else [_without_constraints(own, free)]
             # impossible values are reported even if no reading explains them
-            yield from held or list(_explaining(own)) or wrong
+            yield from held or list(_fitting_readings(own)) or wrong
             return
     yield from wrong
 
@@ -110,21 +110,21 @@ def _p(problem: Problem, cost: float) -> float:
     return p if np.isfinite(p) else 0.0
 
 
-def _explaining(problem: Problem) -> Iterator[Advice]:
+def _fitting_readings(problem: Problem) -> Iterator[Advice]:
     """Yield the readings with a good fit that is unlikely by chance, the most probable reading first."""
     tried = list(_readings(problem))
     found = []
     for one in tried:
         # noise that is stated in a separate unit keeps its size
         scaled, stated = _read(problem, one, False), _read(problem, one, True)
-        able = [other for other in (scaled, stated) if _by_chance(other) * 2.0 * len(tried) <= _CHANCE]
+        able = [other for other in (scaled, stated) if _chance_of_fit(other) * 2.0 * len(tried) <= _CHANCE]
         if not able or _is_impossible(able[0]):
             continue
         p = max(_fit(other) for other in able)
         if p >= _FITS:
             found.append((p, one))
     # feet and nanoseconds are so similar that both may fit: the better fit comes first
-    for p, one in sorted(found, key=lambda each: -each[0])[:_TOLD]:
+    for p, one in sorted(found, key=lambda each: -each[0])[:_MAX_READINGS]:
         yield Advice(one.cause, f"{one.seen} (p = {p:.2g})", one.advice, one.toml)
 
 
@@ -150,15 +150,19 @@ def _length_units(kinds: tuple[str, ...]) -> Iterator[Reading]:
     table = {name: size * (SPEED_OF_LIGHT if name in _TIMES else 1.0) for name, size in UNITS["length"].items()}
     what = " and ".join(kinds)
     seen_before: list[float] = []
-    for said, size in table.items():
+    for stated, size in table.items():
         for meant, other in table.items():
             ratio = other / size
-            if said not in _SAID or meant not in _MEANT or any(abs(ratio / old - 1.0) < 1e-6 for old in seen_before):
+            if (
+                stated not in _STATED_UNITS
+                or meant not in _MEANT_UNITS
+                or any(abs(ratio / old - 1.0) < 1e-6 for old in seen_before)
+            ):
                 continue
             if ratio == 1.0:
                 continue
             seen_before.append(ratio)
-            seen = f"the {what} values fit in {meant} instead of the stated {said}, {ratio:.4g} times as large"
+            seen = f"the {what} values fit in {meant} instead of the stated {stated}, {ratio:.4g} times as large"
             pairs = [f"{a} for {b}" for b in table for a in table if abs(table[a] / table[b] / ratio - 1.0) < 1e-6]
             advice = f"state their unit; by the ratio it may be {_either(pairs)}"
             yield Reading("unit", kinds, ratio, 0.0, seen, advice, f'unit = "{meant}"\n')
@@ -167,15 +171,15 @@ def _length_units(kinds: tuple[str, ...]) -> Iterator[Reading]:
 _TIMES = ("s", "ms", "us", "ns", "ps")
 # Units that a file states, first the unit without a statement; and units that may be meant. Feet occur if the unit is
 # not stated, thousands if the prefix is wrong, and times if the speed of light is missing.
-_SAID = ("m", "s", "ns")
-_MEANT = ("m", "km", "mm", "ft", "s", "ms", "us", "ns")
+_STATED_UNITS = ("m", "s", "ns")
+_MEANT_UNITS = ("m", "km", "mm", "ft", "s", "ms", "us", "ns")
 # Largest number of pairs of units in a sentence.
-_SHOWN = 3
+_MAX_PAIRS = 3
 
 
 def _either(pairs: list[str]) -> str:
     """Return the first few pairs of units as one text."""
-    return " or ".join(pairs[:_SHOWN])
+    return " or ".join(pairs[:_MAX_PAIRS])
 
 
 def _angle_readings(kinds: tuple[str, ...]) -> Iterator[Reading]:
@@ -190,12 +194,12 @@ def _angle_readings(kinds: tuple[str, ...]) -> Iterator[Reading]:
         seen = "the azimuths intersect behind the stations: they point from the target to the station"
         advice = "subtract half a turn"
         yield Reading("opposite", bearings, 1.0, np.pi, seen, advice, 'correction = "180 deg"\n')
-    for said, meant, factor in (("rad", "deg", np.pi / 180.0), ("deg", "rad", 180.0 / np.pi)):
+    for stated, meant, factor in (("rad", "deg", np.pi / 180.0), ("deg", "rad", 180.0 / np.pi)):
         if kinds:
-            seen = f"the {' and '.join(kinds)} values fit in {meant} instead of the stated {said}"
+            seen = f"the {' and '.join(kinds)} values fit in {meant} instead of the stated {stated}"
             key = f'unit = "{meant}"\n'
             yield Reading("unit", kinds, factor, 0.0, seen, "state their unit", key)
-        if bearings and said == "rad":
+        if bearings and stated == "rad":
             seen = "the azimuths fit as compass bearings in degrees instead of the stated radians from east"
             both = f'{key}azimuth = "north-clockwise"\n'
             yield Reading("compass", bearings, -factor, turned, seen, "state unit and convention", both)
@@ -230,7 +234,7 @@ def _reach(problem: Problem) -> float:
     return 2.0 * float(np.max(centre_and_spread(problem.stations.places)[1]))
 
 
-def _by_chance(problem: Problem) -> float:
+def _chance_of_fit(problem: Problem) -> float:
     """Return the probability that random values fit: each redundant value within four sigma of its prediction.
 
     Random lengths are anywhere within the array, random angles anywhere on the circle.
@@ -243,7 +247,7 @@ def _by_chance(problem: Problem) -> float:
     return float(np.median(share)) ** int(degrees_of_freedom(problem).sum())
 
 
-def _beyond(problem: Problem) -> Iterator[tuple[Rows, int, float]]:
+def _impossible_rows(problem: Problem) -> Iterator[tuple[Rows, int, float]]:
     """Yield rows, number and limit (m) of differences above the distance of their stations, and of negative ranges."""
     sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count)
     observed, weight = (np.reshape(a, (-1, problem.count)) for a in (problem.observed, problem.weight))
@@ -259,7 +263,7 @@ def _beyond(problem: Problem) -> Iterator[tuple[Rows, int, float]]:
             apart = np.sqrt((line**2).sum(-1)).reshape(-1, rows.count)[0]
         value = observed[:, part] * np.ones((len(observed), 1))
         over = np.abs(value) - apart if ranges == (1, -1) else apart - value
-        bad = (over > _BEYOND * sigma[:, part]) & (weight[:, part] > 0.0)
+        bad = (over > _IMPOSSIBLE_SIGMAS * sigma[:, part]) & (weight[:, part] > 0.0)
         for i in np.flatnonzero(bad.any(0)):
             yield rows, int(i), float(apart[i])
 
@@ -271,12 +275,12 @@ def _is_biased(problem: Problem, part: slice) -> bool:
 
 def _is_impossible(problem: Problem) -> bool:
     """Return whether a value is impossible at any position."""
-    return next(_beyond(problem), None) is not None
+    return next(_impossible_rows(problem), None) is not None
 
 
-def _impossible(problem: Problem) -> Iterator[Advice]:
+def _impossible_advice(problem: Problem) -> Iterator[Advice]:
     """Yield advice about the first value that no position can have, and the number of other impossible values."""
-    found = list(_beyond(problem))
+    found = list(_impossible_rows(problem))
     if not found:
         return
     rows, i, apart = found[0]

@@ -35,9 +35,9 @@ _MINORITY = 0.5
 # few fixes with little redundancy equally well.
 _NEARLY_ALL = 0.95
 # Smallest change of sigma that is reported: a change of 20 % moves no fix by a tenth of its sigma.
-_WORTH = 1.2
+_MIN_CHANGE = 1.2
 # An eigenvalue of the tests of a group below this share of the largest eigenvalue is rounding.
-_NOTHING = 1e-9
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,58 +140,58 @@ def common_level_at(problem: Problem, x: Array) -> CommonLevel:
     kept = np.flatnonzero(np.isfinite(x).all(-1))
     kinds = tuple(dict.fromkeys(rows.kind for rows in problem.rows))
     same = np.ones(len(kinds))
-    none = CommonLevel(kinds, same, same, same, False, "", np.nan, 0.0, 0, 0, 0)
+    unchanged = CommonLevel(kinds, same, same, same, False, "", np.nan, 0.0, 0, 0, 0)
     if not len(kept):
-        return none
+        return unchanged
     batch, x = problem.take(kept), x[kept]
     by_station, by_kind = elements(batch, x, "station"), elements(batch, x, "kind")
     tests = tested(by_station, np.ones(()))
-    cost, dof = _path(tests)
-    count, accused = int((tests.dof > 0).sum()), _accused(tests)
-    none = replace(none, fixes=count, accused=accused, left=accused)
+    cost, dof = _exclusion_path(tests)
+    count, accused = int((tests.dof > 0).sum()), _count_rejected(tests)
+    unchanged = replace(unchanged, fixes=count, accused=accused, left=accused)
     if not count or not accused:
-        return none
-    stated = _least(cost, dof, 1.0)
-    common = np.array([_least(cost, dof, f).sum() for f in _FACTORS])
+        return unchanged
+    stated = _lowest_deviance(cost, dof, 1.0)
+    common = np.array([_lowest_deviance(cost, dof, f).sum() for f in _FACTORS])
     # Instead of the factor of one group, every fix may also exclude measurements.
-    single = [*_alone(by_station, tests, cost, dof)]
-    single += [*_alone(by_kind, tested(by_kind, np.ones(())), cost, dof)] if len(kinds) > 1 else []
+    single = [*_single_groups(by_station, tests, cost, dof)]
+    single += [*_single_groups(by_kind, tested(by_kind, np.ones(())), cost, dof)] if len(kinds) > 1 else []
     name, size, least = min(single, key=lambda one: one[2], default=("", np.nan, np.inf))
     gain = float(stated.sum() - min(common.min(), least))
     if gain <= ROW_PRICE:
-        return none
+        return unchanged
     if least < common.min() and name not in kinds:
-        return replace(none, alone=name, size=size, gain=gain)
+        return replace(unchanged, alone=name, size=size, gain=gain)
     # A minority of late rows widens the residuals like a larger noise. The late rows are then reported for each fix.
-    if 0.0 < _late_rows(by_kind, _able(batch)).share < _MINORITY:
-        return replace(none, gain=gain)
-    return _rescaled(replace(none, gain=gain), by_kind)
+    if 0.0 < _late_rows(by_kind, _late_kinds(batch)).share < _MINORITY:
+        return replace(unchanged, gain=gain)
+    return _with_factors(replace(unchanged, gain=gain), by_kind)
 
 
-def _rescaled(none: CommonLevel, made: Elements) -> CommonLevel:
+def _with_factors(unchanged: CommonLevel, made: Elements) -> CommonLevel:
     """Return the explanation with the factors of all kinds; a factor that is not significant is 1."""
     left = np.zeros(len(made.names), dtype=bool)
     found = fit(made, left, left)
-    place = [made.names.index(kind) if kind in made.names else -1 for kind in none.kinds]
+    place = [made.names.index(kind) if kind in made.names else -1 for kind in unchanged.kinds]
     factor, low, high = (np.append(np.sqrt(v), np.nan)[place] for v in (found.variance, found.low, found.high))
     with np.errstate(invalid="ignore"):
-        told = ((low > 1.0) | (high < 1.0)) & (np.abs(np.log(factor)) > np.log(_WORTH))
-    if not told.any():
-        return none
-    factor, low, high = (np.where(told, v, 1.0) for v in (factor, low, high))
-    own = np.append(factor, 1.0)[[none.kinds.index(n) if n in none.kinds else -1 for n in (*made.names, "")]]
+        significant = ((low > 1.0) | (high < 1.0)) & (np.abs(np.log(factor)) > np.log(_MIN_CHANGE))
+    if not significant.any():
+        return unchanged
+    factor, low, high = (np.where(significant, v, 1.0) for v in (factor, low, high))
+    own = np.append(factor, 1.0)[[unchanged.kinds.index(n) if n in unchanged.kinds else -1 for n in (*made.names, "")]]
     after = tested(made, own[made.of_effect] ** 2)
-    return replace(none, factor=factor, low=low, high=high, suspect=True, left=_accused(after))
+    return replace(unchanged, factor=factor, low=low, high=high, suspect=True, left=_count_rejected(after))
 
 
-def _accused(tests: Tested) -> int:
+def _count_rejected(tests: Tested) -> int:
     """Return the number of fixes that the chi-square test rejects."""
     from scipy.special import gammaincc
 
     return int(((tests.dof > 0) & (gammaincc(np.maximum(tests.dof, 1) / 2, tests.cost / 2) < ACCUSED)).sum())
 
 
-def _path(tests: Tested) -> tuple[Array, Array]:
+def _exclusion_path(tests: Tested) -> tuple[Array, Array]:
     """Return the cost and the redundancy (N, 1 + k) of each fix without its 0, 1, ... k most outstanding errors.
 
     Only errors whose squared test exceeds the penalty are excluded. A fix with fewer of these errors gets an infinite
@@ -211,16 +211,16 @@ def _path(tests: Tested) -> tuple[Array, Array]:
 
 def priced_cost(tests: Tested) -> Array:
     """Return the lowest cost (N,) of each fix with any of its errors excluded, penalties included."""
-    return _least(*_path(tests), 1.0)
+    return _lowest_deviance(*_exclusion_path(tests), 1.0)
 
 
-def _least(cost: Array, dof: Array, factor: float) -> Array:
+def _lowest_deviance(cost: Array, dof: Array, factor: float) -> Array:
     """Return the minimum (N,) of twice the negative log-likelihood of each fix, with sigma times a factor."""
     left = np.arange(cost.shape[1])
     return np.asarray((cost / factor**2 + dof * np.log(factor**2) + ROW_PRICE * left).min(1))
 
 
-def _alone(made: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[tuple[str, float, float]]:
+def _single_groups(made: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[tuple[str, float, float]]:
     """Yield for each group its name, the most likely factor of sigma of its errors alone, and the likelihood with it.
 
     The likelihood is twice the negative logarithm. A factor f adds (f^2 - 1) B B' to V, with the columns B of the
@@ -237,7 +237,7 @@ def _alone(made: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[t
         here = np.take_along_axis(own, order, 1)
         matrix = np.take_along_axis(np.take_along_axis(tests.matrix, order[:, :, None], 1), order[:, None], 2)
         values, vectors = np.linalg.eigh(np.where(here[:, :, None] & here[:, None, :], matrix, 0.0))
-        seen = values > _NOTHING * values[:, -1:]
+        seen = values > _ROUNDING * values[:, -1:]
         vector = np.where(here, np.take_along_axis(tests.vector, order, 1), 0.0)
         squared = np.where(seen, (np.swapaxes(vectors, 1, 2) @ vector[..., None])[..., 0] ** 2, 0.0)
         values = np.where(seen, values, 0.0)
@@ -320,13 +320,13 @@ def late_signals_at(problem: Problem, kept: Array, x: Array) -> LateSignals:
         Parameter vectors of these fixes.
     """
     late, carried = np.zeros(problem.batch_shape[0], dtype=int), np.zeros(problem.batch_shape[0], dtype=bool)
-    able = _able(problem)
+    able = _late_kinds(problem)
     if not able:
         return LateSignals(0.0, 0.0, 0.0, 0, late, carried)
     part = problem.take(kept)
     found = _late_rows(elements(part, x, "kind"), able)
     if found.share:
-        kind, offset, error, left = min((_alike(part, x, one) for one in able), key=lambda one: one[3])
+        kind, offset, error, left = min((_common_delay(part, x, one) for one in able), key=lambda one: one[3])
         if offset > 0.0 and left < found.left:
             found = replace(found, share=0.0, delay=0.0, alike=kind, offset=offset, offset_error=error)
             return replace(found, late=late, carried=carried)
@@ -340,16 +340,16 @@ def late_signals_at(problem: Problem, kept: Array, x: Array) -> LateSignals:
 # change of share and delay that ends EM.
 _CHOICES, _TURNS, _ENDED = 10, 500, 1e-6
 # Mean delay in sigmas below which no delay is reported: its effect on a fix is negligible.
-_NO_DELAY = 0.1
+_MIN_DELAY = 0.1
 # Test, in standard deviations, above which a row is late in the first selection.
-_STANDS_OUT = 3.0
+_FIRST_CUT = 3.0
 # Late rows must explain at least this share of the misfit that gross errors of both signs explain. The share is 0.8 to
 # 1 if a tenth or more of the rows are late by 5 sigma on average. It is 0.6 at most if the noise is three or five times
 # the stated noise (50 fixes).
 _ONE_SIDED = 0.7
 
 
-def _able(problem: Problem) -> list[str]:
+def _late_kinds(problem: Problem) -> list[str]:
     """Return the kinds of a problem whose rows can be late."""
     return [rows.kind for rows in problem.rows if rows.kind in LATE]
 
@@ -372,10 +372,10 @@ def _late_rows(made: Elements, able: list[str]) -> LateSignals:
 
 # Largest number of Gauss-Newton steps of an offset, with new fixes in each step; a step below this share of the sigma
 # of the offset ends them.
-_STEPS, _STILL = 8, 0.1
+_STEPS, _CONVERGED = 8, 0.1
 
 
-def _alike(problem: Problem, x: Array, kind: str) -> tuple[str, float, float, float]:
+def _common_delay(problem: Problem, x: Array, kind: str) -> tuple[str, float, float, float]:
     """Return a kind, the common offset of all its rows, the standard deviation of the offset, and the remaining cost.
 
     Gauss-Newton estimates the offset over all fixes together and refines each fix after each step, because a large
@@ -395,7 +395,7 @@ def _alike(problem: Problem, x: Array, kind: str) -> tuple[str, float, float, fl
         if size <= 0.0:  # the emission time absorbs a common delay
             return kind, 0.0, np.inf, np.inf
         step, error = float(tests.vector[:, tests.errors :][here].sum()) / size, size**-0.5
-        if abs(step) <= _STILL * error:
+        if abs(step) <= _CONVERGED * error:
             break
         offset += step
     return kind, offset, error, np.inf if tests is None else float(priced_cost(tests).sum()) + ROW_PRICE
@@ -403,12 +403,12 @@ def _alike(problem: Problem, x: Array, kind: str) -> tuple[str, float, float, fl
 
 def _mixture(tests: Tested, able: Array) -> tuple[float, float, float, Array, int]:
     """Return share, mean delay in sigmas, gain, late rows (N, q) and the number of rows that other rows check."""
-    found = snooped(tests, slice(0, tests.errors), _STANDS_OUT)
+    found = snooped(tests, slice(0, tests.errors), _FIRST_CUT)
     late = found.gross & able & (found.shift > 0.0)
     share = delay = gain = 0.0
     seen = able & np.isfinite(found.shift)
     for _ in range(_CHOICES):
-        shift, sigma = _without_others(tests, late)
+        shift, sigma = _leave_one_out(tests, late)
         seen = able & np.isfinite(shift)
         share, delay, gain, chance = _expect(shift[seen], sigma[seen], late[seen])
         now = np.zeros(late.shape, dtype=bool)
@@ -421,7 +421,7 @@ def _mixture(tests: Tested, able: Array) -> tuple[float, float, float, Array, in
     return share, delay, gain, late, int(seen.sum())
 
 
-def _without_others(tests: Tested, late: Array) -> tuple[Array, Array]:
+def _leave_one_out(tests: Tested, late: Array) -> tuple[Array, Array]:
     """Return the error (N, q) of each row and its standard deviation, from the other rows that are not late."""
     items, q = np.arange(len(late)), tests.errors
     shift, sigma = shown(without(tests, late), slice(0, q))
@@ -462,7 +462,7 @@ def _expect(error: Array, sigma: Array, late: Array) -> tuple[float, float, floa
         new = float(np.clip(chance.mean(), 1e-12, 1.0 - 1e-6))
         longer = float((chance * mean).sum() / max(chance.sum(), 1e-300))
         done = abs(new - share) <= _ENDED * share and abs(longer - delay) <= _ENDED * delay
-        if longer < _NO_DELAY:
+        if longer < _MIN_DELAY:
             return 0.0, 0.0, 0.0, np.zeros(len(error))
         share, delay = new, longer
         if done:

@@ -45,7 +45,7 @@ _ORDER = (*FORMS, "step", "burst")
 # for all stations, so the odds are a hundred to one. In a run where both look alike, noise alone would decide.
 _STRETCHED_TIME = 9.0
 # If the other unknowns leave less than this share of the information of a candidate, the rest is rounding.
-_OPEN = 1e-9
+_ROUNDING = 1e-9
 # Smallest number of epochs of a run for steps and bursts, and the number of times that are tried.
 _STEP_EPOCHS, _STEP_TIMES = 6, 12
 
@@ -129,7 +129,7 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
     # The search for steps and bursts selects the best error of many: every channel, every first epoch and several last
     # epochs. Bonferroni counts all of them.
     channels = sum(one.is_channel_offset for one in found)
-    more = channels * problem.epochs * (2 * _around(problem) + 2) if any(o.form == "step" for o in found) else 0
+    more = channels * problem.epochs * (2 * _search_width(problem) + 2) if any(o.form == "step" for o in found) else 0
     level = 1.0 - FALSE_ALARM / (len(found) + more)
     # a statistic is the square of a projection of the residual, so it is at most the cost
     if cost[0] <= quantile(level, 1):
@@ -141,38 +141,38 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
     limit = np.array([quantile(level, max(1, size)) for _, _, size in scores])
     values = np.array([one for one, _, _ in scores])
     order = np.argsort(-np.where(values > limit, values - limit, -np.inf), kind="stable")[:_FITTED]
-    told = []
+    explained = []
     for i in order:
         if values[i] <= limit[i] or dof - scores[i][2] < 1:
             continue
         own = _fitted(problem, x, found[i], scores[i])
         after = float(tail_probability(own.cost + np.zeros(1), np.array([dof - scores[i][2]]))[0])
         if after >= FITS and cost[0] - own.cost > limit[i]:
-            told.append(replace(own, p_before=before, p_after=after))
-    return _distinct(told)
+            explained.append(replace(own, p_before=before, p_after=after))
+    return _distinct(explained)
 
 
-def _distinct(told: list[Explained]) -> tuple[Explained, ...]:
+def _distinct(explained: list[Explained]) -> tuple[Explained, ...]:
     """Return the explanations with almost the lowest cost, in ascending order; of equal ones only the simplest."""
     # for one row, an offset, a scale and a drift are equal, and also for rows of one position
-    simple = sorted(told, key=lambda one: (_is_stretched(one), _ORDER.index(one.candidate.form), one.cost))
+    simple = sorted(explained, key=lambda one: (_is_time_scale(one), _ORDER.index(one.candidate.form), one.cost))
     kept: list[Explained] = []
     for one in simple:
         same = [other for other in kept if other.candidate.bias.members == one.candidate.bias.members]
-        if not any(_stands_for(other, one) for other in same):
+        if not any(_replaces(other, one) for other in same):
             kept.append(one)
     kept.sort(key=lambda one: one.cost)
     return tuple(one for one in kept if one.cost <= kept[0].cost + _RIVAL)
 
 
-def _stands_for(other: Explained, one: Explained) -> bool:
+def _replaces(other: Explained, one: Explained) -> bool:
     """Return whether an explanation replaces another explanation of the same station."""
-    if _is_stretched(one) and not _is_stretched(other):
+    if _is_time_scale(one) and not _is_time_scale(other):
         return other.cost - one.cost < _STRETCHED_TIME
     return abs(other.cost - one.cost) < _SAME
 
 
-def _is_stretched(one: Explained) -> bool:
+def _is_time_scale(one: Explained) -> bool:
     """Return whether an explanation is a scale of arrival times."""
     form, kind = form_of(one.candidate.bias), one.candidate.kind
     return form.enters == "scales" and kind != "" and _is_of_arrivals(kind)
@@ -245,10 +245,10 @@ def _steps(problem: Problem, found: list[Candidate]) -> Iterator[Candidate]:
     spans = [*((first, k) for first in cuts), *pairwise(cuts)]
     stations = [one for one in found if one.is_channel_offset]
     for first, last in spans:
-        yield from (made for one in stations for made in _lasting(problem, one, first, last))
+        yield from (made for one in stations for made in _limited(problem, one, first, last))
 
 
-def _lasting(problem: Problem, one: Candidate, first: int, last: int) -> Iterator[Candidate]:
+def _limited(problem: Problem, one: Candidate, first: int, last: int) -> Iterator[Candidate]:
     """Yield an offset of the epochs first <= k < last, unless it affects no row or all rows."""
     when = problem.epoch[one.bias.row]
     inside = (when >= first) & (when < last)
@@ -262,7 +262,7 @@ def _sharpened(problem: Problem, x: Array, found: Sequence[Candidate], values: A
 
     An error of many sigma between two tried times leaves a misfit, which would hide the kind of the error.
     """
-    out, around = [], _around(problem)
+    out, around = [], _search_width(problem)
     for form in ("step", "burst"):
         own = [i for i, one in enumerate(found) if one.form == form]
         if not own:
@@ -278,13 +278,13 @@ def _sharpened(problem: Problem, x: Array, found: Sequence[Candidate], values: A
             ends = _ends(problem, best)
             near = np.clip(ends[end] + np.arange(-around, around + 1), 1 if end == 0 else ends[0] + 1, problem.epochs)
             spans = [(k, ends[1]) if end == 0 else (ends[0], k) for k in np.unique(near).tolist()]
-            tried = tuple(made for span in spans if span[0] < span[1] for made in _lasting(problem, whole, *span))
+            tried = tuple(made for span in spans if span[0] < span[1] for made in _limited(problem, whole, *span))
             best = tried[int(np.argmax([value for value, _, _ in score(problem, x, tried)]))]
         out.append(best)
     return out
 
 
-def _around(problem: Problem) -> int:
+def _search_width(problem: Problem) -> int:
     """Return the number of epochs between two times of the first search."""
     return -(-problem.epochs // _STEP_TIMES)
 
@@ -329,9 +329,9 @@ def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tupl
         coupling = root.T @ information[:, part]
         left = information[part, part] - coupling.T @ coupling
         pull = vector[part] - coupling.T @ (root.T @ vector)
-        told = np.diagonal(left) > _OPEN * np.diagonal(information[part, part])
+        determined = np.diagonal(left) > _ROUNDING * np.diagonal(information[part, part])
         half, _ = linalg.root(left)
-        inverse = half @ half.T if told.all() else np.zeros_like(left)
+        inverse = half @ half.T if determined.all() else np.zeros_like(left)
         value = inverse @ pull
         out.append((float(pull @ value), value, part.stop - part.start))
     return out

@@ -77,11 +77,11 @@ def law_of(problem: Problem, x: Array, covariance: Array, shift: Array) -> Law |
         give = _departures(problem, sides, x, spread, values, normal, np.isfinite(slack))
     bent = np.isfinite(slack) & (give > _FLAT * sigma)
     # a curved bound that the fix does not touch is treated like a bound far away
-    held = slack <= _ON * sigma
-    slack = np.where(bent & ~held, np.inf, slack)
+    touched = slack <= _ON * sigma
+    slack = np.where(bent & ~touched, np.inf, slack)
     along, span = _edges(problem, sides, x, part)
     truncated = Truncated(normal, slack, along, span, give, shift[:, part], spread)
-    return Law(truncated, ~(bent & held).any(1))
+    return Law(truncated, ~(bent & touched).any(1))
 
 
 def _planes(problem: Problem, sides: tuple[Level, ...], x: Array, part: slice) -> tuple[Array, Array]:
@@ -163,13 +163,13 @@ def _inward_steps(law: Truncated) -> list[tuple[Array, float]]:
     factor = factor_of(law.covariance)
     turned = law.normal @ factor
     sigma = np.sqrt((turned**2).sum(-1))
-    held = np.flatnonzero((law.slack <= _ON * sigma) & (sigma > 0.0) & _beside(law))[: factor.shape[0]]
-    unit = turned[held] / sigma[held, None]
+    touched = np.flatnonzero((law.slack <= _ON * sigma) & (sigma > 0.0) & _touches_edge(law))[: factor.shape[0]]
+    unit = turned[touched] / sigma[touched, None]
     middle = np.linalg.solve(factor.T @ factor, factor.T @ law.shift)
-    others = np.where(np.isin(np.arange(len(sigma)), held), np.inf, law.slack)
+    others = np.where(np.isin(np.arange(len(sigma)), touched), np.inf, law.slack)
     rest = replace(law, slack=others)
     found = []
-    for k in range(len(held)):
+    for k in range(len(touched)):
         beside = np.delete(unit, k, axis=0)
         inward = -unit[k] + beside.T @ (np.linalg.pinv(beside.T) @ unit[k]) if len(beside) else -unit[k]
         size = np.sqrt((inward**2).sum())
@@ -182,7 +182,7 @@ def _inward_steps(law: Truncated) -> list[tuple[Array, float]]:
     return found
 
 
-def _beside(law: Truncated) -> Array:
+def _touches_edge(law: Truncated) -> Array:
     """Return a mask (h,) of bounds without ends, and of edges with the fix between their ends."""
     reach = _ON * np.sqrt(np.trace(law.covariance))
     return np.asarray((law.span[:, 0] <= reach) & (law.span[:, 1] >= -reach))

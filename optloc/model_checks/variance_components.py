@@ -32,7 +32,7 @@ CUT = 3.5
 One normal error in 2000 exceeds this limit. Without it, the variance is 0.5 % too small, which needs no correction.
 With a limit of 4, the tails of aircraft messages (7.7 % beyond 3 sigma) count as noise of single receivers."""
 
-_WIDE = 10.0
+_CUT_SHARED = 10.0
 """The same limit for an error that several rows share.
 
 A fix can absorb a shared error like a change of position, so the test is not reliable. An error that is excluded from
@@ -47,11 +47,11 @@ LOOSE = 0.5
 # Probability of the confidence intervals of the factors.
 _LEVEL = 0.95
 # If P keeps less than this share of a column's size, the remainder is rounding: the fix absorbs the whole column.
-_NOTHING = 1e-9
+_ROUNDING = 1e-9
 # Median of the square of a standard normal variable.
 _MEDIAN = 0.45493642
 # Lower limit of a variance factor. Without this limit, data without any error would give zero.
-_LEAST = 1e-16
+_MIN_VARIANCE = 1e-16
 # Constant that is added to the scores of all log-factors. A factor of r squared errors then has its maximum at their
 # sum divided by r - 4 instead of r. For large r the difference is negligible. For small r, the likelihood without this
 # constant often has its maximum at zero: for a quarter of the stations with half the noise of the others (27 fixes by
@@ -60,7 +60,7 @@ _LEAST = 1e-16
 _PENALTY = 2.0
 # Largest share of the information of a factor that the penalty uses. The information is computed with one factor for
 # all groups. With this limit the penalty at most doubles a variance.
-_SHARE = 0.5
+_MAX_PENALTY_SHARE = 0.5
 # Largest numbers of iterations: steps by medians, which only give rough factors; selections of gross errors; scoring
 # steps after each selection.
 _COARSE, _ROUNDS, _STEPS = 8, 5, 40
@@ -68,15 +68,15 @@ _COARSE, _ROUNDS, _STEPS = 8, 5, 40
 # standard errors.
 _NEAR, _CLOSE, _SETTLED = 0.05, 1e-2, 0.05
 # Smallest redundancy of an error whose test enters a median; value that replaces a median of zero.
-_SHOWN, _SMALL = 1e-3, 1e-2
+_MIN_REDUNDANCY, _MIN_MEDIAN = 1e-3, 1e-2
 # Limits of a step of a log-factor by medians: a median of few errors is rough.
 _DOWN, _UP = -4.0, 8.0
 # Smallest eigenvalue of an information matrix with unit diagonal. Below it, the eigenvector is a combination of factors
 # that the data do not determine; the eigenvalue is rounding.
-_UNSEEN = 1e-9
+_RANK_TOLERANCE = 1e-9
 # Smallest share of the axis of a factor inside the space that the data determine: below it the factor is not
 # determined.
-_OWN = 0.9
+_DETERMINED = 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ class VarianceFit:
 
 
 @dataclass(frozen=True, slots=True)
-class _FoundLevels:
+class _MaximumLikelihood:
     """Variances (c,) of classes of errors, their standard errors (c,), gross errors (N, q), and tests without these."""
 
     variance: Array
@@ -144,20 +144,20 @@ def fit(made: Elements, left: Array, single: Array) -> VarianceFit:
     # One factor for all groups. If the data do not determine it, they determine no factor.
     alike = _maximise(made, np.minimum(group, 0), np.zeros(1), none[:1], np.zeros(1))
     begin = np.full(count, np.log(alike.variance[0]))
-    shared = ~(_errors(alike.tests, group, np.exp(begin), none) < LOOSE) & ~single[used]
+    shared = ~(_relative_errors(alike.tests, group, np.exp(begin), none) < LOOSE) & ~single[used]
     # Groups whose factors are not determined are merged. The merged class has the number of its first group.
     merge = np.where(shared, np.flatnonzero(shared)[0] if shared.any() else 0, np.arange(count))
     kinds, place = np.unique(merge, return_inverse=True)
-    own = np.append(place, -1)[group]
+    classes = np.append(place, -1)[group]
     # If several groups are merged, the data may determine their common factor.
     alone = np.isin(kinds, np.flatnonzero(shared))
     if shared.sum() > 1:
-        alone &= ~(_errors(alike.tests, own, np.exp(begin[: len(kinds)]), none[: len(kinds)]) < LOOSE)
+        alone &= ~(_relative_errors(alike.tests, classes, np.exp(begin[: len(kinds)]), none[: len(kinds)]) < LOOSE)
     level = np.where(alone, 0.0, begin[: len(kinds)])
-    information, _ = _score(alike.tests, own, np.exp(begin[: len(kinds)]), alone)
-    penalty = np.minimum(_PENALTY, _SHARE * np.diagonal(information))
-    found = _maximise(made, own, level, alone, penalty)
-    low, high = (np.where(alone, np.nan, end)[place] for end in _interval(found, own, alone))
+    information, _ = _score(alike.tests, classes, np.exp(begin[: len(kinds)]), alone)
+    penalty = np.minimum(_PENALTY, _MAX_PENALTY_SHARE * np.diagonal(information))
+    found = _maximise(made, classes, level, alone, penalty)
+    low, high = (np.where(alone, np.nan, end)[place] for end in _confidence_interval(found, classes, alone))
 
     def spread(values: Array) -> Array:
         return np.asarray(np.append(values, np.nan)[number[:-1]])
@@ -176,14 +176,14 @@ def fit(made: Elements, left: Array, single: Array) -> VarianceFit:
 
 def without_groups(made: Elements, left: Array) -> Elements:
     """Return the elements without the errors of the groups that `left` (g,) marks."""
-    gone = np.append(left, False)[made.of_effect]
-    effect = np.where(gone[:, None], 0.0, made.effect)
-    return replace(made, effect=effect, of_effect=np.where(gone, -1, made.of_effect))
+    removed = np.append(left, False)[made.of_effect]
+    effect = np.where(removed[:, None], 0.0, made.effect)
+    return replace(made, effect=effect, of_effect=np.where(removed, -1, made.of_effect))
 
 
 # Limit of a score, in standard deviations, above which an excluded group gets a factor. One in a hundred groups without
 # errors exceeds it.
-_SEEN = 2.33
+_SIGNIFICANT = 2.33
 
 
 def visible(made: Elements, found: VarianceFit, left: Array) -> Array:
@@ -200,10 +200,14 @@ def visible(made: Elements, found: VarianceFit, left: Array) -> Array:
     information, per_fix = _score(tests, made.of_effect, scale, np.zeros(size, dtype=bool))
     rest = np.flatnonzero(~left)
     coupling = information[:, rest]
-    own = np.diagonal(information) - ((coupling @ _inverse(information[np.ix_(rest, rest)])) * coupling).sum(1)
+    remaining = np.diagonal(information) - ((coupling @ _inverse(information[np.ix_(rest, rest)])) * coupling).sum(1)
     # If the other factors explain a group completely, the remaining information is rounding.
-    told = left & (own > (1.0 - _OWN) ** 2 * np.diagonal(information)) & _determinable(tests, made, found, left)
-    return np.asarray(told & (per_fix.sum(0) > _SEEN * np.sqrt(np.where(told, own, 1.0))))
+    determined = (
+        left
+        & (remaining > (1.0 - _DETERMINED) ** 2 * np.diagonal(information))
+        & _determinable(tests, made, found, left)
+    )
+    return np.asarray(determined & (per_fix.sum(0) > _SIGNIFICANT * np.sqrt(np.where(determined, remaining, 1.0))))
 
 
 # A shared error of three times the sigma of the rows must have a level with at most this relative error. Range fixes
@@ -222,16 +226,16 @@ def _determinable(tests: Tested, made: Elements, found: VarianceFit, left: Array
     return np.asarray(information * (2.0 * _RELATIVE) ** 2 > 1.0)
 
 
-def _maximise(made: Elements, own: Array, level: Array, held: Array, penalty: Array) -> _FoundLevels:
+def _maximise(made: Elements, classes: Array, level: Array, fixed: Array, penalty: Array) -> _MaximumLikelihood:
     """Return the variance factors of c classes of errors, their standard errors and the gross errors.
 
-    `own` (N, q) is the class of each error, `level` (c,) the log-factors at the start, `held` (c,) marks fixed factors,
-    and `penalty` (c,) is added to the scores.
+    `classes` (N, q) is the class of each error and `level` (c,) the log-factors at the start. `fixed` (c,) marks
+    factors that keep their value. `penalty` (c,) is added to the scores.
     """
     count, level = len(level), level.copy()
     # Start with medians: medians tolerate up to half of the errors as gross, but scores of the likelihood do not.
     for _ in range(_COARSE):
-        step = np.where(held, 0.0, _coarse(tested(made, np.exp(level)[own]), own, np.exp(level)))
+        step = np.where(fixed, 0.0, _median_step(tested(made, np.exp(level)[classes]), classes, np.exp(level)))
         level += step
         if np.abs(step).max() < _NEAR:
             break
@@ -239,52 +243,52 @@ def _maximise(made: Elements, own: Array, level: Array, held: Array, penalty: Ar
         before = level.copy()
         # Gross errors are selected once per round, not in every step. Otherwise the steps would jump when the selection
         # changes.
-        gross, tests = cleaned(made, np.exp(level)[own])
+        gross, tests = cleaned(made, np.exp(level)[classes])
         for _ in range(_STEPS):
-            step, sure = _step(tests, own, np.exp(level), held, penalty)
-            last, level = level, np.maximum(level + step, np.log(_LEAST))
-            tests = without(tested(made, np.exp(level)[own]), gross)
+            step, sure = _scoring_step(tests, classes, np.exp(level), fixed, penalty)
+            last, level = level, np.maximum(level + step, np.log(_MIN_VARIANCE))
+            tests = without(tested(made, np.exp(level)[classes]), gross)
             if (np.abs(level - last) <= _CLOSE * sure).all():
                 break
         if (np.abs(level - before) <= _SETTLED * sure).all():
             break
     variance = np.exp(level)
-    return _FoundLevels(variance, _errors(tests, own, variance, held[:count]), gross, tests)
+    return _MaximumLikelihood(variance, _relative_errors(tests, classes, variance, fixed[:count]), gross, tests)
 
 
-def _coarse(tests: Tested, own: Array, variance: Array) -> Array:
+def _median_step(tests: Tested, classes: Array, variance: Array) -> Array:
     """Return steps of the log-factors (c,) that make the median of the squared tests the median of normal errors."""
-    q = own.shape[1]
-    squared, share = tests.sigmas[:, :q] ** 2, tests.size[:, :q] * variance[own]
+    q = classes.shape[1]
+    squared, share = tests.sigmas[:, :q] ** 2, tests.size[:, :q] * variance[classes]
     step = np.zeros(len(variance))
     for g in range(len(variance)):
-        values = squared[(own == g) & (share > _SHOWN)]
+        values = squared[(classes == g) & (share > _MIN_REDUNDANCY)]
         if len(values):
-            step[g] = np.log(max(float(np.median(values)) / _MEDIAN, _SMALL))
+            step[g] = np.log(max(float(np.median(values)) / _MEDIAN, _MIN_MEDIAN))
     return np.clip(step, _DOWN, _UP)
 
 
-def _step(tests: Tested, own: Array, variance: Array, held: Array, penalty: Array) -> tuple[Array, Array]:
+def _scoring_step(tests: Tested, classes: Array, variance: Array, fixed: Array, penalty: Array) -> tuple[Array, Array]:
     """Return the scoring step (c,) of the log-factors and the standard errors (c,) of the log-factors.
 
     The step has no component along a combination of factors that the data do not determine.
     """
-    information, per_fix = _score(tests, own, variance, held)
+    information, per_fix = _score(tests, classes, variance, fixed)
     # The penalty has no curvature in the log-factors. Its size damps steps if the data hardly determine a factor.
     inverse = _inverse(information + np.diag(penalty))
     # A step changes a variance at most by the factor e: the quadratic model of the likelihood is not valid beyond.
     return np.clip(inverse @ (per_fix.sum(0) + penalty), -1.0, 1.0), np.sqrt(np.diagonal(inverse))
 
 
-def _score(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Array, Array]:
+def _score(tests: Tested, classes: Array, variance: Array, fixed: Array) -> tuple[Array, Array]:
     """Return the information (c, c) of the log-factors and the scores of each problem (N, c).
 
     With T and t of `Tested`, the score of theta_g is the sum of (t_j^2 - T_jj) / 2 over the errors j of group g. The
     information of theta_g and theta_h is the sum of T_ij^2 / 2 (Harville 1977, section 5).
     """
-    (n, q), count = own.shape, len(variance)
+    (n, q), count = classes.shape, len(variance)
     # Errors without a group get an additional last class, which is dropped.
-    number, scale = np.where(own >= 0, own, count), np.where(held, 0.0, variance)
+    number, scale = np.where(classes >= 0, classes, count), np.where(fixed, 0.0, variance)
     each = 0.5 * (tests.vector[:, :q] ** 2 - tests.size[:, :q])
     place = (np.arange(n)[:, None] * (count + 1) + number).ravel()
     per_fix = np.bincount(place, each.ravel(), n * (count + 1)).reshape(n, -1)[:, :count] * scale
@@ -295,34 +299,34 @@ def _score(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Arr
 
 
 def _inverse(information: Array) -> Array:
-    """Return the pseudo-inverse of an information matrix, without its eigenvectors below `_UNSEEN` at unit diagonal."""
-    half, _ = linalg.root(information, _UNSEEN)
+    """Return the pseudo-inverse of an information matrix, which is scaled to a unit diagonal for its rank."""
+    half, _ = linalg.root(information, _RANK_TOLERANCE)
     return np.asarray(half @ half.T)
 
 
-def _spread(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Array, Array, Array]:
+def _log_variances(tests: Tested, classes: Array, variance: Array, fixed: Array) -> tuple[Array, Array, Array]:
     """Return the variances of the log-factors, flags of determined factors, and the scoring step; all (c,).
 
     A variance is the larger one of two: the variance for normal errors, and the variance from the scatter of the
     problems' scores.
     """
-    information, per_fix = _score(tests, own, variance, held)
+    information, per_fix = _score(tests, classes, variance, fixed)
     inverse = _inverse(information)
     # Sandwich estimate from the problems' scores: errors that are not normal, for instance with tails, increase the
     # variance.
     scattered = inverse @ (per_fix.T @ per_fix) @ inverse
-    told = np.diagonal(inverse @ information) > _OWN
-    return np.maximum(np.diagonal(inverse), np.diagonal(scattered)), told, inverse @ per_fix.sum(0)
+    determined = np.diagonal(inverse @ information) > _DETERMINED
+    return np.maximum(np.diagonal(inverse), np.diagonal(scattered)), determined, inverse @ per_fix.sum(0)
 
 
-def _errors(tests: Tested, own: Array, variance: Array, held: Array) -> Array:
+def _relative_errors(tests: Tested, classes: Array, variance: Array, fixed: Array) -> Array:
     """Return the relative standard errors (c,) of the square roots of the factors; infinite if not determined."""
-    spread, told, _ = _spread(tests, own, variance, held)
+    spread, determined, _ = _log_variances(tests, classes, variance, fixed)
     # Convert the error of a log-variance to the error of its square root.
-    return np.where(told, np.sqrt(1.0 + np.sqrt(spread)) - 1.0, np.inf)
+    return np.where(determined, np.sqrt(1.0 + np.sqrt(spread)) - 1.0, np.inf)
 
 
-def _interval(found: _FoundLevels, own: Array, held: Array) -> tuple[Array, Array]:
+def _confidence_interval(found: _MaximumLikelihood, classes: Array, fixed: Array) -> tuple[Array, Array]:
     """Return the lower and upper ends (c,) of the confidence intervals of the variance factors.
 
     The residuals show an error plus the error of its prediction from the other rows. The variance of this sum is theta
@@ -332,17 +336,17 @@ def _interval(found: _FoundLevels, own: Array, held: Array) -> tuple[Array, Arra
     """
     from scipy.special import gammaincinv
 
-    variance, q = found.variance, own.shape[1]
-    share = found.tests.size[:, :q] * variance[own]
-    redundancy = total(own, len(variance), share**2) / np.maximum(total(own, len(variance), share), _SMALL)
-    redundancy = np.clip(redundancy, _SHOWN, 1.0)
+    variance, q = found.variance, classes.shape[1]
+    share = found.tests.size[:, :q] * variance[classes]
+    redundancy = total(classes, len(variance), share**2) / np.maximum(total(classes, len(variance), share), _MIN_MEDIAN)
+    redundancy = np.clip(redundancy, _MIN_REDUNDANCY, 1.0)
     predicted = variance * (1.0 / redundancy - 1.0)
-    spread, told, step = _spread(found.tests, own, variance, held)
+    spread, determined, step = _log_variances(found.tests, classes, variance, fixed)
     # The step removes the effect of the penalty: the intervals belong to the likelihood alone.
-    seen = np.maximum(variance * (1.0 + step) + predicted, _SHOWN * predicted)
-    half = 1.0 / np.maximum(spread * redundancy**2, _SHOWN)  # half the degrees of freedom
+    seen = np.maximum(variance * (1.0 + step) + predicted, _MIN_REDUNDANCY * predicted)
+    half = 1.0 / np.maximum(spread * redundancy**2, _MIN_REDUNDANCY)  # half the degrees of freedom
     ends = [gammaincinv(half, p) / half for p in (0.5 + 0.5 * _LEVEL, 0.5 - 0.5 * _LEVEL)]
-    return tuple(np.where(told, np.maximum(seen / end - predicted, 0.0), np.nan) for end in ends)  # type: ignore[return-value]
+    return tuple(np.where(determined, np.maximum(seen / end - predicted, 0.0), np.nan) for end in ends)  # type: ignore[return-value]
 
 
 def total(group: Array, count: int, values: Array | None = None) -> Array:
@@ -395,7 +399,7 @@ class Tested:
         dof[items] -= 1
         # Column j explains these columns completely, so they cannot be tested any more; rounding would make them
         # outliers.
-        gone = np.diagonal(matrix[items], axis1=-2, axis2=-1) <= _NOTHING * self.size[items]
+        gone = np.diagonal(matrix[items], axis1=-2, axis2=-1) <= _ROUNDING * self.size[items]
         matrix[items] *= ~(gone[:, :, None] | gone[:, None, :])
         vector[items] *= ~gone
         return Tested(matrix, vector, self.errors, cost, dof)
@@ -421,7 +425,7 @@ def tested(made: Elements, variance: Array) -> Tested:
     rank = (whiten != 0.0).any(-1).sum(-1) - (root != 0.0).any(-2).sum(-1)
     matrix = gram[:, :-1, :-1]
     size = np.diagonal(np.swapaxes(white, 1, 2) @ white, axis1=-2, axis2=-1)[:, :-1]
-    seen = np.diagonal(matrix, axis1=-2, axis2=-1) > _NOTHING * size
+    seen = np.diagonal(matrix, axis1=-2, axis2=-1) > _ROUNDING * size
     both = seen[:, :, None] & seen[:, None, :]
     return Tested(np.where(both, matrix, 0.0), np.where(seen, gram[:, :-1, -1], 0.0), q, gram[:, -1, -1], rank)
 
@@ -450,7 +454,7 @@ def deviance(made: Elements, found: VarianceFit) -> float:
     covariance += absent[:, :, None] * np.eye(covariance.shape[1])
     basis, sizes, _ = np.linalg.svd(made.jacobian)
     seen = np.zeros((len(basis), basis.shape[-1]), dtype=bool)
-    seen[:, : sizes.shape[1]] = sizes > _NOTHING * sizes[:, :1]
+    seen[:, : sizes.shape[1]] = sizes > _ROUNDING * sizes[:, :1]
     # Directions of the Jacobian get a unit variance and no residual.
     free = np.swapaxes(basis, 1, 2) * ~seen[:, :, None]
     inside = free @ covariance @ np.swapaxes(free, 1, 2) + seen[:, :, None] * np.eye(basis.shape[-1])
@@ -480,7 +484,7 @@ def cleaned(made: Elements, variance: Array) -> tuple[Array, Tested]:
     """
     tests = tested(made, variance)
     shared = made.common[made.of_effect] & (np.broadcast_to(variance, made.of_effect.shape) > 0.0)
-    cut = np.where(made.common[made.of_effect], _WIDE, CUT)
+    cut = np.where(made.common[made.of_effect], _CUT_SHARED, CUT)
     found = snooped(tests, slice(0, tests.errors), cut, shared if shared.any() else None)
     return found.gross, found.tests
 

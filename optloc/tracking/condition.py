@@ -74,11 +74,11 @@ class Recent:
 
     def judge(self, entry: Entry) -> Entry:
         """Return the entry of a scan; if its status is ok, the status that follows from the last scans replaces it."""
-        found = objections(_RECENTLY, self) if entry.code == Status.OK else []
+        found = objections(_FINDINGS, self) if entry.code == Status.OK else []
         return replace(entry, code=found[0][0], reason=found[0][1]) if found else entry
 
 
-_RECENTLY = (
+_FINDINGS = (
     Finding(Status.UNBOUNDED, lambda recent: recent.vague, lambda recent: [recent.vague]),
     Finding(Status.MISFIT, lambda recent: recent.share > _DOUBTFUL, lambda recent: [recent.sentence]),
     Finding(

@@ -165,14 +165,14 @@ def _line_track(problem: Problem, apart: Problem, fitted: Array, cov: Array, ok:
     mean = np.concatenate([position, rates.reshape(*batch, n - d)], axis=-1)
     spread = np.einsum("...ai,...qirj,...bj->...qarb", back, cov, back, optimize=True).reshape(*batch, n, n)
     good = np.broadcast_to(ok, batch)
-    heard = (_weights(apart) > 0.0).sum(-1)[..., problem.epochs - batch[-1] :]
+    observed = (_weights(apart) > 0.0).sum(-1)[..., problem.epochs - batch[-1] :]
     none = np.zeros(batch)
     return Track(
         problem.times[problem.epochs - batch[-1] :],
         np.where(good[..., None], mean, np.nan),
         np.where(good[..., None, None], spread, np.nan),
         none + np.nan,
-        np.broadcast_to(heard, batch),
+        np.broadcast_to(observed, batch),
         none,
         np.where(good, code, int(Status.TOO_FEW_ROWS)).astype(np.int8),
         d,
@@ -250,18 +250,20 @@ def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, f
     steps = []
     for k in range(epochs):
         scan = apart.take(np.arange(k, size * epochs, epochs))
-        heard = np.asarray((np.isfinite(scan.z) & (scan.weight > 0.0)).all(-1))
+        observed = np.asarray((np.isfinite(scan.z) & (scan.weight > 0.0)).all(-1))
         # Start again while the first mean is not full, at every restart, and for every lost state.
-        again = heard & ((k < mean or (restart is not None and k % restart == 0)) | ~np.isfinite(state.value).all(-1))
+        again = observed & (
+            (k < mean or (restart is not None and k % restart == 0)) | ~np.isfinite(state.value).all(-1)
+        )
         with np.errstate(invalid="ignore"):
             moved = _advance(state, scan, home, floor)
-        state = _choose(heard & ~again, moved, state)
+        state = _choose(observed & ~again, moved, state)
         if again.any():
             begun = _restart(cut(flat, max(0, k + 1 - mean), k + 1), scan, home)
             state = _choose(again, begun, state)
         at, axes, _, _ = _linearise_at(state.value, scan, home)
-        code = np.where(heard, np.where(np.isfinite(at).all(-1), Status.OK, Status.NUMERICAL), Status.TOO_FEW_ROWS)
-        steps.append((at, axes @ state.cov @ np.swapaxes(axes, -1, -2), np.where(heard, 3, 0), code))
+        code = np.where(observed, np.where(np.isfinite(at).all(-1), Status.OK, Status.NUMERICAL), Status.TOO_FEW_ROWS)
+        steps.append((at, axes @ state.cov @ np.swapaxes(axes, -1, -2), np.where(observed, 3, 0), code))
     return _bistatic_track(problem, steps)
 
 

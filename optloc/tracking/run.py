@@ -48,7 +48,7 @@ from optloc.tracking.updates import Filter, Update, Updated, filter_of, innovati
 
 # If the first scan is less likely than this, it contradicts the given state. The run is then refused, so the limit is
 # very small.
-_ABSURD = 1e-9
+_CONTRADICTORY = 1e-9
 Screen = tuple[float, float, float]
 
 
@@ -264,7 +264,7 @@ class _TrackRun:
             if found is not None and found.values[CODE] != GENERAL:
                 values = found.values.tolist()
                 if values[SPREAD] > self.near and self.rules.gap is None:
-                    why = self._unbridged(predicted(state, self.dynamics, time, self.problem.dimension), silence)
+                    why = self._too_uncertain(predicted(state, self.dynamics, time, self.problem.dimension), silence)
                     if why:
                         return why
                 entry = self._entry(k, read(found), int(values[CODE]), int(values[REJECTED_ROWS]), [])
@@ -274,9 +274,9 @@ class _TrackRun:
                     (values[REPEATS], values[EXCESS], values[SPREAD]),
                 )
         ahead = predicted(state, self.dynamics, time, self.problem.dimension)
-        return ("" if self.rules.gap is not None else self._unbridged(ahead, silence)) or self._general(k, ahead)
+        return ("" if self.rules.gap is not None else self._too_uncertain(ahead, silence)) or self._general(k, ahead)
 
-    def _unbridged(self, ahead: State, silence: float) -> str:
+    def _too_uncertain(self, ahead: State, silence: float) -> str:
         """Return the reason why a prediction is too uncertain to follow; empty if it is not."""
         d = self.problem.dimension
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(ahead.cov[:d, :d])[-1], 0.0)))
@@ -440,7 +440,7 @@ def _check_start(start: State, problem: Problem, dynamics: Dynamics) -> None:
 def _check_agrees(entry: Entry) -> None:
     """Raise InvalidProblem if the first scan contradicts a given state by its chi-square, or fails the gate."""
     p_value = tail_probability(entry.updated.nis, entry.updated.count)  # NaN without a row
-    if entry.code == Status.REJECTED or p_value < _ABSURD:
+    if entry.code == Status.REJECTED or p_value < _CONTRADICTORY:
         what = f"the initial state contradicts the first scan, at {entry.time:.10g} s"
         advice = "correct it, increase its standard deviation, or remove it: a start needs no guess"
         raise InvalidProblem(what, "start", advice)

@@ -194,7 +194,7 @@ def mixed(states: Sequence[State], weight: Array, transition: Array) -> tuple[li
     share = weight[..., :, None] * transition / np.maximum(coming, np.finfo(float).tiny)[..., None, :]
     out = []
     for j, own in enumerate(states):
-        parts = [_lend(state, own) for state in states]
+        parts = [_in_order_of(state, own) for state in states]
         mean, cov = moments([p.mean for p in parts], [p.cov for p in parts], share[..., j])
         # An unreachable model keeps its state.
         kept = coming[..., j] <= 0.0
@@ -217,15 +217,15 @@ def _transition(transition: Array, count: int) -> Array:
     return chain
 
 
-def _lend(state: State, own: State) -> State:
+def _in_order_of(state: State, own: State) -> State:
     """Return a state in the order of another state, which also provides missing components."""
-    n, held = own.mean.shape[-1], state.mean.shape[-1]
-    if held >= n:
+    n, present = own.mean.shape[-1], state.mean.shape[-1]
+    if present >= n:
         return State(state.time, state.mean[..., :n], state.cov[..., :n, :n])
     batch = np.broadcast_shapes(state.mean.shape[:-1], own.mean.shape[:-1])
     mean, cov = np.broadcast_to(own.mean, (*batch, n)).copy(), np.zeros((*batch, n, n))
-    mean[..., :held] = state.mean
-    cov[..., :held, :held], cov[..., held:, held:] = state.cov, own.cov[..., held:, held:]
+    mean[..., :present] = state.mean
+    cov[..., :present, :present], cov[..., present:, present:] = state.cov, own.cov[..., present:, present:]
     return State(state.time, mean, cov)
 
 
@@ -247,7 +247,7 @@ def _weigh(done: Sequence[tuple[Updated, Array]], coming: Array) -> tuple[Array,
 def _combine(done: Sequence[tuple[Updated, Array]], weight: Array, total: Array) -> tuple[Updated, Array]:
     """Return the update over all models, and its status: the best status of the models."""
     n = max(each.mean.shape[-1] for each, _ in done)
-    both = [_widened(each, n) for each, _ in done]
+    both = [_padded(each, n) for each, _ in done]
     mean, cov = moments([one for one, _ in both], [around for _, around in both], weight)
     nis = np.stack([each.nis for each, _ in done], axis=-1)
     used = np.where(weight > 0.0, nis, 0.0)
@@ -257,13 +257,13 @@ def _combine(done: Sequence[tuple[Updated, Array]], weight: Array, total: Array)
     return Updated(mean, cov, (weight * used).sum(-1), total, count), code
 
 
-def _widened(done: Updated, n: int) -> tuple[Array, Array]:
+def _padded(done: Updated, n: int) -> tuple[Array, Array]:
     """Return mean (..., n) and covariance (..., n, n); missing velocity or acceleration is zero without variance."""
-    held = done.mean.shape[-1]
-    if held == n:
+    present = done.mean.shape[-1]
+    if present == n:
         return done.mean, done.cov
     mean, cov = np.zeros((*done.mean.shape[:-1], n)), np.zeros((*done.cov.shape[:-2], n, n))
-    mean[..., :held], cov[..., :held, :held] = done.mean, done.cov
+    mean[..., :present], cov[..., :present, :present] = done.mean, done.cov
     return mean, cov
 
 
@@ -298,21 +298,21 @@ def resized(
     InvalidProblem
         If a missing component has no prior.
     """
-    n, held = (order + 1) * dimension, state.mean.shape[-1]
-    if held >= n:
+    n, present = (order + 1) * dimension, state.mean.shape[-1]
+    if present >= n:
         return State(state.time, state.mean[..., :n], state.cov[..., :n, :n])
     sizes = {1: ("velocity", "speed", speed), 2: ("acceleration", "rate", rate)}
     variance = []
-    for part in range(held // dimension, order + 1):
+    for part in range(present // dimension, order + 1):
         name, argument, size = sizes[part]
         if size is None:
             raise InvalidProblem(f"the start has no {name}", argument, "give its prior standard deviation")
         variance += [float(size) ** 2] * dimension
     batch = np.broadcast_shapes(state.mean.shape[:-1], state.cov.shape[:-2])
     mean, cov = np.zeros((*batch, n)), np.zeros((*batch, n, n))
-    mean[..., :held], cov[..., :held, :held] = state.mean, state.cov
+    mean[..., :present], cov[..., :present, :present] = state.mean, state.cov
     # Priors of single coordinates are independent of the components of the start.
-    cov[..., range(held, n), range(held, n)] = variance
+    cov[..., range(present, n), range(present, n)] = variance
     return State(state.time, mean, cov)
 
 

@@ -205,11 +205,11 @@ def with_height_rows(problem: Problem) -> Problem:
     if other is not None:
         advice = "replace it by bounds, or solve the run as one problem"
         raise InvalidProblem(f"the constraint {other.name!r} is an equality", "track", advice)
-    heard = np.unique(problem.epoch[problem.weight > 0.0])
-    m, none = len(heard), np.full(len(heard), -1)
+    observed = np.unique(problem.epoch[problem.weight > 0.0])
+    m, none = len(observed), np.full(len(observed), -1)
     rise = problem.motions[0].rise
-    z = np.broadcast_to(exact[0].lower, (m,)) if rise is None else exact[0].lower[..., None] + rise[..., heard, 0]
-    rows = Rows("height", z, none, none, heard, np.zeros_like(heard), np.ones(m), np.zeros(m))
+    z = np.broadcast_to(exact[0].lower, (m,)) if rise is None else exact[0].lower[..., None] + rise[..., observed, 0]
+    rows = Rows("height", z, none, none, observed, np.zeros_like(observed), np.ones(m), np.zeros(m))
     block = Block(problem.count + np.arange(m)[:, None], np.full((1, 1, 1), _EXACT**2))
     kept = tuple(c for c in problem.constraints if not any(c is e for e in exact))
     return replace(problem, rows=(*problem.rows, rows), noise=Noise((*problem.noise.blocks, block)), constraints=kept)
@@ -310,11 +310,11 @@ def begin(
     """
     doubtful: list[_Stretch] = []
     verdict, last = Status.TOO_FEW_ROWS, first
-    heard = _heard(problem, first)
-    for i in _slides(len(heard) if ends else np.inf):
-        if i >= len(heard):
+    observed = _scans_with_rows(problem, first)
+    for i in _slides(len(observed) if ends else np.inf):
+        if i >= len(observed):
             raise Undecided(problem.epochs + 1)
-        last = int(heard[i])
+        last = int(observed[i])
         run = cut(problem, last, problem.epochs)
         # For a run that continues, add the next numbers of scans beyond the present length.
         tries = counts(run.epochs if ends else 2 * run.epochs + 2, dynamics.order, speed, rate)
@@ -420,7 +420,7 @@ def _is_vague(problem: Problem, state: State) -> bool:
     return not sigma <= reach(problem, state.mean[:d])
 
 
-def _heard(problem: Problem, first: int) -> Array:
+def _scans_with_rows(problem: Problem, first: int) -> Array:
     """Return the scans from `first` on that have a valid row."""
     scans = np.unique(problem.epoch[problem.weight > 0.0])
     return np.asarray(scans[scans >= first])

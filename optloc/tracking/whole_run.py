@@ -88,7 +88,7 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
         If the order is unknown, or the run has several targets.
     """
     fix = fitted(problem, order, method=method)
-    told = status_of_scans(fix)
+    status = status_of_scans(fix)
     state = State(float(problem.times[-1]), *(np.asarray(part) for part in (fix.x, fix.cov)))
     mean, cov = along(state, problem.times, problem.dimension)
     steps = []
@@ -104,7 +104,7 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
             white = whitened(scan, at)
             square = (white.residual**2).sum(-1)
         found = Updated(at, spread, square, -0.5 * (square + white.logdet), np.broadcast_to(white.count, none.shape))
-        code = np.where(white.count > 0, told, int(Status.TOO_FEW_ROWS)).astype(np.int8)
+        code = np.where(white.count > 0, status, int(Status.TOO_FEW_ROWS)).astype(np.int8)
         steps.append((found, np.broadcast_to(code, none.shape)))
     return collect(np.asarray(problem.times), steps, problem.dimension)
 
