@@ -216,7 +216,10 @@ def distance_from_plane(problem: Problem, fix: Fix, level: float = 0.95) -> tupl
 
 
 def information_in_square(across: Across, x: Array) -> tuple[Array, Array]:
-    """Return the information (N, n, n) on the shared unknowns with q instead of w, and a mask (N,) of its existence."""
+    """Return the information (N, n, n) on the shared unknowns, and a mask (N,) of its existence.
+
+    The unknown w, the distance from the plane, is replaced by q = w^2.
+    """
     own = across.part.stop - 1
     at = np.array(x)
     at[:, own] = np.maximum(at[:, own], across.least)

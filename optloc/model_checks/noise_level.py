@@ -82,8 +82,9 @@ class CommonLevel:
         """Return the explanation as one sentence without its full stop; empty if no cause was found."""
         accused = f"{self.accused} of {self.fixes} fixes do not fit"
         if self.suspect:
+            several = len(self.kinds) > 1
             parts = [
-                f"{f:.2g} times the stated one ({a:.2g} to {b:.2g}){f' in {kind} rows' if len(self.kinds) > 1 else ''}"
+                f"{f:.2g} times the stated noise ({a:.2g} to {b:.2g}){f' in {kind} rows' if several else ''}"
                 for kind, f, a, b in zip(self.kinds, self.factor, self.low, self.high, strict=True)
                 if f != 1.0
             ]

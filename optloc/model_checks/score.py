@@ -383,8 +383,7 @@ def _fitted(problem: Problem, x: Array, one: Candidate, scored: tuple[float, Arr
     slot, _ = larger.layout.find(larger.biases[-1].name)
     part = slice(slot.start, slot.start + slot.size)
     start = _embed(problem, larger, x)
-    # for a large drift or rotation, the step of the test is a poor start: descend from it and from zero, and take the
-    # better
+    # for a large drift or rotation, the step of the test is a poor start: descend from it and from zero
     start = np.concatenate([start, start])
     start[1, part] = scored[1]
     both, cost = descend(larger.take(np.zeros(2, dtype=int)), start)
