@@ -193,10 +193,10 @@ def _without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:
     n, length = problem.layout.n_shared, problem.layout.n_local
     if problem.epochs > 1 and length and np.isfinite(x[:, :n]).all():
         own = x[:, n:].reshape(-1, length)
-        lost = np.asarray(~np.isfinite(own).all(-1))
-        if lost.any() and not lost.all():
-            weight = np.where(lost[problem.epoch], 0.0, weight)
-            own = np.where(lost[:, None], np.mean(own[~lost], axis=0), own)
+        unfixed = np.asarray(~np.isfinite(own).all(-1))
+        if unfixed.any() and not unfixed.all():
+            weight = np.where(unfixed[problem.epoch], 0.0, weight)
+            own = np.where(unfixed[:, None], np.mean(own[~unfixed], axis=0), own)
             x = np.concatenate([x[:, :n], own.reshape(1, -1)], axis=1)
     # an absent value may have any size, but the arithmetic must not meet NaN
     rows = problem.with_rows(z=np.where(np.isfinite(problem.z), problem.z, 0.0), weight=weight)

@@ -113,16 +113,16 @@ class Across:
         `x` (N, size) are the starts. With `held`, the distance from the plane stays fixed.
         """
         start = np.array(x)
-        own = self.part.stop - 1
-        start[:, own] = np.maximum(start[:, own], self.least)
-        least = start[:, own] if held else self.least
+        axis = self.part.stop - 1
+        start[:, axis] = np.maximum(start[:, axis], self.least)
+        least = start[:, axis] if held else self.least
         with np.errstate(all="ignore"):
             done = refine(
                 self.problem,
                 start,
                 tolerance=_PROFILED if held else _SETTLED,
                 limit=_STEPS,
-                folded=Folded(own, least, held),
+                folded=Folded(axis, least, held),
             )
         return done.x, done.cost, done.status
 
@@ -220,13 +220,13 @@ def information_in_square(across: Across, x: Array) -> tuple[Array, Array]:
 
     The unknown w, the distance from the plane, is replaced by q = w^2.
     """
-    own = across.part.stop - 1
+    axis = across.part.stop - 1
     at = np.array(x)
-    at[:, own] = np.maximum(at[:, own], across.least)
+    at[:, axis] = np.maximum(at[:, axis], across.least)
     with np.errstate(all="ignore"):
         information, _, ok = marginal(equations_at(across.problem, at))
     scale = np.ones((len(x), information.shape[-1]))
-    scale[:, own] = 0.5 / at[:, own]
+    scale[:, axis] = 0.5 / at[:, axis]
     return information * scale[:, :, None] * scale[:, None, :], ok
 
 
@@ -255,9 +255,9 @@ def interval_across(across: Across, x: Array, cost: Array, level: float = REGION
 def _spread_of_square(across: Across, x: Array) -> Array:
     """Return the standard deviations (N,) of q, m^2; the squared sizes of the arrays if q has no information."""
     covariance, _ = linalg.inverse(information_in_square(across, x)[0])
-    own = across.part.stop - 1
+    axis = across.part.stop - 1
     with np.errstate(invalid="ignore"):
-        sigma = np.sqrt(np.maximum(covariance[:, own, own], 0.0))
+        sigma = np.sqrt(np.maximum(covariance[:, axis, axis], 0.0))
     return np.where(np.isfinite(sigma) & (sigma > 0.0), sigma, across.size**2)
 
 

@@ -194,10 +194,10 @@ def candidates(problem: Problem) -> tuple[Candidate, ...]:
         if not own.any():
             continue
         taken = MODELS[rows.kind].stations
-        heard = np.unique(np.concatenate([index[own] for index in (rows.a, rows.b)[:taken]] or [np.zeros(0, int)]))
+        observing = np.unique(np.concatenate([index[own] for index in (rows.a, rows.b)[:taken]] or [np.zeros(0, int)]))
         for form in _forms(problem, rows.kind):
             out.append(_candidate(problem, form, "kind", rows.kind, None))
-            out += [_candidate(problem, form, "station", rows.kind, names[i]) for i in heard if i >= 0]
+            out += [_candidate(problem, form, "station", rows.kind, names[i]) for i in observing if i >= 0]
     out += list(_turns(problem, present))
     return (*out, *_steps(problem, out))
 

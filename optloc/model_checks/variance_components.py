@@ -399,9 +399,9 @@ class Tested:
         dof[items] -= 1
         # Column j explains these columns completely, so they cannot be tested any more; rounding would make them
         # outliers.
-        gone = np.diagonal(matrix[items], axis1=-2, axis2=-1) <= _ROUNDING * self.size[items]
-        matrix[items] *= ~(gone[:, :, None] | gone[:, None, :])
-        vector[items] *= ~gone
+        explained = np.diagonal(matrix[items], axis1=-2, axis2=-1) <= _ROUNDING * self.size[items]
+        matrix[items] *= ~(explained[:, :, None] | explained[:, None, :])
+        vector[items] *= ~explained
         return Tested(matrix, vector, self.errors, cost, dof)
 
 

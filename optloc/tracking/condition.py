@@ -100,7 +100,7 @@ class Condition:
     """Condition of a track between two scans.
 
     - state: None before a start.
-    - heard: time of the last valid row, s.
+    - last_row: time of the last valid row, s.
     - recent: fit of the last scans.
     - lasting: errors that last from scan to scan.
     - rivals: other states of the start that the scans do not refute.
@@ -110,7 +110,7 @@ class Condition:
     """
 
     state: State | None
-    heard: float
+    last_row: float
     recent: Recent
     lasting: LastingErrors
     rivals: tuple[Rival, ...] = ()
@@ -119,9 +119,9 @@ class Condition:
     fresh: bool = False
 
     @classmethod
-    def of(cls, state: State | None, heard: float, rules: Rules) -> Condition:
+    def of(cls, state: State | None, last_row: float, rules: Rules) -> Condition:
         """Return the condition of a track before its first scan."""
-        return cls(state, heard, Recent(rules), LastingErrors(_WINDOW * rules.patience))
+        return cls(state, last_row, Recent(rules), LastingErrors(_WINDOW * rules.patience))
 
     def take(self, entry: Entry, fit: Fit, gated: int) -> None:
         """Update the condition by a scan; `gated` is the number of rows that the gate rejected."""
@@ -129,7 +129,7 @@ class Condition:
         # scan without rows does not change the count.
         used = int(entry.updated.count)
         self.missed = self.missed + 1 if gated > used else self.missed * int(used == 0)
-        self.heard = entry.time if used else self.heard
+        self.last_row = entry.time if used else self.last_row
         self.recent.add(fit)
         self.state = State(entry.time, entry.updated.mean, entry.updated.cov)
 

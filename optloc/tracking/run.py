@@ -132,9 +132,9 @@ def tracked(
     cleaned, broken = _clean(problem)
     # This function is no generator, so the checks above run at the call and not at the first scan.
     rules = rules or Rules()
-    course = Condition.of(start, float(problem.times[0]) if start is None else start.time, rules)
-    course.fresh = start is not None
-    return _TrackRun.of(cleaned, broken, dynamics, rule, rules).entries(course)
+    condition = Condition.of(start, float(problem.times[0]) if start is None else start.time, rules)
+    condition.fresh = start is not None
+    return _TrackRun.of(cleaned, broken, dynamics, rule, rules).entries(condition)
 
 
 def collected(entries: Sequence[Entry], dimension: int) -> Track:
@@ -187,43 +187,43 @@ class _TrackRun:
         near = 0.5 * float(np.ptp(problem.stations.places.reshape(-1, problem.dimension), axis=0).max())
         return cls(problem, Scans.of(problem, dynamics.order), bad, dynamics, rule, rules, how, near**2)
 
-    def entries(self, course: Condition, *, ends: bool = True) -> Iterator[Entry]:
+    def entries(self, condition: Condition, *, ends: bool = True) -> Iterator[Entry]:
         """Yield one entry per scan, from the present condition of the track; `ends` as in `begin`."""
         times, k = self.problem.times.tolist(), 0
         while k < len(times):
-            if course.state is None:
+            if condition.state is None:
                 r = self.rules
                 start_here = begin(self.problem, k, self.dynamics, r.speed, r.rate, r.starts, ends=ends)
-                yield from self._starting(start_here, k, course)
-                k, course.state, course.missed = start_here.last + 1, start_here.state, 0
-                course.rivals = start_here.rivals
-                course.recent.begin(start_here)
-                course.heard = times[start_here.last]
+                yield from self._starting(start_here, k, condition)
+                k, condition.state, condition.missed = start_here.last + 1, start_here.state, 0
+                condition.rivals = start_here.rivals
+                condition.recent.begin(start_here)
+                condition.last_row = times[start_here.last]
                 continue
-            before = course.state
-            found = self._update(k, before, times[k] - course.heard, course.lasting.memory(self.scans.memory))
+            before = condition.state
+            found = self._update(k, before, times[k] - condition.last_row, condition.lasting.memory(self.scans.memory))
             if isinstance(found, str):
-                course.why, course.state = found, None
+                condition.why, condition.state = found, None
                 continue
-            course.why = ""
+            condition.why = ""
             entry, fit, screen = found
-            if course.fresh and entry.updated.count + entry.rejected > 0:
+            if condition.fresh and entry.updated.count + entry.rejected > 0:
                 _check_agrees(entry)
-                course.fresh = False
-            course.take(entry, fit, entry.rejected - self.bad[k])
-            course.rivals = self._remaining(course.rivals, k, entry, times[k] - course.heard)
-            cov = course.lasting.take((self.scans, k, before), self.dynamics, entry.updated.cov, screen)
+                condition.fresh = False
+            condition.take(entry, fit, entry.rejected - self.bad[k])
+            condition.rivals = self._remaining(condition.rivals, k, entry, times[k] - condition.last_row)
+            cov = condition.lasting.take((self.scans, k, before), self.dynamics, entry.updated.cov, screen)
             k += 1
             wide = screen is None or screen[2] > self.near or cov is not entry.updated.cov
             vague = out_of_sight(self.problem, entry.updated.mean, cov) if wide else ""
-            yield course.judged(entry, cov, vague)
-            course.judge(vague)
+            yield condition.judged(entry, cov, vague)
+            condition.judge(vague)
 
-    def _starting(self, begun: Beginning, k: int, course: Condition) -> Iterator[Entry]:
+    def _starting(self, begun: Beginning, k: int, condition: Condition) -> Iterator[Entry]:
         """Yield the scans of a start; only the last scan has a state."""
         n = (self.dynamics.order + 1) * self.problem.dimension
         # Scans of a start have no separate states: their common fix is valid at the last scan.
-        why = course.why
+        why = condition.why
         none = Updated(np.full(n, np.nan), np.full((n, n), np.nan), np.array(np.nan), np.array(0.0), np.array(0))
         for i in range(k, begun.last + 1):
             time = float(self.problem.times[i])
@@ -231,7 +231,7 @@ class _TrackRun:
                 yield Entry(time, none, begun.waiting, self.bad[i], "starting", begun.reason)
                 continue
             count = np.array(int((self.problem.weight[self.problem.epoch == i] > 0.0).sum()) - begun.left_out)
-            cov = course.lasting.begin(self._stretch(begun), begun.state)
+            cov = condition.lasting.begin(self._stretch(begun), begun.state)
             done = replace(none, mean=begun.state.mean, cov=cov, count=count)
             reason = "; ".join(filter(None, (why, begun.reason)))
             out = self.bad[i] + begun.left_out
@@ -289,20 +289,20 @@ class _TrackRun:
         scan = scan_at(self.problem, k, self.dynamics.order)
         # Apply the gate before the update: a gross error would pull an iterated update.
         off = innovation(scan, ahead.mean, ahead.cov).normalised[scan.weight > 0.0] if scan.rows else np.zeros(0)
-        lost = int((~(np.abs(off) <= self.rules.gate)).sum())
+        gated = int((~(np.abs(off) <= self.rules.gate)).sum())
         used = scan
-        if lost:
+        if gated:
             used = scan.with_rows(weight=weights_within(scan, ahead.mean, ahead.cov, self.rules.gate))
         # The size of one gross error has no information about the other rows, so each row counts at most as the gate.
         # NaN also counts as the gate.
         fit = float(np.nan_to_num(np.minimum(off**2, self.rules.most), nan=self.rules.most).sum()), len(off)
         causes: list[str] = []
         done, code = take_scan(used, ahead, self.rule, causes)
-        return self._entry(k, done, int(code), lost, causes), fit, None
+        return self._entry(k, done, int(code), gated, causes), fit, None
 
-    def _entry(self, k: int, done: Updated, code: int, lost: int, causes: list[str]) -> Entry:
-        """Return the entry of an update; `lost` is the number of rows that failed the gate."""
-        rejected = lost + self.bad[k]
+    def _entry(self, k: int, done: Updated, code: int, gated: int, causes: list[str]) -> Entry:
+        """Return the entry of an update; `gated` is the number of rows that failed the gate."""
+        rejected = gated + self.bad[k]
         found = objections(_FINDINGS, _Taken(Status(code), rejected, int(done.count), causes))
         status, reason = found[0] if found else (Status(code), "")
         return Entry(float(self.problem.times[k]), done, status, rejected, "", reason)
@@ -360,7 +360,7 @@ class Follower:
 
     def __init__(self, dynamics: Dynamics, update: Update | str = "iekf", rules: Rules | None = None) -> None:
         self._dynamics, self._rule, self._rules = dynamics, filter_of(update), rules or Rules()
-        self._course: Condition | None = None
+        self._condition: Condition | None = None
         self._waiting: list[Problem] = []
         self._needed = 1  # number of scans that the next attempt of a start needs
         self.last = -np.inf
@@ -369,7 +369,7 @@ class Follower:
     @property
     def lost(self) -> str:
         """Return the reason why the track lost its state; empty if there is a state, or if there was no state yet."""
-        return self._course.why if self._course is not None and self._course.state is None else ""
+        return self._condition.why if self._condition is not None and self._condition.state is None else ""
 
     def take(self, scan: Problem) -> list[Entry]:
         """Return the results of all pending scans up to this scan; empty if a start needs more scans.
@@ -397,15 +397,15 @@ class Follower:
             return []
         cleaned, broken = _clean(reduce(joined, run))
         stretch = _TrackRun.of(cleaned, broken, self._dynamics, self._rule, self._rules)
-        course = self._course or Condition.of(None, float(run[0].times[0]), self._rules)
+        condition = self._condition or Condition.of(None, float(run[0].times[0]), self._rules)
         done: list[Entry] = []
         self._needed = 1
         try:
-            for entry in stretch.entries(course, ends=len(run) >= _WAITING):
+            for entry in stretch.entries(condition, ends=len(run) >= _WAITING):
                 done.append(entry)  # noqa: PERF402  # entries before an undecided start are kept
         except Undecided as undecided:
             self._needed = undecided.scans - len(done)
-        self._course, self._waiting, self.last = course, run[len(done) :], time
+        self._condition, self._waiting, self.last = condition, run[len(done) :], time
         return done
 
 

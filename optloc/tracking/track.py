@@ -234,12 +234,12 @@ def take_scan(scan: Problem, ahead: State, rule: Update, causes: list[str] | Non
     if not broken.any() and np.isfinite(done.cov).all() and np.isfinite(done.mean).all() and np.all(done.count > 0):
         return done, np.zeros(done.mean.shape[:-1], dtype=np.int8)
     lost = ~(np.isfinite(done.mean).all(-1) & np.isfinite(done.cov).all((-1, -2)))
-    silent = done.count == 0
+    empty = done.count == 0
     # Order of severity: a lost state, then rows that are not finite, then a scan without rows.
-    code = np.where(lost, Status.NUMERICAL, np.where(silent, Status.TOO_FEW_ROWS, Status.OK))
+    code = np.where(lost, Status.NUMERICAL, np.where(empty, Status.TOO_FEW_ROWS, Status.OK))
     code = np.where(broken & ~lost, Status.REJECTED, code).astype(np.int8)
     # Without a usable row, the prediction is the best estimate.
-    kept = lost | silent
+    kept = lost | empty
     mean = np.where(kept[..., None], ahead.mean, done.mean)
     cov = np.where(kept[..., None, None], ahead.cov, done.cov)
     return Updated(
