@@ -141,7 +141,7 @@ class _Recursion:
 
     @property
     def active(self) -> bool:
-        """Return whether errors are found."""
+        """Return whether an error was found."""
         return self.size > 0.0 or self.excess > 0.0
 
     def reset(self, white: Array) -> None:

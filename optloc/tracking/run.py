@@ -183,7 +183,7 @@ class _TrackRun:
         if isinstance(rule, Filter):
             own = min(gate, rule.how.gate)
             how = rule.how._replace(gate=float(own), most=rules.most, d=problem.dimension)
-        # From any centre, a station is at least half of the largest extent away.
+        # Whatever the position of the centre, one station is at least half of the largest extent away from it.
         near = 0.5 * float(np.ptp(problem.stations.places.reshape(-1, problem.dimension), axis=0).max())
         return cls(problem, Scans.of(problem, dynamics.order), bad, dynamics, rule, rules, how, near**2)
 
@@ -439,7 +439,7 @@ def _check_start(start: State, problem: Problem, dynamics: Dynamics) -> None:
 
 def _check_agrees(entry: Entry) -> None:
     """Raise InvalidProblem if the first scan contradicts a given state by its chi-square, or fails the gate."""
-    p_value = tail_probability(entry.updated.nis, entry.updated.count)  # NaN without a row
+    p_value = tail_probability(entry.updated.nis, entry.updated.count)  # NIS is NaN without a row
     if entry.code == Status.REJECTED or p_value < _CONTRADICTORY:
         what = f"the initial state contradicts the first scan, at {entry.time:.10g} s"
         advice = "correct it, increase its standard deviation, or remove it: a start needs no guess"

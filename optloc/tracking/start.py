@@ -421,7 +421,7 @@ def _is_vague(problem: Problem, state: State) -> bool:
 
 
 def _scans_with_rows(problem: Problem, first: int) -> Array:
-    """Return the scans from `first` on that have a valid row."""
+    """Return the scans from `first` on that have a valid row, in ascending order."""
     scans = np.unique(problem.epoch[problem.weight > 0.0])
     return np.asarray(scans[scans >= first])
 
