@@ -337,8 +337,8 @@ def late_signals_at(problem: Problem, kept: Array, x: Array) -> LateSignals:
     return replace(found, late=late, carried=carried)
 
 
-# Largest numbers of selections of late rows and of iterations of expectation and maximisation (EM), and the relative
-# change of share and delay that ends EM.
+# Largest number of selections of late rows; largest number of iterations of expectation and maximisation (EM); and the
+# relative change of share and delay that ends EM.
 _CHOICES, _TURNS, _ENDED = 10, 500, 1e-6
 # Mean delay in sigmas below which no delay is reported: its effect on a fix is negligible.
 _MIN_DELAY = 0.1

@@ -28,8 +28,8 @@ def profile(problem: Problem, x: Array, at: Array, passes: int = 1) -> tuple[Arr
     other unknowns. One update is exact if the rows are linear in them, unless the start is so far off that rounding
     matters.
 
-    The results are the costs (q, N), the information of the position (q, N, d, d) with other unknowns eliminated, and
-    half the negative gradient of the cost (q, N, d).
+    The results are costs (q, N), information (q, N, d, d) and vectors (q, N, d). The information belongs to the
+    position, with other unknowns eliminated. The vector is half the negative gradient of the cost.
     """
     slot, _ = problem.layout.find("position")
     part, n = slice(slot.start, slot.start + slot.size), problem.layout.n_shared
@@ -101,8 +101,8 @@ def departure(problem: Problem, x: Array, covariance: Array, face: Face, centre:
 
     It is the largest ``|ln((f(x +- 3 t) - f(x)) / 9)|`` over the principal axes t, in both directions: zero for a
     Gaussian, infinite if there is no chart. The second chart is tested only if the departure in the first chart exceeds
-    a tenth. `x` (N, size) are the fixes, `covariance` (N, n, n) the covariances of their shared unknowns, `face` the
-    equality constraints, and `centre` (N, d) the origin of the inverse-range chart.
+    a tenth. `x` (N, size) are the fixes, and `covariance` (N, n, n) the covariances of their shared unknowns. `face`
+    holds the equality constraints. `centre` (N, d) is the origin of the inverse-range chart.
 
     References
     ----------

@@ -142,8 +142,8 @@ def departure_inwards(problem: Problem, x: Array, covariance: Array, law: Trunca
 
     It is ``|ln((f(x + s t) - f(x)) / q)|``, the largest over the directions t that leave one bound and stay on the
     others. The step s ends where the quadratic model has increased by q = 9, or at another bound. `problem` is a flat
-    batch of N problems with one static position, `x` (N, size) are fixes on bounds, `covariance` (N, n, n) is the
-    covariance of the shared unknowns without the inequalities, and `law` their distribution.
+    batch of N problems with one static position, and `x` (N, size) are fixes on bounds. `covariance` (N, n, n) is the
+    covariance of the shared unknowns without the inequalities. `law` is the distribution of the positions.
     """
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)

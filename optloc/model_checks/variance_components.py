@@ -510,8 +510,8 @@ def snooped(tests: Tested, columns: slice, cut: float | Array, shared: Array | N
 
     In each problem, the column with the largest test above its limit `cut` is excluded, and the remaining columns are
     tested again. The procedure ends when no test exceeds its limit. `cut` is one limit for all columns or one limit per
-    column. If `shared` (N, p) is given, the squared test of a row must also exceed the squared tests of all shared
-    columns of its problem by a margin.
+    column. With `shared` (N, p), the squared test of a row must also exceed a limit: the squared tests of all shared
+    columns of its problem plus a margin.
     """
     n, first = len(tests.vector), range(tests.vector.shape[1])[columns].start
     shift, sigma = shown(tests, columns)

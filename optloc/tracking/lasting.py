@@ -46,8 +46,8 @@ _KEEP = 0.98
 # Standard deviations of the score above which errors last. Of 120 simulated tracks without lasting errors (60 scans
 # each), 3 exceeded it for some scans, and NEES was between 1.01 and 1.08.
 _SURE = 3.0
-# Standard deviations that are subtracted from the score of one error for all angles, because a chi-square with one
-# degree of freedom has a long tail. Without it, 7 % of tracks without lasting errors have a common error for some
+# Standard deviations that are subtracted from the score of one error for all angles. The reason is the long tail of a
+# chi-square with one degree of freedom. Without it, 7 % of tracks without lasting errors have a common error for some
 # scans.
 _SKEWED = 1.5
 # The same for larger errors that do not last: heavy tails of real rows must not trigger it.

@@ -23,8 +23,8 @@ from optloc.tracking.track import State, check_trackable
 
 # Metres. It is below every other error; a millimetre has too few digits in ECEF coordinates for convergence.
 _EXACT = 1e-2
-# If the chi-square of the rows of a start is less likely than this, the rows contradict each other, and a start at the
-# next scan is tried. One of ten thousand good starts is rejected, which costs a scan; a wrong start costs the track.
+# If the chi-square of the rows of a start is less likely than this, the rows contradict each other. The next scan is
+# then tried as a start. One of ten thousand good starts is rejected, which costs a scan; a wrong start costs the track.
 _PLAUSIBLE = 1e-4
 # Largest number of first scans that are tried before a contradictory start is accepted: every attempt needs a fix, and
 # for a longer contradiction a status is better than a longer search. The distance grows by half each time, and eleven
