@@ -137,38 +137,42 @@ def fit(made: Elements, left: Array, single: Array) -> VarianceFit:
     used = np.flatnonzero(total(made.of_effect, size))
     count, number = len(used), np.full(size + 1, -1)
     number[used] = np.arange(count)
-    group, none = number[made.of_effect], np.zeros(count, dtype=bool)
+    group, nothing_fixed = number[made.of_effect], np.zeros(count, dtype=bool)
     if not (tested(made, np.ones(())).dof > 0).any():
         advice = "add rows, stations or known heights"
         raise InvalidProblem("no fix has more rows than unknowns, so the noise cannot be estimated", "noise", advice)
     # One factor for all groups. If the data do not determine it, they determine no factor.
-    alike = _maximise(made, np.minimum(group, 0), np.zeros(1), none[:1], np.zeros(1))
-    begin = np.full(count, np.log(alike.variance[0]))
-    shared = ~(_relative_errors(alike.tests, group, np.exp(begin), none) < LOOSE) & ~single[used]
+    common = _maximise(made, np.minimum(group, 0), np.zeros(1), nothing_fixed[:1], np.zeros(1))
+    begin = np.full(count, np.log(common.variance[0]))
+    shared = ~(_relative_errors(common.tests, group, np.exp(begin), nothing_fixed) < LOOSE) & ~single[used]
     # Groups whose factors are not determined are merged. The merged class has the number of its first group.
     merge = np.where(shared, np.flatnonzero(shared)[0] if shared.any() else 0, np.arange(count))
-    kinds, place = np.unique(merge, return_inverse=True)
-    classes = np.append(place, -1)[group]
+    kinds, class_of = np.unique(merge, return_inverse=True)
+    classes = np.append(class_of, -1)[group]
     # If several groups are merged, the data may determine their common factor.
-    alone = np.isin(kinds, np.flatnonzero(shared))
+    undetermined = np.isin(kinds, np.flatnonzero(shared))
     if shared.sum() > 1:
-        alone &= ~(_relative_errors(alike.tests, classes, np.exp(begin[: len(kinds)]), none[: len(kinds)]) < LOOSE)
-    level = np.where(alone, 0.0, begin[: len(kinds)])
-    information, _ = _score(alike.tests, classes, np.exp(begin[: len(kinds)]), alone)
+        undetermined &= ~(
+            _relative_errors(common.tests, classes, np.exp(begin[: len(kinds)]), nothing_fixed[: len(kinds)]) < LOOSE
+        )
+    level = np.where(undetermined, 0.0, begin[: len(kinds)])
+    information, _ = _score(common.tests, classes, np.exp(begin[: len(kinds)]), undetermined)
     penalty = np.minimum(_PENALTY, _MAX_PENALTY_SHARE * np.diagonal(information))
-    found = _maximise(made, classes, level, alone, penalty)
-    low, high = (np.where(alone, np.nan, end)[place] for end in _confidence_interval(found, classes, alone))
+    found = _maximise(made, classes, level, undetermined, penalty)
+    low, high = (
+        np.where(undetermined, np.nan, end)[class_of] for end in _confidence_interval(found, classes, undetermined)
+    )
 
-    def spread(values: Array) -> Array:
+    def per_group(values: Array) -> Array:
         return np.asarray(np.append(values, np.nan)[number[:-1]])
 
     return VarianceFit(
-        np.where(left, 0.0, spread(found.variance[place])),
-        spread(np.where(shared, np.nan, found.error[place])),
-        spread(low),
-        spread(high),
+        np.where(left, 0.0, per_group(found.variance[class_of])),
+        per_group(np.where(shared, np.nan, found.error[class_of])),
+        per_group(low),
+        per_group(high),
         np.isin(np.arange(size), used[shared]),
-        bool(alone.any()),
+        bool(undetermined.any()),
         found.gross,
         found.tests,
     )
