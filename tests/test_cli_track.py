@@ -152,7 +152,7 @@ def test_a_given_state_needs_no_start(tmp_path):
     [
         (["--filter", "ikf"], "did you mean 'iekf'"),
         (["--model", "cvv"], "did you mean 'cv'"),
-        (["--noise", "-1"], "process noise of -1"),
+        (["--noise", "-1"], "process noise is -1"),
         (["--gap", "0"], "--gap"),
         (["--gate", "-3"], "--gate"),
         (["--model", "csm", "--memory", "0"], "time_constant"),

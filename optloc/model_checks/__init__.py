@@ -1,4 +1,4 @@
-"""Whether what is assumed holds: of a covariance that it covers, of a model that it fits."""
+"""Tests of the measurement model: noise levels, systematic errors, unit mistakes, geometry, Gaussian shape."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,7 @@
-"""Why a fix is not ok, as far as geometry, readings of the values and score tests can name it."""
+"""Explanations of a fix that is not `ok`: geometry, misread values (unit, sign, convention), and systematic errors.
+
+Score tests name a systematic error. Each explanation comes with a remedy, if possible as lines of a problem file.
+"""
 
 from __future__ import annotations
 
@@ -18,44 +21,48 @@ from optloc.problem.fix import Fix
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 
-# Explanations of a misfit that are told where several do as well.
-_SHOWN = 3
-# Rows of a run that are looked at: what lasts shows in them, and tests of all channels take seconds with more.
-_ROWS = 2000
+# Largest number of explanations of a misfit that are listed if several fit equally well.
+_MAX_ERRORS = 3
+# Largest number of rows of a run that are tested: lasting errors are visible in them, and tests of all channels of more
+# rows take seconds.
+_MAX_ROWS = 2000
 # Probability of the chi-square test below which the residuals are a misfit.
 _MISFIT = 0.01
 
 
 def advise(problem: Problem, fix: Fix | None = None) -> Any:
-    """Return what may be why a fix is not `ok`, and the lines of a problem file or the option that would help.
+    """Return possible reasons why a fix is not `ok`, each with the lines of a problem file or the option that helps.
 
-    Stations in a plane or on a line, no redundancy, values of another unit, sign or convention, and an offset, scale,
-    turn, drift or step of one channel, or of a whole kind, that explains what does not fit.
+    The reasons are: stations in a plane or on a line; no redundancy; values with another unit, sign or convention; and
+    a systematic error that explains the misfit. This error is an offset, scale, turn, drift or step of one channel or
+    of a whole kind.
 
     Parameters
     ----------
     problem : Problem
         One problem, a run, or a batch (...) of problems.
     fix : Fix, optional
-        Its fix, (k,) fixes of a run whose epochs share nothing, or those of the batch; None: what the geometry says,
-        and values by a fit of their own.
+        The fix of the problem, (k,) fixes of a run whose epochs share nothing, or the fixes of the batch. Without it,
+        the check uses the geometry, and compares values with a new fit.
 
     Returns
     -------
     tuple of Advice, or object array (...) of tuples
-        Empty where nothing is seen. Of data of a right model a score test names something once in a thousand times.
+        Empty if nothing was found. With a correct model, a score test reports an error in one of a thousand cases.
 
     Raises
     ------
     InvalidProblem
-        Where the fix is not one of this problem.
+        If the fix is not a fix of this problem.
     """
     shape = problem.batch_shape
     if not shape:
         return advise_at(problem, np.full((1, problem.layout.size), np.nan) if fix is None else fix.x)
     flat, out = problem.flat(), np.empty(int(np.prod(shape)), dtype=object)
     if fix is not None and fix.shape != shape:
-        raise InvalidProblem(f"fixes of shape {fix.shape} for problems of shape {shape}", "fix", "give its own")
+        raise InvalidProblem(
+            f"fixes of shape {fix.shape} for problems of shape {shape}", "fix", "give one fix per problem"
+        )
     x = np.full((len(out), problem.layout.size), np.nan) if fix is None else fix.flat().x
     for i in range(len(out)):
         out[i] = advise_at(flat.take(np.array([i])), x[i])
@@ -63,17 +70,12 @@ def advise(problem: Problem, fix: Fix | None = None) -> Any:
 
 
 def advise_at(problem: Problem, x: Array) -> tuple[Advice, ...]:
-    """Return the advice for one problem at a vector (size,), or at those (k, size) of epochs that share nothing.
+    """Return the advice for one problem or run at a fix (size,), or at fixes (k, size of an epoch) of separate epochs.
 
-    Parameters
-    ----------
-    problem : Problem
-        One problem or run.
-    x : array (size,) or (k, size of an epoch)
-        Least squares begin there; NaN where there is no fix.
+    Least squares starts at `x`; `x` is NaN if there is no fix.
     """
     flat, x = problem.flat(), _joined(problem, np.asarray(x))
-    # rows that are not measured yet count for the geometry
+    # planned rows without a measurement also count for the geometry
     found = list(advise_on_geometry(flat, x))
     problem, x = _shortened(*_without_unknown(flat, x))
     if not bool((problem.weight > 0.0).any()):
@@ -81,35 +83,35 @@ def advise_at(problem: Problem, x: Array) -> tuple[Advice, ...]:
     values = list(advise_on_values(problem, x))
     if not np.isfinite(x).all() and one_place(problem):
         x = fit_anywhere(problem).x
-    # what another reading explains needs no error besides
+    # if another unit, sign or convention explains the values, no systematic error is needed
     read = any(one.cause not in ("impossible", "constraint") for one in values)
-    errors = [] if read else [_tell(problem, one) for one in explain_misfit(problem, x)[:_SHOWN]]
+    errors = [] if read else [_error_advice(problem, one) for one in explain_misfit(problem, x)[:_MAX_ERRORS]]
     return (*values, *errors, *found)
 
 
 def explained(problem: Problem, fix: Fix) -> Problem | None:
-    """Return a problem with the systematic error among its unknowns that would explain most of the misfit of its fix.
+    """Return a problem with one more unknown: the systematic error that explains most of the misfit of its fix.
 
-    Nothing of it is done by itself: solve the larger problem and compare. An error that is there in truth is estimated
-    with what else is unknown; where there is none, a test names one in a thousand runs.
+    The given problem does not change. Solve the larger problem and compare. An error that exists is estimated together
+    with the other unknowns. Without an error, a test reports one in a thousand runs.
 
     Parameters
     ----------
     problem : Problem
         One problem or run.
     fix : Fix
-        Its fix, or those (k,) of a run whose epochs share nothing.
+        Its fix, or the fixes (k,) of a run whose epochs share nothing.
 
     Returns
     -------
     Problem or None
-        The error is its last bias, whose name tells what and whose it is, such as "drift of R2". None where no single
-        error explains the misfit.
+        The error is its last bias. The name of the bias states its form and its channel, such as "drift of R2". None if
+        no single error explains the misfit.
 
     Raises
     ------
     InvalidProblem
-        Where the fix is not one of this problem, or a batch is given.
+        If the fix is not a fix of this problem, or if the problem is a batch.
 
     References
     ----------
@@ -120,37 +122,32 @@ def explained(problem: Problem, fix: Fix) -> Problem | None:
 
 
 def explained_at(problem: Problem, x: Array) -> Problem | None:
-    """Return what `explained` does, for vectors as `advise_at` takes them."""
+    """Return the result of `explained` for a parameter vector with the shapes of `advise_at`."""
     if problem.batch_shape:
-        raise InvalidProblem("there are several problems", "explained", "take them one by one")
+        raise InvalidProblem("a batch of problems was given", "explained", "call it for each problem")
     part, x = _shortened(*_without_unknown(problem.flat(), _joined(problem, np.asarray(x))))
-    told = explain_misfit(part, x)
-    if not told:
+    explanations = explain_misfit(part, x)
+    if not explanations:
         return None
-    return replace(problem, biases=(*problem.biases, _whole(problem, told[0].candidate)))
+    return replace(problem, biases=(*problem.biases, _bias_of_run(problem, explanations[0].candidate)))
 
 
 def misfit_of(problem: Problem, x: Array) -> str:
-    """Return what would explain most of the misfit of a run at a vector (size,), in words; empty where nothing does.
+    """Return a sentence about the error that explains most of the misfit of a run at its fix (size,).
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of one run.
-    x : array (size,)
-        Its fix.
+    `problem` is a flat batch of one run.
     """
     part, x = _shortened(*_without_unknown(problem, x[None]))
-    told = explain_misfit(part, x)
-    if not told:
+    explanations = explain_misfit(part, x)
+    if not explanations:
         return "no error of a single station explains the misfit"
-    (value, unit), one = _size(part, told[0]), told[0]
+    (value, unit), one = _size(part, explanations[0]), explanations[0]
     article = _noun(one.candidate).split()[0]
     return f"{article} {one.candidate.name}, {value} {unit}, would explain it (p = {one.p_after:.2g})"
 
 
-def _whole(problem: Problem, one: Candidate) -> Bias:
-    """Return the bias of a candidate over all rows of a run, of which it was found in some."""
+def _bias_of_run(problem: Problem, one: Candidate) -> Bias:
+    """Return the bias of a candidate over all rows of a run; the test used only some of the rows."""
     members = (one.bias.members[0],) if one.per == "station" else None
     rows, names, kind = problem.rows, problem.stations.names, one.kind or None
     bias = family(rows, names, one.name, per=one.per, form=one.bias.form, kind=kind, members=members)
@@ -162,25 +159,27 @@ def _whole(problem: Problem, one: Candidate) -> Bias:
 
 
 def _joined(problem: Problem, x: Array) -> Array:
-    """Return the parameter vector (1, size) of a problem, of its epochs together where they are fixed one by one."""
+    """Return the parameter vector (1, size) of a problem; separate fixes of its epochs are joined."""
     layout = problem.layout
     if x.size == layout.size and x.ndim < 3 and not (separable(problem) and len(x) == problem.epochs > 1):
         return x.reshape(1, -1)
     if not separable(problem) or x.shape != (problem.epochs, by_epoch(problem).layout.size):
-        raise InvalidProblem(f"a fix of shape {x.shape} is not of this problem", "fix", "give the fix of this problem")
+        raise InvalidProblem(
+            f"a fix of shape {x.shape} does not belong to this problem", "fix", "give the fix of this problem"
+        )
     own = by_epoch(problem).layout
     parts = [own.take(x, slot.name).reshape(problem.epochs, -1) for slot in layout.local]
     return np.concatenate(parts, axis=1).reshape(1, -1)
 
 
 def _shortened(problem: Problem, x: Array) -> tuple[Problem, Array]:
-    """Return epochs of a long run, evenly over all of it: what lasts shows in them, and tests take time.
+    """Return some epochs of a long run, evenly over the whole run, to limit the time of the tests.
 
-    Errors grow with the run: its first epochs alone would not show a slow drift, nor what begins late.
+    Errors can grow with the run: its first epochs alone would not show a slow drift or an error that starts late.
     """
-    if problem.count <= _ROWS or problem.epochs == 1 or has_correlated_epochs(problem):
+    if problem.count <= _MAX_ROWS or problem.epochs == 1 or has_correlated_epochs(problem):
         return problem, x
-    kept = max(2, int(problem.epochs * _ROWS / problem.count))
+    kept = max(2, int(problem.epochs * _MAX_ROWS / problem.count))
     chosen = np.unique(np.linspace(0, problem.epochs - 1, kept).round().astype(int))
     chosen = chosen[np.isin(chosen, problem.epoch)]
     n, length = problem.layout.n_shared, problem.layout.n_local
@@ -189,22 +188,22 @@ def _shortened(problem: Problem, x: Array) -> tuple[Problem, Array]:
 
 
 def _without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:
-    """Return the problem without values that are no numbers, and of a run without the epochs that have no fix."""
+    """Return the problem without values that are not finite, and without the epochs of a run that have no fix."""
     weight = np.where(np.isfinite(problem.z), problem.weight, 0.0)
     n, length = problem.layout.n_shared, problem.layout.n_local
     if problem.epochs > 1 and length and np.isfinite(x[:, :n]).all():
         own = x[:, n:].reshape(-1, length)
-        lost = np.asarray(~np.isfinite(own).all(-1))
-        if lost.any() and not lost.all():
-            weight = np.where(lost[problem.epoch], 0.0, weight)
-            own = np.where(lost[:, None], np.mean(own[~lost], axis=0), own)
+        unfixed = np.asarray(~np.isfinite(own).all(-1))
+        if unfixed.any() and not unfixed.all():
+            weight = np.where(unfixed[problem.epoch], 0.0, weight)
+            own = np.where(unfixed[:, None], np.mean(own[~unfixed], axis=0), own)
             x = np.concatenate([x[:, :n], own.reshape(1, -1)], axis=1)
-    # an absent value may be anything, but no fit may meet it
+    # an absent value may have any size, but the arithmetic must not meet NaN
     rows = problem.with_rows(z=np.where(np.isfinite(problem.z), problem.z, 0.0), weight=weight)
     return rows, x
 
 
-# What a score test has found, in words.
+# Sentences about the result of a score test.
 
 
 def _noun(one: Candidate) -> str:
@@ -212,7 +211,8 @@ def _noun(one: Candidate) -> str:
     return {"step": "a step", "burst": "a burst of errors"}.get(one.form) or form_of(one.bias).noun
 
 
-def _tell(problem: Problem, one: Explained) -> Advice:
+def _error_advice(problem: Problem, one: Explained) -> Advice:
+    """Return the advice about a systematic error: its form, channel, size, duration and p-values."""
     bias, who = one.candidate.bias, one.candidate
     value, unit = _size(problem, one)
     station = bias.members[0]
@@ -225,10 +225,10 @@ def _tell(problem: Problem, one: Explained) -> Advice:
     seen = f"{what} of {whose}{rows} of {value} {unit}{when} would explain {better}: p = {one.p_after:.2g}"
     seen += f" with it, {one.p_before:.2g} without"
     if kind == "step":
-        return Advice("step", seen, "cut the run there, or give the rows from then on another station name")
+        return Advice("step", seen, "split the run there, or give the later rows another station name")
     if kind == "burst":
-        return Advice("burst", seen, "leave these rows out, or fix with the method 'robust'")
-    return Advice(kind, seen, "look at that channel; model it until then", _lines(problem, one))
+        return Advice("burst", seen, "remove these rows, or use the method 'robust'")
+    return Advice(kind, seen, "check this channel; until then, model the error", _lines(problem, one))
 
 
 def _size(problem: Problem, one: Explained) -> tuple[str, str]:
@@ -248,7 +248,7 @@ def _unit(problem: Problem, one: Explained) -> str:
 
 
 def _lines(problem: Problem, one: Explained) -> str:
-    """Return the lines of a problem file that model an error."""
+    """Return the lines of a problem file that model an error as a bias."""
     who, bias = one.candidate, one.candidate.bias
     taken = {each.name for each in problem.biases}
     name = next(text for text in (bias.form, *(f"{bias.form} {i}" for i in range(2, 99))) if text not in taken)
@@ -259,5 +259,5 @@ def _lines(problem: Problem, one: Explained) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return a name as TOML spells it."""
+    """Return a name as a TOML string."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

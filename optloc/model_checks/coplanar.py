@@ -1,7 +1,7 @@
-"""How far a target is from the plane of all stations, both sides of which fit alike.
+"""Interval of the distance of a target from the plane of all stations, where both sides of the plane fit equally well.
 
-The cost is one of the place in the plane and of q = w^2, the square of the distance. The law of w follows from
-the profile of the cost over q: near the plane no Gaussian describes it.
+The cost depends on the position in the plane and on q = w^2, the square of the distance w from the plane. The
+distribution of w follows from the profile of the cost over q, because no Gaussian describes w near the plane.
 """
 
 from __future__ import annotations
@@ -24,42 +24,38 @@ from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
 
 REGION_LEVEL = 0.95
-"""Probability of the interval of the distance from the plane, which separates one region from two."""
+"""Probability of the interval of the distance from the plane; the interval decides between one region and two."""
 JOINED = quantile(REGION_LEVEL, 1)
-"""Cost on the plane, above the least, up to which both sides of it are one region."""
+"""Cost on the plane, above the minimum, up to which both sides form one region."""
 
-# Share of the spread of the stations by which they may be off a plane: rounding of their coordinates. And the share of
-# the noise: it changes a residual by a thousandth of a standard deviation at most.
-_COPLANAR, _UNHEARD = 1e-9, 1e-3
-# Share of the spread of the stations that counts as no distance: its square changes no range by a digit that counts.
-_NONE = 1e-6
-# Steps at most: the cost is nearly quadratic in q, and most take two.
+# Stations are coplanar if their distances from a plane are below a share of their spread, which is rounding of
+# coordinates. They are also coplanar below a share of the noise: such a distance changes a residual by a thousandth of
+# a standard deviation at most.
+_COPLANAR, _NOISE_SHARE = 1e-9, 1e-3
+# Share of the spread of the stations that counts as zero distance: its square changes no significant digit of a range.
+_ZERO_DISTANCE = 1e-6
+# Largest number of steps. The cost is nearly quadratic in q, and most refinements take two steps.
 _STEPS = 100
-# Length of the last step, standard deviations: of a fix it is far below any uncertainty, and the cost of a profile is
-# off by its square.
+# Length of the last step in standard deviations, for a fix and for a point of a profile. For a fix it is far below any
+# uncertainty. The cost of a profile has an error of the square of this length.
 _SETTLED, _PROFILED = 1e-7, 1e-2
-# Standard deviations of q at which the end of its interval is looked for first: of a Gaussian it is at two.
-_FIRST = 2.5
-# Fourfold steps away from the plane: twelve lead a million spreads of the stations away.
+# The search for the end of the interval starts at this number of standard deviations of q; for a Gaussian the end is at
+# two.
+_FIRST_STEP = 2.5
+# Largest number of fourfold steps away from the plane: twelve steps lead to a million spreads of the stations.
 _FURTHER = 12
-# Steps towards an end at most, and the standard deviations that it may be off.
+# Largest number of steps towards an end of the interval, and the tolerance of the end in standard deviations.
 _TRIALS, _CLOSE = 20, 1e-2
 
 
 @dataclass(frozen=True, slots=True)
 class Across:
-    """N problems in coordinates of which the last is the distance from the plane of the stations.
+    """N problems in coordinates whose last axis is the distance from the plane of the stations.
 
-    Parameters
-    ----------
-    problem : Problem
-        The problems, without constraints.
-    centre : array (N, d)
-        Mean of the stations, metres.
-    axes : array (N, d, d)
-        Unit vectors in columns, the normal of the plane last.
-    size : array (N,)
-        Spread of the stations, metres.
+    - problem: the problems without constraints.
+    - centre (N, d): mean of the stations, m.
+    - axes (N, d, d): unit vectors in columns; the last one is the normal of the plane.
+    - size (N,): spread of the stations, m.
     """
 
     problem: Problem
@@ -69,7 +65,7 @@ class Across:
 
     @classmethod
     def of(cls, problem: Problem) -> Across:
-        """Return problems whose stations are coplanar."""
+        """Return problems with coplanar stations in the coordinates of their plane."""
         count = problem.batch_shape[0]
         centre, axes, _, size = plane_of_stations(problem)
         centre, axes = np.broadcast_to(centre, (count, centre.shape[-1])), axes[..., ::-1]
@@ -81,7 +77,7 @@ class Across:
         return cls(turned, centre, axes, np.broadcast_to(np.where(size > 0.0, size, 1.0), (count,)))
 
     def take(self, items: Array) -> Across:
-        """Return some of them."""
+        """Return the problems with these numbers."""
         return Across(self.problem.take(items), self.centre[items], self.axes[items], self.size[items])
 
     @property
@@ -92,11 +88,11 @@ class Across:
 
     @property
     def least(self) -> Array:
-        """Return the distances (N,) that count as zero, metres."""
-        return _NONE * self.size
+        """Return the distances (N,) that count as zero, m."""
+        return _ZERO_DISTANCE * self.size
 
     def to_plane(self, x: Array) -> Array:
-        """Return vectors (N, size) with the position in these coordinates, on the side where w is positive."""
+        """Return vectors (N, size) with the position in plane coordinates, on the side with positive w."""
         out = np.array(x)
         place = ((x[:, self.part] - self.centre)[:, None] @ self.axes)[:, 0]
         place[:, -1] = np.abs(place[:, -1])
@@ -104,7 +100,7 @@ class Across:
         return out
 
     def to_space(self, x: Array, side: Array) -> Array:
-        """Return vectors (N, size) of the problem as it was, on one side of the plane."""
+        """Return vectors (N, size) in the original coordinates, on one side (1 or -1) of the plane."""
         out = np.array(x)
         place = x[:, self.part].copy()
         place[:, -1] *= side
@@ -112,31 +108,26 @@ class Across:
         return out
 
     def refine(self, x: Array, *, held: bool) -> tuple[Array, Array, Array]:
-        """Return the ends of steps in the plane and in q: vectors (N, size), costs and `Status` numbers (N,).
+        """Return the refined vectors (N, size), their costs and their `Status` numbers (N,), by steps in plane and q.
 
-        Parameters
-        ----------
-        x : array (N, size)
-            Starts.
-        held : bool
-            Whether the distance from the plane stays as it is.
+        `x` (N, size) are the starts. With `held`, the distance from the plane stays fixed.
         """
         start = np.array(x)
-        own = self.part.stop - 1
-        start[:, own] = np.maximum(start[:, own], self.least)
-        least = start[:, own] if held else self.least
+        axis = self.part.stop - 1
+        start[:, axis] = np.maximum(start[:, axis], self.least)
+        least = start[:, axis] if held else self.least
         with np.errstate(all="ignore"):
             done = refine(
                 self.problem,
                 start,
                 tolerance=_PROFILED if held else _SETTLED,
                 limit=_STEPS,
-                folded=Folded(own, least, held),
+                folded=Folded(axis, least, held),
             )
         return done.x, done.cost, done.status
 
     def profile(self, x: Array, w: Array) -> tuple[Array, Array]:
-        """Return vectors (N, size) and costs (N,) at distances w (N,) from the plane, all else at its best."""
+        """Return the optimal vectors (N, size) and their costs (N,) at fixed distances w (N,) from the plane, m."""
         start = np.array(x)
         start[:, self.part.stop - 1] = w
         end, cost, _ = self.refine(start, held=True)
@@ -144,7 +135,7 @@ class Across:
 
 
 def is_symmetric(problem: Problem) -> bool:
-    """Return whether rows and priors of a problem are the same for mirror images in a plane of its stations."""
+    """Return whether rows and priors are equal for mirror images of the target in a plane of all stations."""
     if not one_position(problem) or depends_on_place(problem) or problem.stations.errors:
         return False
     if any(name == "position" for name, _, _ in prior_parts(problem)):
@@ -153,19 +144,19 @@ def is_symmetric(problem: Problem) -> bool:
 
 
 def is_coplanar(problem: Problem) -> Array:
-    """Return whether all stations of each problem lie in one plane, or in the plane on one line, (N,).
+    """Return a mask (N,) of problems with all stations in one plane, or on one line for problems in the plane.
 
-    So do stations that are off it by far less than the noise.
+    Distances from the plane far below the noise count as zero.
     """
     count = problem.batch_shape[0]
     if not is_symmetric(problem):
         return np.zeros(count, dtype=bool)
     _, _, off, size = plane_of_stations(problem)
-    return np.broadcast_to(off <= np.maximum(_COPLANAR * size, _UNHEARD * _noise(problem)), (count,))
+    return np.broadcast_to(off <= np.maximum(_COPLANAR * size, _NOISE_SHARE * _noise(problem)), (count,))
 
 
 def _noise(problem: Problem) -> Array:
-    """Return the least standard deviation (N or 1,) of the ranges, metres; zero for other rows."""
+    """Return the smallest standard deviation of the ranges (N or 1,), m; zero if a row depends on no range."""
     if any(MODELS[rows.kind].ranges is None for rows in problem.rows):
         return np.zeros(1)
     sigma = np.sqrt(variances(problem.noise, problem.count))
@@ -173,22 +164,22 @@ def _noise(problem: Problem) -> Array:
 
 
 def normal_of(problem: Problem) -> Array | None:
-    """Return the normal (d,) of the plane of the stations of one problem, or None where its sides are not alike."""
+    """Return the normal (d,) of the plane of the stations, or None if the two sides of the plane differ."""
     if problem.constraints or not is_coplanar(problem).all():
         return None
     return np.asarray(plane_of_stations(problem)[1][0, :, 0])
 
 
 def distance_from_plane(problem: Problem, fix: Fix, level: float = 0.95) -> tuple[float, float]:
-    """Return the interval of the distance of a target from the plane that all stations lie in.
+    """Return the interval of the distance of a target from the plane of all stations.
 
-    It follows from the profile likelihood: in it the least cost is below the cost of the fix plus a quantile of
-    chi-square. Both sides of the plane fit alike, so the distance has no sign.
+    It follows from the profile likelihood. The interval holds the distances whose minimal cost is at most the cost of
+    the fix plus a quantile of chi-square. Both sides of the plane fit equally well, so the distance has no sign.
 
     Parameters
     ----------
     problem : Problem
-        A single problem: one position that stays, ranges or sums, differences or ratios of ranges, no constraints.
+        A single problem: one static position; ranges or sums, differences or ratios of ranges; no constraints.
     fix : Fix
         Its fix.
     level : float
@@ -197,12 +188,12 @@ def distance_from_plane(problem: Problem, fix: Fix, level: float = 0.95) -> tupl
     Returns
     -------
     low, high : float
-        Metres; `low` is zero where the target may lie in the plane, `high` is infinite where no distance is excluded.
+        Metres. `low` is zero if the target may be in the plane. `high` is infinite if no distance is excluded.
 
     Raises
     ------
     InvalidProblem
-        For stations that lie in no plane, other rows, or a fix without a position.
+        If the stations are not in one plane, for other rows, or for a fix without a position.
 
     References
     ----------
@@ -211,10 +202,12 @@ def distance_from_plane(problem: Problem, fix: Fix, level: float = 0.95) -> tupl
     flat, x = problem.flat(), fix.flat().x
     if problem.constraints or not is_coplanar(flat).all():
         raise InvalidProblem(
-            "the sides of no plane fit alike", "problem", "give ranges of stations in one plane, without constraints"
+            "the stations have no plane of symmetry",
+            "problem",
+            "give ranges of stations in one plane, without constraints",
         )
     if not np.isfinite(x).all():
-        raise InvalidProblem("there is no position that an interval could be about", "fix", "see its status for why")
+        raise InvalidProblem("the fix has no position", "fix", "see its status for the reason")
     across = Across.of(flat)
     at = across.to_plane(x)
     _, cost = across.profile(at, at[:, across.part.stop - 1])
@@ -223,33 +216,25 @@ def distance_from_plane(problem: Problem, fix: Fix, level: float = 0.95) -> tupl
 
 
 def information_in_square(across: Across, x: Array) -> tuple[Array, Array]:
-    """Return the information (N, n, n) on the shared unknowns with q in place of w, and where it exists (N,)."""
-    own = across.part.stop - 1
+    """Return the information (N, n, n) on the shared unknowns, and a mask (N,) of its existence.
+
+    The unknown w, the distance from the plane, is replaced by q = w^2.
+    """
+    axis = across.part.stop - 1
     at = np.array(x)
-    at[:, own] = np.maximum(at[:, own], across.least)
+    at[:, axis] = np.maximum(at[:, axis], across.least)
     with np.errstate(all="ignore"):
         information, _, ok = marginal(equations_at(across.problem, at))
     scale = np.ones((len(x), information.shape[-1]))
-    scale[:, own] = 0.5 / at[:, own]
+    scale[:, axis] = 0.5 / at[:, axis]
     return information * scale[:, :, None] * scale[:, None, :], ok
 
 
 def interval_across(across: Across, x: Array, cost: Array, level: float = REGION_LEVEL) -> tuple[Array, Array]:
-    """Return the ends (N,) of the distance from the plane within which the profile of the cost is low enough.
+    """Return the ends (N,) of the interval of the distance from the plane, by the profile of the cost.
 
-    Parameters
-    ----------
-    across : Across
-        N problems.
-    x, cost : array (N, size), (N,)
-        Their fixes, in these coordinates.
-    level : float
-        Probability that the interval holds the distance.
-
-    Returns
-    -------
-    low, high : array (N,)
-        Metres; the far end is infinite where no distance up to a million spreads of the stations costs enough.
+    `x` (N, size) are the fixes in plane coordinates and `cost` (N,) their costs. Both ends are in metres. The upper end
+    is infinite if no distance up to a million spreads of the stations has a high enough cost.
     """
     rise, w = quantile(level, 1), x[:, across.part.stop - 1]
     sigma = _spread_of_square(across, x)
@@ -259,7 +244,7 @@ def interval_across(across: Across, x: Array, cost: Array, level: float = REGION
         least = across.least[apart] ** 2
         ends = (w[apart] ** 2, cost[apart], least, on_plane[apart])
         low[apart] = _crossing(across.take(apart), x[apart], rise, ends, w[apart] ** 2 - np.sqrt(rise) * sigma[apart])
-    far, there = _beyond(across, x, cost + rise, sigma)
+    far, there = _bracket(across, x, cost + rise, sigma)
     found, high = np.flatnonzero(np.isfinite(far)), np.full(len(x), np.inf)
     if len(found):
         ends = (w[found] ** 2, cost[found], far[found] ** 2, there[found])
@@ -268,18 +253,18 @@ def interval_across(across: Across, x: Array, cost: Array, level: float = REGION
 
 
 def _spread_of_square(across: Across, x: Array) -> Array:
-    """Return standard deviations (N,) of q; the squared sizes of the arrays where q has no information."""
+    """Return the standard deviations (N,) of q, m^2; the squared sizes of the arrays if q has no information."""
     covariance, _ = linalg.inverse(information_in_square(across, x)[0])
-    own = across.part.stop - 1
+    axis = across.part.stop - 1
     with np.errstate(invalid="ignore"):
-        sigma = np.sqrt(np.maximum(covariance[:, own, own], 0.0))
+        sigma = np.sqrt(np.maximum(covariance[:, axis, axis], 0.0))
     return np.where(np.isfinite(sigma) & (sigma > 0.0), sigma, across.size**2)
 
 
-def _beyond(across: Across, x: Array, top: Array, sigma: Array) -> tuple[Array, Array]:
-    """Return distances (N,) from the plane at which the profile of the cost is above a level (N,), and these costs."""
-    # one step where the cost is quadratic in q
-    far = np.sqrt(x[:, across.part.stop - 1] ** 2 + _FIRST * sigma)
+def _bracket(across: Across, x: Array, top: Array, sigma: Array) -> tuple[Array, Array]:
+    """Return distances (N,) whose profile cost exceeds a level (N,), and these costs; infinite without a crossing."""
+    # one step is enough if the cost is quadratic in q
+    far = np.sqrt(x[:, across.part.stop - 1] ** 2 + _FIRST_STEP * sigma)
     reached, cost = across.profile(x, far)
     for _ in range(_FURTHER):
         within = cost <= top
@@ -293,20 +278,10 @@ def _beyond(across: Across, x: Array, top: Array, sigma: Array) -> tuple[Array, 
 
 
 def _crossing(across: Across, x: Array, rise: float, ends: tuple[Array, ...], first: Array) -> Array:
-    """Return the distances (N,) at which the profile of the cost reaches a rise: false position in q.
+    """Return the distances (N,) at which the profile of the cost reaches `rise` above the fix, by false position in q.
 
-    What is followed is the root of the rise, which is nearly linear in q.
-
-    Parameters
-    ----------
-    across, x : Across, array (N, size)
-        The problems, and their fixes.
-    rise : float
-        Of the cost above the fix.
-    ends : tuple of array (N,)
-        The q of the fix and its cost; a q whose cost is above the level, and this cost.
-    first : array (N,)
-        Where the crossing is expected.
+    The iteration uses the square root of the rise, which is nearly linear in q. `ends` are q and cost of the fix, and q
+    and cost of a point above the level. `first` (N,) is the expected q of the crossing.
 
     References
     ----------
@@ -323,7 +298,7 @@ def _crossing(across: Across, x: Array, rise: float, ends: tuple[Array, ...], fi
             break
         over = now > 0.0
         reached = np.where(over[:, None], reached, there)
-        # an end that stays twice in a row counts half
+        # an end that stays for two iterations counts half, as in the modified regula falsi
         low, high = np.where(over & (side > 0.0), 0.5 * low, low), np.where(~over & (side < 0.0), 0.5 * high, high)
         a, low = np.where(over, a, q), np.where(over, low, now)
         b, high = np.where(over, q, b), np.where(over, now, high)

@@ -1,4 +1,7 @@
-"""Directions, ranges, places and curves that the data of one fix determine, in every status."""
+"""Quantities that the data of one fix determine, with any status: directions, ranges, coordinates and curves.
+
+A fix that is not `ok` may still determine a direction, a distance from a line or plane, or a curve.
+"""
 
 from __future__ import annotations
 
@@ -20,46 +23,46 @@ from optloc.problem.fix import Fix
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
 
-# Standard deviations of a 95 % interval.
+# Half width of a 95 % interval in standard deviations.
 _WIDE = float(np.sqrt(quantile(LEVEL, 1)))
-# Least redundancy of a direction: the range may be open, and nothing else.
-_LEAST = -1
-# Reach of a curve without an end, baselines; and its points, an odd number.
+# Smallest redundancy for a direction: one unknown, the range, may be undetermined.
+_MIN_DOF = -1
+# Length of an infinite curve in baselines, and the number of its points, which is odd.
 _REACH, _POINTS = 10.0, 201
-# Cosine of an axis with the normal of a plane below which it is in the plane: rounding.
+# Cosine between an axis and the normal of a plane below which the axis is in the plane: rounding.
 _IN_PLANE = 1e-9
-# Distance, spreads of the stations, beyond which an end is infinite: a tenth of that in the place of infinity.
+# Distance in spreads of the stations beyond which an end is infinite: a tenth of the distance that represents infinity.
 _ENDLESS = 0.1 / INFINITY
 
 
 def determined(problem: Problem, fix: Fix) -> Determined:
-    """Return directions, ranges and curves that the data of one fix determine, in every status.
+    """Return directions, ranges and curves that the data of one fix determine, with any status.
 
     Parameters
     ----------
     problem : Problem
         A single problem.
     fix : Fix
-        Its fix. Only the weights of its rows and its reason count: all minima are searched.
+        Its fix. Only the weights of its rows and its reason are used: the function searches all minima.
 
     Returns
     -------
     Determined
-        Of one position at rest without constraints: directions with cones and ranges, numbers about a line or plane
-        that all stations lie in, and the curve of a single measurement. Of other problems the reason of the fix.
+        For one static position without constraints: directions with cones and ranges; coordinates relative to a line or
+        plane of all stations; or the curve of a single measurement. For other problems, the reason of the fix.
 
     Raises
     ------
     InvalidProblem
-        For several fixes.
+        If there are several fixes.
 
     Notes
     -----
     A cone holds the directions u with ``min over w >= 0 of f(u, w) <= f_min + q``. Here w is the inverse of the
-    distance from the stations' middle, and f_min the least cost, infinity included; q is the quantile of chi-square
-    with d - 1 degrees of freedom. Azimuth, elevation, range and all other intervals follow from profiles of the cost
-    with one degree of freedom. With small arrays and far targets,
-    94.6 % of 2 200 simulated directions are in the cones.
+    distance from the centre of the stations. f_min is the lowest cost, infinity included. q is the quantile of
+    chi-square with d - 1 degrees of freedom. Azimuth, elevation, range and all other intervals follow from profiles of
+    the cost with one degree of freedom. With small arrays and far targets, 94.6 % of 2 200 simulated directions are in
+    the cones.
 
     References
     ----------
@@ -68,8 +71,8 @@ def determined(problem: Problem, fix: Fix) -> Determined:
     """
     if fix.shape != () or int(np.prod(problem.batch_shape)) != 1:
         advice = "take one fix of a batch: `problem.flat().take([i])` and `fix.flat()[i]`"
-        raise InvalidProblem("this describes one fix, and these are several", "fix", advice)
-    # weights of a fix among fixes with more rows are padded
+        raise InvalidProblem("several fixes were given, not one", "fix", advice)
+    # in a batch, the weights of a fix with fewer rows are padded
     flat = problem.flat().with_rows(weight=fix.weights[None, : problem.count])
     words = str(fix.reason[()] or "")
     if not has_directions(flat) or not _is_complete(flat):
@@ -80,18 +83,18 @@ def determined(problem: Problem, fix: Fix) -> Determined:
 
 
 def _level(problem: Problem, centre: Array) -> Array:
-    """Return east, north and up (d, d) in rows at a place, or the axes of the frame."""
+    """Return the unit vectors east, north and up (d, d) at a position in rows, or the axes of a Cartesian frame."""
     return problem.frame.enu_axes(centre) if problem.frame.geodetic else np.eye(problem.dimension)
 
 
 def _is_complete(problem: Problem) -> bool:
-    """Return whether there are rows, and numbers in all of them."""
+    """Return whether the problem has present rows and all their values are finite."""
     present = problem.weight > 0.0
     return bool(present.any() and np.isfinite(np.where(present, problem.z, 0.0)).all())
 
 
 def _of_one(flat: Problem, dof: int) -> Determined:
-    """Return the `Determined` of a flat batch of one problem, with directions if it has enough rows for them."""
+    """Return the determined quantities of a flat batch of one problem; directions only with enough rows."""
     view, north = DirectionCost.of(flat), flat.frame.geodetic
     level = _level(flat, view.centre)
     axes, line = plane_of_stations(flat)[1][0], _about_line(flat)
@@ -100,23 +103,23 @@ def _of_one(flat: Problem, dof: int) -> Determined:
     outside, (name, curve, numbers) = False, _curve(flat)
     if curve is not None:
         return Determined(view.centre, level, north, (), numbers, curve, name)
-    found = directions_of(view, level, dof < 0) if dof >= _LEAST else ()
+    found = directions_of(view, level, dof < 0) if dof >= _MIN_DOF else ()
     if dof >= 0 and not found:
-        # between the stations any direction is possible: look at targets outside their sphere alone
+        # between the stations any direction is possible: consider only targets outside their sphere
         found = directions_of(replace(view, most=1.0), level)
         outside = bool(found)
-    # where the range has no end, the distance from a plane has no end either
+    # if the range is unbounded, the distance from a plane is unbounded too
     closed = not outside and all(one.mixed for one in found)
     across = _in_plane(flat, view) if closed and is_coplanar(flat)[0] else ()
     axis = axes[:, 0] if across else None
     return Determined(view.centre, level, north, found, across, axis=axis, outside=outside)
 
 
-# Stations on a line in space: the target may turn about it.
+# Stations on a line in space: the data do not determine the angle of the target about the line.
 
 
 def _about_line(flat: Problem) -> Problem | None:
-    """Return the problem in the plane through a line that all stations lie on, or None where there is no line."""
+    """Return the problem in a plane through the line of all stations, or None if the stations are on no line."""
     if flat.dimension != 3 or not is_coplanar(flat)[0]:
         return None
     centre, axes, _, size = plane_of_stations(flat)
@@ -130,7 +133,10 @@ def _about_line(flat: Problem) -> Problem | None:
 
 
 def _along_line(problem: Problem) -> tuple[Quantity, ...]:
-    """Return angle to a line of stations, place along it and distance from it, of a problem with the line as x axis."""
+    """Return the angle to the line of stations, the coordinate along it and the distance from it.
+
+    The problem has the line as its x axis.
+    """
     view, rise = DirectionCost.of(problem), quantile(LEVEL, 1)
     minima = minima_of(view, rise)
     if not np.isfinite(minima.cost[0]):
@@ -162,17 +168,17 @@ def _along_line(problem: Problem) -> tuple[Quantity, ...]:
 
 
 def _endless(values: Array, limit: float) -> tuple[float, float]:
-    """Return the least and greatest of values; infinite beyond a limit."""
+    """Return the smallest and the largest value; infinite beyond a limit."""
     ends = np.array([values.min(), values.max()])
     low, high = np.where(np.abs(ends) < limit, ends, np.copysign(np.inf, ends)).tolist()
     return low, high
 
 
-# Stations in a plane: the side is open.
+# Stations in a plane: the data do not determine the side of the plane.
 
 
 def _in_plane(flat: Problem, view: DirectionCost) -> tuple[Quantity, ...]:
-    """Return the place in the plane of all stations and the distance from it; nothing where either has no end."""
+    """Return the coordinates in the plane of all stations and the distance from it; empty if one is unbounded."""
     if (flat.weight > 0.0).sum() < flat.dimension:
         return ()
     minima = minima_of(view, 0.0)
@@ -192,7 +198,7 @@ def _in_plane(flat: Problem, view: DirectionCost) -> tuple[Quantity, ...]:
 
 
 def _coordinates(across: Across, place: Array, covariance: Array) -> tuple[Quantity, ...]:
-    """Return coordinates in a plane: the frame's where they lie in it, else along its axes."""
+    """Return coordinates in a plane: along axes of the frame if they are in the plane, else along principal axes."""
     centre, axes = across.centre[0], across.axes[0]
     level = np.flatnonzero(np.abs(axes[:, -1]) <= _IN_PLANE)
     if len(level) == len(place):
@@ -206,14 +212,17 @@ def _coordinates(across: Across, place: Array, covariance: Array) -> tuple[Quant
     return tuple(Quantity(name, value, low, high, "m") for name, value, low, high in ends)
 
 
-# One measurement in the plane: a curve.
+# One measurement in the plane determines a curve.
 
 _NAMES = {"tdoa": "hyperbola", "range": "circle", "range_sum": "ellipse"}
 _LENGTHS = {"tdoa": "difference", "range": "range", "range_sum": "sum"}
 
 
 def _curve(flat: Problem) -> tuple[str, Array | None, tuple[Quantity, ...]]:
-    """Return the name of the line that a single row in the plane leaves, its points, and the length; or nothing."""
+    """Return the name of the curve of a single row in the plane, its points (k, 2) in m, and the measured length.
+
+    The points are None if the problem is not of this form.
+    """
     numbers = np.flatnonzero(flat.weight.reshape(-1) > 0.0)
     if flat.dimension != 2 or len(numbers) != 1 or flat.biases or flat.priors:
         return "", None, ()
@@ -232,20 +241,20 @@ def _curve(flat: Problem) -> tuple[str, Array | None, tuple[Quantity, ...]]:
 
 
 def _hyperbola(a: Array, b: Array, z: float) -> Array:
-    """Return points (k, 2) that are farther from a than from b by z; a ray where z exceeds the distance from a to b."""
+    """Return points (k, 2) of the hyperbola |x - a| - |x - b| = z, m; of a ray if |z| exceeds the baseline."""
     base = float(np.hypot(*(a - b)))
     along = (b - a) / base
     if abs(z) >= base:
         return np.stack([b, b + _REACH * base * along] if z > 0.0 else [a, a - _REACH * base * along])
     vertex, side = 0.5 * z, np.sqrt(0.25 * base**2 - 0.25 * z**2)
     turn = np.linspace(-1.0, 1.0, _POINTS) * np.arcsinh(_REACH * base / side)
-    # z > 0: nearer b
+    # for z > 0 the branch is nearer to b
     ahead = vertex * np.cosh(turn)
     return np.asarray(0.5 * (a + b) + ahead[:, None] * along + (side * np.sinh(turn))[:, None] * _across(along))
 
 
 def _ellipse(a: Array, b: Array, total: float) -> Array:
-    """Return points (k, 2) with a sum of the distances from a and b; the stretch between them where it is too short."""
+    """Return points (k, 2) with a given sum of distances from a and b, m; the segment a-b if the sum is too small."""
     base = float(np.hypot(*(a - b)))
     along = (b - a) / base if base > 0.0 else np.array([1.0, 0.0])
     if total <= base:
@@ -258,14 +267,15 @@ def _ellipse(a: Array, b: Array, total: float) -> Array:
 
 
 def _across(along: Array) -> Array:
+    """Return a vector in the plane, rotated counter-clockwise by a right angle."""
     return np.array([-along[1], along[0]])
 
 
-# A fix by itself.
+# A single fix with the status `ok`.
 
 
 def of_fix(fix: Fix) -> Determined | None:
-    """Return the coordinates of a single fix that is `ok` with their intervals, None for others."""
+    """Return the coordinates of a single fix with their intervals if it is `ok`, else None."""
     if Status(int(fix.code)) is not Status.OK or fix.chart is None:
         return None
     numbers = tuple(
@@ -277,7 +287,7 @@ def of_fix(fix: Fix) -> Determined | None:
 
 
 def _ends(fix: Fix, axis: Extent) -> tuple[float, float]:
-    """Return the 95 % interval of a coordinate: shortest where bounds cut its law off."""
+    """Return the 95 % interval of a coordinate, m; the shortest interval if bounds truncate the distribution."""
     if fix.chart is not None and fix.chart.cut_off:
         low, high = fix.interval(axis)
         return float(low), float(high)

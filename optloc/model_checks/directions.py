@@ -1,9 +1,9 @@
-"""Which directions and ranges the data allow: the likelihood set over the direction and the inverse of the range.
+"""Confidence sets of direction and range of a target, from the likelihood over direction and inverse range.
 
-The target is at ``x = c + (s / v) u``: c is the middle of the stations, s their spread, u a unit vector, and v >= 0 the
-inverse of the range in spreads. Infinity is v = 0, a point like others, so a plane wave needs no special case. A cone
-holds the directions whose cost, at the v that suits them best, is near enough to the least. The inverse range is not
-Gaussian at its bound, so all ends follow from the cost itself.
+The target is at ``x = c + (s / v) u``. Here c is the centre of the stations, s their spread, u a unit vector, and v >=
+0 the inverse range in spreads. Infinity is v = 0, a regular point, so a plane wave needs no special case. A cone holds
+the directions whose cost, at the best v, is close enough to the minimum. The inverse range is not Gaussian at its
+bound, so all ends follow from the cost itself.
 """
 
 from __future__ import annotations
@@ -27,63 +27,57 @@ from optloc.problem.determined import LEVEL, Direction, is_in_cone
 from optloc.problem.problem import Problem
 
 INFINITY = 1e-6
-"""Inverse range that counts as zero: fronts bend by 5e-7 of the spread, and derivatives by it keep four digits."""
+"""Inverse range that counts as zero: wave fronts bend by 5e-7 of the spread, and derivatives keep four digits."""
 
-# Greatest inverse range: a point so near the middle has no direction.
-_NEAR = 1e3
-# Directions that are tried, some 28 degrees apart in space and 15 in the plane, each at these inverse ranges.
+# Largest inverse range: a point closer to the centre has no direction.
+_LARGEST = 1e3
+# Numbers of directions of the grid search, about 28 degrees apart in space and 15 in the plane, and the inverse ranges
+# at each direction.
 _TRIED = {2: 24, 3: 50}
 _INVERSE = np.array([INFINITY, 0.1, 0.3, 1.0, 3.0])
-# Starts that are refined, and steps of each: a damped step squares a small error.
+# Number of starts that are refined, and number of steps of each: a damped step squares a small error.
 _REFINED, _STEPS = 16, 40
-# Steps at one point of an edge: it begins next to its end.
+# Number of steps at one point of an edge, where the start is close to the result.
 _FEW = 12
-# Share of a cost that steps must promise to go on: it is compared with a quantile of several.
-_STILL = 1e-6
+# Steps end if the predicted decrease is below this share of the cost; the cost is compared with a quantile of several.
+_CONVERGED = 1e-6
 # Damping of the first step, relative to the diagonal.
 _DAMPING = 1e-3
-# Largest turn of a step, radians: beyond it the model is of another place.
+# Largest rotation of a step in radians: beyond it the linear model is not valid.
 _TURN = 0.5
-# Rays to the edge of a cone in space: the polygon lacks 0.6 % of an ellipse.
+# Number of rays to the edge of a cone in space: the area of the polygon is 0.6 % smaller than the ellipse.
 _RAYS = 32
-# Growth of a step that looks for the far side of an edge, and false positions at most.
+# Growth of a step that searches the outer side of an edge, and the largest number of false positions.
 _GROWTH, _TRIALS = 1.6, 14
-# Departure of the root of a rise from its goal that is left: a hundredth of a standard deviation.
+# Tolerance of the square root of the rise: a hundredth of a standard deviation.
 _CLOSE = 1e-2
-# Cones at most. More minima are points of a valley, which no cone describes.
+# Largest number of cones. More minima are points of a valley, which no cone describes.
 _CONES = 4
-# Inverse range next to the stations, where the cost may have another minimum.
-_BESIDE = 0.5
-# Largest angle to the edge of a cone, radians: farther away it has no edge. Lunes of two mirror images are as long.
+# Inverse range close to the stations, where the cost may have another minimum.
+_NEAR_STATIONS = 0.5
+# Largest angle to the edge of a cone in radians: beyond it the cone has no edge. Lunes of two mirror images reach it.
 _WIDEST = 0.999 * np.pi
-# Angle and relative range within which two minima are one.
+# Angle in radians and relative range within which two minima are equal.
 _SAME = 1e-3
-# Angle within which a direction is the image of another, radians, and share of a cone that must be in one of another.
+# Angle in radians within which a direction is the mirror image of another, and the share of a cone that must be inside
+# another cone.
 _ALIKE, _WITHIN = 1e-2, 0.97
-# Angle between points of a valley, radians: cones that are useful are as narrow.
-_APART = 0.1
-# Share of rays without an edge from which on a cone has none. A lune between opposite images has some.
+# Angle between points of a valley in radians: useful cones are not wider.
+_VALLEY_ANGLE = 0.1
+# Share of rays without an edge above which a cone has no edge. A lune between opposite images has some of these rays.
 _OPEN = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class DirectionCost:
-    """The cost over direction and inverse range, all other unknowns at their best.
+    """The cost as a function of direction and inverse range, minimised over all other unknowns.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of one problem of one position.
-    x : array (1, size)
-        Where the search for the other unknowns begins.
-    centre : array (d,)
-        Middle of the stations that rows are present of, metres.
-    spread : float
-        Their greatest distance from it, metres; 1 for one station.
-    weighed : array (1, size), optional
-        Where station errors are weighed; at each place itself if absent.
-    most : float
-        Greatest inverse range that is looked at.
+    - problem: flat batch of one problem with one position.
+    - x (1, size): start of the search for the other unknowns.
+    - centre (d,): centre of the stations with present rows, m.
+    - spread: largest distance of these stations from the centre, m; 1 for one station.
+    - weighed (1, size): parameters at which station errors are weighted; without it, each position itself.
+    - most: largest inverse range of the search.
     """
 
     problem: Problem
@@ -91,7 +85,7 @@ class DirectionCost:
     centre: Array
     spread: float
     weighed: Array | None = None
-    most: float = _NEAR
+    most: float = _LARGEST
 
     @classmethod
     def of(cls, problem: Problem) -> DirectionCost:
@@ -101,18 +95,18 @@ class DirectionCost:
         return cls(problem, vectors(problem, np.zeros((1, 1, problem.dimension)))[:, 0], centre[0], spread)
 
     def positions(self, u: Array, v: Array) -> Array:
-        """Return positions (q, d), metres."""
+        """Return positions (q, d), m."""
         return np.asarray(self.centre + (self.spread / v)[:, None] * u)
 
     def vectors(self, u: Array, v: Array) -> Array:
-        """Return parameter vectors (q, size)."""
+        """Return parameter vectors (q, size) with these positions."""
         slot, _ = self.problem.layout.find("position")
         x = np.repeat(self.x, len(u), axis=0)
         x[:, slot.start : slot.start + slot.size] = self.positions(u, v)
         return x
 
     def look(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Return costs (q,), and the normal equations in a turn of u and in v: (q, d, d) and (q, d)."""
+        """Return costs (q,) and the normal equations (q, d, d) and (q, d) for a rotation of u and a change of v."""
         x = self.vectors(u, v)[:, None]
         own = profile_by_rows if has_scales(self.problem) else profile
         cost, information, vector = own(self.problem, x, x if self.weighed is None else self.weighed, 2)
@@ -123,16 +117,9 @@ class DirectionCost:
         return cost, turned @ information[:, 0] @ gradient, (turned @ vector[:, 0, :, None])[..., 0]
 
     def descend(self, u: Array, v: Array, turns: bool, moves: bool, steps: int) -> tuple[Array, Array, Array]:
-        """Return the ends of damped steps of Gauss and Newton: directions (q, d), inverse ranges and costs (q,).
+        """Return the directions (q, d), inverse ranges and costs (q,) after at most `steps` damped Gauss-Newton steps.
 
-        Parameters
-        ----------
-        u, v : array (q, d), (q,)
-            Starts.
-        turns, moves : bool
-            Whether the direction changes, and the inverse range.
-        steps : int
-            At most.
+        `u` and `v` are the starts. `turns` allows changes of the direction, `moves` changes of the inverse range.
         """
         d = u.shape[1]
         free = np.array([turns] * (d - 1) + [moves])
@@ -140,7 +127,7 @@ class DirectionCost:
         damping, growth = np.full(len(u), _DAMPING), np.full(len(u), FIRST_GROWTH)
         for _ in range(steps):
             move, gain, ok = _step(information, vector, damping, self._free(free, v, vector))
-            if not (gain > _STILL * (1.0 + cost)).any():
+            if not (gain > _CONVERGED * (1.0 + cost)).any():
                 break
             there, v_there = self._moved(u, v, move)
             new, more, other = self.look(there, v_there)
@@ -160,14 +147,14 @@ class DirectionCost:
         return there, np.clip(v + move[:, -1], INFINITY, self.most)
 
     def _free(self, free: Array, v: Array, vector: Array) -> Array:
-        """Return the mask (q, d) of coordinates that move: an inverse range at its bound does so only away from it."""
+        """Return the mask (q, d) of free coordinates: an inverse range at its bound moves only away from it."""
         out = np.broadcast_to(free, vector.shape).copy()
         out[:, -1] &= ~(((v <= INFINITY) & (vector[:, -1] <= 0.0)) | ((v >= self.most) & (vector[:, -1] >= 0.0)))
         return out
 
     def best_range(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Return the best inverse ranges (q,) of directions (q, d) and their costs: the best of three starts."""
-        starts = np.concatenate([v, np.full(len(v), INFINITY), np.full(len(v), _BESIDE)])
+        """Return the best inverse ranges (q,) of directions (q, d) and their costs, from three starts."""
+        starts = np.concatenate([v, np.full(len(v), INFINITY), np.full(len(v), _NEAR_STATIONS)])
         _, found, cost = self.descend(np.tile(u, (3, 1)), starts, False, True, _FEW)
         found, cost = found.reshape(3, -1), cost.reshape(3, -1)
         best = cost.argmin(0)[None]
@@ -175,11 +162,11 @@ class DirectionCost:
 
 
 def _step(information: Array, vector: Array, damping: Array, free: Array) -> tuple[Array, Array, Array]:
-    """Return damped steps (q, d) of the coordinates that move, the gain that they promise, and where they exist."""
+    """Return damped steps (q, d) of the free coordinates, their predicted decreases, and a mask of solvable systems."""
     inner = np.where(free[:, :, None] & free[:, None, :], information, 0.0)
     right = np.where(free, vector, 0.0)
     size = np.diagonal(inner, axis1=-2, axis2=-1).copy()
-    # turns share a scale: across the plane of the stations the derivative vanishes on it
+    # both rotations have one scale: on the plane of the stations, the derivative across the plane is zero
     size[:, :-1] = size[:, :-1].max(-1, keepdims=True)
     size = np.where(free & (size > 0.0), size, np.maximum(size.max(-1, keepdims=True), 1e-300))
     grown = inner + (damping[:, None] * size + np.where(free, 0.0, size))[..., None] * np.eye(size.shape[-1])
@@ -188,12 +175,12 @@ def _step(information: Array, vector: Array, damping: Array, free: Array) -> tup
     return move, (move * right).sum(-1), ok
 
 
-# All minima, whatever a fix has found.
+# Search for all minima, independent of the fix.
 
 
 @dataclass(frozen=True, slots=True)
 class DirectionMinima:
-    """Minima of the cost over direction and inverse range, the cheapest first: (k, d), (k,), (k,)."""
+    """Minima of the cost in ascending order: directions (k, d), inverse ranges (k,) in 1/spread, and costs (k,)."""
 
     u: Array
     v: Array
@@ -204,7 +191,7 @@ class DirectionMinima:
 
 
 def minima_of(view: DirectionCost, rise: float) -> DirectionMinima:
-    """Return the minima that cost no more than a rise above the least."""
+    """Return the minima with a cost of at most `rise` above the lowest cost."""
     d = len(view.centre)
     spot = spread_directions(_TRIED[d], d)
     u, v = np.repeat(spot, len(_INVERSE), axis=0), np.tile(np.minimum(_INVERSE, view.most), len(spot))
@@ -212,7 +199,7 @@ def minima_of(view: DirectionCost, rise: float) -> DirectionMinima:
     order = np.argsort(cost.min(1), kind="stable")[:_REFINED]
     found = view.descend(spot[order], np.minimum(_INVERSE, view.most)[cost[order].argmin(1)], True, True, _STEPS)
     found = _lowest(view, *found)
-    # mirror images in the plane of the stations, and points on it, where an own minimum has no width
+    # add mirror images in the plane of the stations, and points on the plane, where a separate minimum is a point
     image = normalised(mirror(view.problem, view.centre + found[0][None])[0] - view.centre)
     on = normalised(found[0] + image)
     more = view.descend(np.concatenate([image, on]), np.tile(found[1], 2), True, True, _STEPS)
@@ -221,14 +208,14 @@ def minima_of(view: DirectionCost, rise: float) -> DirectionMinima:
 
 
 def _lowest(view: DirectionCost, u: Array, v: Array, cost: Array) -> tuple[Array, Array, Array]:
-    """Return minima with the better of their inverse range and of infinity."""
+    """Return minima at their inverse range or at infinity, whichever has the lower cost."""
     there, other, flat = view.descend(u, np.full(len(v), INFINITY), True, True, _STEPS)
     better = flat < cost
     return np.where(better[:, None], there, u), np.where(better, other, v), np.where(better, flat, cost)
 
 
 def _distinct(u: Array, v: Array, cost: Array, rise: float) -> DirectionMinima:
-    """Return the minima within a rise of the least, each once."""
+    """Return the different minima within a rise above the lowest cost."""
     order = [int(i) for i in np.argsort(cost, kind="stable") if cost[i] <= cost.min() + rise]
     kept: list[int] = []
     for i in order:
@@ -238,29 +225,21 @@ def _distinct(u: Array, v: Array, cost: Array, rise: float) -> DirectionMinima:
     return DirectionMinima(u[kept], v[kept], cost[kept])
 
 
-# Edges: where the root of the rise of the cost reaches a goal.
+# Edges: points where the square root of the rise of the cost reaches a given value.
 
-# Excess of the root at arguments (k,), with guesses of what is profiled out, and these at their best.
+# Function of arguments (k,) and guesses (k,) of the minimised unknown; it returns the excess of the root and the
+# optimal unknown.
 Profile = Callable[[Array, Array], tuple[Array, Array]]
 
 
 def edge(
     view: DirectionCost, start: tuple[Array, Array], ways: Array, least: float, rise: Array
 ) -> tuple[Array, Array]:
-    """Return the angles (k,) at which cones end along rays, and the directions (k, d) there; NaN beyond the widest.
+    """Return the angles (k,) of the edge of a cone along rays, in radians, and the directions (k, d) there.
 
-    Parameters
-    ----------
-    view : View
-        The cost.
-    start : tuple of array (d,), ()
-        Direction and inverse range of a minimum.
-    ways : array (k, d)
-        Unit vectors across the direction.
-    least : float
-        Cost of the best minimum of all.
-    rise : array (k,)
-        By how much the cost exceeds it on the edge.
+    `start` is the direction and inverse range of a minimum. `ways` (k, d) are unit vectors perpendicular to the
+    direction. `least` is the lowest cost of all minima, and `rise` (k,) the rise of the cost at the edge. The results
+    are NaN beyond the widest angle.
     """
     u0, v0 = start
     wanted, v = np.sqrt(rise), np.full(len(ways), v0)
@@ -286,14 +265,15 @@ def edge(
 
 
 def _root(cost: Array, least: float) -> Array:
+    """Return the square root of the rise of costs above the lowest cost, in standard deviations."""
     return np.sqrt(np.maximum(cost - least, 0.0))
 
 
 def _first(view: DirectionCost, u: Array, v: Array, ways: Array, wanted: Array) -> Array:
-    """Return angles (k,) at which a Gaussian cone would end."""
+    """Return the angles (k,) of the edge of a Gaussian cone, in radians."""
     _, information, _ = view.look(u[None], np.atleast_1d(v))
     across = ways @ basis(u)
-    form = ((across @ _of_turns(information[0], float(v))) * across).sum(-1)
+    form = ((across @ _direction_information(information[0], float(v))) * across).sum(-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         guess = wanted / np.sqrt(form)
     return np.clip(np.where(np.isfinite(guess), guess, _TURN), 1e-9, _TURN)
@@ -325,12 +305,12 @@ def _false_position(at: Profile, low: tuple[Array, Array], high: tuple[Array, Ar
 
 
 def ends_of_range(view: DirectionCost, minima: DirectionMinima, least: float, rise: float) -> tuple[float, float]:
-    """Return the least and the greatest inverse range, in spreads, at which a direction near minima costs little.
+    """Return the smallest and largest inverse range near minima with a low enough cost, in 1/spread.
 
-    All directions may follow: the profile of the cost over the inverse range.
+    The cost is a profile over the inverse range: the directions adapt to each inverse range.
     """
     wanted, count = np.sqrt(rise), len(minima.v)
-    # all ends at once, the near ones with the sign changed: each is a search upwards
+    # all ends together: lower ends with the sign changed, so that each search goes upwards
     side, state = np.repeat([-1.0, 1.0], count), np.tile(minima.u, (2, 1))
     low, limit = side * np.tile(minima.v, 2), np.where(side > 0.0, view.most, -INFINITY)
 
@@ -358,16 +338,10 @@ def ends_of_range(view: DirectionCost, minima: DirectionMinima, least: float, ri
 
 
 def directions_of(view: DirectionCost, level: Array, few: bool = False) -> tuple[Direction, ...]:
-    """Return the directions that the data allow with their cones; none where no few cones hold them.
+    """Return the directions that the data allow, with their cones; empty if a few cones cannot hold all directions.
 
-    Parameters
-    ----------
-    view : View
-        The cost.
-    level : array (d, d)
-        Rows: two level axes and, in space, the upward one.
-    few : bool
-        Whether there are fewer rows than unknowns: separate minima are then points of a valley, and no cone is traced.
+    `level` (d, d) has two horizontal axes and, in space, the vertical axis as rows. `few` means fewer rows than
+    unknowns: separate minima are then points of a valley, and no cone is traced.
     """
     d = len(view.centre)
     rise, single = quantile(LEVEL, d - 1), quantile(LEVEL, 1)
@@ -390,29 +364,29 @@ def directions_of(view: DirectionCost, level: Array, few: bool = False) -> tuple
         if cone is None or len(found) == _CONES:
             return ()
         found.append((cone, own))
-    return tuple(_ranged(view, cone, minima[np.array(items)], least, single) for cone, items in found)
+    return tuple(_with_range(view, cone, minima[np.array(items)], least, single) for cone, items in found)
 
 
 def _is_valley(u: Array) -> bool:
-    """Return whether directions (k, d) are more than cones may be, all well apart."""
+    """Return whether directions (k, d) contain more well separated directions than the largest number of cones."""
     kept = u[:1]
     for one in u[1:]:
-        if (kept @ one).max() < np.cos(_APART):
+        if (kept @ one).max() < np.cos(_VALLEY_ANGLE):
             kept = np.concatenate([kept, one[None]])
     return len(kept) > _CONES
 
 
 def _is_image(view: DirectionCost, one: Array, other: Array) -> bool:
-    """Return whether a direction is the mirror image of another in the plane of the stations.
+    """Return whether a direction is the mirror image of another direction in the plane of the stations.
 
-    Cones of images that touch have a waist, and rays from one of them miss much of the other.
+    Two touching cones of mirror images have a waist, so rays from one of them miss much of the other.
     """
     image = mirror(view.problem, (view.centre + one)[None])[0] - view.centre
     return bool(np.abs(image - other).max() < _ALIKE and np.abs(image - one).max() > _ALIKE)
 
 
 def _cone(view: DirectionCost, minima: DirectionMinima, i: int, rises: Array, level: Array) -> Direction | None:
-    """Return the cone about a minimum without a range, or None where it is no cone."""
+    """Return the cone about a minimum without its range, or None if the set has no closed edge."""
     u, v, least = minima.u[i], minima.v[i], float(minima.cost[0])
     usable, across = rises > minima.cost[i] - least, _principal(view, minima.u[i], minima.v[i])
     sides = np.concatenate([across.T, -across.T])
@@ -420,8 +394,8 @@ def _cone(view: DirectionCost, minima: DirectionMinima, i: int, rises: Array, le
     if np.isnan(reach).mean() > _OPEN:
         return None
     half = np.where(np.isnan(reach), _WIDEST, reach).reshape(2, -1).mean(0)
-    # rays are spread evenly in the metric of the ellipse, so that its tips are not cut off
-    ways = sides if len(u) == 2 else normalised(_around() * half @ across.T)
+    # rays have equal angles in the metric of the ellipse, so that its tips are not cut off
+    ways = sides if len(u) == 2 else normalised(_circle() * half @ across.T)
     k = len(ways)
     angle, edges = np.zeros((2, k)), np.tile(u, (2, k, 1))
     found = edge(view, (u, v), np.tile(ways, (usable.sum(), 1)), least, np.repeat(rises[usable], k))
@@ -437,19 +411,19 @@ def _cone(view: DirectionCost, minima: DirectionMinima, i: int, rises: Array, le
 
 
 def _principal(view: DirectionCost, u: Array, v: float) -> Array:
-    """Return unit vectors (d, d - 1) across a direction along which the information on it is least and greatest."""
+    """Return the principal axes (d, d - 1) of the information on a direction: unit vectors perpendicular to it."""
     _, information, _ = view.look(u[None], np.atleast_1d(v))
-    return np.asarray(basis(u) @ np.linalg.eigh(_of_turns(information[0], v))[1])
+    return np.asarray(basis(u) @ np.linalg.eigh(_direction_information(information[0], v))[1])
 
 
-def _around() -> Array:
-    """Return unit vectors (k, 2) all around counter-clockwise."""
+def _circle() -> Array:
+    """Return unit vectors (k, 2) on the whole circle, counter-clockwise."""
     turn = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
     return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
 
 
-def _of_turns(information: Array, v: float) -> Array:
-    """Return the information (d - 1, d - 1) on turns of a direction, the inverse range at its best."""
+def _direction_information(information: Array, v: float) -> Array:
+    """Return the information (d - 1, d - 1) on rotations of a direction, with the inverse range eliminated."""
     turns = information[:-1, :-1]
     if v <= INFINITY or information[-1, -1] <= 0.0:
         return turns
@@ -457,14 +431,14 @@ def _of_turns(information: Array, v: float) -> Array:
 
 
 def _ellipse(u: Array, ways: Array, angle: Array) -> tuple[Array, Array]:
-    """Return semi-axes (d - 1,) and their unit vectors (d, d - 1) of the ellipse with the moments of an outline."""
+    """Return semi-axes (d - 1,), rad, and unit vectors (d, d - 1) of the ellipse with the moments of an outline."""
     across = basis(u)
     if len(u) == 2:
         return np.array([0.5 * angle.sum()]), across
     rim = angle[:, None] * (ways @ across)
     rim = rim[np.argsort(np.arctan2(rim[:, 1], rim[:, 0]))]
     following = np.roll(rim, -1, axis=0)
-    # triangles from the direction: twice their areas, and their second moments
+    # triangles from the direction to the outline: twice their areas, and their second moments
     double = rim[:, 0] * following[:, 1] - rim[:, 1] * following[:, 0]
     both = rim + following
     moment = (double[:, None, None] * sum(e[:, :, None] * e[:, None, :] for e in (rim, following, both))).sum(0) / 24.0
@@ -473,7 +447,7 @@ def _ellipse(u: Array, ways: Array, angle: Array) -> tuple[Array, Array]:
 
 
 def _angles(u: Array, edges: Array, level: Array) -> tuple[tuple[float, float, float], tuple[float, ...]]:
-    """Return azimuth and elevation of a direction with their ends, from the edge (k, d) of a cone."""
+    """Return azimuth and elevation of a direction with their ends in radians, from the edge (k, d) of a cone."""
     own, rim = level @ u, edges @ level.T
     middle = float(np.arctan2(own[1], own[0]))
     turn = np.arctan2(rim[:, 1] * own[0] - rim[:, 0] * own[1], rim[:, :2] @ own[:2])
@@ -483,13 +457,13 @@ def _angles(u: Array, edges: Array, level: Array) -> tuple[tuple[float, float, f
     height = np.arcsin(np.clip(rim[:, 2], -1.0, 1.0))
     up, down = (bool(is_in_cone(u, edges, side * level[2])) for side in (1.0, -1.0))
     low, high = -0.5 * np.pi if down else float(height.min()), 0.5 * np.pi if up else float(height.max())
-    # about a cone that holds the vertical every azimuth is possible
+    # if a cone contains the vertical, every azimuth is possible
     ends = (middle - np.pi, middle + np.pi) if up or down else ends
     return (middle, *ends), (float(np.arcsin(np.clip(own[2], -1.0, 1.0))), low, high)
 
 
-def _ranged(view: DirectionCost, cone: Direction, minima: DirectionMinima, least: float, rise: float) -> Direction:
-    """Return a cone with its range: the inverse ranges of all minima in it."""
+def _with_range(view: DirectionCost, cone: Direction, minima: DirectionMinima, least: float, rise: float) -> Direction:
+    """Return a cone with its range in m, from the inverse ranges of all minima in the cone."""
     near = minima[minima.cost <= least + rise]
     if not len(near.cost):
         near = minima[minima.cost == minima.cost.min()]
@@ -498,35 +472,28 @@ def _ranged(view: DirectionCost, cone: Direction, minima: DirectionMinima, least
         best = near.v[near.cost.argmin()]
 
     def distance(v: float) -> float:
-        return np.inf if v <= INFINITY else 0.0 if v >= _NEAR else view.spread / v
+        return np.inf if v <= INFINITY else 0.0 if v >= _LARGEST else view.spread / v
 
     return replace(cone, range=(distance(float(best)), distance(high), distance(low)))
 
 
 def has_directions(problem: Problem) -> bool:
-    """Return whether problems are of one position at rest, without constraints: what has a view from the stations."""
+    """Return whether problems have one static position, no constraints and no medium, as `View` requires."""
     still = one_position(problem) and problem.motions[0].order == 0 and problem.layout.shares("position")
     return still and not problem.constraints and problem.medium is None
 
 
 # Regions in the plane.
 
-# Rays about a minimum: the extent along an axis lacks 0.1 % of an ellipse.
+# Number of rays about a minimum: the extent along an axis is 0.1 % smaller than the extent of an ellipse.
 _AROUND = 64
 
 
 def extent_of(view: DirectionCost, u: Array, v: float, least: float, rise: float) -> Array:
-    """Return positions (k, 2) on the edge of the region in the plane whose cost is less than a rise above the least.
+    """Return positions (k, 2) on the edge of a region in the plane, m.
 
-    Parameters
-    ----------
-    view : View
-        A problem in the plane.
-    u, v : array (2,), float
-        A minimum within it.
-    least, rise : float
-        Cost of the best minimum of all, and how much more the edge costs. The edge at infinity is at 1e6 spreads of the
-        stations.
+    The region holds the positions with a cost of less than `rise` above the lowest cost `least`. `u` (2,) and `v` are a
+    minimum inside the region. An edge at infinity is at 1e6 spreads of the stations.
     """
     _, information, _ = view.look(u[None], np.atleast_1d(v))
     values, axes = np.linalg.eigh(information[0])
@@ -536,13 +503,13 @@ def extent_of(view: DirectionCost, u: Array, v: float, least: float, rise: float
 
     def places(share: Array) -> tuple[Array, Array]:
         angle = np.clip(share * ways[:, 0], -np.pi, np.pi)
-        inverse = np.clip(v + share * ways[:, 1], INFINITY, _NEAR)
+        inverse = np.clip(v + share * ways[:, 1], INFINITY, _LARGEST)
         return np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * side, inverse
 
     def at(share: Array, _: Array) -> tuple[Array, Array]:
         return _root(view.look(*places(share))[0], least) - np.sqrt(rise), share
 
-    # a ray that arrives at infinity ends there
+    # a ray that reaches infinity ends there
     falls = ways[:, 1] < 0.0
     most = np.where(falls, (v - INFINITY) / np.maximum(-ways[:, 1], 1e-300), _FARTHEST)
     low, high = np.zeros(_AROUND), np.minimum(1.0, most)
@@ -558,5 +525,5 @@ def extent_of(view: DirectionCost, u: Array, v: float, least: float, rise: float
     return view.positions(*places(ends))
 
 
-# Longest ray, in lengths of a Gaussian one.
+# Longest ray, in units of the ray of a Gaussian region.
 _FARTHEST = 1e4

@@ -1,4 +1,7 @@
-"""The errors and offsets of many small problems, linearised at their fixes and packed."""
+"""Linearised residuals, errors and offsets of many small problems at their fixes, packed into arrays.
+
+`variance_components` and `noise_level` estimate noise levels from these arrays.
+"""
 
 from __future__ import annotations
 
@@ -21,41 +24,30 @@ from optloc.problem.problem import Problem
 
 By = Literal["station", "pair", "kind"]
 GROUPINGS = ("station", "pair", "kind")
-# Difference of two covariances, as a share of the largest entry, below which they are the same: files round theirs.
-_FITS = 1e-6
-# Rows of one problem that can be handled: their m x m matrices take 32 MB each at this number.
-_LARGEST = 2000
-# Problems that are linearised at once, so that the matrices of a part, most with tens of rows, fit into memory.
-_PART = 2000
-# Eigenvalue of the normal matrix of variances, as a share of the largest, below which a combination of them is not
-# seen.
-_UNSEEN = 1e-10
+# Two covariances are equal if they differ by less than this share of the largest entry: files contain rounded values.
+_ROUNDED = 1e-6
+# Largest number of rows of one problem: each m x m matrix then needs 32 MB.
+_MAX_ROWS = 2000
+# Number of problems that are linearised together: their matrices, most with tens of rows, then fit into memory.
+_BATCH = 2000
+# Relative eigenvalue of the normal matrix of variances below which a combination of variances is not determined.
+_RANK_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True, slots=True)
 class Elements:
-    """N linearised problems with their rows, errors and offsets packed; whatever is not there is zero.
+    """N linearised problems with packed rows, errors and offsets; missing entries are zero.
 
-    Parameters
-    ----------
-    names : tuple of G str
-        Groups.
-    residual : array (N, m)
-        Measured less modelled.
-    jacobian : array (N, m, p)
-        Derivative with respect to the unknowns.
-    effect : array (N, m, q)
-        B: effect of each error of unit variance, in the rows' units.
-    offset : array (N, m, c)
-        E: effect of an offset of each group.
-    fixed : array (N, m, m)
-        C: covariance that belongs to no group.
-    sigma : array (N, q)
-        Stated standard deviation of each error, in the rows' units.
-    of_effect, of_offset : int array (N, q), (N, c)
-        Groups; -1 for none.
-    path : array (N, c)
-        Length of the path to a station, metres, on average over the rows of an offset; NaN where it is not one.
+    - names: names of the G groups.
+    - residual (N, m): measured minus modelled value, SI units.
+    - jacobian (N, m, p): derivative with respect to the unknowns.
+    - effect (N, m, q): B, the effect of each error of unit variance, in the units of the rows.
+    - offset (N, m, c): E, the effect of an offset of each group.
+    - fixed (N, m, m): C, the covariance that belongs to no group.
+    - sigma (N, q): stated standard deviation of each error, in the units of the rows.
+    - of_effect (N, q), of_offset (N, c): group number of each error and each offset; -1 for no group.
+    - path (N, c): mean length of the signal path to the station over the rows of an offset, m; NaN if the row measures
+      no single path.
     """
 
     names: tuple[str, ...]
@@ -71,59 +63,52 @@ class Elements:
 
     @property
     def common(self) -> Array:
-        """Return which groups (G + 1,) are what rows have in common; the last stands for none."""
+        """Return a mask (G + 1,) of the groups of shared errors; the last entry, for no group, is False."""
         shared = [common_name(name) for name in self.names]
         return np.append(np.isin(np.array(self.names, dtype=object), shared), False)
 
     def take(self, index: Any) -> Elements:
-        """Return some of the problems."""
+        """Return the elements of the problems with these indices."""
         arrays = ("residual", "jacobian", "effect", "offset", "fixed", "sigma", "of_effect", "of_offset", "path")
         return replace(self, **{name: getattr(self, name)[index] for name in arrays})
 
 
 def batch_of(problem: Problem) -> Problem:
-    """Return the independent problems that a problem consists of as a flat batch, station errors of epochs as noise.
+    """Return a flat batch of the independent problems of a problem, with the station errors of epochs as noise.
 
     Raises
     ------
     InvalidProblem
-        Where more rows than can be handled share unknowns.
+        If more rows share unknowns than `_MAX_ROWS`.
     """
     problem = replace(problem, stations=problem.stations.with_noise())
     flat = (by_epoch(problem) if separable(problem) else problem).flat()
-    if flat.count > _LARGEST and flat.epochs > 1:
-        what = f"{flat.count} rows share unknowns"
-        raise InvalidProblem(what, "noise", f"use at most {_LARGEST}, or epochs that are fixed one by one")
+    if flat.count > _MAX_ROWS and flat.epochs > 1:
+        what = f"{flat.count} rows share unknowns, too many for variance components"
+        raise InvalidProblem(what, "noise", f"use at most {_MAX_ROWS}, or epochs that share no unknowns")
     return flat
 
 
 def elements(problem: Problem, x: Array, by: By, common: By | None = None) -> Elements:
-    """Return the elements of a flat batch of problems at parameter vectors.
+    """Return the elements of a flat batch of N problems, from `batch_of`, at the fixes `x` (N, size).
 
-    Parameters
-    ----------
-    problem : Problem
-        N problems, of `batch_of`.
-    x : array (N, size)
-        Their fixes, finite.
-    by : "station", "pair" or "kind"
-        What makes a group.
-    common : "station", "pair" or "kind", optional
-        Whose rows have an error in common in every epoch besides: a group of its own, named as `common_name` says, of
-        which the noise states nothing; its sigma is that of `typical_sigma`.
+    `by` selects the groups: one per station, pair of stations, or kind. `common` adds a shared error per epoch for each
+    station, pair or kind. Each shared error has a separate group (see `common_name`). The noise of the problem does not
+    state its size, so its sigma comes from `typical_sigma`.
     """
     ends = ends_of(problem, by)
     names = sorted({*ends.name.ravel().tolist()} - {""})
     size = typical_sigma(problem, common) if common else {}
     parts = []
-    for first in range(0, len(x), _PART):
-        items = np.arange(first, min(first + _PART, len(x)))
+    for first in range(0, len(x), _BATCH):
+        items = np.arange(first, min(first + _BATCH, len(x)))
         parts.append(_part(problem.take(items), x[items], by, (common, size)))
     more = sorted({name for part in parts for name in part.names} - set(names))
     return _join((*names, *more), parts)
 
 
 def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str, float]]) -> Elements:
+    """Return the elements of a part of a batch at the fixes x (n, size); `common` as in `elements`, with sigmas."""
     count, rows = len(x), problem.count
     present = np.broadcast_to(problem.weight > 0.0, (count, rows))
     residual, jacobian = _linearise(problem, x)
@@ -138,7 +123,7 @@ def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str,
     names = tuple(sorted({*error_names.tolist(), *offset_names.tolist()} - {""}))
     number = {name: i for i, name in enumerate(names)} | {"": -1}
     path = np.broadcast_to(_paths(problem, x, residual), present.shape)
-    # Absent rows go: problems of one station less do not need the room of all stations.
+    # Remove absent rows: problems with one station fewer then need less memory.
     kept = _present_first(present)
     residual, present_packed = (np.take_along_axis(a, kept, 1) for a in (residual, present))
     jacobian, effect, offset = (
@@ -152,7 +137,7 @@ def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str,
     sigma = np.take_along_axis(sigma, chosen, 1)
     offset, of_offset, _ = _pack(offset, np.array([number[n] for n in offset_names], dtype=np.int64))
     path = np.take_along_axis(path, kept, 1)[..., None]
-    # The growth of an offset is told per metre of path: of several rows their mean path.
+    # The growth of an offset is stated per metre of path; for several rows it is the mean path.
     mean = np.where(offset != 0.0, path, 0.0).sum(1) / np.maximum((offset != 0.0).sum(1), 1)
     made = Elements(
         names, residual * present_packed, jacobian, effect, offset, fixed, sigma, of_effect, of_offset, mean
@@ -161,11 +146,11 @@ def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str,
 
 
 def _linearise(problem: Problem, x: Array) -> tuple[Array, Array]:
-    """Return residuals (N, m) and Jacobians (N, m, p) along what equality constraints leave free."""
+    """Return residuals (N, m) and Jacobians (N, m, p) along the directions that equality constraints leave free."""
     residual, jacobian = differentiate(problem, x)
     if problem.epochs > 1 and problem.layout.n_local:
         n, length = problem.layout.n_shared, problem.layout.n_local
-        # Jacobians come with the local unknowns of their own epoch only; here each epoch has columns of its own.
+        # The Jacobian has columns for the local unknowns of one epoch only; here each epoch gets separate columns.
         spread = np.zeros((*residual.shape, problem.layout.size))
         spread[..., :n] = jacobian[..., :n]
         rows = np.arange(problem.count)[:, None]
@@ -174,18 +159,18 @@ def _linearise(problem: Problem, x: Array) -> tuple[Array, Array]:
         jacobian = spread
     face = exact(problem)
     if face:
-        # What an equality holds is no unknown: one column less for each.
+        # Each equality constraint removes one unknown, so it removes one column.
         along, n = tangent_at(problem, face, x), problem.layout.n_shared
         jacobian = np.concatenate([jacobian[..., :n] @ along, jacobian[..., n:]], axis=-1)
     return residual, jacobian
 
 
 def _paths(problem: Problem, x: Array, residual: Array) -> Array:
-    """Return the modelled path (N, m) from target to station of rows that measure one; NaN of others."""
+    """Return the modelled path (N, m) from target to station, m; NaN for a row that does not measure a single path."""
     parts, start = [], 0
     for rows in problem.rows:
         model = MODELS[rows.kind]
-        # What is modelled is what was measured less the residual: h need not be evaluated again.
+        # The modelled value is the measurement minus the residual, so h need not be evaluated again.
         path = rows.z - rows.correction - residual[..., start : start + rows.count]
         if model.ranges != (1, 0):
             path = np.full_like(path, np.nan)
@@ -201,14 +186,14 @@ def _paths(problem: Problem, x: Array, residual: Array) -> Array:
 
 
 def _effects(problem: Problem, by: By, present: Array) -> tuple[Array, Array, Array]:
-    """Return the effects (N, m, Q) of all errors, their groups (Q,) and standard deviations (N, Q)."""
+    """Return the effects (N, m, Q) of all errors, the group names (Q,) and the standard deviations (N, Q)."""
     count, rows = present.shape
     effects, names, sigmas = [], [], []
     for block in problem.noise.blocks:
         own, name, sigma = split(problem, block, by, present)
         own = np.broadcast_to(own, (count, len(block.row), *own.shape[-2:]))
         g, _r, q = own.shape[1:]
-        # Blocks stand side by side: each group of a block has columns of its own over all rows.
+        # Each group of a block gets separate columns over all rows.
         wide = np.zeros((count, rows, g, q))
         wide[:, block.row, np.arange(g)[:, None]] = own
         effects.append(wide.reshape(count, rows, g * q))
@@ -218,19 +203,19 @@ def _effects(problem: Problem, by: By, present: Array) -> tuple[Array, Array, Ar
 
 
 def _offsets(problem: Problem, by: By) -> tuple[Array, Array]:
-    """Return the effects (m, c) of offsets of groups, and their names (c,)."""
+    """Return the effects (m, c) of the offsets of the groups, and the names (c,) of the groups."""
     ends = ends_of(problem, by)
     names = np.array(sorted({*ends.name.ravel().tolist()} - {""}), dtype=object)
     return ((ends.name[..., None] == names) * ends.sign[..., None]).sum(1), names
 
 
 def common_name(name: str) -> str:
-    """Return the name of the error that all rows of a group have in common in an epoch."""
+    """Return the name of the error that all rows of a group share in an epoch."""
     return f"{name} common"
 
 
 def typical_sigma(problem: Problem, by: By) -> dict[str, float]:
-    """Return the stated standard deviation of the rows of each group, root mean square over all problems."""
+    """Return the stated standard deviation of the rows of each group: the root mean square over all problems."""
     variance = np.broadcast_to(variances(problem.noise, problem.count), (problem.batch_shape[0], problem.count))
     weight, ends = np.broadcast_to(problem.weight > 0.0, variance.shape), ends_of(problem, by).name
     found = {}
@@ -242,7 +227,7 @@ def typical_sigma(problem: Problem, by: By) -> dict[str, float]:
 
 
 def common_effects(problem: Problem, by: By, size: dict[str, float]) -> tuple[Array, Array, Array]:
-    """Return the effects (m, c) of errors that the rows of a group have in common in an epoch, names and sizes (c,)."""
+    """Return the effects (m, c) of the errors that rows of a group share in an epoch, their names and sizes (c,)."""
     ends, epoch = ends_of(problem, by), problem.epoch
     columns, names = [], []
     for name, own in size.items():
@@ -260,20 +245,20 @@ def _ungrouped_noise(problem: Problem, x: Array) -> Array:
     stated = gathered(problem.noise, rows)[..., 0, :, :]
     whole = gathered(with_station_noise(problem, x).noise, rows)[..., 0, :, :]
     weight = np.where(problem.weight > 0.0, problem.weight, 1.0)
-    # A row of weight w has 1/w of its variance: the rest belongs to no group.
+    # A row of weight w has 1/w times its variance: the difference belongs to no group.
     own = (1.0 / weight - 1.0) * np.diagonal(whole, axis1=-2, axis2=-1)
     added = whole - stated + own[..., None] * np.eye(problem.count)
     return np.broadcast_to(added, (len(x), *added.shape[-2:]))
 
 
 def _present_first(present: Array) -> Array:
-    """Return the rows (N, most) of each problem, those that are present first."""
+    """Return the row numbers (N, most) of each problem with the present rows first."""
     most = max(1, int(present.sum(1).max(initial=0)))
     return np.argsort(~present, axis=1, kind="stable")[:, :most]
 
 
 def _pack(columns: Array, number: Array) -> tuple[Array, Array, Array]:
-    """Return the columns (N, m, q) that are not zero, their groups (N, q), -1 for zeros, and which they are (N, q)."""
+    """Return the nonzero columns (N, m, q), their groups (N, q) with -1 for zero columns, and their numbers (N, q)."""
     used = (columns != 0.0).any(1)
     kept = _present_first(used)
     group = np.where(np.take_along_axis(used, kept, 1), number[kept], -1)
@@ -281,8 +266,9 @@ def _pack(columns: Array, number: Array) -> tuple[Array, Array, Array]:
 
 
 def _with_priors(problem: Problem, x: Array, made: Elements) -> Elements:
-    """Return the elements with the priors of a problem as rows that belong to no group."""
-    # On a tangent space the columns of the prior are not unit vectors; the equality says more than it, too.
+    """Return the elements with additional rows for the priors of the problem; these rows belong to no group."""
+    # With equality constraints, priors are omitted: their columns on the tangent space are not unit vectors, and the
+    # constraint is stronger than the prior.
     parts = [] if exact(problem) else prior_parts(problem)
     for name, mean, precision in parts:
         slot, shared = problem.layout.find(name)
@@ -295,7 +281,7 @@ def _with_priors(problem: Problem, x: Array, made: Elements) -> Elements:
         n, m = made.residual.shape
         fixed = np.zeros((n, m + slot.size, m + slot.size))
         fixed[:, :m, :m], fixed[:, m:, m:] = made.fixed, covariance
-        # A prior has no errors of a group and no offsets: its rows are zero there.
+        # A prior has no grouped errors and no offsets: its rows are zero in both arrays.
         below = ((0, 0), (0, slot.size), (0, 0))
         made = replace(
             made,
@@ -309,10 +295,10 @@ def _with_priors(problem: Problem, x: Array, made: Elements) -> Elements:
 
 
 def _join(names: tuple[str, ...], parts: list[Elements]) -> Elements:
-    """Return parts as one, with groups numbered alike and arrays padded to one size."""
+    """Return the parts joined into one, with common group numbers and with arrays padded to one size."""
     renamed = []
     for part in parts:
-        # -1, no group, stays -1: it is the last entry.
+        # The number -1, for no group, selects the last entry, which is -1.
         number = np.array([*(names.index(name) for name in part.names), -1])
         renamed.append(replace(part, of_effect=number[part.of_effect], of_offset=number[part.of_offset]))
 
@@ -326,19 +312,15 @@ def _join(names: tuple[str, ...], parts: list[Elements]) -> Elements:
     return Elements(names, **joined, of_effect=stack("of_effect", -1), of_offset=stack("of_offset", -1))
 
 
-# Which group of errors each row belongs to, and its noise as independent errors of such groups.
+# The groups of the errors of each row, and the noise as independent errors of these groups.
 
 
 @dataclass(frozen=True, slots=True)
 class Ends:
-    """The groups that each row belongs to: one, or one at either of its stations.
+    """Groups of each row: one group, or one group per station of the row.
 
-    Parameters
-    ----------
-    name : object array (m, 2)
-        Names of the groups; empty where there is none.
-    sign : array (m, 2)
-        Sign with which an offset of the group enters the row; 0 where there is none.
+    - name (m, 2): names of the groups; empty for no group.
+    - sign (m, 2): sign with which an offset of the group enters the row; 0 for no group.
     """
 
     name: Array
@@ -348,22 +330,18 @@ class Ends:
 def ends_of(problem: Problem, by: By) -> Ends:
     """Return the groups of the rows of a problem.
 
-    Parameters
-    ----------
-    problem : Problem
-        Rows and names of stations.
-    by : "station", "pair" or "kind"
-        A group is a station (with a kind where stations measure several), a pair of stations, or a kind of rows.
+    With `by` = "station", a group is a station, or a station with a kind if stations measure several kinds. With
+    "pair", a group is a pair of stations; with "kind", a kind of rows.
 
     Raises
     ------
     InvalidProblem
-        For an unknown grouping.
+        If the grouping is unknown.
     """
     if by not in GROUPINGS:
         raise InvalidProblem(f"unknown grouping {by!r}", "by", nearest(str(by), GROUPINGS))
     parts = [_ends(problem, rows.kind, rows.a, rows.b, by) for rows in problem.rows]
-    # Errors of compass bearings are clockwise; those of a group that is read both ways are anticlockwise.
+    # Errors of compass bearings are clockwise. If a group has rows of both senses, its errors are anticlockwise.
     blocks = list(zip(problem.rows, parts, strict=True))
     others = [name for rows, (name, _) in blocks if rows.kind == "azimuth" and rows.sense > 0.0]
     both = list({text for name in others for text in name.ravel().tolist()})
@@ -372,13 +350,14 @@ def ends_of(problem: Problem, by: By) -> Ends:
 
 
 def _ends(problem: Problem, kind: str, a: Array, b: Array, by: By) -> tuple[Array, Array]:
+    """Return the group names and signs (m, 2) of rows of one kind with the stations a and b (m,)."""
     name, sign = np.full((len(a), 2), "", dtype=object), np.zeros((len(a), 2))
     model = MODELS[kind]
     if by == "kind" or model.stations == 0:
         name[:, 0], sign[:, 0] = kind, 1.0
     elif by == "pair" and model.stations == 2:
-        # A-B and B-A are one pair, with the sign of its offset turned; names as the file has them where that is not
-        # needed.
+        # A-B and B-A are one pair; the sign of the offset changes with the order. If each pair occurs in one order
+        # only, the names keep the order of the file.
         turned = (a > b) if _both_ways(a, b) else np.zeros(len(a), dtype=bool)
         one, two = np.where(turned, b, a), np.where(turned, a, b)
         labels = np.array(problem.stations.names, dtype=object)
@@ -393,17 +372,18 @@ def _ends(problem: Problem, kind: str, a: Array, b: Array, by: By) -> tuple[Arra
 
 
 def _both_ways(a: Array, b: Array) -> bool:
-    """Return whether some pair of stations occurs in either order."""
+    """Return whether a pair of stations occurs in both orders."""
     pairs = set(zip(a.tolist(), b.tolist(), strict=True))
     return any((two, one) in pairs for one, two in pairs)
 
 
 def station_names(problem: Problem, kind: str) -> Array:
-    """Return the name (s,) of the group that each station makes with a kind."""
+    """Return the name (s,) of the group of each station for rows of a kind."""
     return np.array(problem.stations.names, dtype=object) + _suffix(problem, kind)
 
 
 def _suffix(problem: Problem, kind: str) -> str:
+    """Return the suffix " kind" of the names of groups if stations measure several kinds, else an empty text."""
     several = sum(MODELS[rows.kind].stations > 0 for rows in problem.rows) > 1
     return f" {kind}" if several else ""
 
@@ -414,40 +394,24 @@ def kinds_of(problem: Problem) -> Array:
 
 
 def split(problem: Problem, block: Block, by: By, present: Array) -> tuple[Array, Array, Array]:
-    """Return the noise of a block as independent errors of unit variance, each of one group.
+    """Return the noise of a block as independent errors of unit variance, each in one group.
 
-    Independent rows are errors of their own; one that belongs to two stations is half of each. Rows that combine
-    arrivals, R = D diag(v) D', are made of the arrivals at their stations, and of errors of the single rows if R has a
-    multiple of the unit matrix besides. Other correlated rows are one group.
+    An independent row is one error; if the row belongs to two stations, each station has half of its variance. Rows
+    that combine arrivals have R = D diag(v) D'. They become errors of the arrivals at their stations, plus errors of
+    single rows if R also contains a multiple of the unit matrix. Other correlated rows form one group.
 
-    Parameters
-    ----------
-    problem : Problem
-        Batch (...).
-    block : Block
-        One of its blocks, g groups of r rows.
-    by : "station", "pair" or "kind"
-        As in `ends_of`.
-    present : bool array (..., m)
-        Rows that count.
-
-    Returns
-    -------
-    effect : array (..., g, r, q)
-        ``effect @ effect'`` is the covariance of the rows that are present; in the rows' units.
-    name : object array (g, q)
-        Group of each error.
-    sigma : array (..., g, q)
-        Its stated standard deviation, in the rows' units.
+    The block has g groups of r rows; `present` (..., m) marks rows with a weight above zero. The results are the
+    effects (..., g, r, q), the names (g, q) of the groups, and the stated standard deviations (..., g, q). Effects and
+    deviations are in the units of the rows, and ``effect @ effect'`` is the covariance of the present rows.
     """
     _g, r = block.row.shape
     if r == 1:
         name = ends_of(problem, by).name[block.row[:, 0]]
-        # Half of the variance each, so the root of a half of the effect.
+        # Each of two stations has half of the variance, so the effect is multiplied by the square root of one half.
         share = np.where(name == "", 0.0, np.where((name != "").all(1)[:, None], np.sqrt(0.5), 1.0))
         effect = np.sqrt(block.covariance) * share[:, None]
         return effect, name, effect[..., 0, :]
-    # Absent rows are no errors: their rows and columns of the covariance are zero.
+    # Absent rows have no errors: their rows and columns of the covariance are zero.
     here = present[..., block.row]
     covariance = np.where(here[..., :, None] & here[..., None, :], block.covariance, 0.0)
     kinds = kinds_of(problem)[block.row]
@@ -456,7 +420,8 @@ def split(problem: Problem, block: Block, by: By, present: Array) -> tuple[Array
         found = _arrivals(problem, block.row, covariance, here, by)
         if found is not None:
             return found
-    # Any other correlation: the axes of the covariance are errors of one group, in the size of the mean variance.
+    # Any other correlation: the eigenvectors of the covariance are errors of one group. Their sigma is the square root
+    # of the mean variance.
     whole = np.array([" + ".join(dict.fromkeys(row)) for row in kinds], dtype=object)
     values, vectors = np.linalg.eigh(covariance)
     mean = values.sum(-1, keepdims=True) / np.maximum(here.sum(-1, keepdims=True), 1)
@@ -467,15 +432,18 @@ def split(problem: Problem, block: Block, by: By, present: Array) -> tuple[Array
 def _arrivals(
     problem: Problem, row: Array, covariance: Array, here: Array, by: By
 ) -> tuple[Array, Array, Array] | None:
-    """Return the noise of groups of rows (g, r) as arrivals, with errors of the rows if need be; None if it is not."""
+    """Return the noise of groups of rows (g, r) as errors of arrivals, plus errors of the rows if necessary.
+
+    Return None if the covariance does not have this form.
+    """
     ends = ends_of(problem, "station")
     kind = str(kinds_of(problem)[row[0, 0]])
     labels = station_names(problem, kind)
-    # D: signs with which the arrivals at each station (columns) enter each row.
+    # D: the sign with which the arrival at each station (columns) enters each row.
     design = ((ends.name[row][..., None] == labels) * ends.sign[row][..., None]).sum(-2) * here[..., None]
     own = np.eye(row.shape[1]) * here[..., None]
     groups = labels if by == "station" else np.full(len(labels), kind, dtype=object)
-    # First arrivals alone, then with errors of the rows besides; what neither makes is another correlation.
+    # Try arrivals alone first, then arrivals and errors of the rows. If neither fits, the correlation has another form.
     for parts, names in (
         ([design], groups),
         ([design, own], np.concatenate([groups, np.full(row.shape[1], f"{kind} rows", dtype=object)])),
@@ -485,23 +453,24 @@ def _arrivals(
         effect = np.concatenate(parts, axis=-1) * sigma[..., None, :]
         made = effect @ np.swapaxes(effect, -1, -2)
         size = np.abs(covariance).max()
-        if np.allclose(made, covariance, rtol=0.0, atol=_FITS * size):
+        if np.allclose(made, covariance, rtol=0.0, atol=_ROUNDED * size):
             return effect, np.broadcast_to(names, (len(row), len(names))), sigma
     return None
 
 
 def _variances(parts: list[Array], covariance: Array) -> Array:
-    """Return variances (..., q) of errors whose covariance is nearest to a given one; rows' own errors share theirs.
+    """Return the variances (..., q) of errors whose covariance is nearest to a given covariance.
 
-    With the columns d of the parts, sum v_i d_i d_i' = R in least squares: the normal matrix is (d_i' d_j)^2.
+    The fit is sum v_i d_i d_i' = R in least squares with the columns d of the parts, and its normal matrix is (d_i'
+    d_j)^2. All errors of single rows have the same variance.
     """
     design = np.concatenate(parts, axis=-1)
     gram = (np.swapaxes(design, -1, -2) @ design) ** 2
     right = np.einsum("...rq,...rp,...pq->...q", design, covariance, design)
-    # Each arrival has a variance of its own; all errors of single rows share one.
+    # Each arrival has a separate variance; all errors of single rows share one variance.
     widths = [parts[0].shape[-1], *(1 for _ in parts[1:])]
     merge = np.zeros((design.shape[-1], sum(widths)))
     merge[np.arange(widths[0]), np.arange(widths[0])] = 1.0
     merge[widths[0] :, widths[0] :] = 1.0
-    found = np.linalg.pinv(merge.T @ gram @ merge, rcond=_UNSEEN, hermitian=True) @ (right @ merge)[..., None]
+    found = np.linalg.pinv(merge.T @ gram @ merge, rcond=_RANK_TOLERANCE, hermitian=True) @ (right @ merge)[..., None]
     return np.asarray((merge @ found)[..., 0])

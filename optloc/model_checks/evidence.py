@@ -1,9 +1,11 @@
-"""How much the data speak against each group: the drop of the cost without it, to first order, and its error.
+"""Evidence against each group of rows: the decrease of the cost without the group, to first order, and its error.
 
-A group g in error shifts its rows by an unknown e_g. With residuals y, weights P = R^-1 and Jacobian J of the full
-fit, Q = P - P J (J'P J)^-1 J'P; leaving the group out lowers the cost by u'Q_gg^-1 u with u = (Q y)_g, and its error is
-Q_gg^-1 u with covariance Q_gg^-1 (Baarda 1968, "A testing procedure for use in geodetic networks"; Teunissen 2006,
-"Testing theory", eqs. 3.21 and 4.23). Priors are rows too.
+A group g with an error shifts its rows by an unknown e_g. With residuals y, weights P = R^-1 and Jacobian J of the full
+fit, Q = P - P J (J'P J)^-1 J'P. Exclusion of the group lowers the cost by u'Q_gg^-1 u with u = (Q y)_g. The estimated
+error is Q_gg^-1 u with the covariance Q_gg^-1. Priors are rows too.
+
+W. Baarda, "A testing procedure for use in geodetic networks" (1968); P. J. G. Teunissen, "Testing theory" (2006), eqs.
+3.21 and 4.23.
 """
 
 from __future__ import annotations
@@ -26,37 +28,29 @@ from optloc.problem.explanations import Suspect
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
 
-# A component of an error is known where Q Q^+ has a one on its diagonal: what is less by more than rounding is open.
-_OPEN = 1e-6
-# Eigenvalue of Q, in units of the weights, below which the other rows say nothing: above what rounding leaves of a
+# A component of an error is determined if the diagonal of Q Q^+ is one there; a larger difference than this is not
+# rounding.
+_UNDETERMINED = 1e-6
+# Eigenvalue of Q, in units of the weights, below which the other rows have no information; it exceeds the rounding of
 # zero.
-_NOTHING = 1e-9
-# Rows and priors up to which P is a plain array: the square takes less time there than a sparse array.
+_ROUNDING = 1e-9
+# Largest number of rows and priors for a dense P: a sparse array takes more time there.
 _DENSE = 128
-# Where the tail of a chi-square leaves the range of floating-point numbers, with room for what is computed from it.
+# Probability of a chi-square tail near the underflow of floating-point numbers, with a margin for later operations.
 _TINY = 1e-290
 
 
 @dataclass(frozen=True, slots=True)
 class Influence:
-    """The matrix Q of one problem and Q y, in parts: Q = P - S S' - T T' within each epoch.
+    """Matrix Q of one problem and the vector Q y, in factors: Q = P - S S' - T T', with T T' only within each epoch.
 
-    Parameters
-    ----------
-    pull : array (q,)
-        Q y, of the rows and then of the means of the priors.
-    precision : array (q, q), sparse for many rows
-        P.
-    shared : array (q, n)
-        S, of the shared unknowns.
-    local : array (q, l)
-        T, of the unknowns of each epoch.
-    epoch : int array (q,)
-        Epoch of each row; -1 of priors.
-    prior : dict of int to array
-        Rows of each prior by its number.
-    deviation : array (n, n)
-        Its product with its transpose is the covariance of the shared unknowns.
+    - pull (q,): Q y of the rows, then of the means of the priors.
+    - precision (q, q): P; sparse for many rows.
+    - shared (q, n): S of the shared unknowns.
+    - local (q, l): T of the unknowns of each epoch.
+    - epoch (q,): epoch of each row; -1 for priors.
+    - prior: the rows of each prior by its number.
+    - deviation (n, n): a square root of the covariance of the shared unknowns.
     """
 
     pull: Array
@@ -68,41 +62,38 @@ class Influence:
     deviation: Array
 
     def rows(self, group: Group) -> Array:
-        """Return the rows of a group, (q,)."""
+        """Return the row numbers of a group, (q,)."""
         return np.array(group.rows) if group.prior < 0 else self.prior[group.prior]
 
     def block(self, rows: Array) -> Array:
-        """Return Q (..., r, r) of sets of rows (..., r)."""
+        """Return the blocks of Q (..., r, r) of sets of rows (..., r)."""
         i, j = np.broadcast_arrays(rows[..., :, None], rows[..., None, :])
         precision = np.asarray(self.precision[i.ravel(), j.ravel()]).reshape(i.shape)
         shared, local = self.shared[rows], self.local[rows]
-        # priors are of epoch -1: their rows have no local unknowns, so that their product is zero
+        # priors have epoch -1 and no local unknowns, so their product is zero
         same = self.epoch[i] == self.epoch[j]
         lost = shared @ np.swapaxes(shared, -1, -2) + same * (local @ np.swapaxes(local, -1, -2))
         return np.asarray(precision - lost)
 
     def root(self, rows: Array) -> Array:
-        """Return A with A A' the pseudo-inverse of Q (..., r, r) of sets of rows; zero columns where nothing tells."""
+        """Return A with A A' the pseudo-inverse of Q (..., r, r) of sets of rows; undetermined columns are zero."""
         weight = np.asarray(self.precision.diagonal())[rows]
         scale = 1.0 / np.sqrt(np.where(weight > 0.0, weight, 1.0))
         values, vectors = np.linalg.eigh(self.block(rows) * scale[..., :, None] * scale[..., None, :])
-        kept = values > _NOTHING
+        kept = values > _ROUNDING
         lengths = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
         return np.asarray(scale[..., :, None] * vectors * lengths[..., None, :])
 
 
 @dataclass(frozen=True, slots=True)
 class Error:
-    """The estimated error of a group.
+    """Estimated error of a group.
 
-    Parameters
-    ----------
-    value, sigma : array (q,)
-        Of each of its rows, measured less true, and standard deviations; infinite where nothing else tells.
-    statistic : float
-        Its squared length in its own standard deviations: what the cost rises by, to first order, with the group back.
-    dof : int
-        How many of its components the other rows tell.
+    - value, sigma (q,): error of each row of the group (measured minus true) and its standard deviation; infinite if
+      the other rows do not determine the error.
+    - statistic: squared length of the error in its standard deviations. To first order, the cost rises by this value if
+      the group is included again.
+    - dof: number of components that the other rows determine.
     """
 
     value: Array
@@ -119,35 +110,29 @@ class Error:
 def influence(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()) -> Influence:
     """Return the influence of the rows and priors of a flat batch of one problem at a vector (size,).
 
-    See `influences`, also for what it raises.
+    See `influences` for arguments and exceptions.
     """
     return influences(problem, x[None], dropped)[0]
 
 
 def influences(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()) -> list[Influence]:
-    """Return the influence of the rows and priors of each problem of a batch.
+    """Return the influence of the rows and priors of each problem of a batch of N problems.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems, whose noise ties no epochs.
-    x : array (N, size)
-        Where they are linearised; these need not be minima.
-    dropped : frozenset of int
-        Priors to do without.
+    The problems are linearised at `x` (N, size), which need not be minima. The noise must not correlate epochs.
+    `dropped` are the numbers of priors to exclude.
 
     Raises
     ------
     InvalidProblem
-        Where a bias walks: rows of one epoch then say something of the next.
+        If a bias is a random walk: rows of one epoch then have information about the next epoch.
     """
     if walks(problem):
-        what = f"the walk {walks(problem)[0].name!r} ties each epoch to the next, and errors are weighed epoch by epoch"
-        raise InvalidProblem(what, "biases", "fix with a loss such as 'huber', or let the bias be a spline")
+        what = f"the walk {walks(problem)[0].name!r} correlates epochs, but errors are estimated epoch by epoch"
+        raise InvalidProblem(what, "biases", "use a loss such as 'huber', or make the bias a spline")
     layout, size = problem.layout, len(x)
     numbers = [j for j, p in enumerate(problem.priors) if j not in dropped and layout.find(p.name)[1]]
     problem = replace(problem, priors=tuple(p for j, p in enumerate(problem.priors) if j not in dropped))
-    # whitened in neither: Q needs P and J apart
+    # whitening is applied to neither: Q needs P and J separately
     linear, equations = linearise(problem, x), equations_at(problem, x)
     picks, means, inner = _prior_rows(problem)
     cuts = np.cumsum([problem.count, *(len(pick) for pick in picks)])
@@ -175,7 +160,7 @@ def influences(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()
 
 
 def _prior_rows(problem: Problem) -> tuple[list[Array], list[Array], list[Array]]:
-    """Return the picked unknowns (p, n), means (N or 1, p) and precisions (p, p) of the priors on shared unknowns."""
+    """Return selection matrices (p, n), means (N or 1, p) and precisions (p, p) of the priors on shared unknowns."""
     layout = problem.layout
     picks, means, inner = [], [], []
     for prior in problem.priors:
@@ -190,7 +175,7 @@ def _prior_rows(problem: Problem) -> tuple[list[Array], list[Array], list[Array]
 def _precisions(linear: Linear, count: int, inner: Sequence[Array], size: int) -> list[Any]:
     """Return the inverse covariances (q, q) of the rows and priors of each problem; absent rows are zero.
 
-    Arrays for few rows, sparse arrays for many.
+    The result is dense for few rows and sparse for many rows.
     """
     parts = []
     for whitener in linear.noise:
@@ -214,23 +199,26 @@ def _precisions(linear: Linear, count: int, inner: Sequence[Array], size: int) -
 
 
 def _roots(equations: Normal, A: Array, B: Array, epoch: Array) -> tuple[Array, Array, Array]:
-    """Return roots (N, n, n) of (J'P J)^-1, and factors (N, q, n), (N, q, l) of J (J'P J)^-1 J', locals eliminated."""
+    """Return roots (N, n, n) of (J'P J)^-1, and factors (N, q, n) and (N, q, l) of J (J'P J)^-1 J'.
+
+    The local unknowns are eliminated.
+    """
     information, _, _ = marginal(equations)
     root, _ = linalg.root(information)
     if not B.shape[-1]:
         return root, A @ root, B
     inner, _ = linalg.root(equations.local)
     gain = inner @ np.swapaxes(inner, -1, -2) @ np.swapaxes(equations.cross, -1, -2)
-    # J without what the unknowns of its own epoch explain: Schur's complement, row by row
+    # J minus the part that the local unknowns of the epoch explain: Schur complement, row by row
     left = A - (B[..., None, :] @ gain[:, epoch])[..., 0, :]
     return root, left @ root, (B[..., None, :] @ inner[:, epoch])[..., 0, :]
 
 
 def log_tail(statistic: Array, dof: Array) -> Array:
-    """Return the logarithm of the probability of a chi-square at least this large, also where it is tiny.
+    """Return the logarithm of the tail probability of a chi-square, also for very small probabilities.
 
-    Beyond the range of floating-point numbers by the leading term of its asymptotic series (Abramowitz, Stegun 1964,
-    eq. 6.5.32).
+    Below the range of floating-point numbers, the leading term of the asymptotic series is used (Abramowitz, Stegun
+    1964, eq. 6.5.32).
     """
     from scipy.special import gammaincc, gammaln
 
@@ -241,14 +229,14 @@ def log_tail(statistic: Array, dof: Array) -> Array:
 
 
 def significance(at: Influence, groups: Sequence[Group]) -> Array:
-    """Return the logarithms (G,) of the probabilities of the drop of the cost without each group."""
+    """Return the logarithms (G,) of the probabilities of the decrease of the cost without each group."""
     return log_tail(*drops(at, [at.rows(group) for group in groups]))
 
 
 def drops(at: Influence, rows: Sequence[Array]) -> tuple[Array, Array]:
-    """Return the drop of the cost without each of G sets of rows, to first order, and its degrees of freedom, (G,)."""
+    """Return the first-order decrease of the cost without each of G sets of rows, and its degrees of freedom, (G,)."""
     drop, dof = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
-    # sets of one size at a time: thousands of small eigenvalue problems as one batch
+    # handle sets of one size together: thousands of small eigenvalue problems are one batch
     sizes = np.array([len(own) for own in rows])
     for size in np.unique(sizes):
         members = np.flatnonzero(sizes == size)
@@ -260,16 +248,16 @@ def drops(at: Influence, rows: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def errors(at: Influence, groups: Sequence[Group]) -> list[Error]:
-    """Return the estimated error of each of some groups that are all in error."""
+    """Return the estimated error of each of some groups that all have errors."""
     rows = [at.rows(group) for group in groups]
     index = np.concatenate(rows)
     block, root = at.block(index), at.root(index)
     covariance = root @ root.T
-    known = np.abs(np.diagonal(covariance @ block) - 1.0) < _OPEN
+    known = np.abs(np.diagonal(covariance @ block) - 1.0) < _UNDETERMINED
     value, sigma = covariance @ at.pull[index], np.where(known, np.sqrt(np.diagonal(covariance)), np.inf)
     out = []
     for own in np.split(np.arange(len(index)), np.cumsum([len(one) for one in rows])[:-1]):
-        # a group's statistic is that of its known components, in their own covariance
+        # the statistic of a group uses only its determined components and their covariance
         inside = own[known[own]]
         information, _ = linalg.root(covariance[np.ix_(inside, inside)]) if len(inside) else (np.zeros((0, 0)), None)
         squared = ((information.T @ value[inside]) ** 2).sum()
@@ -277,26 +265,28 @@ def errors(at: Influence, groups: Sequence[Group]) -> list[Error]:
     return out
 
 
-# Reliability: what the test does not see.
+# Reliability: errors that the test does not detect.
 
 NOTICEABLE = 7.0**0.5 + 1.645
-"""Standard deviations of an error that goes unnoticed in one case of twenty: a search for suspects notices what
-lowers the cost by 7 (the price of a row, 16, less the gap of 9 of what is listed); 1.645 is for the noise."""
+"""Size of an error, in standard deviations, that remains undetected in one of twenty cases.
+
+A search for suspects detects an error that changes the cost by 7: the penalty of a row, 16, minus the gap of 9 of
+listed explanations. The noise adds 1.645."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reliability:
-    """The errors of single stations that go unnoticed, and what they do to the position.
+    """Smallest detectable errors of single stations, and the effect of undetected errors on the position.
 
     Parameters
     ----------
     names : tuple of G str
         Station and kind.
     least : array (G,)
-        Error of all its rows of the kind that is noticed in 95 % of all cases, metres, radians or ratios; infinite
-        where the others cannot check it at all.
+        Error of all rows of the station and kind that is detected in 95 % of all cases, metres, radians or ratios;
+        infinite if the other rows cannot check it.
     shift : array (G,)
-        How far such an error moves the position, metres; infinite where any size goes unnoticed and moves it.
+        Shift of the position by this error, metres; infinite if an undetected error of any size shifts the position.
     """
 
     names: tuple[str, ...]
@@ -305,25 +295,26 @@ class Reliability:
 
 
 def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) -> Reliability:
-    """Return the least error of each station that a search for suspects notices, and what an unseen one does.
+    """Return the smallest detectable error of each station, and the shift of the position by an undetected error.
 
-    An error e of rows c shifts the cost by the noncentrality e^2 c'Q c; it is noticed where the cost falls without it
-    by more than the price of one exclusion less the gap to which explanations are listed.
+    An error e of rows c changes the cost by the noncentrality e^2 c'Q c. The error is detected if the cost without
+    these rows decreases by more than a threshold. The threshold is the penalty of one exclusion minus the gap of listed
+    explanations.
 
     Parameters
     ----------
     problem : Problem
         A single problem.
     x : array (size,)
-        Where it is linearised: a fix, or a truth.
+        Parameters for the linearisation: a fix or a true value.
     suspects : sequence of Suspect
-        What the fix left out, `fix.suspects`: of the rest then.
+        Suspects that the fix excluded, `fix.suspects`; the result is for the remaining rows.
 
     Returns
     -------
     Reliability
-        For each station that is heard, and each kind it measures; differences whose noise is that of arrival times
-        count as these.
+        For each station with rows, and each kind that it measures. Differences whose noise comes from arrival times
+        count as arrival times.
 
     References
     ----------
@@ -335,32 +326,37 @@ def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) ->
     work = flat if made is None else made.problem
     origin = tuple(np.arange(flat.count)[:, None]) if made is None else made.origin
     for one in suspects:
-        work = work.with_rows(weight=np.where(_touched(work, origin, one), 0.0, work.weight))
+        work = work.with_rows(weight=np.where(_rows_of_suspect(work, origin, one), 0.0, work.weight))
     at = influence(work, embed(flat.layout, work.layout, np.asarray(x, dtype=float)))
     channels = _channels(work)
     seen = np.array([at.block(rows).sum() for _, rows in channels])
-    told = np.array([at.block(rows).sum() > _NOTHING * at.precision[rows][:, rows].sum() for _, rows in channels])
-    least = np.where(told, NOTICEABLE / np.sqrt(np.where(told, seen, 1.0)), np.inf)
+    determined = np.array(
+        [at.block(rows).sum() > _ROUNDING * at.precision[rows][:, rows].sum() for _, rows in channels]
+    )
+    least = np.where(determined, NOTICEABLE / np.sqrt(np.where(determined, seen, 1.0)), np.inf)
     moved = np.stack([at.deviation @ at.shared[rows].sum(0) for _, rows in channels])
     places = [slot.start + i for slot in work.layout.shared if slot.name == "position" for i in range(slot.size)]
     pull = np.linalg.norm(moved[:, places], axis=-1)
-    # what moves nothing may be of any size
+    # an error that does not shift the position may have any size
     shift = np.where(pull > 0.0, least * np.where(pull > 0.0, pull, 1.0), 0.0)
     return Reliability(tuple(name for name, _ in channels), least, shift)
 
 
-def _touched(work: Problem, origin: Sequence[Array], suspect: Suspect) -> Array:
-    """Return which rows (m,) of a problem, perhaps with arrivals for differences, a suspect is."""
+def _rows_of_suspect(work: Problem, origin: Sequence[Array], suspect: Suspect) -> Array:
+    """Return a mask (m,) of the rows of a suspect; the problem may have arrival times instead of differences."""
     if suspect.group == "station":
         a, b = (np.concatenate([getattr(rows, end) for rows in work.rows]) for end in "ab")
         number = work.stations.names.index(suspect.name.removeprefix("station "))
         return np.asarray((a == number) | (b == number))
-    # a single arrival is its station; all others come from one row
+    # for a suspect row, mark the rows that come from it alone; an arrival comes from several rows
     return np.array([len(own) == 1 and int(own[0]) in suspect.rows for own in origin])
 
 
 def embed(layout: Layout, other: Layout, x: Array) -> Array:
-    """Return a vector (size,) in the order of a layout with more unknowns, which are zero: rows are linear in them."""
+    """Return a vector (size,) in the order of a layout with more unknowns.
+
+    The additional unknowns are zero: the rows are linear in them.
+    """
     out, (shared, local) = np.zeros(other.size), layout.split(x)
     out[shared_places(layout, other)] = shared
     by_epoch = other.split(out)[1]
@@ -372,7 +368,7 @@ def embed(layout: Layout, other: Layout, x: Array) -> Array:
 
 
 def _channels(problem: Problem) -> list[tuple[str, Array]]:
-    """Return the rows that are present of every station and kind, and their name; those of no station are none."""
+    """Return the name and the present rows of every station and kind; rows without a station are omitted."""
     present, out = problem.weight.reshape(-1)[: problem.count] > 0.0, []
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         own = present[start : start + rows.count] & (rows.a >= 0)

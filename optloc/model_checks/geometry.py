@@ -1,4 +1,4 @@
-"""What the places of stations and the number of rows leave open: mirror images, turns, and no redundancy."""
+"""Ambiguities of the geometry (mirror images, rotations about a line) and missing redundancy, with advice."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from optloc.problem.problem import Problem
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """What is seen in a problem that may be why its fix is not `ok`, and what helps.
+    """A possible reason why a fix is not `ok`, and the remedy.
 
     Parameters
     ----------
     cause : str
-        A word for programs: "plane", "line", "redundancy", "mirror", "unit", "sign", "compass", "opposite",
+        A keyword for programs: "plane", "line", "redundancy", "mirror", "unit", "sign", "compass", "opposite",
         "impossible", "constraint", "offset", "scale", "rotation", "drift" or "step".
     seen : str
-        What is seen, a sentence without its full stop.
+        The observation, a sentence without its full stop.
     advice : str
-        What to do about it, the same.
+        The remedy, a sentence without its full stop.
     toml : str
-        Lines of a problem file that do it, to be put at its end or, where they are keys, into `[[measurements]]`;
-        empty where there is no such line.
+        Lines of a problem file for the remedy. Put them at the end of the file; put keys into `[[measurements]]`. Empty
+        if there is no such line.
     """
 
     cause: str
@@ -42,36 +42,31 @@ class Advice:
     toml: str = ""
 
 
-# Chi-square by which stations off their plane, at the most, tell a place from its mirror image: below it nowhere do the
-# data tell the two apart by three sigma.
-_TOLD = 9.0
-# Share of the extent of stations that counts as none whatever the noise: a micrometre a metre.
+# Limit of the chi-square that separates a position from its mirror image, if stations are not exactly in a plane. Below
+# the limit, the data separate no position from its image by three sigma.
+_SEPARATED = 9.0
+# Share of the extent of the stations that counts as zero with any noise: a micrometre per metre.
 _FLAT = 1e-6
-# Share of the extent of stations that is rounding of their coordinates.
+# Share of the extent of the stations that is rounding of their coordinates.
 _ROUNDING = 1e-12
-# Cosine from which a normal counts as an axis of the frame, so that a box is on one side of the plane.
+# Cosine above which a normal counts as an axis of the frame, so that a box can exclude one side of the plane.
 _ALONG = 0.999
 
 
 def advise_on_geometry(problem: Problem, x: Array) -> Iterator[Advice]:
-    """Yield what places and numbers of rows leave open.
+    """Yield advice about positions of stations and numbers of rows that leave the position ambiguous.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of one problem or run.
-    x : array (1, size)
-        Its fix; NaN where there is none.
+    `problem` is a flat batch of one problem or run. `x` (1, size) is its fix; NaN if there is no fix.
     """
-    found = list(_count_rows(problem))
+    found = list(_redundancy_advice(problem))
     yield from found
-    # with fewer rows than unknowns there are more than two places
+    # with fewer rows than unknowns, more than two positions fit
     if not any("fewer" in one.seen for one in found):
-        yield from _see_mirror(problem, x)
+        yield from _mirror_advice(problem, x)
 
 
-def _count_rows(problem: Problem) -> Iterator[Advice]:
-    """Yield what the least redundancy of the epochs lets anyone notice."""
+def _redundancy_advice(problem: Problem) -> Iterator[Advice]:
+    """Yield advice about the smallest redundancy of the epochs: an error may not be detectable, or not attributable."""
     alone = separable(problem)
     dof = np.ravel(degrees_of_freedom(by_epoch(problem) if alone else problem))
     least, k = int(dof.min()), len(dof)
@@ -81,12 +76,12 @@ def _count_rows(problem: Problem) -> Iterator[Advice]:
     where = f"{count} of {k} epochs {'has' if count == 1 else 'have'}" if k > 1 else "the rows have"
     if least < 0:
         seen = f"{where} {-least} measurement{'s' if least < -1 else ''} fewer than unknowns"
-        yield Advice("redundancy", seen, "add rows, or state what is known: a height, a bias, a prior")
+        yield Advice("redundancy", seen, "add rows, or state known quantities: a height, a bias, a prior")
     elif least == 0:
-        seen = f"{where} no redundancy: every set of values fits, a wrong one as well"
-        yield Advice("redundancy", seen, "add a row, better two: one shows that something is wrong, two show what")
+        seen = f"{where} no redundancy: all values fit, even wrong values"
+        yield Advice("redundancy", seen, "add a row, or better two: one row detects an error, two rows identify it")
     else:
-        seen = f"{where} a redundancy of 1: an error would be noticed, and nobody could say which row has it"
+        seen = f"{where} a redundancy of 1: an error is detectable, but the wrong row is not identifiable"
         yield Advice("redundancy", seen, "add a row")
 
 
@@ -95,7 +90,7 @@ def _count_rows(problem: Problem) -> Iterator[Advice]:
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """Stations about their middle: extents, root mean square, ascending, and their directions in columns."""
+    """Stations relative to their centre: RMS extents in ascending order, m, and their directions in columns."""
 
     places: Array
     centre: Array
@@ -104,16 +99,16 @@ class _Shape:
 
     @property
     def height(self) -> Array:
-        """Return the distances (s,) of the stations from the plane or line that fits them best."""
+        """Return the distances (s,) of the stations from their best-fitting plane or line, m."""
         return np.asarray((self.places - self.centre) @ self.axes[:, 0])
 
 
 def _shape(problem: Problem) -> _Shape | None:
-    """Return the shape of the stations whose rows are present; None where the rows tell more than ranges do."""
+    """Return the shape of the stations with present rows; None if a row is more than a function of ranges."""
     used, weight = set(), np.broadcast_to(problem.weight, (1, problem.count))[0]
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         model = MODELS[rows.kind]
-        # angles and heights know above from below, and range rates of moving stations may
+        # angles and heights distinguish above from below, and range rates of moving stations may do so
         if model.axes or model.velocity or model.ecef or not model.stations:
             return None
         present = weight[start : start + rows.count] > 0.0
@@ -127,7 +122,7 @@ def _shape(problem: Problem) -> _Shape | None:
 
 
 def _noise(problem: Problem) -> float:
-    """Return the least standard deviation of rows that are lengths, metres; zero where there are none."""
+    """Return the smallest standard deviation of rows that are lengths, m; zero if there are no lengths."""
     sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count)[0]
     weight = np.broadcast_to(problem.weight, (1, problem.count))[0]
     lengths = np.concatenate([np.full(r.count, MODELS[r.kind].quantity == "length") for r in problem.rows])
@@ -135,8 +130,8 @@ def _noise(problem: Problem) -> float:
     return float(own.min()) if len(own) else 0.0
 
 
-def _see_mirror(problem: Problem, x: Array) -> Iterator[Advice]:
-    """Yield that the stations stand in a plane or on a line, or that the mirror image of a fix fits."""
+def _mirror_advice(problem: Problem, x: Array) -> Iterator[Advice]:
+    """Yield advice if the stations are in a plane or on a line, or if the mirror image of a fix fits."""
     shape = _shape(problem)
     if shape is None or shape.extent[-1] == 0.0:
         return
@@ -145,25 +140,28 @@ def _see_mirror(problem: Problem, x: Array) -> Iterator[Advice]:
         return
     if d == 3 and flat[1]:
         axis = _spell(shape.axes[:, -1])
-        seen = f"the stations stand on one line along {axis}: a turn about it changes no measurement"
+        seen = f"the stations are on one line along {axis}: a rotation about it changes no measurement"
         yield Advice("line", seen, "add a station off the line, or a bearing or height")
     elif flat[0]:
         name = "plane" if d == 3 else "line"
-        seen = f"the stations stand {'in one plane' if d == 3 else 'on one line'} within the noise ({_off(shape)})"
-        seen += f": every place has a mirror image on the other side of the {name} that fits as well"
-        yield Advice(name, seen, _say_side(problem, shape)[0], _say_side(problem, shape)[1])
+        seen = f"the stations are {'in one plane' if d == 3 else 'on one line'} within the noise"
+        seen += (
+            f" ({_describe_offset(shape)}): every position has a mirror image across the {name} that fits equally well"
+        )
+        yield Advice(name, seen, _side_advice(problem, shape)[0], _side_advice(problem, shape)[1])
     elif _mirror_fits(problem, shape, x):
         name = "plane" if d == 3 else "line"
-        seen = f"the mirror image of the fix in the best {name} of the stations ({_off(shape)}) fits about as well"
-        yield Advice("mirror", seen, _say_side(problem, shape)[0], _say_side(problem, shape)[1])
+        seen = f"the mirror image of the fix in the best-fitting {name} of the stations ({_describe_offset(shape)})"
+        seen += " fits almost equally well"
+        yield Advice("mirror", seen, _side_advice(problem, shape)[0], _side_advice(problem, shape)[1])
 
 
-# Share of a normal along which an equality changes, from which a mirror image breaks it.
+# Share of the normal in the gradient of an equality above which a mirror image violates the equality.
 _ACROSS = 0.1
 
 
 def _is_decided(problem: Problem, shape: _Shape) -> bool:
-    """Return whether an equality holds the target off the plane of the stations: its mirror image breaks that."""
+    """Return whether an equality excludes mirror images: it keeps the target off the plane of the stations."""
     normal = shape.axes[:, 0]
     for band in problem.constraints:
         if not isinstance(band, Band) or not is_exact(band):
@@ -179,21 +177,22 @@ def _is_decided(problem: Problem, shape: _Shape) -> bool:
 
 
 def _is_flat(problem: Problem, shape: _Shape, axis: int) -> bool:
-    """Return whether no place could be told from its mirror image across an axis by three sigma."""
+    """Return whether the data separate no position from its mirror image across an axis by three sigma."""
     height = (shape.places - shape.centre) @ shape.axes[:, axis]
-    # a mirror image changes a range by twice the height of the station at the most
+    # a mirror image changes a range by at most twice the height of the station
     noise = _noise(problem)
-    told = np.inf if noise == 0.0 else float(((2.0 * height / noise) ** 2).sum())
-    return bool(told < _TOLD or shape.extent[axis] < _FLAT * shape.extent[-1])
+    separation = np.inf if noise == 0.0 else float(((2.0 * height / noise) ** 2).sum())
+    return bool(separation < _SEPARATED or shape.extent[axis] < _FLAT * shape.extent[-1])
 
 
-def _off(shape: _Shape) -> str:
+def _describe_offset(shape: _Shape) -> str:
+    """Return a text with the RMS distance of the stations from their plane, and their extent."""
     off, size = float(np.sqrt((shape.height**2).mean())), float(shape.extent[-1])
     return f"{off if off > _ROUNDING * size else 0.0:.2g} m off it, over {size:.3g} m"
 
 
 def _mirror_fits(problem: Problem, shape: _Shape, x: Array) -> bool:
-    """Return whether the mirror image of a fix is another minimum that costs less than nine more."""
+    """Return whether the mirror image of a fix is another minimum whose cost is higher by less than nine."""
     if not one_place(problem) or not np.isfinite(x).all():
         return False
     slot, _ = problem.layout.find("position")
@@ -204,32 +203,33 @@ def _mirror_fits(problem: Problem, shape: _Shape, x: Array) -> bool:
     both, cost = descend(problem.take(np.zeros(2, dtype=int)), np.concatenate([x, other]))
     after = (both[:, part] - shape.centre) @ shape.axes[:, 0]
     inside = not problem.constraints or bool((violation(problem, both[1:]) <= 0.0).all())
-    # on the other side still, and not all the way back to the plane
+    # the descent must stay on the other side, and not return to the plane
     return bool(
-        after[0] * after[1] < 0.0 and abs(after[1]) > 0.1 * abs(height) and cost[1] - cost[0] < _TOLD and inside
+        after[0] * after[1] < 0.0 and abs(after[1]) > 0.1 * abs(height) and cost[1] - cost[0] < _SEPARATED and inside
     )
 
 
-def _say_side(problem: Problem, shape: _Shape) -> tuple[str, str]:
-    """Return what decides between the sides of the plane, and the lines that say it."""
+def _side_advice(problem: Problem, shape: _Shape) -> tuple[str, str]:
+    """Return advice on how to decide between the sides of the plane, and the lines of a problem file for it."""
     if problem.constraints:
-        return "see whether a constraint decides between the two; or add a station off it, a bearing or a height", ""
+        return "check if a constraint excludes one of the two, or add a station off it, a bearing or a height", ""
     normal = shape.axes[:, 0]
     if problem.frame.geodetic:
-        advice = "say that the target is above ground, `--above-ground`, if that is known; or add a station off it"
+        advice = "if the target is above ground, use `--above-ground`; or add a station off it"
         return f"{advice}, a bearing or a height", '[[constraints]]\nkind = "above-ground"\n'
     axis = int(np.argmax(np.abs(normal)))
     if abs(normal[axis]) < _ALONG:
-        return "add a station off it, a bearing, or a constraint that the target meets on one side alone", ""
-    # the side is for the user to say: the line shows the upper one
+        return "add a station off it, a bearing, or a constraint that excludes one side", ""
+    # only the user can know the side: the lines select the upper side
     low = ["-inf"] * problem.dimension
     low[axis] = f"{float(shape.centre[axis]):.6g}"
     high, bound = ["inf"] * problem.dimension, ",".join(low)
-    advice = f"say on which side the target is, here {'xyz'[axis]} above {low[axis]} m: "
+    advice = f"state the side of the target, here {'xyz'[axis]} above {low[axis]} m: "
     advice += f"`--box={bound}:{','.join(high)}`; or add a station off it or a bearing"
     box = f'[[constraints]]\nkind = "box"\nmin = [{", ".join(low)}]\nmax = [{", ".join(high)}]\n'
     return advice, box
 
 
 def _spell(vector: Array) -> str:
+    """Return a vector as text with two decimals."""
     return "(" + ", ".join(f"{v:.2f}" for v in vector) + ")"

@@ -1,4 +1,8 @@
-"""What may be wrong together: all rows of a station, one measurement, a prior, all lengths of a kind by one offset."""
+"""Groups of rows, priors and offsets that can be wrong together, for the search for suspects.
+
+A group is one of four: all rows of a station, one measurement, one prior, or a common offset of all lengths of a kind.
+Each group has a penalty, the decrease of the cost that justifies its exclusion.
+"""
 
 from __future__ import annotations
 
@@ -16,31 +20,25 @@ from optloc.problem.problem import Problem
 
 KINDS: tuple[GroupKind, ...] = ("station", "row", "prior", "offset")
 
-_ONE, _EACH = 9.0, 7.0
-"""Twice the logarithms of what an error has against it: odds of a hundred to one that a group has none, and for each of
-its components that it is somewhere in a hundred sigma, not at zero (100 / sqrt(2 pi))."""
-ROW_PRICE = _ONE + _EACH
-"""Price of leaving out one row."""
+_GROUP_PENALTY, _COMPONENT_PENALTY = 9.0, 7.0
+"""Parts of the penalty of an exclusion: twice the logarithm of odds.
+
+The first part is for the group: odds of a hundred to one that a group has no error. The second part is for each
+component of its error: the error is anywhere within a hundred sigma, not at zero (100 / sqrt(2 pi))."""
+ROW_PRICE = _GROUP_PENALTY + _COMPONENT_PENALTY
+"""Penalty for the exclusion of one row."""
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """What is left out together.
+    """A set of measurements, a prior or an offset that can be wrong together.
 
-    Parameters
-    ----------
-    name : str
-        In words.
-    kind : "station", "row", "prior" or "offset"
-        What it is.
-    rows : tuple of int
-        Its rows that are present, as numbers of the problem's rows; empty for a prior and an offset.
-    prior : int
-        Number of the prior; -1 for others.
-    offset : Bias, optional
-        Unknown that all lengths of a kind get in common: nothing is left out then, but something more is unknown.
-    size : int
-        How many numbers it holds.
+    - name: description for messages.
+    - kind: "station", "row", "prior" or "offset".
+    - rows: numbers of the present rows of the group; empty for a prior and an offset.
+    - prior: number of the prior; -1 for other groups.
+    - offset: additional unknown that all lengths of a kind share; no row is excluded then.
+    - size: number of components of the error.
     """
 
     name: str
@@ -52,13 +50,17 @@ class Group:
 
     @property
     def price(self) -> float:
-        """Return by how much the cost has to fall for its error to be as likely as none, a few of them being wrong."""
-        return _ONE + _EACH * self.size
+        """Return the penalty: the decrease of the cost at which an error of this group is as likely as no error."""
+        return _GROUP_PENALTY + _COMPONENT_PENALTY * self.size
 
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """What each row is: stations are -1 where its kind takes none; the `place`-th of so many `alike`."""
+    """Kind, stations, epoch and target of each row, for the names of rows.
+
+    A station is -1 if the kind of the row has no station there. `alike` is the number of rows with equal columns, and
+    `place` the number of the row among them.
+    """
 
     kind: list[str]
     a: Array
@@ -70,6 +72,7 @@ class _Columns:
 
     @classmethod
     def of(cls, problem: Problem) -> _Columns:
+        """Return the columns of all rows of a problem."""
         taken = [MODELS[rows.kind].stations for rows in problem.rows]
         none = [np.full(rows.count, -1) for rows in problem.rows]
         kind = [rows.kind for rows in problem.rows for _ in range(rows.count)]
@@ -78,7 +81,7 @@ class _Columns:
         epoch, target = problem.epoch, np.concatenate([rows.target for rows in problem.rows])
         sort = np.unique(kind, return_inverse=True)[1]
         _, label = np.unique(np.column_stack([sort, a, b, epoch, target]), axis=0, return_inverse=True)
-        # place: the how-manyth of the rows that look alike, so that a reader can tell them apart
+        # place: the number of a row among rows with equal columns, so that their names differ
         label, place = label.reshape(-1), np.empty(len(a), dtype=np.int64)
         order, sizes = np.argsort(label, kind="stable"), np.bincount(label)
         place[order] = np.arange(len(a)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
@@ -86,25 +89,17 @@ class _Columns:
 
 
 def groups_of(problem: Problem, present: Array, by: Sequence[GroupKind] = KINDS) -> tuple[Group, ...]:
-    """Return what may be wrong together, each set of rows once: stations first, then rows, then priors.
+    """Return the groups that can be wrong together, each set of rows once: stations first, then rows, then priors.
 
-    The measurements that the same stations made of one target at one epoch are a group too, for instance an azimuth
-    and an elevation. A station that made all the rows is none: nothing would be left.
-
-    Parameters
-    ----------
-    problem : Problem
-        Any batch.
-    present : bool array (m,)
-        Rows that are there.
-    by : sequence of "station", "row", "prior", "offset"
-        Which groups are wanted.
+    The rows of one target at one epoch by the same stations also form a group, for instance an azimuth and an
+    elevation. A station with all rows forms no group: without it no row would remain. `present` (m,) marks the rows
+    that are present, and `by` lists the kinds of groups.
     """
     columns, found = _Columns.of(problem), dict[tuple[int, ...], Group]()
     if "station" in by:
         for i, name in enumerate(problem.stations.names):
             rows = _numbers(present & ((columns.a == i) | (columns.b == i)))
-            # setdefault: rows that two groups share by name are listed once, under the first
+            # setdefault: if two groups have the same rows, only the first group is listed
             if rows and len(rows) < present.sum():
                 found.setdefault(rows, Group(f"station {name}", "station", rows, size=len(rows)))
     if "row" in by:
@@ -120,10 +115,10 @@ def groups_of(problem: Problem, present: Array, by: Sequence[GroupKind] = KINDS)
 
 
 def _offsets(problem: Problem, present: Array) -> Iterator[Group]:
-    """Yield the common offset of each kind of length that is known to be free of one: no emission time, no bias."""
+    """Yield a common offset for each kind of length without an emission time and without a bias."""
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         own, model = slice(start, start + rows.count), MODELS[rows.kind]
-        # differences have none, and what a bias touches has its own
+        # differences have no common offset, and rows with a bias already have an offset
         alike = model.ranges is not None and sum(model.ranges) != 0 and not model.emission
         touched = any(np.isin(bias.row, np.arange(start, start + rows.count)).any() for bias in problem.biases)
         if alike and not touched and present[own].sum() > 1:
@@ -137,18 +132,18 @@ def _offsets(problem: Problem, present: Array) -> Iterator[Group]:
 
 
 def check_kinds(by: str | Sequence[str]) -> tuple[GroupKind, ...]:
-    """Return kinds of groups; raise InvalidProblem naming an unknown one."""
+    """Return the kinds of groups; raise InvalidProblem if a kind is unknown."""
     wanted = (by,) if isinstance(by, str) else tuple(by)
     for name in wanted:
         if name not in KINDS:
-            raise InvalidProblem(f"nothing is grouped by {name!r}", "by", nearest(str(name), KINDS))
+            raise InvalidProblem(f"unknown kind of group {name!r}", "by", nearest(str(name), KINDS))
     if not wanted:
-        raise InvalidProblem("nobody is suspected", "by", f"name some of {', '.join(KINDS)}")
+        raise InvalidProblem("no kind of group is given", "by", f"name at least one of {', '.join(KINDS)}")
     return tuple(kind for kind in KINDS if kind in wanted)
 
 
 def leave_out(problem: Problem, left: Array, others: Sequence[Group] = ()) -> Problem:
-    """Return a flat batch of problems without some rows (N, m), without the priors and with the offsets of groups."""
+    """Return a flat batch of problems without some rows (N, m), without the groups' priors, with their offsets."""
     weight = np.where(left, 0.0, np.broadcast_to(problem.weight, left.shape))
     dropped = {group.prior for group in others}
     priors = tuple(prior for j, prior in enumerate(problem.priors) if j not in dropped)
@@ -157,7 +152,7 @@ def leave_out(problem: Problem, left: Array, others: Sequence[Group] = ()) -> Pr
 
 
 def mark_rows(groups: Sequence[Group], count: int) -> Array:
-    """Return the rows (count,) of some groups."""
+    """Return a mask (count,) of the rows of some groups."""
     out = np.zeros(count, dtype=bool)
     for group in groups:
         out[list(group.rows)] = True
@@ -165,17 +160,18 @@ def mark_rows(groups: Sequence[Group], count: int) -> Array:
 
 
 def _sightings(columns: _Columns, present: Array) -> list[tuple[int, ...]]:
-    """Return the rows that the same stations measured of one target at one epoch, where there are several."""
+    """Return sets of several rows that the same stations measured of one target at one epoch."""
     keys = np.column_stack([columns.a, columns.b, columns.epoch, columns.target])
     seen = (columns.a >= 0) & present
     _, label = np.unique(keys, axis=0, return_inverse=True)
     order = np.flatnonzero(seen)[np.argsort(label.reshape(-1)[seen], kind="stable")]
-    # rows of one label lie together now: cut where it changes
+    # rows of one label are adjacent now: split where the label changes
     cuts = np.flatnonzero(np.diff(label.reshape(-1)[order])) + 1
     return [tuple(part.tolist()) for part in np.split(order, cuts) if len(part) > 1]
 
 
 def _row_name(problem: Problem, columns: _Columns, rows: tuple[int, ...]) -> str:
+    """Return the description of rows of the same stations: kinds, stations, target and epoch."""
     first, names = rows[0], problem.stations.names
     kinds = " and ".join(dict.fromkeys(columns.kind[i] for i in rows))
     stations = " and ".join(names[int(s)] for s in (columns.a[first], columns.b[first]) if s >= 0)
@@ -187,4 +183,5 @@ def _row_name(problem: Problem, columns: _Columns, rows: tuple[int, ...]) -> str
 
 
 def _numbers(inside: Array) -> tuple[int, ...]:
+    """Return the indices at which a mask is True."""
     return tuple(np.flatnonzero(inside).tolist())

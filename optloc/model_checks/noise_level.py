@@ -1,4 +1,8 @@
-"""What many accusations mean: a noise that is understated, one station that is wrong, late rows, or an offset."""
+"""Explanation of many rejected fixes: understated noise, one bad station or kind, late rows (NLOS), or a common offset.
+
+The chi-square test of a single fix cannot separate these causes. The functions here compare the likelihoods of the
+causes over all fixes together. Each cause may also exclude single rows, at a penalty per row.
+"""
 
 from __future__ import annotations
 
@@ -17,47 +21,48 @@ from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem
 
 SEVERAL = 3
-"""Fixes from which the level of the noise is asked for: of fewer one liar each is as likely."""
+"""Smallest number of fixes for which the level of the noise is estimated: with fewer, one gross error per fix is as
+likely."""
 
 ACCUSED = 0.01
-"""Chi-square probability below which a fix accuses somebody: that from which `robust` looks for suspects."""
+"""Chi-square probability below which a fix is rejected. `robust` searches for suspects below the same probability."""
 
-# Factors of sigma that are tried: a grid of 5 % over what a wrong unit would not explain better.
+# Factors of sigma that are tried: a grid of 5 %, up to factors that only a wrong unit would explain better.
 _FACTORS = np.exp(np.arange(-60, 100) * 0.05)
-# Share of late rows from which they are no exception: what all have in common may be an offset.
+# Above this share, late rows are not exceptions: their common delay may be an offset.
 _MINORITY = 0.5
-# Share of late rows from which no row on time is left that others are late against: few fixes of hardly any redundancy
-# are explained by that as well as by noise of another size.
+# Above this share, hardly any row on time is left as a reference for the late rows. Noise of another level explains a
+# few fixes with little redundancy equally well.
 _NEARLY_ALL = 0.95
-# Change of sigma that is worth a word: 20 % of it move no fix by a tenth of its sigma.
-_WORTH = 1.2
-# Eigenvalue of the tests of a group, as a share of the largest, below which it is rounding.
-_NOTHING = 1e-9
+# Smallest change of sigma that is reported: a change of 20 % moves no fix by a tenth of its sigma.
+_MIN_CHANGE = 1.2
+# An eigenvalue of the tests of a group below this share of the largest eigenvalue is rounding.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class CommonLevel:
-    """What explains the misfit of many fixes at the least price.
+    """The most likely explanation of the misfit of many fixes, penalties included.
 
     Parameters
     ----------
     kinds : tuple of str
         Kinds of rows.
     factor, low, high : array (k,)
-        What the stated standard deviations of each are to be multiplied by, and its interval of 95 %; 1 where the noise
-        is not the suspect, or where one of the other kinds is.
+        Factor of the stated standard deviation of each kind and its interval of 95 %. The factor is 1 if the noise is
+        not the suspect, or if only other kinds are.
     suspect : bool
         Whether the noise is the suspect.
     alone : str
-        Whose errors alone, a station's or a kind's, are larger than stated, if that explains more than a factor of all.
+        Station or kind whose errors are larger than stated, if this explains more than one factor for all rows.
     size : float
-        How many times larger these are; NaN where there is none.
+        Factor of the errors of `alone`; NaN if `alone` is empty.
     gain : float
-        By how much twice the logarithm of the likelihood is larger than with the noise as stated.
+        Twice the gain of the log-likelihood over the noise as stated.
     fixes : int
-        Fixes with redundancy.
+        Number of fixes with redundancy.
     accused, left : int
-        Those of them that a chi-square test at 1 % rejects, with the noise as stated and with the factors.
+        Number of fixes that a chi-square test at 1 % rejects, with the noise as stated and with the factors.
     """
 
     kinds: tuple[str, ...]
@@ -74,37 +79,38 @@ class CommonLevel:
 
     @property
     def sentence(self) -> str:
-        """Return what is found in one sentence without its full stop; empty where nothing is."""
-        accused = f"{self.accused} of {self.fixes} fixes accuse somebody"
+        """Return the explanation as one sentence without its full stop; empty if no cause was found."""
+        accused = f"{self.accused} of {self.fixes} fixes do not fit"
         if self.suspect:
+            several = len(self.kinds) > 1
             parts = [
-                f"{f:.2g} times the stated one ({a:.2g} to {b:.2g}){f' in {kind} rows' if len(self.kinds) > 1 else ''}"
+                f"{f:.2g} times the stated noise ({a:.2g} to {b:.2g}){f' in {kind} rows' if several else ''}"
                 for kind, f, a, b in zip(self.kinds, self.factor, self.low, self.high, strict=True)
                 if f != 1.0
             ]
-            return f"the noise level is the suspect: {accused}, and {self.left} with {' and '.join(parts)}"
+            return f"the noise level is the suspect: {accused}, but only {self.left} with {' and '.join(parts)}"
         if self.alone:
             what = f"errors of {self.alone} are {self.size:.2g} times as large as stated"
-            return f"{accused}, and what is wrong is {self.alone}: {what}, or biased"
+            return f"{accused}, and the suspect is {self.alone}: {what}, or biased"
         return ""
 
     @property
     def refutes(self) -> bool:
-        """Return whether noise is stated too small: what is claimed of such fixes does not hold."""
+        """Return whether the stated noise is too small: the claims about these fixes are then not valid."""
         return self.suspect and bool((self.factor > 1.0).any())
 
     def sizes(self, problem: Problem) -> Array:
-        """Return the factors (m,) of the rows of a problem."""
+        """Return the factor of the standard deviation of each row (m,)."""
         factor = dict(zip(self.kinds, self.factor.tolist(), strict=True))
         return np.array([factor.get(kind, 1.0) for kind in kinds_of(problem).tolist()])
 
     def scale(self, problem: Problem) -> Problem:
-        """Return a problem of the same kinds with its noise times the factors.
+        """Return a problem with its noise multiplied by the factors.
 
         Parameters
         ----------
         problem : Problem
-            Of any epochs; kinds that were not there stay as they are.
+            With any epochs. Rows of a kind without a factor keep their noise.
         """
         size = self.sizes(problem)
         blocks = [
@@ -115,80 +121,82 @@ class CommonLevel:
 
 
 def common_level_at(problem: Problem, x: Array) -> CommonLevel:
-    """Return what explains the misfit of fixes: the noise as stated, a factor of it, or one station or kind.
+    """Return the most likely explanation of the misfit: the noise as stated, one factor of it, or one station or kind.
 
-    Every fix may leave out measurements at a price each, under any of these: a few liars are no larger noise. Of a fix
-    whose cost is c_k without k measurements and whose redundancy then is r_k, twice the negative logarithm of the
-    restricted likelihood with sigma times f is ``c_k / f^2 + r_k ln f^2`` and the price of k (see `ROW_PRICE`); the
-    measurements that are left out are those that stand out most, one after another, to first order at the fix. A
-    factor of one station or kind changes c and r by the update of V for its errors. What is cheapest over all fixes,
-    the price of its factor included, is what is told; the factors are those of `variance_components.fit`.
+    With each explanation, a fix may exclude measurements at a penalty each (see `ROW_PRICE`), because a few gross
+    errors are not a higher noise level. Let c_k be the cost of a fix without k measurements, r_k its redundancy, and f
+    the factor of sigma. Twice the negative logarithm of the restricted likelihood is then ``c_k / f^2 + r_k ln f^2``
+    plus the penalty of k measurements. The measurements with the largest tests are excluded one after another, to first
+    order at the fix. A factor of one station or kind changes c and r by the update of V for its errors. The result is
+    the explanation with the lowest sum over all fixes, including the penalty of its factor. `variance_components.fit`
+    computes the factors.
 
     Parameters
     ----------
     problem : Problem
-        A flat batch of N problems, of `elements.batch_of`.
+        A flat batch of N problems, from `elements.batch_of`.
     x : array (N, size)
-        Their fixes, robust or not; NaN where there is none.
+        Fixes of the problems, robust or not; NaN for a problem without a fix.
     """
     kept = np.flatnonzero(np.isfinite(x).all(-1))
     kinds = tuple(dict.fromkeys(rows.kind for rows in problem.rows))
     same = np.ones(len(kinds))
-    none = CommonLevel(kinds, same, same, same, False, "", np.nan, 0.0, 0, 0, 0)
+    unchanged = CommonLevel(kinds, same, same, same, False, "", np.nan, 0.0, 0, 0, 0)
     if not len(kept):
-        return none
+        return unchanged
     batch, x = problem.take(kept), x[kept]
     by_station, by_kind = elements(batch, x, "station"), elements(batch, x, "kind")
     tests = tested(by_station, np.ones(()))
-    cost, dof = _path(tests)
-    count, accused = int((tests.dof > 0).sum()), _accused(tests)
-    none = replace(none, fixes=count, accused=accused, left=accused)
+    cost, dof = _exclusion_path(tests)
+    count, accused = int((tests.dof > 0).sum()), _count_rejected(tests)
+    unchanged = replace(unchanged, fixes=count, accused=accused, left=accused)
     if not count or not accused:
-        return none
-    stated = _least(cost, dof, 1.0)
-    common = np.array([_least(cost, dof, f).sum() for f in _FACTORS])
-    # What a factor of one group explains, every fix may explain by leaving out measurements instead.
-    single = [*_alone(by_station, tests, cost, dof)]
-    single += [*_alone(by_kind, tested(by_kind, np.ones(())), cost, dof)] if len(kinds) > 1 else []
+        return unchanged
+    stated = _lowest_deviance(cost, dof, 1.0)
+    common = np.array([_lowest_deviance(cost, dof, f).sum() for f in _FACTORS])
+    # Instead of the factor of one group, every fix may also exclude measurements.
+    single = [*_single_groups(by_station, tests, cost, dof)]
+    single += [*_single_groups(by_kind, tested(by_kind, np.ones(())), cost, dof)] if len(kinds) > 1 else []
     name, size, least = min(single, key=lambda one: one[2], default=("", np.nan, np.inf))
     gain = float(stated.sum() - min(common.min(), least))
     if gain <= ROW_PRICE:
-        return none
+        return unchanged
     if least < common.min() and name not in kinds:
-        return replace(none, alone=name, size=size, gain=gain)
-    # A minority of late rows widens what is left like a larger noise does: who is late is then said of each fix.
-    if 0.0 < _late_rows(by_kind, _able(batch)).share < _MINORITY:
-        return replace(none, gain=gain)
-    return _rescaled(replace(none, gain=gain), by_kind)
+        return replace(unchanged, alone=name, size=size, gain=gain)
+    # A minority of late rows widens the residuals like a larger noise. The late rows are then reported for each fix.
+    if 0.0 < _late_rows(by_kind, _late_kinds(batch)).share < _MINORITY:
+        return replace(unchanged, gain=gain)
+    return _with_factors(replace(unchanged, gain=gain), by_kind)
 
 
-def _rescaled(none: CommonLevel, made: Elements) -> CommonLevel:
-    """Return the factors of all kinds; those that need none keep theirs."""
+def _with_factors(unchanged: CommonLevel, made: Elements) -> CommonLevel:
+    """Return the explanation with the factors of all kinds; a factor that is not significant is 1."""
     left = np.zeros(len(made.names), dtype=bool)
     found = fit(made, left, left)
-    place = [made.names.index(kind) if kind in made.names else -1 for kind in none.kinds]
+    place = [made.names.index(kind) if kind in made.names else -1 for kind in unchanged.kinds]
     factor, low, high = (np.append(np.sqrt(v), np.nan)[place] for v in (found.variance, found.low, found.high))
     with np.errstate(invalid="ignore"):
-        told = ((low > 1.0) | (high < 1.0)) & (np.abs(np.log(factor)) > np.log(_WORTH))
-    if not told.any():
-        return none
-    factor, low, high = (np.where(told, v, 1.0) for v in (factor, low, high))
-    own = np.append(factor, 1.0)[[none.kinds.index(n) if n in none.kinds else -1 for n in (*made.names, "")]]
+        significant = ((low > 1.0) | (high < 1.0)) & (np.abs(np.log(factor)) > np.log(_MIN_CHANGE))
+    if not significant.any():
+        return unchanged
+    factor, low, high = (np.where(significant, v, 1.0) for v in (factor, low, high))
+    own = np.append(factor, 1.0)[[unchanged.kinds.index(n) if n in unchanged.kinds else -1 for n in (*made.names, "")]]
     after = tested(made, own[made.of_effect] ** 2)
-    return replace(none, factor=factor, low=low, high=high, suspect=True, left=_accused(after))
+    return replace(unchanged, factor=factor, low=low, high=high, suspect=True, left=_count_rejected(after))
 
 
-def _accused(tests: Tested) -> int:
-    """Return how many fixes the chi-square test rejects."""
+def _count_rejected(tests: Tested) -> int:
+    """Return the number of fixes that the chi-square test rejects."""
     from scipy.special import gammaincc
 
     return int(((tests.dof > 0) & (gammaincc(np.maximum(tests.dof, 1) / 2, tests.cost / 2) < ACCUSED)).sum())
 
 
-def _path(tests: Tested) -> tuple[Array, Array]:
-    """Return cost and redundancy (N, 1 + k) without none, one, ... of the errors that stand out most.
+def _exclusion_path(tests: Tested) -> tuple[Array, Array]:
+    """Return the cost and the redundancy (N, 1 + k) of each fix without its 0, 1, ... k most outstanding errors.
 
-    Only those beyond the price are tried; a fix that has fewer of them repeats its last.
+    Only errors whose squared test exceeds the penalty are excluded. A fix with fewer of these errors gets an infinite
+    cost in the remaining columns.
     """
     costs, dofs = [tests.cost], [tests.dof]
     while True:
@@ -203,33 +211,34 @@ def _path(tests: Tested) -> tuple[Array, Array]:
 
 
 def priced_cost(tests: Tested) -> Array:
-    """Return the least cost of each fix (N,) with any of its errors left out, at the price of each."""
-    return _least(*_path(tests), 1.0)
+    """Return the lowest cost (N,) of each fix with any of its errors excluded, penalties included."""
+    return _lowest_deviance(*_exclusion_path(tests), 1.0)
 
 
-def _least(cost: Array, dof: Array, factor: float) -> Array:
-    """Return the least of twice the negative log-likelihood of each fix (N,) with sigma times a factor."""
+def _lowest_deviance(cost: Array, dof: Array, factor: float) -> Array:
+    """Return the minimum (N,) of twice the negative log-likelihood of each fix, with sigma times a factor."""
     left = np.arange(cost.shape[1])
     return np.asarray((cost / factor**2 + dof * np.log(factor**2) + ROW_PRICE * left).min(1))
 
 
-def _alone(made: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[tuple[str, float, float]]:
-    """Yield each group, the factor of sigma of its errors alone that explains most, and the likelihood with it.
+def _single_groups(made: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[tuple[str, float, float]]:
+    """Yield for each group its name, the most likely factor of sigma of its errors alone, and the likelihood with it.
 
-    With V + (f^2 - 1) B B' for the columns B of a group, T of `Tested` for them and its eigenvalues l and vectors, in
-    which t has the components y, the cost falls by (f^2 - 1) y^2 / (1 + (f^2 - 1) l), summed, and the determinants grow
-    by 1 + (f^2 - 1) l (A. J. Woodbury 1950), also of a fix that leaves out another measurement instead.
+    The likelihood is twice the negative logarithm. A factor f adds (f^2 - 1) B B' to V, with the columns B of the
+    group. Let l be the eigenvalues of T of `Tested` for these columns, and y the components of t along its
+    eigenvectors. The cost decreases by the sum of (f^2 - 1) y^2 / (1 + (f^2 - 1) l), and the determinant of V is
+    multiplied by 1 + (f^2 - 1) l for each l (A. J. Woodbury 1950). A fix may also exclude a measurement instead.
     """
     left = ROW_PRICE * np.arange(1, cost.shape[1])
     instead = (cost[:, 1:] + left).min(1, initial=np.inf)
     for g in np.flatnonzero(total(made.of_effect, len(made.names))):
         own = made.of_effect == g
-        # Its columns first; the others of the same number are zeros.
+        # The columns of the group come first; a fix with fewer columns is padded with zeros.
         order = np.argsort(~own, axis=1, kind="stable")[:, : int(own.sum(1).max())]
         here = np.take_along_axis(own, order, 1)
         matrix = np.take_along_axis(np.take_along_axis(tests.matrix, order[:, :, None], 1), order[:, None], 2)
         values, vectors = np.linalg.eigh(np.where(here[:, :, None] & here[:, None, :], matrix, 0.0))
-        seen = values > _NOTHING * values[:, -1:]
+        seen = values > _ROUNDING * values[:, -1:]
         vector = np.where(here, np.take_along_axis(tests.vector, order, 1), 0.0)
         squared = np.where(seen, (np.swapaxes(vectors, 1, 2) @ vector[..., None])[..., 0] ** 2, 0.0)
         values = np.where(seen, values, 0.0)
@@ -242,31 +251,32 @@ def _alone(made: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[t
         yield made.names[g], float(np.sqrt(1.0 + more[best, 0, 0])), float(sums[best])
 
 
-# Late rows: how many of them there are, by how much, and which fixes stand on them.
+# Late rows (NLOS): their share, their mean delay, and the fixes that depend on them.
 
 
 @dataclass(frozen=True, slots=True)
 class LateSignals:
-    """How many ranges and arrivals are late, as the residuals of many fixes show it.
+    """Share and delay of late ranges and arrival times, estimated from the residuals of many fixes.
 
     Parameters
     ----------
     share, delay : float
-        Probability of a row to be late, and the mean delay of those in sigmas of the rows; zero where none are seen.
+        Probability that a row is late, and the mean delay of late rows in sigmas of the rows; zero if none was found.
     gain : float
-        Twice the logarithm of the likelihood over that of no late row.
+        Twice the gain of the log-likelihood over the model without late rows.
     count : int
-        Rows that the rest of their fix can check.
+        Number of rows that the other rows of their fix can check.
     late : int array (N,)
-        Rows of each fix that are late rather than not.
+        Number of rows of each fix that are probably late.
     carried : bool array (N,)
-        Fixes that stand on late rows: without these nothing checks them.
+        True for a fix that depends on late rows: without them it has no redundancy.
     alike : str
-        Kind whose rows are all late by one amount, which then are not counted as late; empty for none.
+        Kind whose rows are all late by the same amount; these rows do not count as late. Empty if there is no such
+        kind.
     offset, offset_error : float
-        That amount and its standard deviation, SI units.
+        The common delay and its standard deviation, SI units.
     left : float
-        Chi-square of all fixes without the late rows, and the price of these.
+        Chi-square of all fixes without the late rows, plus the penalty of these rows.
     """
 
     share: float
@@ -282,75 +292,77 @@ class LateSignals:
 
     @property
     def method(self) -> str:
-        """Return the method that fixes with such rows, for `solve`; "late" where none are seen."""
+        """Return the name of the method for `solve` that fits these late rows; "late" if no row is late."""
         return f"late({self.share:.3g},{self.delay:.3g})" if self.share else "late"
 
     @property
     def sentence(self) -> str:
-        """Return what is found in one sentence without its full stop; empty where no row is late."""
+        """Return the result as one sentence without its full stop; empty if no row is late."""
         if self.alike:
             size = f"{self.offset:.4g} ± {self.offset_error:.2g} m"
-            return f"all {self.alike} rows are late alike, by {size}: that looks like a bias, an offset per kind"
+            return f"all {self.alike} rows are late by the same {size}: model a bias, an offset per kind"
         if not self.share:
             return ""
         text = f"{100.0 * self.share:.2g} % of {self.count} rows are late, by {self.delay:.2g} sigma on average"
         stand = int(self.carried.sum())
-        return text + (f"; {stand} of {len(self.late)} fixes stand on late rows" if stand else "")
+        return text + (f"; {stand} of {len(self.late)} fixes depend on late rows" if stand else "")
 
 
 def late_signals_at(problem: Problem, kept: Array, x: Array) -> LateSignals:
-    """Return the late rows of fixes that were made before; see `late_signals`.
+    """Return the late rows of given fixes.
 
     Parameters
     ----------
     problem : Problem
-        Flat batch of N problems, of `batch_of`.
+        Flat batch of N problems, from `batch_of`.
     kept : int array (n,)
-        Those that have a fix.
+        Numbers of the problems that have a fix.
     x : array (n, size)
-        Their parameter vectors.
+        Parameter vectors of these fixes.
     """
     late, carried = np.zeros(problem.batch_shape[0], dtype=int), np.zeros(problem.batch_shape[0], dtype=bool)
-    able = _able(problem)
+    able = _late_kinds(problem)
     if not able:
         return LateSignals(0.0, 0.0, 0.0, 0, late, carried)
     part = problem.take(kept)
     found = _late_rows(elements(part, x, "kind"), able)
     if found.share:
-        kind, offset, error, left = min((_alike(part, x, one) for one in able), key=lambda one: one[3])
+        kind, offset, error, left = min((_common_delay(part, x, one) for one in able), key=lambda one: one[3])
         if offset > 0.0 and left < found.left:
             found = replace(found, share=0.0, delay=0.0, alike=kind, offset=offset, offset_error=error)
             return replace(found, late=late, carried=carried)
-        if found.share > _NEARLY_ALL:  # late against what
+        if found.share > _NEARLY_ALL:  # no rows on time are left as a reference
             return replace(found, share=0.0, delay=0.0, late=late, carried=carried)
     late[kept], carried[kept] = found.late, found.carried
     return replace(found, late=late, carried=carried)
 
 
-# Turns of choosing late rows and of expectation and maximisation, and the change of both numbers that ends the latter.
+# Largest number of selections of late rows; largest number of iterations of expectation and maximisation (EM); and the
+# relative change of share and delay that ends EM.
 _CHOICES, _TURNS, _ENDED = 10, 500, 1e-6
-# Mean delay, sigmas, below which it is none: it moves no fix by what anybody notices.
-_NO_DELAY = 0.1
-# Test, standard deviations, from which a row is taken for late to begin with.
-_STANDS_OUT = 3.0
-# Share of what gross errors of either side explain that late rows have to: 0.8 to 1 where a tenth or more are late by 5
-# sigma on average, 0.6 at the most where the noise is three or five times what is stated (50 fixes).
+# Mean delay in sigmas below which no delay is reported: its effect on a fix is negligible.
+_MIN_DELAY = 0.1
+# Test, in standard deviations, above which a row is late in the first selection.
+_FIRST_CUT = 3.0
+# Late rows must explain at least this share of the misfit that gross errors of both signs explain. The share is 0.8 to
+# 1 if a tenth or more of the rows are late by 5 sigma on average. It is 0.6 at most if the noise is three or five times
+# the stated noise (50 fixes).
 _ONE_SIDED = 0.7
 
 
-def _able(problem: Problem) -> list[str]:
-    """Return the kinds of a problem that may be late."""
+def _late_kinds(problem: Problem) -> list[str]:
+    """Return the kinds of a problem whose rows can be late."""
     return [rows.kind for rows in problem.rows if rows.kind in LATE]
 
 
 def _late_rows(made: Elements, able: list[str]) -> LateSignals:
-    """Return the late rows of linearised fixes, their noise as stated."""
+    """Return the late rows of linearised fixes with the noise as stated."""
     tests = tested(made, np.ones(()))
     fit_for = np.isin(np.array([*made.names, ""], dtype=object)[made.of_effect], able)
     share, delay, gain, late, seen = _mixture(tests, fit_for)
     none = np.zeros(len(late), dtype=int)
-    # What leaving out late rows explains of what leaving out rows of either side does, at a price each: half of it
-    # where errors are tails, less where the noise is understated.
+    # Compare the misfit that late rows explain with the misfit that excluded rows of both signs explain, penalties
+    # included. The ratio is about one half if the errors have symmetric tails, and less if the noise is understated.
     left = float((without(tests, late).cost + ROW_PRICE * late.sum(1)).sum())
     explained = float(tests.cost.sum()) - left
     if min(gain, explained) <= ROW_PRICE or explained < _ONE_SIDED * float((tests.cost - priced_cost(tests)).sum()):
@@ -359,15 +371,17 @@ def _late_rows(made: Elements, able: list[str]) -> LateSignals:
     return LateSignals(share, delay, gain, seen, count, (count > 0) & (tests.dof - count <= 0), left=left)
 
 
-# Steps of an offset, each with fixes made anew, and the move in its sigma that ends them.
-_STEPS, _STILL = 8, 0.1
+# Largest number of Gauss-Newton steps of an offset, with new fixes in each step; a step below this share of the sigma
+# of the offset ends them.
+_STEPS, _CONVERGED = 8, 0.1
 
 
-def _alike(problem: Problem, x: Array, kind: str) -> tuple[str, float, float, float]:
-    """Return a kind, the offset that all its rows have in common, its standard deviation, and what is left to explain.
+def _common_delay(problem: Problem, x: Array, kind: str) -> tuple[str, float, float, float]:
+    """Return a kind, the common offset of all its rows, the standard deviation of the offset, and the remaining cost.
 
-    Gauss-Newton over all fixes together, each of which is refined in between: the rows are as late as they are, and a
-    fix may be far off for it.
+    Gauss-Newton estimates the offset over all fixes together and refines each fix after each step, because a large
+    delay moves the fixes far. Offset and standard deviation are in SI units; the cost includes the penalty of the
+    offset.
     """
     own = np.concatenate([np.full(rows.count, rows.kind == kind) for rows in problem.rows])
     offset, error = 0.0, np.inf
@@ -379,28 +393,28 @@ def _alike(problem: Problem, x: Array, kind: str) -> tuple[str, float, float, fl
         tests = tested(made, np.ones(()))
         here = made.of_offset == made.names.index(kind)
         size = float(tests.size[:, tests.errors :][here].sum())
-        if size <= 0.0:  # a common delay is a time of emission
+        if size <= 0.0:  # the emission time absorbs a common delay
             return kind, 0.0, np.inf, np.inf
         step, error = float(tests.vector[:, tests.errors :][here].sum()) / size, size**-0.5
-        if abs(step) <= _STILL * error:
+        if abs(step) <= _CONVERGED * error:
             break
         offset += step
     return kind, offset, error, np.inf if tests is None else float(priced_cost(tests).sum()) + ROW_PRICE
 
 
 def _mixture(tests: Tested, able: Array) -> tuple[float, float, float, Array, int]:
-    """Return share, mean delay, gain, late rows (N, q) and the number of rows that are checked."""
-    found = snooped(tests, slice(0, tests.errors), _STANDS_OUT)
+    """Return share, mean delay in sigmas, gain, late rows (N, q) and the number of rows that other rows check."""
+    found = snooped(tests, slice(0, tests.errors), _FIRST_CUT)
     late = found.gross & able & (found.shift > 0.0)
     share = delay = gain = 0.0
     seen = able & np.isfinite(found.shift)
     for _ in range(_CHOICES):
-        shift, sigma = _without_others(tests, late)
+        shift, sigma = _leave_one_out(tests, late)
         seen = able & np.isfinite(shift)
         share, delay, gain, chance = _expect(shift[seen], sigma[seen], late[seen])
         now = np.zeros(late.shape, dtype=bool)
         now[seen] = chance > 0.5
-        # Rows that nothing checks once the others are left out stay what they were.
+        # Rows that no other row checks after the exclusions keep their state.
         now |= late & ~seen
         if (now == late).all():
             break
@@ -408,8 +422,8 @@ def _mixture(tests: Tested, able: Array) -> tuple[float, float, float, Array, in
     return share, delay, gain, late, int(seen.sum())
 
 
-def _without_others(tests: Tested, late: Array) -> tuple[Array, Array]:
-    """Return the error (N, q) of each row, and its sigma, that the others show which are not late."""
+def _leave_one_out(tests: Tested, late: Array) -> tuple[Array, Array]:
+    """Return the error (N, q) of each row and its standard deviation, from the other rows that are not late."""
     items, q = np.arange(len(late)), tests.errors
     shift, sigma = error_sizes(without(tests, late), slice(0, q))
     order = np.argsort(~late, axis=1, kind="stable")[:, : int(late.sum(1).max(initial=0))]
@@ -417,7 +431,7 @@ def _without_others(tests: Tested, late: Array) -> tuple[Array, Array]:
         own = late[items, column]
         others = late.copy()
         others[items, column] = False
-        # of a late row all the other late ones are left out, not itself
+        # for a late row, exclude all other late rows but keep this row
         one, error = error_sizes(without(tests, others), slice(0, q))
         shift[items[own], column[own]] = one[items[own], column[own]]
         sigma[items[own], column[own]] = error[items[own], column[own]]
@@ -425,7 +439,10 @@ def _without_others(tests: Tested, late: Array) -> tuple[Array, Array]:
 
 
 def _expect(error: Array, sigma: Array, late: Array) -> tuple[float, float, float, Array]:
-    """Return share, mean delay and gain, and the chance of each row to be late: errors are normal, plus delays."""
+    """Return share, mean delay, gain, and the probability of each row to be late, by EM.
+
+    The errors are normal. A late row has an additional exponentially distributed delay.
+    """
     from scipy.special import erfcx, log_ndtr
 
     share = float(np.clip(late.mean(), 0.5 / max(len(late), 1), 0.9)) if len(late) else 0.0
@@ -434,18 +451,19 @@ def _expect(error: Array, sigma: Array, late: Array) -> tuple[float, float, floa
         return 0.0, 0.0, 0.0, np.zeros(len(error))
     prompt = -0.5 * (error / sigma) ** 2 - np.log(sigma) - 0.5 * np.log(2.0 * np.pi)
     for _ in range(_TURNS):
-        # A delay given the error is normal about error - sigma^2 / delay, cut off at zero.
+        # Given the error, the delay is normal about error - sigma^2 / delay, truncated at zero.
         middle = error - sigma**2 / delay
         tail = log_ndtr(middle / sigma)
         density = np.log(share / delay) + 0.5 * (sigma / delay) ** 2 - error / delay + tail
         both = np.logaddexp(np.log1p(-share) + prompt, density)
         chance = np.exp(density - both)
-        # its mean: the density over the distribution of a normal variable, as erfcx has it without cancellation
+        # mean of the truncated normal distribution; erfcx computes the ratio of density and distribution without
+        # cancellation
         mean = middle + sigma * np.sqrt(2.0 / np.pi) / erfcx(-middle / (np.sqrt(2.0) * sigma))
         new = float(np.clip(chance.mean(), 1e-12, 1.0 - 1e-6))
         longer = float((chance * mean).sum() / max(chance.sum(), 1e-300))
         done = abs(new - share) <= _ENDED * share and abs(longer - delay) <= _ENDED * delay
-        if longer < _NO_DELAY:
+        if longer < _MIN_DELAY:
             return 0.0, 0.0, 0.0, np.zeros(len(error))
         share, delay = new, longer
         if done:

@@ -1,4 +1,4 @@
-"""Standard deviations that bound the tails of errors: real noise is seldom normal at five sigma."""
+"""Overbounds: standard deviations that bound the tails of errors; real noise is seldom normal at five sigma."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from optloc.base.types import Array
 from optloc.model_checks.elements import Elements
 from optloc.model_checks.variance_components import Tested, VarianceFit, snooped, tested, without
 
-# Sizes of a test, standard deviations, at which tails are compared: beyond them are 5 %, 1 % and 0.1 % of normal
-# errors.
+# Limits of a test, in standard deviations, for the comparison of tails: 5 %, 1 % and 0.1 % of normal errors exceed
+# them.
 _SIZES = np.array([1.960, 2.576, 3.291])
-# Standard deviations by which a count may exceed its expectation: with three, few clean groups are enlarged.
+# A count may exceed its expectation by this number of standard deviations: with three, few groups without tails get a
+# factor.
 _CHANCE = 3.0
-# Size of a test beyond which an error is gross here.
+# A test above this limit is a gross error here.
 _GROSS = 10.0
-# Share of an error that the residuals must show for its test to count.
+# A test counts only if the residuals show at least this share of the error.
 _SHOWN = 1e-3
 # Factors of a variance that are tried: in steps of 5 %, up to sixteen times the standard deviation.
 _FACTORS = np.exp(0.05 * np.arange(112))
-# Turns, and the factor of a variance that counts as none.
+# Largest number of iterations, and the factor of a variance that counts as one.
 _TURNS, _NONE = 8, 1.05
 
 
@@ -27,23 +28,17 @@ def tail_factors(made: Elements, found: VarianceFit) -> Array:
     """Return the factor of the standard deviation of each group (g,) with which a Gaussian bounds its tails.
 
     With k times the variance theta of an error, its test t / sqrt(T) has the variance 1 + (k - 1) theta T. The factor
-    is the least k that explains the numbers of tests beyond 2, 2.6 and 3.3 sigma: an overbound, as in the
-    integrity of satellite navigation. Each variance grows by the root of its factor, and the tests are repeated until
-    all factors are one: errors that the residuals cannot separate share the excess.
-
-    Parameters
-    ----------
-    made : Elements
-        N linearised problems.
-    found : VarianceFit
-        Their variances.
+    is the smallest k that explains the numbers of tests beyond 2, 2.6 and 3.3 sigma. It is an overbound, as in the
+    integrity of satellite navigation. Each variance is multiplied by the square root of its factor, and the tests are
+    repeated until all factors are one. Errors that the residuals cannot separate share the excess. `made` holds N
+    linearised problems, and `found` their variances.
 
     References
     ----------
     B. DeCleene, "Defining pseudorange integrity - overbounding", Proc. ION GPS (2000).
     """
     variance = np.append(np.nan_to_num(found.variance), 0.0)
-    # Errors of five sigma are tails, errors of ten are gross.
+    # Errors of five sigma are tails; errors of ten sigma are gross.
     gross = snooped(tested(made, variance[made.of_effect]), slice(0, made.effect.shape[-1]), _GROSS).gross
     grown = np.ones(len(variance))
     for _ in range(_TURNS):
@@ -56,7 +51,7 @@ def tail_factors(made: Elements, found: VarianceFit) -> Array:
 
 
 def _needed(tests: Tested, own: Array, variance: float) -> float:
-    """Return the least factor of the variance of some errors (N, q) with which normal tails bound theirs."""
+    """Return the smallest factor of the variance of some errors (N, q) with which normal tails bound their tails."""
     size = tests.size[:, : tests.errors]
     own = own & (size * variance > _SHOWN)
     count = int(own.sum())
@@ -66,7 +61,7 @@ def _needed(tests: Tested, own: Array, variance: float) -> float:
     expected = count * _beyond()
     allowed = expected + _CHANCE * np.sqrt(expected) + 1.0
     for factor in _FACTORS:
-        # Errors of one fix depend on each other; most pairs of errors are of different fixes.
+        # Errors of one fix depend on each other, but most pairs of errors belong to different fixes.
         beyond = squared[:, None] > _SIZES**2 * (1.0 + (factor - 1.0) * share)[:, None]
         if (beyond.sum(0) <= allowed).all():
             return float(factor)
@@ -74,7 +69,7 @@ def _needed(tests: Tested, own: Array, variance: float) -> float:
 
 
 def _beyond() -> Array:
-    """Return the shares of normal errors beyond the sizes (3,)."""
+    """Return the probabilities of normal errors beyond the limits (3,)."""
     from scipy.special import ndtr
 
     return np.asarray(2.0 * ndtr(-_SIZES))

@@ -1,8 +1,8 @@
-"""The cost over the position of rows with unknown scales, as a sum of squares, near by and infinitely far away.
+"""Cost over the position for rows with unknown scales, as a sum of squares, at any distance and at infinity.
 
 At a fixed position the rows are linear in all other unknowns. The column of an unknown scale is as long as the ranges.
-Far away normal equations lose the digits of this column that differ from the column of an emission time. This module
-projects the rows instead, and it subtracts nothing from a cost.
+For a distant position, normal equations lose the digits in which this column differs from the column of an emission
+time. This module projects the rows instead, and it subtracts nothing from a cost.
 """
 
 from __future__ import annotations
@@ -22,21 +22,22 @@ from optloc.problem.forms import form_of
 from optloc.problem.noise import whiten_rows
 from optloc.problem.problem import Problem
 
-# Least share of a column that must remain after projection. Rounding leaves a hundredth of this share; ranges at ten
-# million spreads leave 1e-7.
+# Smallest share of a column that must remain after the projection. Rounding leaves a hundredth of this share; ranges at
+# ten million spreads leave 1e-7.
 _EXPLAINED = 1e-13
-# Least scale error of ranges: the wave has no speed, and below it the wave would run backwards. Of levels: power would
-# grow with the distance.
+# Lower bound of the scale error of ranges and of levels. For ranges, the wave has no speed at the bound, and below it
+# the wave would run backwards. For levels, power would increase with the distance.
 _STILL = -1.0
-# Greatest exponent of a candidate: it grows with the distance, and differences of logarithms keep seven digits here.
-# Beyond, their rounding explains rows.
+# Largest exponent of a candidate: it increases with the distance, and differences of logarithms keep seven digits here.
+# Beyond it, their rounding explains rows.
 _STEEP = 1e9
 # Thickness of coplanar stations, as a share of their width: rounding of coordinates.
 _FLAT = 1e-9
-# Offsets from the middle of coplanar stations from which descents begin, in spreads along each tangent, and steps.
+# Starts of descents near coplanar stations: offsets from their centre along each tangent, in spreads; and number of
+# steps.
 _OFFSETS, _STEPS = (-1.0, 0.0, 1.0), 12
-# Distance in spreads at which wave fronts are taken as paraboloids. Higher orders are 1e-8 of the bend there, and the
-# rounding of ranges as well.
+# Distance in spreads at which wave fronts are approximated by paraboloids. Higher orders are 1e-8 of the bend there,
+# and so is the rounding of ranges.
 _DISTANT = 1e4
 
 
@@ -46,9 +47,10 @@ def has_scales(problem: Problem) -> bool:
 
 
 def runs_backwards(problem: Problem, x: Array) -> Array:
-    """Return a mask (...) of the vectors whose unknown factor of ranges, times or levels is zero or less.
+    """Return a mask (...) of the vectors with an unknown factor of ranges, times or levels of zero or less.
 
-    Of candidates (N, K, size), the mask also has those whose exponent is of rounding (`_STEEP`), if another is not.
+    For candidates (N, K, size), the mask also marks candidates whose exponent is rounding (`_STEEP`), unless all others
+    are marked too.
     """
     out, steep = np.zeros(x.shape[:-1], dtype=bool), np.zeros(x.shape[:-1], dtype=bool)
     levels = _touch(problem, _is_level)
@@ -61,10 +63,10 @@ def runs_backwards(problem: Problem, x: Array) -> Array:
 
 
 def profile_by_rows(problem: Problem, x: Array, at: Array, passes: int) -> tuple[Array, Array, Array]:
-    """Return the least cost over all unknowns but the position, and its normal equations there.
+    """Return the lowest cost over all unknowns except the position, with the information and gradient of the position.
 
-    Arguments and results are as for `optloc.model_checks.shape.profile`. More passes make the slope along the position
-    exact, which depends on the scales. Factors of ranges, times and levels are not negative.
+    Arguments and results are as in `optloc.model_checks.shape.profile`. The derivative of a row by the position depends
+    on the scales, so more passes make it exact. Factors of ranges, times and levels are not negative.
     """
     slot, _ = problem.layout.find("position")
     part, (scale, least) = np.arange(slot.start, slot.start + slot.size), _scales(problem)
@@ -91,17 +93,11 @@ def profile_by_rows(problem: Problem, x: Array, at: Array, passes: int) -> tuple
 
 
 def cost_beyond_speed(problem: Problem, x: Array) -> Array:
-    """Return the least cost (N,) of waves whose distance and unknown factor grow together, or infinity.
+    """Return the lowest cost (N,) of waves whose distance and unknown factor increase together, or infinity.
 
-    Stations in a plane of space, or on a line of the plane, see a wave from straight above as a paraboloid. Its bend
-    and tilt stay finite if the factor grows with the distance. A prior on the factor makes such waves expensive.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems of one position.
-    x : array (N, size)
-        Fixes.
+    Stations in a plane of space, or on a line of the plane, receive a wave from straight above as a paraboloid. Its
+    bend and tilt stay finite if the factor increases with the distance. A prior on the factor gives these waves a high
+    cost. `problem` is a flat batch of N problems with one position, and `x` (N, size) are fixes.
     """
     out, free = np.full(len(x), np.inf), _without_prior(problem)
     if problem.constraints or not len(free):
@@ -123,7 +119,7 @@ def cost_beyond_speed(problem: Problem, x: Array) -> Array:
 
 
 def _above_any_place(problem: Problem, there: Array, at: Array, part: Array, tangents: Array, j: int) -> Array:
-    """Return the least cost (N,) of distant waves with one free factor j. A place is a tilt of the wave front."""
+    """Return the lowest cost (N,) of distant waves with one free factor j; a position is a tilt of the wave front."""
     residual, design = _rows(problem, there, at)
     touched = (design[..., j] != 0.0)[..., None]
     tilt = np.where(touched, design[..., part] @ tangents, 0.0)
@@ -135,9 +131,10 @@ def _above_any_place(problem: Problem, there: Array, at: Array, part: Array, tan
 
 
 def _above_one_place(problem: Problem, there: Array, at: Array, part: Array, tangents: Array) -> Array:
-    """Return the least cost (N,) of distant waves with several free factors: all come from one place.
+    """Return the lowest cost (N,) of distant waves with several free factors, which all come from one position.
 
-    Gauss-Newton along the tangents (N, d, d - 1), which are as long as a spread; steps are a spread at most.
+    The method is Gauss-Newton along the tangents (N, d, d - 1), whose length is one spread. A step is at most one
+    spread.
     """
     count, along = tangents.shape[-1], np.swapaxes(tangents, -1, -2)
     first = np.stack(np.meshgrid(*[_OFFSETS] * count), axis=-1).reshape(-1, 1, count)
@@ -154,7 +151,7 @@ def _above_one_place(problem: Problem, there: Array, at: Array, part: Array, tan
 
 
 def _without_prior(problem: Problem) -> Array:
-    """Return the columns of unknown factors of ranges that have no prior."""
+    """Return the columns of unknown factors of ranges without a prior."""
     scale, least = _scales(problem)
     levels = scale[~_touch(problem, lambda model: model.ranges is not None)]
     known = [columns(problem.layout, name, np.array([0]))[0] for name, _, _ in prior_parts(problem)]
@@ -162,7 +159,7 @@ def _without_prior(problem: Problem) -> Array:
 
 
 def _planes_of(problem: Problem, count: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Return centre, normal, tangents (n, d, d - 1) and spread of coplanar stations, and the problems' numbers (n,)."""
+    """Return centre, normal, tangents (n, d, d - 1) and spread (m) of coplanar stations, and problem numbers (n,)."""
     places = problem.stations.places
     places = np.broadcast_to(places, (count, *places.shape[-2:]))
     centre, spread = linalg.centre_and_spread(places)
@@ -175,7 +172,7 @@ def _planes_of(problem: Problem, count: int) -> tuple[Array, Array, Array, Array
 
 
 def _scales(problem: Problem) -> tuple[Array, Array]:
-    """Return the columns (n,) of all unknown factors, and the least value of each."""
+    """Return the columns (n,) of all unknown factors, and the lower bound of each."""
     falls = _touch(problem, lambda model: model.ranges is not None or _is_level(model))
     own = [columns(problem.layout, bias.name, np.array([0]))[0] for bias in _multiplying(problem)]
     return np.concatenate([np.zeros(0, dtype=int), *own]), np.where(falls, _STILL, -np.inf)
@@ -187,7 +184,7 @@ def _multiplying(problem: Problem) -> list[Bias]:
 
 
 def _is_level(model: Model) -> bool:
-    """Return whether a kind is of received power, which falls with the distance."""
+    """Return whether a kind is a received power, which decreases with the distance."""
     return {node for _, node in model.nodes} == {"log range"}
 
 
@@ -223,16 +220,17 @@ def _rows(problem: Problem, x: Array, at: Array) -> tuple[Array, Array]:
 
 
 def _without(basis: Array, values: Array) -> Array:
-    """Return values (..., r, k) less their projection onto an orthonormal basis, twice because of rounding."""
+    """Return values (..., r, k) minus their projection onto an orthonormal basis, projected twice due to rounding."""
     back = np.swapaxes(basis, -1, -2)
     once = values - basis @ (back @ values)
     return np.asarray(once - basis @ (back @ once))
 
 
 def _bounded(column: Array, left: Array, least: Array) -> tuple[Array, Array, Array]:
-    """Return the best steps (..., n) of factors for residuals (..., r, 1), the residuals after them, and a mask.
+    """Return the best steps (..., n) of factors for residuals (..., r, 1), the remaining residuals, and a mask.
 
-    Steps are at least `least` (..., n). The mask marks the factors that are held there; the others move again.
+    A step is at least `least` (..., n). The mask marks factors at this bound; the steps of the other factors are
+    computed again.
     """
     held = np.zeros(column.shape[:-2] + column.shape[-1:], dtype=bool)
     move = np.zeros(held.shape)

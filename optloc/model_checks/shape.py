@@ -1,4 +1,4 @@
-"""The shape of the likelihood about a fix: how far it is Gaussian, in which chart, and what infinity costs."""
+"""Shape of the likelihood near a fix: departure from a Gaussian in two coordinate charts, and the cost at infinity."""
 
 from __future__ import annotations
 
@@ -17,32 +17,19 @@ from optloc.model_checks.scaled_rows import cost_beyond_speed, has_scales, profi
 from optloc.problem.chart import INVERSE_RANGE, Chart, basis
 from optloc.problem.problem import Problem
 
-# The cost over the position alone: other unknowns take the values that fit best there.
+# Cost as a function of the position alone, minimised over the other unknowns.
 
 
 def profile(problem: Problem, x: Array, at: Array, passes: int = 1) -> tuple[Array, Array, Array]:
-    """Return the least cost over all unknowns but the position, and its normal equations there.
+    """Return the lowest cost over all unknowns except the position, with the information and gradient of the position.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems of one position.
-    x : array (q, N, size)
-        Positions, and where the search for the other unknowns begins.
-    at : array (N, size)
-        Where station errors of span "noise" are weighed.
-    passes : int
-        How often the other unknowns move to where they fit best: once is exact where rows are linear in them, unless
-        they are so far off that rounding shows.
+    `problem` is a flat batch of N problems with one position. `x` (q, N, size) holds positions and starts of the other
+    unknowns. Station errors of span "noise" are weighted at `at` (N, size). `passes` is the number of updates of the
+    other unknowns. One update is exact if the rows are linear in them, unless the start is so far off that rounding
+    matters.
 
-    Returns
-    -------
-    cost : array (q, N)
-        Least costs.
-    information : array (q, N, d, d)
-        Of the position, the other unknowns eliminated.
-    vector : array (q, N, d)
-        Half the negative gradient of the cost.
+    The results are costs (q, N), information (q, N, d, d) and vectors (q, N, d). The information belongs to the
+    position, with other unknowns eliminated. The vector is half the negative gradient of the cost.
     """
     slot, _ = problem.layout.find("position")
     part, n = slice(slot.start, slot.start + slot.size), problem.layout.n_shared
@@ -55,8 +42,8 @@ def profile(problem: Problem, x: Array, at: Array, passes: int = 1) -> tuple[Arr
             return equations.cost, equations.shared, equations.shared_vector
         along = _others(problem, x, part)
         move, _ = step(equations, np.zeros(equations.cost.shape), along)
-    # The model is quadratic: it falls by the product of step and slope. After one step this product is rounding. The
-    # sum of squares without it is never negative.
+    # The model is quadratic, so the cost decreases by the product of step and slope. After one step this product is
+    # rounding, and the sum of squares without it is never negative.
     cost = equations.cost - decrement(equations, move, n) if passes == 1 else equations.cost
     information, vector, _ = marginal(equations)
     across = information[..., part, :] @ along
@@ -68,9 +55,9 @@ def profile(problem: Problem, x: Array, at: Array, passes: int = 1) -> tuple[Arr
 
 
 def _others(problem: Problem, x: Array, part: slice) -> Array:
-    """Return the directions (..., n, q) of the shared unknowns but the position, along the equalities about them.
+    """Return the directions (..., n, q) of the shared unknowns except the position, along the equalities about them.
 
-    A height that is kept along a course is about the velocity as well.
+    A height that is kept along a course is an equality about the velocity as well.
     """
     n, face = problem.layout.n_shared, exact(problem)
     free = np.eye(n)[:, np.r_[0 : part.start, part.stop : n]]
@@ -84,65 +71,49 @@ def _others(problem: Problem, x: Array, part: slice) -> Array:
     return np.asarray(free @ np.swapaxes(axes[..., rank:, :], -1, -2))
 
 
-# Share of the largest gradient below which an equality says nothing that another one does not.
+# Share of the largest gradient below which an equality depends on the other equalities.
 _DEPENDENT = 1e-9
 
 
-# How far the cost is that of a Gaussian.
+# Departure of the cost from the cost of a Gaussian.
 
 BENT = 0.3
-"""Logarithm of the cost three sigma away over 9 beyond which no Gaussian covers.
+"""Limit of the logarithm of (cost rise at three sigma) / 9. Beyond it, no Gaussian covers as stated.
 
-At 0.3 the 99.9 % ellipsoids hold 99.8 to 100 % of the truths; at 0.5 far fixes that look near by luck pass as well, and
-theirs hold 79 to 92 %.
-"""
+With 0.3 the 99.9 % ellipsoids hold 99.8 to 100 % of the true positions. With 0.5, far fixes that look near by chance
+pass as well, and their ellipsoids hold 79 to 92 %."""
 
 AWAY = 3.0
-"""Where the cost is looked at, standard deviations: 2 and 4 tell good covariances from bad ones as well."""
-# The cost there is no less than this share of a Gaussian's: beyond, one is as bad as another.
+"""Distance of the test points in standard deviations; 2 and 4 give the same verdicts."""
+# Lower limit of the ratio of the cost to the cost of a Gaussian: below it, all values are equally bad.
 _FLOOR = 1e-9
-# Variances that differ by less have no axes of their own: those turned by half a right angle are as good.
+# Variances whose relative difference is below this share have no distinct axes: axes rotated by 45 degrees are tested
+# too.
 _EQUAL = 0.05
-# Least w of the chart: infinity is zero, and no position.
+# Smallest w of the chart: w = 0 is infinity and not a position.
 _NEAR_INFINITY = 1e-6
-# Vectors at a time: their normal equations then take some tens of megabytes.
+# Number of vectors that are processed together: their normal equations need some tens of megabytes.
 _PART = 2**16
 
 
 def departure(problem: Problem, x: Array, covariance: Array, face: Face, centre: Array) -> Array:
-    """Return by how much the cost departs from that of a Gaussian at three sigma, in metres and in inverse range.
+    """Return the departure (N, 2) of the cost from a Gaussian at three sigma, in metres and in inverse range.
 
-    Along each principal axis and both ways, ``|ln((f(x +- 3 t) - f(x)) / 9)|``, the largest; the second chart is looked
-    at only where the first departs by more than a tenth.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems of one position.
-    x : array (N, size)
-        Fixes.
-    covariance : array (N, n, n)
-        Of their shared unknowns.
-    face : Face
-        Constraints that hold all of them.
-    centre : array (N, d)
-        Centre of the stations: that of the inverse-range chart.
-
-    Returns
-    -------
-    array (N, 2)
-        Zero for a Gaussian, infinite where there is no chart.
+    It is the largest ``|ln((f(x +- 3 t) - f(x)) / 9)|`` over the principal axes t, in both directions: zero for a
+    Gaussian, infinite if there is no chart. The second chart is tested only if the departure in the first chart exceeds
+    a tenth. `x` (N, size) are the fixes, and `covariance` (N, n, n) the covariances of their shared unknowns. `face`
+    holds the equality constraints. `centre` (N, d) is the origin of the inverse-range chart.
 
     References
     ----------
-    D. M. Bates and D. G. Watts, "Relative curvature measures of nonlinearity" (1980): what is tested here by the cost
+    D. M. Bates and D. G. Watts, "Relative curvature measures of nonlinearity" (1980). The test here uses the cost
     itself, without second derivatives.
     """
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
     spread = covariance[:, part, part]
     precision, _ = linalg.inverse(spread)
-    pull = covariance[:, :, part] @ (precision if not face else np.linalg.pinv(spread))  # of the others by the position
+    pull = covariance[:, :, part] @ (precision if not face else np.linalg.pinv(spread))  # response of the others
     look = ShapeTest(problem, x, pull, part, face)
     out = np.full((len(x), 2), np.inf)
     position, axes = x[:, part], _axes(spread)
@@ -157,13 +128,13 @@ def departure(problem: Problem, x: Array, covariance: Array, face: Face, centre:
     return out
 
 
-# Below it the covariance in metres serves, whatever another chart says.
+# Below this departure the covariance in metres is used; the other chart is not tested.
 _SETTLED = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class ShapeTest:
-    """The cost about a batch of fixes, and how the other unknowns follow the position there."""
+    """A batch of fixes, and the response `pull` of the other unknowns to a change of the position."""
 
     problem: Problem
     x: Array
@@ -172,11 +143,11 @@ class ShapeTest:
     face: Face
 
     def take(self, items: Array) -> ShapeTest:
-        """Return some fixes."""
+        """Return the fixes with these numbers."""
         return ShapeTest(self.problem.take(items), self.x[items], self.pull[items], self.part, self.face)
 
     def departs(self, moved: Array, sigmas: Array) -> Array:
-        """Return the largest departure (N,) over displacements (N, k, d) of so many standard deviations (N, k)."""
+        """Return the largest departure (N,) over displacements (N, k, d) of lengths (N, k) in standard deviations."""
         most = max(1, _PART // max(1, moved.shape[1]))
         if len(moved) > most:
             parts = [slice(i, i + most) for i in range(0, len(moved), most)]
@@ -188,20 +159,23 @@ class ShapeTest:
         x[..., :n] += shift
         if self.face:
             x = np.stack([restore(self.problem, self.face, one) for one in x])
-        # with the fix itself: of one fix a call costs as much as ten vectors of it
+        # include the fix itself: for one fix, a separate call takes as long as ten vectors
         cost, _, _ = profile(self.problem, np.concatenate([self.x[None], x]), self.x)
         ratio = (cost[1:] - cost[0]) / sigmas.T**2
         found = np.abs(np.log(np.maximum(ratio, _FLOOR)))
-        # what has no width has no axis, and what cannot be evaluated is no Gaussian
+        # a zero displacement has no departure, and a cost that cannot be evaluated is not Gaussian
         still = (moved == 0.0).all(-1).T
         return np.asarray(np.where(still, 0.0, np.where(np.isnan(found), np.inf, found)).max(0, initial=0.0))
 
 
 def _axes(covariance: Array) -> Array:
-    """Return one standard deviation along every principal axis (N, k, d), and turned ones where axes are arbitrary."""
+    """Return displacements (N, k, d) of one standard deviation along all principal axes.
+
+    For equal variances, axes rotated by 45 degrees are added.
+    """
     known = np.isfinite(covariance).all((-1, -2), keepdims=True)
     values, vectors = np.linalg.eigh(np.where(known, covariance, 0.0))
-    # rounding, or a constraint, may leave a variance of nothing or less
+    # rounding or a constraint can make a variance zero or negative
     values = np.where(values > _EXACT * values[:, -1:], values, 0.0)
     axes = np.swapaxes(vectors * np.sqrt(values)[:, None, :], -1, -2)
     d, more = axes.shape[-1], []
@@ -214,7 +188,7 @@ def _axes(covariance: Array) -> Array:
     return np.concatenate([axes, np.stack(more, axis=1)], axis=1) if more else np.asarray(axes)
 
 
-# Share of the largest variance below which one is rounding.
+# Share of the largest variance below which a variance is rounding.
 _EXACT = 1e-14
 
 
@@ -225,7 +199,7 @@ def _in_inverse_range(look: ShapeTest, centre: Array, covariance: Array) -> Arra
     axes = _axes(chart.spread)
     sigmas = np.full((len(axes), 2 * axes.shape[1]), AWAY)
     y = AWAY * np.concatenate([axes, -axes], axis=1)
-    # a step across infinity ends just before it, and counts for as many sigmas as it has left
+    # a step across infinity ends just before it, and its length in sigmas is reduced accordingly
     share = np.where(y[..., -1] < 0.0, np.minimum(1.0, (1.0 - _NEAR_INFINITY) / np.maximum(-y[..., -1], 1e-300)), 1.0)
     y, sigmas = y * share[..., None], sigmas * share
     still = (y == 0.0).all(-1)
@@ -235,33 +209,30 @@ def _in_inverse_range(look: ShapeTest, centre: Array, covariance: Array) -> Arra
     return look.departs(np.where(still[..., None], 0.0, there - position[:, None]), sigmas)
 
 
-# What the data say of positions ever farther away.
+# Cost of positions at very large distances.
 
-# Distance that stands for infinity, spreads of the stations: wave fronts bend by 5e-8 of the spread there, and rounding
-# of a difference of ranges is 1e-9 of it.
+# Distance that represents infinity, in spreads of the stations: wave fronts bend by 5e-8 of the spread there, and the
+# rounding of a difference of ranges is 1e-9 of it.
 _INFINITE = 1e7
-# Directions that are tried: every 22.5 degrees of the plane, in space 50 on a spiral, about 28 degrees apart: the cost
-# of range differences is quadratic in the direction and has two minima at most.
+# Numbers of directions of the search: every 22.5 degrees of the plane; in space 50 on a spiral, about 28 degrees apart.
+# The cost of range differences is quadratic in the direction and has two minima at most.
 _DIRECTIONS = {2: 16, 3: 50}
-# Those of them that are refined, beside that of the fix; and steps, of which each squares a small error.
+# Number of directions that are refined in addition to the direction of the fix, and number of steps: each step squares
+# a small error.
 _REFINED, _STEPS = 2, 12
-# Share of a cost that no step promises any more at the end: what is compared with it is a gap of several.
+# Steps end if the predicted decrease is below this share of the cost; the cost is compared with a gap of several.
 _STILL = 1e-4
-# Damping of the first steps (Nielsen's tau): the directions that are tried are no closed forms near a minimum.
+# Damping of the first steps (Nielsen's tau): the directions of the search are not closed forms near a minimum.
 _DAMPING = 1e-3
-# Relative violation of a constraint (`optloc.linear.constraints.violation`) beyond rounding at such distances.
+# Relative violation of a constraint (`optloc.linear.constraints.violation`) beyond rounding at these distances.
 _BROKEN = 1e-4
 
 
 def cost_at_infinity(problem: Problem, x: Array) -> Array:
-    """Return the least cost (N,) of positions infinitely far away; very large where it grows without bound.
+    """Return the lowest cost (N,) of positions at infinity; very large if the cost is unbounded there.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems of one position.
-    x : array (N, size)
-        Their fixes: the first direction that is tried, and where the other unknowns begin.
+    `problem` is a flat batch of N problems with one position. The fixes `x` (N, size) give the first direction and the
+    start of the other unknowns.
     """
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
@@ -282,7 +253,7 @@ def cost_at_infinity(problem: Problem, x: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _Sphere:
-    """Positions so far away that they are directions."""
+    """Positions on a sphere so large that only their directions matter."""
 
     problem: Problem
     x: Array
@@ -292,7 +263,7 @@ class _Sphere:
     along: Array | None
 
     def direction(self, vector: Array) -> Array:
-        """Return unit vectors (..., N, d), along the equalities where there are some."""
+        """Return unit vectors (..., N, d), along the equalities if there are any."""
         if self.along is not None:
             vector = (self.along @ (np.swapaxes(self.along, -1, -2) @ vector[..., None]))[..., 0]
         return normalised(vector)
@@ -309,7 +280,7 @@ class _Sphere:
         return np.where(np.isfinite(cost), cost, np.inf), information, vector
 
     def descend(self, direction: Array) -> Array:
-        """Return the least costs (q, N) next to directions (q, N, d): damped Gauss-Newton on the sphere."""
+        """Return the lowest costs (q, N) near directions (q, N, d), by damped Gauss-Newton on the sphere."""
         cost, information, vector = self.look(direction)
         damping, growth = np.full(cost.shape, _DAMPING), np.full(cost.shape, FIRST_GROWTH)
         scale = self.radius[:, None, None]
@@ -320,7 +291,7 @@ class _Sphere:
             grown = inner * (1.0 + damping[..., None, None] * np.eye(inner.shape[-1]))
             pull = turned @ vector[..., None]
             move, ok = linalg.solve(grown, pull)
-            # what the step promises: where that is nothing for any start, all have arrived
+            # predicted decrease: if it is negligible for all starts, all have converged
             gain = (move * pull).sum((-1, -2))
             if not (gain > _STILL * (1.0 + cost)).any():
                 break

@@ -1,4 +1,4 @@
-"""Bounds at a fix or near it: the planes that cut its normal law off, and how Gaussian the cost is inwards of them."""
+"""Truncated normal distributions of fixes at or near bounds, and the shape of the cost inside the bounds."""
 
 from __future__ import annotations
 
@@ -14,35 +14,30 @@ from optloc.model_checks.shape import AWAY, ShapeTest
 from optloc.problem.problem import Problem
 from optloc.problem.truncated import Truncated, factor_of
 
-# Standard deviations to a bound up to which the law is cut off: one farther away takes a thousandth of it.
+# Largest distance to a bound, in standard deviations, at which the distribution is truncated: a farther bound removes a
+# thousandth of it.
 _NEAR = 3.0
-# The same up to which another bound of such a fix counts: beyond, there is nothing left to cut off.
+# The same limit for the other bounds of such a fix: beyond it, a bound removes nothing.
 _REACH = 7.0
-# Share of a standard deviation by which a curved bound may depart from its plane three deviations away.
+# Largest departure of a curved bound from its tangent plane at three standard deviations, in standard deviations.
 _FLAT = 0.1
-# Share of a standard deviation up to which a fix is on a bound: refinement leaves less.
+# A fix within this number of standard deviations is on a bound; refinement is more exact.
 _ON = 1e-3
-# Directions inwards that are shorter lie along other bounds.
+# A shorter inward direction is parallel to other bounds.
 _ALONG = 1e-6
 
 
 def has_law(problem: Problem) -> bool:
-    """Return whether bounds may cut off the law of a position: one that stays, with inequalities about it."""
+    """Return whether the problem has one static position and inequalities, which can truncate its distribution."""
     limited = any(not is_exact(constraint) for constraint in problem.constraints)
     return limited and one_position(problem) and problem.motions[0].order == 0
 
 
 def are_near(limits: Array, value: Array, gradient: Array, covariance: Array) -> bool:
-    """Return whether a bound may cut off the law of one of a few fixes: it is within three standard deviations.
+    """Return whether a bound is within three standard deviations of one of n fixes and truncates its distribution.
 
-    Parameters
-    ----------
-    limits : array (k, 2)
-        Least and greatest values of quantities; infinite for none.
-    value, gradient : array (n, k), (n, k, d)
-        The quantities at the fixes.
-    covariance : array (n, d, d)
-        Of the positions.
+    `limits` (k, 2) are lower and upper limits of k quantities; infinite for none. `value` (n, k) and `gradient` (n, k,
+    d) are the quantities at the fixes, and `covariance` (n, d, d) belongs to the positions.
     """
     reach = _NEAR * np.sqrt(np.maximum(((gradient @ covariance) * gradient).sum(-1), 0.0))
     return bool(((value - reach <= limits[:, 0]) | (value + reach >= limits[:, 1])).any())
@@ -50,14 +45,10 @@ def are_near(limits: Array, value: Array, gradient: Array, covariance: Array) ->
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """The normal laws of N fixes, cut off.
+    """Truncated normal distributions of N fixes.
 
-    Parameters
-    ----------
-    truncated : Truncated
-        Of the positions.
-    sound : bool array (N,)
-        Where the bounds are flat enough, or far away.
+    - truncated: distributions of the positions.
+    - sound (N,): True if all bounds are flat enough or far away.
     """
 
     truncated: Truncated
@@ -65,18 +56,11 @@ class Law:
 
 
 def law_of(problem: Problem, x: Array, covariance: Array, shift: Array) -> Law | None:
-    """Return the normal laws of fixes cut off at the bounds near them; None where no bound is near any.
+    """Return the normal distributions of fixes, truncated at near bounds; None if no bound is near a fix.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems of one static position.
-    x : array (N, size)
-        Fixes, or NaN.
-    covariance : array (N, n, n)
-        Of the shared unknowns without the inequalities.
-    shift : array (N, n)
-        Mean of the law without the inequalities, less the fix.
+    `problem` is a flat batch of N problems with one static position. `x` (N, size) are the fixes; NaN for none.
+    `covariance` (N, n, n) is the covariance of the shared unknowns without the inequalities. `shift` (N, n) is the mean
+    of the distribution without inequalities minus the fix.
     """
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
@@ -84,7 +68,7 @@ def law_of(problem: Problem, x: Array, covariance: Array, shift: Array) -> Law |
     with np.errstate(all="ignore"):
         values, normal = _planes(problem, sides, x, part)
         sigma = np.sqrt(np.maximum(np.einsum("nhi,nij,nhj->nh", normal, spread, normal), 0.0))
-        # one that an equality holds where it is cuts nothing off
+        # a bound along which an equality fixes the position truncates nothing
         open_ones = (sigma > 0.0) & np.isfinite(values)
         near = open_ones & (values <= _NEAR * sigma)
         if not near.any():
@@ -92,16 +76,16 @@ def law_of(problem: Problem, x: Array, covariance: Array, shift: Array) -> Law |
         slack = np.where(near.any(1)[:, None] & open_ones & (values <= _REACH * sigma), np.maximum(values, 0.0), np.inf)
         give = _departures(problem, sides, x, spread, values, normal, np.isfinite(slack))
     bent = np.isfinite(slack) & (give > _FLAT * sigma)
-    # a curved bound that is not reached bounds as little as one far away
-    held = slack <= _ON * sigma
-    slack = np.where(bent & ~held, np.inf, slack)
+    # a curved bound that the fix does not touch is treated like a bound far away
+    touched = slack <= _ON * sigma
+    slack = np.where(bent & ~touched, np.inf, slack)
     along, span = _edges(problem, sides, x, part)
     truncated = Truncated(normal, slack, along, span, give, shift[:, part], spread)
-    return Law(truncated, ~(bent & held).any(1))
+    return Law(truncated, ~(bent & touched).any(1))
 
 
 def _planes(problem: Problem, sides: tuple[Level, ...], x: Array, part: slice) -> tuple[Array, Array]:
-    """Return distances (N, h) of fixes from bounds, metres, and the unit normals outwards (N, h, d)."""
+    """Return distances (N, h) of fixes from bounds, m, and the unit outward normals (N, h, d)."""
     values, gradients = levels(problem, sides, x)
     sense = np.array([outwards(problem, side) for side in sides])
     gradients = gradients[..., part] * sense[:, None]
@@ -114,7 +98,7 @@ def _planes(problem: Problem, sides: tuple[Level, ...], x: Array, part: slice) -
 def _departures(
     problem: Problem, sides: tuple[Level, ...], x: Array, spread: Array, values: Array, normal: Array, near: Array
 ) -> Array:
-    """Return by how many metres near bounds (N, h) depart from their planes three deviations away."""
+    """Return the departures (N, h) of near bounds from their tangent planes at three standard deviations, m."""
     give, d = np.zeros(values.shape), spread.shape[-1]
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
@@ -127,7 +111,7 @@ def _departures(
     worst = np.zeros((len(items), len(sides)))
     for i in range(d):
         for sign in (-AWAY, AWAY):
-            # the row of a covariance over its deviation is the step along which a coordinate changes most
+            # a row of the covariance divided by its deviation is the step that changes this coordinate most
             step = sign * spread[items, i] / np.where(steps[:, i] > 0.0, steps[:, i], 1.0)[:, None]
             moved = np.array(part_of)
             moved[:, part] += step
@@ -139,7 +123,7 @@ def _departures(
 
 
 def _edges(problem: Problem, sides: tuple[Level, ...], x: Array, part: slice) -> tuple[Array, Array]:
-    """Return unit vectors (N, h, d) along the edges of polygons, and where these end (N, h, 2), metres from the fix."""
+    """Return unit vectors (N, h, d) along the edges of polygons, and their ends (N, h, 2), m from the fix."""
     n, d = len(x), part.stop - part.start
     along, span = np.zeros((n, len(sides), d)), np.tile([-np.inf, np.inf], (n, len(sides), 1))
     for i, side in enumerate(sides):
@@ -154,21 +138,12 @@ def _edges(problem: Problem, sides: tuple[Level, ...], x: Array, part: slice) ->
 
 
 def departure_inwards(problem: Problem, x: Array, covariance: Array, law: Truncated) -> Array:
-    """Return by how much the cost inwards of the bounds that hold fixes departs from a Gaussian's, (N,).
+    """Return the departure (N,) of the cost from a Gaussian inside the bounds that the fixes touch.
 
-    ``|ln((f(x + s t) - f(x)) / q)|``, the largest over the directions t that leave one bound and keep to the others.
-    The step s is where the quadratic model has grown by q = 9, or where another bound ends it.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems of one static position.
-    x : array (N, size)
-        Fixes that bounds hold.
-    covariance : array (N, n, n)
-        Of the shared unknowns without the inequalities.
-    law : Truncated
-        Of the fixes.
+    It is ``|ln((f(x + s t) - f(x)) / q)|``, the largest over the directions t that leave one bound and stay on the
+    others. The step s ends where the quadratic model has increased by q = 9, or at another bound. `problem` is a flat
+    batch of N problems with one static position, and `x` (N, size) are fixes on bounds. `covariance` (N, n, n) is the
+    covariance of the shared unknowns without the inequalities. `law` is the distribution of the positions.
     """
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
@@ -184,17 +159,17 @@ def departure_inwards(problem: Problem, x: Array, covariance: Array, law: Trunca
 
 
 def _inward_steps(law: Truncated) -> list[tuple[Array, float]]:
-    """Return steps (d,) from one fix inwards of each bound that holds it, and by how much the model grows there."""
+    """Return inward steps (d,) from each bound that a fix touches, m, and the increase of the model at their ends."""
     factor = factor_of(law.covariance)
     turned = law.normal @ factor
     sigma = np.sqrt((turned**2).sum(-1))
-    held = np.flatnonzero((law.slack <= _ON * sigma) & (sigma > 0.0) & _beside(law))[: factor.shape[0]]
-    unit = turned[held] / sigma[held, None]
+    touched = np.flatnonzero((law.slack <= _ON * sigma) & (sigma > 0.0) & _touches_edge(law))[: factor.shape[0]]
+    unit = turned[touched] / sigma[touched, None]
     middle = np.linalg.solve(factor.T @ factor, factor.T @ law.shift)
-    others = np.where(np.isin(np.arange(len(sigma)), held), np.inf, law.slack)
+    others = np.where(np.isin(np.arange(len(sigma)), touched), np.inf, law.slack)
     rest = replace(law, slack=others)
     found = []
-    for k in range(len(held)):
+    for k in range(len(touched)):
         beside = np.delete(unit, k, axis=0)
         inward = -unit[k] + beside.T @ (np.linalg.pinv(beside.T) @ unit[k]) if len(beside) else -unit[k]
         size = np.sqrt((inward**2).sum())
@@ -207,16 +182,16 @@ def _inward_steps(law: Truncated) -> list[tuple[Array, float]]:
     return found
 
 
-def _beside(law: Truncated) -> Array:
-    """Return a flag (h,) for bounds without ends, and for edges with the fix between their ends."""
+def _touches_edge(law: Truncated) -> Array:
+    """Return a mask (h,) of bounds without ends, and of edges with the fix between their ends."""
     reach = _ON * np.sqrt(np.trace(law.covariance))
     return np.asarray((law.span[:, 0] <= reach) & (law.span[:, 1] >= -reach))
 
 
 def covariance_of(law: Truncated, covariance: Array, part: slice) -> Array:
-    """Return the covariances (N, n, n) of the shared unknowns of fixes whose positions are cut off.
+    """Return the covariances (N, n, n) of the shared unknowns of fixes with truncated positions.
 
-    The others follow the position as they do without the bounds; `part` says where it is among them.
+    The other unknowns respond to the position as without the bounds; `part` is the slice of the position.
     """
     pull = covariance[..., part] @ np.linalg.pinv(law.covariance, hermitian=True)
     return np.asarray(covariance + pull @ (law.moments()[1] - law.covariance) @ np.swapaxes(pull, -1, -2))

@@ -1,4 +1,7 @@
-"""Values that were read wrongly: units off by a thousand or by the speed of light, signs, compass bearings."""
+"""Detection of misread values: units wrong by a thousand or by the speed of light, signs, compass bearings.
+
+If the values do not fit as they are read, other readings of the values are fitted and compared.
+"""
 
 from __future__ import annotations
 
@@ -21,35 +24,28 @@ from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.noise import Block, Noise, variances
 from optloc.problem.problem import Problem
 
-# Probability of the chi-square test below which the values as they stand do not fit, that of the status `misfit`; and
-# from which they fit once read otherwise.
+# Chi-square probability below which the values do not fit as they are read, equal to the limit of the status `misfit`;
+# and the probability above which they fit with another reading.
 _MISFIT, _FITS = 1e-4, 1e-3
-# Probability, over all readings together, that values without any meaning pass under one of them.
+# Probability, over all readings together, that random values fit with one of the readings.
 _CHANCE = 1e-3
-# Standard deviations by which a value is beyond what is possible.
-_BEYOND = 6.0
-# Epochs of a run that are read otherwise: what all rows share shows in a few.
+# Number of standard deviations beyond which a value is impossible.
+_IMPOSSIBLE_SIGMAS = 6.0
+# Number of epochs of a run that are tested: an error of all rows is visible in a few epochs.
 _EPOCHS = 5
-# Readings that are told where several fit.
-_TOLD = 2
+# Largest number of reported readings if several fit.
+_MAX_READINGS = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Another way to read the values of some kinds: ``z -> shift + factor * z``.
+    """Another interpretation of the values of some kinds: ``z -> shift + factor * z``.
 
-    Parameters
-    ----------
-    cause : str
-        As of `Advice`.
-    kinds : tuple of str
-        Whose values.
-    factor, shift : float
-        SI units and radians.
-    seen, advice : str
-        Sentences.
-    toml : str
-        Keys of ``[[measurements]]``.
+    - cause: keyword, as in `Advice`.
+    - kinds: kinds of the values.
+    - factor, shift: in SI units and radians.
+    - seen, advice: sentences, as in `Advice`.
+    - toml: keys of ``[[measurements]]``.
     """
 
     cause: str
@@ -62,33 +58,29 @@ class Reading:
 
 
 def advise_on_values(problem: Problem, x: Array) -> Iterator[Advice]:
-    """Yield how values were perhaps meant that do not fit as they were read.
+    """Yield advice about values that do not fit as they are read, but fit with another unit, sign or convention.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of one problem or run, whose rows that are present are finite.
-    x : array (1, size)
-        Its fix; NaN where there is none.
+    `problem` is a flat batch of one problem or run with finite values in its present rows. `x` (1, size) is its fix;
+    NaN if there is no fix.
     """
     batch = by_epoch(problem).flat() if separable(problem) else problem
-    # the first epochs with redundancy
+    # use the first epochs with redundancy
     items = np.flatnonzero(degrees_of_freedom(batch) > 0)[:_EPOCHS]
-    wrong = list(_impossible(problem))
+    wrong = list(_impossible_advice(problem))
     if len(items) and one_place(batch):
         own = batch.take(items)
         start = x if len(batch.weight) == len(x) and x.shape[-1] == batch.layout.size else None
         refuted, free = _is_refuted(own, start if start is None else start[items])
         if wrong or refuted:
             held = [] if wrong or free < _FITS else [_without_constraints(own, free)]
-            # what no reading explains is said all the same
-            yield from held or list(_explaining(own)) or wrong
+            # impossible values are reported even if no reading explains them
+            yield from held or list(_fitting_readings(own)) or wrong
             return
     yield from wrong
 
 
 def _is_refuted(problem: Problem, start: Array | None) -> tuple[bool, float]:
-    """Return whether the values as they stand do not fit any place that is found, and the p-value free of bounds."""
+    """Return whether the values fit no position, and the p-value of the best position without constraints."""
     near = np.inf if start is None or not np.isfinite(start).all() else float(descend(problem, start)[1].sum())
     if _p(problem, near) >= _MISFIT:
         return False, 1.0
@@ -96,55 +88,57 @@ def _is_refuted(problem: Problem, start: Array | None) -> tuple[bool, float]:
 
 
 def _fit(problem: Problem, start: Array | None = None) -> float:
-    """Return the chi-square probability of the best place that is found; equalities are met, other bounds not."""
+    """Return the chi-square probability of the best position; equalities hold, other bounds are ignored."""
     free = fit_anywhere(replace(problem, constraints=()), start)
     cost = float(free.cost.sum())
     if _p(problem, cost) >= _MISFIT and exact(problem):
-        # equalities take most of the time: only what fits without them is asked to meet them
+        # equalities take most of the time: apply them only if the values fit without them
         cost = float(descend(problem, free.x)[1].sum())
     return _p(problem, cost)
 
 
 def _without_constraints(problem: Problem, p: float) -> Advice:
+    """Return the advice for values that fit with probability p without constraints, but not with them."""
     names = violation_names(problem)
-    seen = f"the values fit without the constraints ({names}; p = {p:.2g}), and no place that was found meets both"
-    return Advice("constraint", seen, "check their values, and heights for being above the ellipsoid, not the sea")
+    seen = f"the values fit without the constraints ({names}; p = {p:.2g}), but no position was found that meets both"
+    return Advice("constraint", seen, "check their values; heights must be above the ellipsoid, not above the sea")
 
 
 def _p(problem: Problem, cost: float) -> float:
-    """Return the chi-square probability of a batch as a whole; zero where no fit was found or nothing can be tested."""
+    """Return the chi-square probability of a whole batch; zero if no fit was found or nothing can be tested."""
     p = float(tail_probability(np.array([cost]), np.array([degrees_of_freedom(problem).sum()]))[0])
     return p if np.isfinite(p) else 0.0
 
 
-def _explaining(problem: Problem) -> Iterator[Advice]:
-    """Yield the readings under which values fit that would not by chance, the most probable first."""
+def _fitting_readings(problem: Problem) -> Iterator[Advice]:
+    """Yield the readings with a good fit that is unlikely by chance, the most probable reading first."""
     tried = list(_readings(problem))
     found = []
     for one in tried:
-        # noise that is stated in a unit of its own keeps its size
+        # noise that is stated in a separate unit keeps its size
         scaled, stated = _read(problem, one, False), _read(problem, one, True)
-        able = [other for other in (scaled, stated) if _by_chance(other) * 2.0 * len(tried) <= _CHANCE]
+        able = [other for other in (scaled, stated) if _chance_of_fit(other) * 2.0 * len(tried) <= _CHANCE]
         if not able or _is_impossible(able[0]):
             continue
         p = max(_fit(other) for other in able)
         if p >= _FITS:
             found.append((p, one))
-    # feet and nanoseconds are so alike that both may pass: the better fit comes first
-    for p, one in sorted(found, key=lambda each: -each[0])[:_TOLD]:
+    # feet and nanoseconds are so similar that both may fit: the better fit comes first
+    for p, one in sorted(found, key=lambda each: -each[0])[:_MAX_READINGS]:
         yield Advice(one.cause, f"{one.seen} (p = {p:.2g})", one.advice, one.toml)
 
 
-# How values may be read.
+# Possible readings of the values.
 
 
 def _readings(problem: Problem) -> Iterator[Reading]:
+    """Yield all readings of the lengths and angles of a problem."""
     lengths = tuple(r.kind for r in problem.rows if MODELS[r.kind].quantity == "length" and MODELS[r.kind].stations)
     angles = tuple(r.kind for r in problem.rows if MODELS[r.kind].quantity == "angle")
     for kind in lengths:
         if MODELS[kind].ranges == (1, -1):
             seen = f"the {kind} values fit with the opposite sign"
-            advice = "say which station is farther where the number is positive (leave the key out if it is there)"
+            advice = "state which station is farther if the number is positive (remove the key if it is there)"
             yield Reading("sign", (kind,), -1.0, 0.0, seen, advice, 'positive = "b-farther"\n')
     for group in dict.fromkeys((lengths, *((kind,) for kind in lengths))):
         yield from _length_units(group) if group else ()
@@ -152,62 +146,67 @@ def _readings(problem: Problem) -> Iterator[Reading]:
 
 
 def _length_units(kinds: tuple[str, ...]) -> Iterator[Reading]:
-    """Yield lengths times every ratio of two units, the SI unit first."""
+    """Yield readings of lengths for the ratio of every two units, the SI unit first."""
     table = {name: size * (SPEED_OF_LIGHT if name in _TIMES else 1.0) for name, size in UNITS["length"].items()}
     what = " and ".join(kinds)
     seen_before: list[float] = []
-    for said, size in table.items():
+    for stated, size in table.items():
         for meant, other in table.items():
             ratio = other / size
-            if said not in _SAID or meant not in _MEANT or any(abs(ratio / old - 1.0) < 1e-6 for old in seen_before):
+            if (
+                stated not in _STATED_UNITS
+                or meant not in _MEANT_UNITS
+                or any(abs(ratio / old - 1.0) < 1e-6 for old in seen_before)
+            ):
                 continue
             if ratio == 1.0:
                 continue
             seen_before.append(ratio)
-            seen = f"the {what} values fit as {meant} where {said} is said, {ratio:.4g} times as large"
+            seen = f"the {what} values fit in {meant} instead of the stated {stated}, {ratio:.4g} times as large"
             pairs = [f"{a} for {b}" for b in table for a in table if abs(table[a] / table[b] / ratio - 1.0) < 1e-6]
-            advice = f"state their unit; by its size it may be {_either(pairs)}"
+            advice = f"state their unit; by the ratio it may be {_either(pairs)}"
             yield Reading("unit", kinds, ratio, 0.0, seen, advice, f'unit = "{meant}"\n')
 
 
 _TIMES = ("s", "ms", "us", "ns", "ps")
-# Units that files say, first that which they say by saying nothing, and units that are meant: feet by those who leave
-# the unit out, thousands by those who take the wrong prefix, times by those who forget the speed of light.
-_SAID = ("m", "s", "ns")
-_MEANT = ("m", "km", "mm", "ft", "s", "ms", "us", "ns")
-# Pairs of units that a sentence names.
-_SHOWN = 3
+# Units that a file states, first the unit without a statement; and units that may be meant. Feet occur if the unit is
+# not stated, thousands if the prefix is wrong, and times if the speed of light is missing.
+_STATED_UNITS = ("m", "s", "ns")
+_MEANT_UNITS = ("m", "km", "mm", "ft", "s", "ms", "us", "ns")
+# Largest number of pairs of units in a sentence.
+_MAX_PAIRS = 3
 
 
 def _either(pairs: list[str]) -> str:
-    return " or ".join(pairs[:_SHOWN])
+    """Return the first few pairs of units as one text."""
+    return " or ".join(pairs[:_MAX_PAIRS])
 
 
 def _angle_readings(kinds: tuple[str, ...]) -> Iterator[Reading]:
-    """Yield azimuths of a compass or looking back, and angles in the other unit."""
+    """Yield readings as compass azimuths, as opposite azimuths, and as angles in the other unit."""
     bearings = tuple(kind for kind in kinds if kind == "azimuth")
     turned = np.pi / 2
     if bearings:
-        seen = "the azimuths do not meet as they are read, from east counter-clockwise or as stated, and they do as"
-        advice = "state the convention; where it is stated already, leave it out"
+        seen = "the azimuths do not intersect as read (from east counter-clockwise, or as stated), but they do as"
+        advice = "state the convention; if it is already stated, remove it"
         key = 'azimuth = "north-clockwise"\n'
         yield Reading("compass", bearings, -1.0, turned, f"{seen} compass bearings", advice, key)
-        seen = "the azimuths meet behind the stations: they point from the target to the station"
-        advice = "take half a turn off"
+        seen = "the azimuths intersect behind the stations: they point from the target to the station"
+        advice = "subtract half a turn"
         yield Reading("opposite", bearings, 1.0, np.pi, seen, advice, 'correction = "180 deg"\n')
-    for said, meant, factor in (("rad", "deg", np.pi / 180.0), ("deg", "rad", 180.0 / np.pi)):
+    for stated, meant, factor in (("rad", "deg", np.pi / 180.0), ("deg", "rad", 180.0 / np.pi)):
         if kinds:
-            seen = f"the {' and '.join(kinds)} values fit as {meant} where {said} is said"
+            seen = f"the {' and '.join(kinds)} values fit in {meant} instead of the stated {stated}"
             key = f'unit = "{meant}"\n'
             yield Reading("unit", kinds, factor, 0.0, seen, "state their unit", key)
-        if bearings and said == "rad":
-            seen = "the azimuths fit as compass bearings in degrees where radians from east are said"
+        if bearings and stated == "rad":
+            seen = "the azimuths fit as compass bearings in degrees instead of the stated radians from east"
             both = f'{key}azimuth = "north-clockwise"\n'
             yield Reading("compass", bearings, -factor, turned, seen, "state unit and convention", both)
 
 
 def _read(problem: Problem, reading: Reading, stated: bool) -> Problem:
-    """Return the problem with values read otherwise; `stated`: the noise has a unit of its own, and stays."""
+    """Return the problem with another reading of the values. If `stated`, the noise has a separate unit and stays."""
     size = np.ones(problem.count)
     rows = []
     for block, start in zip(problem.rows, problem.starts, strict=True):
@@ -222,22 +221,23 @@ def _read(problem: Problem, reading: Reading, stated: bool) -> Problem:
 
 
 def _read_rows(rows: Rows, reading: Reading) -> Rows:
+    """Return rows with another reading of their values; angles are wrapped."""
     z = reading.shift + reading.factor * rows.z
     return replace(rows, z=z if MODELS[rows.kind].period is None else wrap(z))
 
 
-# What cannot be, and what may be by chance.
+# Impossible values, and fits by chance.
 
 
 def _reach(problem: Problem) -> float:
-    """Return the greatest distance between stations, to within a factor of two, metres."""
+    """Return the largest distance between stations to within a factor of two, m."""
     return 2.0 * float(np.max(centre_and_spread(problem.stations.places)[1]))
 
 
-def _by_chance(problem: Problem) -> float:
-    """Return the probability that values without meaning fit: each spare one within four sigma of where it could be.
+def _chance_of_fit(problem: Problem) -> float:
+    """Return the probability that random values fit: each redundant value within four sigma of its prediction.
 
-    Lengths could be anywhere within the array, angles anywhere on the circle.
+    Random lengths are anywhere within the array, random angles anywhere on the circle.
     """
     sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count).max(0)
     room = np.concatenate(
@@ -247,8 +247,8 @@ def _by_chance(problem: Problem) -> float:
     return float(np.median(share)) ** int(degrees_of_freedom(problem).sum())
 
 
-def _beyond(problem: Problem) -> Iterator[tuple[Rows, int, float]]:
-    """Yield kind, row and limit of differences larger than the distance of their stations, and negative ranges."""
+def _impossible_rows(problem: Problem) -> Iterator[tuple[Rows, int, float]]:
+    """Yield rows, number and limit (m) of differences above the distance of their stations, and of negative ranges."""
     sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count)
     observed, weight = (np.reshape(a, (-1, problem.count)) for a in (problem.observed, problem.weight))
     position = problem.stations.position
@@ -263,23 +263,24 @@ def _beyond(problem: Problem) -> Iterator[tuple[Rows, int, float]]:
             apart = np.sqrt((line**2).sum(-1)).reshape(-1, rows.count)[0]
         value = observed[:, part] * np.ones((len(observed), 1))
         over = np.abs(value) - apart if ranges == (1, -1) else apart - value
-        bad = (over > _BEYOND * sigma[:, part]) & (weight[:, part] > 0.0)
+        bad = (over > _IMPOSSIBLE_SIGMAS * sigma[:, part]) & (weight[:, part] > 0.0)
         for i in np.flatnonzero(bad.any(0)):
             yield rows, int(i), float(apart[i])
 
 
 def _is_biased(problem: Problem, part: slice) -> bool:
-    """Return whether a bias of the problem may take rows beyond what is possible."""
+    """Return whether a bias of the problem can move the rows beyond the possible values."""
     return any(((bias.row >= part.start) & (bias.row < part.stop)).any() for bias in problem.biases)
 
 
 def _is_impossible(problem: Problem) -> bool:
-    return next(_beyond(problem), None) is not None
+    """Return whether a value is impossible at any position."""
+    return next(_impossible_rows(problem), None) is not None
 
 
-def _impossible(problem: Problem) -> Iterator[Advice]:
-    """Yield the first value that no place could have, and how many there are."""
-    found = list(_beyond(problem))
+def _impossible_advice(problem: Problem) -> Iterator[Advice]:
+    """Yield advice about the first value that no position can have, and the number of other impossible values."""
+    found = list(_impossible_rows(problem))
     if not found:
         return
     rows, i, apart = found[0]
@@ -287,7 +288,9 @@ def _impossible(problem: Problem) -> Iterator[Advice]:
     more = f"; so are {len(found) - 1} more" if len(found) > 1 else ""
     if MODELS[rows.kind].ranges == (1, -1):
         seen = f"the {rows.kind} of {names[rows.a[i]]} and {names[rows.b[i]]} is {value:.4g} m"
-        seen += f", and the two stand {apart:.4g} m apart: no place is that much farther from one{more}"
+        seen += f", but the stations are {apart:.4g} m apart: no position has this difference{more}"
     else:
-        seen = f"the {rows.kind} at {names[rows.a[i]]} is {value:.4g} m, less than any place can have{more}"
-    yield Advice("impossible", seen, "check the unit of the values and of the stations, and the stations' places")
+        seen = f"the {rows.kind} at {names[rows.a[i]]} is {value:.4g} m, less than possible at any position{more}"
+    yield Advice(
+        "impossible", seen, "check the unit of the values and of the stations, and the positions of the stations"
+    )

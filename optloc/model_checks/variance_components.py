@@ -1,10 +1,15 @@
-"""Variance components by restricted maximum likelihood, with gross errors left out one by one.
+"""Variance components by restricted maximum likelihood (REML), with data snooping for gross errors.
 
-A problem linearised at its fix is v = J dx + B e + E b + n: v residuals, e independent errors of the groups' noise with
-covariance diag(theta), b offsets of the groups, n what has a covariance C of its own. With V = B diag(theta) B' + C and
-P = V^-1 - V^-1 J (J' V^-1 J)^-1 J' V^-1, which annihilates J, all that follows needs only T = F' P F and t = F' P v of
-the columns F = [B, E]: t_j / T_jj is the size of an error along column j that the other rows show (for a row, its
-leave-one-out residual), 1 / sqrt(T_jj) its standard deviation, and t_j / sqrt(T_jj) is standard normal without one.
+The problem, linearised at its fix, is v = J dx + B e + E b + n. Here v are the residuals. The errors e are independent;
+they belong to groups, and their covariance is diag(theta). The offsets b are common to a group. The noise n has a given
+covariance C.
+
+With V = B diag(theta) B' + C, the matrix P = V^-1 - V^-1 J (J' V^-1 J)^-1 J' V^-1 annihilates J. All functions here
+need only T = F' P F and t = F' P v, with the columns F = [B, E]:
+
+- t_j / T_jj estimates the size of an error along column j. For a row this is the leave-one-out residual.
+- 1 / sqrt(T_jj) is the standard deviation of this estimate.
+- t_j / sqrt(T_jj) is standard normal if column j has no error.
 
 W. Baarda, "A testing procedure for use in geodetic networks" (1968), section 4.
 """
@@ -22,70 +27,70 @@ from optloc.model_checks.elements import Elements
 from optloc.model_checks.groups import ROW_PRICE
 
 CUT = 3.5
-"""Size of a test, in standard deviations, from which an error counts as gross.
+"""Limit of a test, in standard deviations: an error with a larger test counts as gross.
 
-One normal error in 2000 is beyond, so that the variance of the rest is 0.5 % too small and needs no correction; at 4
-the tails of airliners' messages (7.7 % beyond 3 sigma) count as noise of single receivers."""
+One normal error in 2000 exceeds this limit. Without it, the variance is 0.5 % too small, which needs no correction.
+With a limit of 4, the tails of aircraft messages (7.7 % beyond 3 sigma) count as noise of single receivers."""
 
-_WIDE = 10.0
-"""The same of an error that rows have in common: a fix follows it as it follows another place, so that no test tells it
-there, and what is left out of the level is in no covariance. One in fifteen headings of robots is beyond 3.5."""
+_CUT_SHARED = 10.0
+"""The same limit for an error that several rows share.
 
-# Margin of the squared test of a gross row over the test of an error in common: a likelihood ratio of ninety.
+A fix can absorb a shared error like a change of position, so the test is not reliable. An error that is excluded from
+the level is in no covariance. One in fifteen headings of the robot data exceeds 3.5."""
+
+# Margin between the squared test of a gross row and the squared test of a shared error: a likelihood ratio of ninety.
 _MARGIN = 9.0
 
 LOOSE = 0.5
-"""Relative standard error of a standard deviation from which the data are said not to tell it."""
+"""Largest relative standard error of a standard deviation that the data determine."""
 
-# Content of the intervals of factors.
+# Probability of the confidence intervals of the factors.
 _LEVEL = 0.95
-# Share of a column's size below which what P leaves of it is rounding: the fix absorbs it whole.
-_NOTHING = 1e-9
+# If P keeps less than this share of a column's size, the remainder is rounding: the fix absorbs the whole column.
+_ROUNDING = 1e-9
 # Median of the square of a standard normal variable.
 _MEDIAN = 0.45493642
-# Factor of a variance below which none falls: data without any error would lead on to zero.
-_LEAST = 1e-16
-# What is added to the scores of all log-factors: a factor of r squares of errors is then most likely at their sum over
-# r - 4 in the place of r; with many nobody sees the difference. With few the likelihood alone has its maximum at zero
-# for a quarter of the stations that have half the noise of others (27 fixes by five ranges), and fixes that believe it
-# are hundreds of sigma off. With 1 the 95 % ellipses of fixes hold 89 % there, with 2 they hold 95 %, with 3 97 %.
+# Lower limit of a variance factor. Without this limit, data without any error would give zero.
+_MIN_VARIANCE = 1e-16
+# Constant that is added to the scores of all log-factors. A factor of r squared errors then has its maximum at their
+# sum divided by r - 4 instead of r. For large r the difference is negligible. For small r, the likelihood without this
+# constant often has its maximum at zero: for a quarter of the stations with half the noise of the others (27 fixes by
+# five ranges). Fixes with this estimate are wrong by hundreds of sigma. There, 95 % ellipses of fixes cover 89 % with
+# the constant 1, 95 % with 2 and 97 % with 3.
 _PENALTY = 2.0
-# Most of what it takes of the information of a factor where all groups have the same: no variance is more than doubled.
-_SHARE = 0.5
-# Steps of the medians, which only bring the factors near; turns of gross errors and steps; scoring steps of a turn.
+# Largest share of the information of a factor that the penalty uses. The information is computed with one factor for
+# all groups. With this limit the penalty at most doubles a variance.
+_MAX_PENALTY_SHARE = 0.5
+# Largest numbers of iterations: steps by medians, which only give rough factors; selections of gross errors; scoring
+# steps after each selection.
 _COARSE, _ROUNDS, _STEPS = 8, 5, 40
-# Moves that end them: of a coarse step in log-factors; of a scoring step and of a turn in standard errors.
+# Changes below which the iterations stop: of a step by medians in log-factors; of a scoring step and of a selection in
+# standard errors.
 _NEAR, _CLOSE, _SETTLED = 0.05, 1e-2, 0.05
-# Redundancy of an error from which its test counts for a median, and what stands for a median of zero.
-_SHOWN, _SMALL = 1e-3, 1e-2
-# Bounds of a coarse step of a log-factor: medians of few errors are rough.
+# Smallest redundancy of an error whose test enters a median; value that replaces a median of zero.
+_MIN_REDUNDANCY, _MIN_MEDIAN = 1e-3, 1e-2
+# Limits of a step of a log-factor by medians: a median of few errors is rough.
 _DOWN, _UP = -4.0, 8.0
-# Eigenvalue of an information matrix of unit diagonal below which a combination of factors is not seen: rounding.
-_UNSEEN = 1e-9
-# Share of a factor's own direction that the data must see to tell it.
-_OWN = 0.9
+# Smallest eigenvalue of an information matrix with unit diagonal. Below it, the eigenvector is a combination of factors
+# that the data do not determine; the eigenvalue is rounding.
+_RANK_TOLERANCE = 1e-9
+# Smallest share of the axis of a factor inside the space that the data determine: below it the factor is not
+# determined.
+_DETERMINED = 0.9
 
 
 @dataclass(frozen=True, slots=True)
 class VarianceFit:
-    """Variance factors of g groups of errors.
+    """Estimated variance factors of g groups of errors.
 
-    Parameters
-    ----------
-    variance : array (g,)
-        What the stated variances are multiplied by; NaN of groups without errors.
-    error : array (g,)
-        Standard error of the root of each, as a share of it; NaN where the data do not tell it.
-    low, high : array (g,)
-        Interval of 95 % of each; NaN where the data do not tell it, `low` zero where they do not tell it from none.
-    shared : bool array (g,)
-        Groups that the data do not tell: they have one factor in common.
-    stay : bool
-        Whether that factor is not told either and stays at one.
-    gross : bool array (N, q)
-        Errors that were left out.
-    tests : Tested
-        What the residuals say, gross errors left out.
+    - variance (g,): factor of the stated variance; NaN for a group without errors.
+    - error (g,): relative standard error of the square root of the factor; NaN if the data do not determine it.
+    - low, high (g,): interval of 95 % of the factor; NaN if the data do not determine it. `low` is zero if the data are
+      also consistent with no error.
+    - shared (g,): True for a group whose factor the data do not determine; all these groups have one common factor.
+    - stay: True if the data do not determine the common factor either; this factor is then 1.
+    - gross (N, q): True for an error that was excluded as gross.
+    - tests: tests of the residuals without the gross errors.
     """
 
     variance: Array
@@ -99,8 +104,8 @@ class VarianceFit:
 
 
 @dataclass(frozen=True, slots=True)
-class _FoundLevels:
-    """Variances (c,) of classes of errors, their standard errors (c,), gross errors, and the tests without them."""
+class _MaximumLikelihood:
+    """Variances (c,) of classes of errors, their standard errors (c,), gross errors (N, q), and tests without these."""
 
     variance: Array
     error: Array
@@ -109,24 +114,19 @@ class _FoundLevels:
 
 
 def fit(made: Elements, left: Array, single: Array) -> VarianceFit:
-    """Return the variance factors of greatest restricted likelihood, kept away from zero.
+    """Return the variance factors that maximise the penalised restricted likelihood.
 
-    The likelihood is multiplied by every factor (see `_PENALTY`): a factor of few errors then has no maximum at zero.
-    Whether the data tell a factor is asked where all groups have the same: a level that turns out to be small is told.
+    The penalty multiplies the likelihood by every factor (see `_PENALTY`), so a factor of few errors has no maximum at
+    zero. `made` holds N linearised problems with g groups. `left` (g,) marks groups without errors: their factor is
+    zero. `single` (g,) marks groups that keep a separate factor, even if the data do not determine it.
 
-    Parameters
-    ----------
-    made : Elements
-        N linearised problems, of g groups.
-    left : bool array (g,)
-        Groups without errors: their factor is zero.
-    single : bool array (g,)
-        Groups that share no factor with others, whatever the data tell.
+    The check of which factors the data determine uses one factor for all groups. Otherwise a group with a small
+    estimate would wrongly count as not determined.
 
     Raises
     ------
     InvalidProblem
-        Where no problem has redundancy.
+        If no problem has redundancy.
 
     References
     ----------
@@ -137,69 +137,65 @@ def fit(made: Elements, left: Array, single: Array) -> VarianceFit:
     used = np.flatnonzero(total(made.of_effect, size))
     count, number = len(used), np.full(size + 1, -1)
     number[used] = np.arange(count)
-    group, none = number[made.of_effect], np.zeros(count, dtype=bool)
+    group, nothing_fixed = number[made.of_effect], np.zeros(count, dtype=bool)
     if not (tested(made, np.ones(())).dof > 0).any():
         advice = "add rows, stations or known heights"
-        raise InvalidProblem("no fix has more rows than unknowns: nothing shows the noise", "noise", advice)
-    # One factor for all: where even that is not told, nothing is.
-    alike = _maximise(made, np.minimum(group, 0), np.zeros(1), none[:1], np.zeros(1))
-    begin = np.full(count, np.log(alike.variance[0]))
-    shared = ~(_errors(alike.tests, group, np.exp(begin), none) < LOOSE) & ~single[used]
-    # Groups that are not told by themselves become one, in the place of the first of them.
+        raise InvalidProblem("no fix has more rows than unknowns, so the noise cannot be estimated", "noise", advice)
+    # One factor for all groups. If the data do not determine it, they determine no factor.
+    common = _maximise(made, np.minimum(group, 0), np.zeros(1), nothing_fixed[:1], np.zeros(1))
+    begin = np.full(count, np.log(common.variance[0]))
+    shared = ~(_relative_errors(common.tests, group, np.exp(begin), nothing_fixed) < LOOSE) & ~single[used]
+    # Groups whose factors are not determined are merged. The merged class has the number of its first group.
     merge = np.where(shared, np.flatnonzero(shared)[0] if shared.any() else 0, np.arange(count))
-    kinds, place = np.unique(merge, return_inverse=True)
-    own = np.append(place, -1)[group]
-    # Together they may be told, if there are several.
-    alone = np.isin(kinds, np.flatnonzero(shared))
+    kinds, class_of = np.unique(merge, return_inverse=True)
+    classes = np.append(class_of, -1)[group]
+    # If several groups are merged, the data may determine their common factor.
+    undetermined = np.isin(kinds, np.flatnonzero(shared))
     if shared.sum() > 1:
-        alone &= ~(_errors(alike.tests, own, np.exp(begin[: len(kinds)]), none[: len(kinds)]) < LOOSE)
-    level = np.where(alone, 0.0, begin[: len(kinds)])
-    information, _ = _score(alike.tests, own, np.exp(begin[: len(kinds)]), alone)
-    penalty = np.minimum(_PENALTY, _SHARE * np.diagonal(information))
-    found = _maximise(made, own, level, alone, penalty)
-    low, high = (np.where(alone, np.nan, end)[place] for end in _interval(found, own, alone))
+        undetermined &= ~(
+            _relative_errors(common.tests, classes, np.exp(begin[: len(kinds)]), nothing_fixed[: len(kinds)]) < LOOSE
+        )
+    level = np.where(undetermined, 0.0, begin[: len(kinds)])
+    information, _ = _score(common.tests, classes, np.exp(begin[: len(kinds)]), undetermined)
+    penalty = np.minimum(_PENALTY, _MAX_PENALTY_SHARE * np.diagonal(information))
+    found = _maximise(made, classes, level, undetermined, penalty)
+    low, high = (
+        np.where(undetermined, np.nan, end)[class_of] for end in _confidence_interval(found, classes, undetermined)
+    )
 
-    def spread(values: Array) -> Array:
+    def per_group(values: Array) -> Array:
         return np.asarray(np.append(values, np.nan)[number[:-1]])
 
     return VarianceFit(
-        np.where(left, 0.0, spread(found.variance[place])),
-        spread(np.where(shared, np.nan, found.error[place])),
-        spread(low),
-        spread(high),
+        np.where(left, 0.0, per_group(found.variance[class_of])),
+        per_group(np.where(shared, np.nan, found.error[class_of])),
+        per_group(low),
+        per_group(high),
         np.isin(np.arange(size), used[shared]),
-        bool(alone.any()),
+        bool(undetermined.any()),
         found.gross,
         found.tests,
     )
 
 
 def without_groups(made: Elements, left: Array) -> Elements:
-    """Return the elements without the errors of some groups (g,)."""
-    gone = np.append(left, False)[made.of_effect]
-    effect = np.where(gone[:, None], 0.0, made.effect)
-    return replace(made, effect=effect, of_effect=np.where(gone, -1, made.of_effect))
+    """Return the elements without the errors of the groups that `left` (g,) marks."""
+    removed = np.append(left, False)[made.of_effect]
+    effect = np.where(removed[:, None], 0.0, made.effect)
+    return replace(made, effect=effect, of_effect=np.where(removed, -1, made.of_effect))
 
 
-# Standard deviations of a score from which a group that was left out is worth a factor: one in a hundred of those
-# without errors is.
-_SEEN = 2.33
+# Limit of a score, in standard deviations, above which an excluded group gets a factor. One in a hundred groups without
+# errors exceeds it.
+_SIGNIFICANT = 2.33
 
 
 def visible(made: Elements, found: VarianceFit, left: Array) -> Array:
-    """Return which groups (g,) of those left out of a fit the data show: a score test of their factor being zero.
+    """Return the excluded groups (g,) whose errors are significant, by a score test of the factor zero.
 
-    With the information I and scores U of all factors at zero, U_g over the root of I_gg - I_gh I_hh^-1 I_hg is
-    standard normal where there are no such errors (Verbeke and Molenberghs 2003, section 4).
-
-    Parameters
-    ----------
-    made : Elements
-        N linearised problems.
-    found : VarianceFit
-        Without these groups.
-    left : bool array (g,)
-        Which they are.
+    `found` is a fit of N problems `made` without the groups that `left` (g,) marks. The test uses the information I and
+    the scores U of all factors. If group g has no errors, U_g divided by the square root of I_gg - I_gh I_hh^-1 I_hg is
+    standard normal (Verbeke and Molenberghs 2003, section 4).
     """
     size = len(made.names)
     variance = np.append(np.nan_to_num(found.variance), 0.0)
@@ -208,84 +204,95 @@ def visible(made: Elements, found: VarianceFit, left: Array) -> Array:
     information, per_fix = _score(tests, made.of_effect, scale, np.zeros(size, dtype=bool))
     rest = np.flatnonzero(~left)
     coupling = information[:, rest]
-    own = np.diagonal(information) - ((coupling @ _inverse(information[np.ix_(rest, rest)])) * coupling).sum(1)
-    # What the other factors can stand for altogether leaves rounding.
-    told = left & (own > (1.0 - _OWN) ** 2 * np.diagonal(information)) & _determinable(tests, made, found, left)
-    return np.asarray(told & (per_fix.sum(0) > _SEEN * np.sqrt(np.where(told, own, 1.0))))
+    remaining = np.diagonal(information) - ((coupling @ _inverse(information[np.ix_(rest, rest)])) * coupling).sum(1)
+    # If the other factors explain a group completely, the remaining information is rounding.
+    determined = (
+        left
+        & (remaining > (1.0 - _DETERMINED) ** 2 * np.diagonal(information))
+        & _determinable(tests, made, found, left)
+    )
+    return np.asarray(determined & (per_fix.sum(0) > _SIGNIFICANT * np.sqrt(np.where(determined, remaining, 1.0))))
 
 
-# An error in common of three times the rows' sigma must have a level with at most this relative error. Fixes by ranges
-# from one side follow it almost entirely, and residuals would give it any size: thirty times the rows' sigma occurred.
+# A shared error of three times the sigma of the rows must have a level with at most this relative error. Range fixes
+# from one side absorb most of a shared error, so the residuals allow any level: estimates of thirty times the sigma of
+# the rows occurred.
 _TIMES, _RELATIVE = 3.0, 0.25
 
 
 def _determinable(tests: Tested, made: Elements, found: VarianceFit, left: Array) -> Array:
-    """Return the groups (g,) whose level the data would show if it were a few times the level of the rows."""
+    """Return the groups (g,) whose level would be determined if it were a few times the level of the rows."""
     level = _TIMES**2 * float(np.nanmedian(found.variance[~left]))
     share = tests.size[:, : tests.errors] * level
-    # The standard error of a log-variance is the root of the inverse information, twice the error of a log-sigma.
+    # The standard error of a log-variance is the square root of the inverse information. It is twice the error of a
+    # log-sigma.
     information = 0.5 * total(made.of_effect, len(left), (share / (1.0 + share)) ** 2)
     return np.asarray(information * (2.0 * _RELATIVE) ** 2 > 1.0)
 
 
-def _maximise(made: Elements, own: Array, level: Array, held: Array, penalty: Array) -> _FoundLevels:
-    """Return the factors of classes of errors `own` (N, q), from log-factors (c,) on; some are held there.
+def _maximise(made: Elements, classes: Array, level: Array, fixed: Array, penalty: Array) -> _MaximumLikelihood:
+    """Return the variance factors of c classes of errors, their standard errors and the gross errors.
 
-    The penalty (c,) is added to their scores.
+    `classes` (N, q) is the class of each error and `level` (c,) the log-factors at the start. `fixed` (c,) marks
+    factors that keep their value. `penalty` (c,) is added to the scores.
     """
     count, level = len(level), level.copy()
-    # Medians first: they stand half of the errors being gross, the scores of the likelihood do not.
+    # Start with medians: medians tolerate up to half of the errors as gross, but scores of the likelihood do not.
     for _ in range(_COARSE):
-        step = np.where(held, 0.0, _coarse(tested(made, np.exp(level)[own]), own, np.exp(level)))
+        step = np.where(fixed, 0.0, _median_step(tested(made, np.exp(level)[classes]), classes, np.exp(level)))
         level += step
         if np.abs(step).max() < _NEAR:
             break
     for _ in range(_ROUNDS):
         before = level.copy()
-        # Gross errors are chosen once a turn, not at every step: else steps would jump as errors come and go.
-        gross, tests = cleaned(made, np.exp(level)[own])
+        # Gross errors are selected once per round, not in every step. Otherwise the steps would jump when the selection
+        # changes.
+        gross, tests = cleaned(made, np.exp(level)[classes])
         for _ in range(_STEPS):
-            step, sure = _step(tests, own, np.exp(level), held, penalty)
-            last, level = level, np.maximum(level + step, np.log(_LEAST))
-            tests = without(tested(made, np.exp(level)[own]), gross)
+            step, sure = _scoring_step(tests, classes, np.exp(level), fixed, penalty)
+            last, level = level, np.maximum(level + step, np.log(_MIN_VARIANCE))
+            tests = without(tested(made, np.exp(level)[classes]), gross)
             if (np.abs(level - last) <= _CLOSE * sure).all():
                 break
         if (np.abs(level - before) <= _SETTLED * sure).all():
             break
     variance = np.exp(level)
-    return _FoundLevels(variance, _errors(tests, own, variance, held[:count]), gross, tests)
+    return _MaximumLikelihood(variance, _relative_errors(tests, classes, variance, fixed[:count]), gross, tests)
 
 
-def _coarse(tests: Tested, own: Array, variance: Array) -> Array:
-    """Return steps of the log-factors (c,) to where the median of the squared tests is that of normal errors."""
-    q = own.shape[1]
-    squared, share = tests.sigmas[:, :q] ** 2, tests.size[:, :q] * variance[own]
+def _median_step(tests: Tested, classes: Array, variance: Array) -> Array:
+    """Return steps of the log-factors (c,) that make the median of the squared tests the median of normal errors."""
+    q = classes.shape[1]
+    squared, share = tests.sigmas[:, :q] ** 2, tests.size[:, :q] * variance[classes]
     step = np.zeros(len(variance))
     for g in range(len(variance)):
-        values = squared[(own == g) & (share > _SHOWN)]
+        values = squared[(classes == g) & (share > _MIN_REDUNDANCY)]
         if len(values):
-            step[g] = np.log(max(float(np.median(values)) / _MEDIAN, _SMALL))
+            step[g] = np.log(max(float(np.median(values)) / _MEDIAN, _MIN_MEDIAN))
     return np.clip(step, _DOWN, _UP)
 
 
-def _step(tests: Tested, own: Array, variance: Array, held: Array, penalty: Array) -> tuple[Array, Array]:
-    """Return the scoring step of the log-factors (c,), at most one, along what the data see, and their sigmas."""
-    information, per_fix = _score(tests, own, variance, held)
-    # The penalty has no curvature in the logarithm; its size damps steps where the data hardly see a factor.
+def _scoring_step(tests: Tested, classes: Array, variance: Array, fixed: Array, penalty: Array) -> tuple[Array, Array]:
+    """Return the scoring step (c,) of the log-factors and the standard errors (c,) of the log-factors.
+
+    The step has no component along a combination of factors that the data do not determine.
+    """
+    information, per_fix = _score(tests, classes, variance, fixed)
+    # The penalty has no curvature in the log-factors. Its size damps steps if the data hardly determine a factor.
     inverse = _inverse(information + np.diag(penalty))
-    # A step of at most e: the quadratic model of the likelihood holds no further.
+    # A step changes a variance at most by the factor e: the quadratic model of the likelihood is not valid beyond.
     return np.clip(inverse @ (per_fix.sum(0) + penalty), -1.0, 1.0), np.sqrt(np.diagonal(inverse))
 
 
-def _score(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Array, Array]:
-    """Return information (c, c) and scores of each problem (N, c) of log-factors.
+def _score(tests: Tested, classes: Array, variance: Array, fixed: Array) -> tuple[Array, Array]:
+    """Return the information (c, c) of the log-factors and the scores of each problem (N, c).
 
-    With T and t of `Tested`, d l / d theta_g is the sum of (t_j^2 - T_jj) / 2 over the errors j of group g, and the
-    information of theta_g and theta_h that of T_ij^2 / 2 (Harville 1977, section 5).
+    With T and t of `Tested`, the score of theta_g is the sum of (t_j^2 - T_jj) / 2 over the errors j of group g. The
+    information of theta_g and theta_h is the sum of T_ij^2 / 2 (Harville 1977, section 5).
     """
-    (n, q), count = own.shape, len(variance)
-    # Errors of no group are counted in a class of their own, behind the others, and dropped.
-    number, scale = np.where(own >= 0, own, count), np.where(held, 0.0, variance)
+    (n, q), count = classes.shape, len(variance)
+    # Errors without a group get an additional last class, which is dropped.
+    number, scale = np.where(classes >= 0, classes, count), np.where(fixed, 0.0, variance)
     each = 0.5 * (tests.vector[:, :q] ** 2 - tests.size[:, :q])
     place = (np.arange(n)[:, None] * (count + 1) + number).ravel()
     per_fix = np.bincount(place, each.ravel(), n * (count + 1)).reshape(n, -1)[:, :count] * scale
@@ -296,55 +303,58 @@ def _score(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Arr
 
 
 def _inverse(information: Array) -> Array:
-    """Return the inverse along the directions that an information matrix, scaled to a unit diagonal, sees."""
-    half, _ = linalg.root(information, _UNSEEN)
+    """Return the pseudo-inverse of an information matrix, which is scaled to a unit diagonal for its rank."""
+    half, _ = linalg.root(information, _RANK_TOLERANCE)
     return np.asarray(half @ half.T)
 
 
-def _spread(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Array, Array, Array]:
-    """Return variances (c,) of log-factors, whether the data tell them, and the step to where the likelihood is flat.
+def _log_variances(tests: Tested, classes: Array, variance: Array, fixed: Array) -> tuple[Array, Array, Array]:
+    """Return the variances of the log-factors, flags of determined factors, and the scoring step; all (c,).
 
-    Variances of normal errors, or what the scatter of the problems' scores says if that is more.
+    A variance is the larger one of two: the variance for normal errors, and the variance from the scatter of the
+    problems' scores.
     """
-    information, per_fix = _score(tests, own, variance, held)
+    information, per_fix = _score(tests, classes, variance, fixed)
     inverse = _inverse(information)
-    # Sandwich of the problems' scores: what normal errors do not explain, such as tails, widens the error.
+    # Sandwich estimate from the problems' scores: errors that are not normal, for instance with tails, increase the
+    # variance.
     scattered = inverse @ (per_fix.T @ per_fix) @ inverse
-    told = np.diagonal(inverse @ information) > _OWN
-    return np.maximum(np.diagonal(inverse), np.diagonal(scattered)), told, inverse @ per_fix.sum(0)
+    determined = np.diagonal(inverse @ information) > _DETERMINED
+    return np.maximum(np.diagonal(inverse), np.diagonal(scattered)), determined, inverse @ per_fix.sum(0)
 
 
-def _errors(tests: Tested, own: Array, variance: Array, held: Array) -> Array:
-    """Return standard errors (c,) of the roots of factors, as shares of them; infinite where they are not told."""
-    spread, told, _ = _spread(tests, own, variance, held)
-    # From the error of a log-variance to that of its root.
-    return np.where(told, np.sqrt(1.0 + np.sqrt(spread)) - 1.0, np.inf)
+def _relative_errors(tests: Tested, classes: Array, variance: Array, fixed: Array) -> Array:
+    """Return the relative standard errors (c,) of the square roots of the factors; infinite if not determined."""
+    spread, determined, _ = _log_variances(tests, classes, variance, fixed)
+    # Convert the error of a log-variance to the error of its square root.
+    return np.where(determined, np.sqrt(1.0 + np.sqrt(spread)) - 1.0, np.inf)
 
 
-def _interval(found: _FoundLevels, own: Array, held: Array) -> tuple[Array, Array]:
-    """Return the ends (c,) of the intervals of variance factors.
+def _confidence_interval(found: _MaximumLikelihood, classes: Array, fixed: Array) -> tuple[Array, Array]:
+    """Return the lower and upper ends (c,) of the confidence intervals of the variance factors.
 
-    What is seen of an error is its sum with the error of what the others predict: of variance theta + tau, tau =
-    theta (1 / r - 1) with r its redundancy. The likelihood of that sum is near that of a chi-square variable
-    (Satterthwaite 1946, equation 17), also where theta is near zero; its interval less tau is that of theta.
+    The residuals show an error plus the error of its prediction from the other rows. The variance of this sum is theta
+    + tau with tau = theta (1 / r - 1) and the redundancy r of the error. Its likelihood is close to the likelihood of a
+    chi-square variable (Satterthwaite 1946, equation 17), even if theta is near zero. The interval of theta is the
+    interval of the sum minus tau.
     """
     from scipy.special import gammaincinv
 
-    variance, q = found.variance, own.shape[1]
-    share = found.tests.size[:, :q] * variance[own]
-    redundancy = total(own, len(variance), share**2) / np.maximum(total(own, len(variance), share), _SMALL)
-    redundancy = np.clip(redundancy, _SHOWN, 1.0)
+    variance, q = found.variance, classes.shape[1]
+    share = found.tests.size[:, :q] * variance[classes]
+    redundancy = total(classes, len(variance), share**2) / np.maximum(total(classes, len(variance), share), _MIN_MEDIAN)
+    redundancy = np.clip(redundancy, _MIN_REDUNDANCY, 1.0)
     predicted = variance * (1.0 / redundancy - 1.0)
-    spread, told, step = _spread(found.tests, own, variance, held)
-    # The penalty is taken out: intervals are those of the likelihood.
-    seen = np.maximum(variance * (1.0 + step) + predicted, _SHOWN * predicted)
-    half = 1.0 / np.maximum(spread * redundancy**2, _SHOWN)  # half of the degrees of freedom
+    spread, determined, step = _log_variances(found.tests, classes, variance, fixed)
+    # The step removes the effect of the penalty: the intervals belong to the likelihood alone.
+    seen = np.maximum(variance * (1.0 + step) + predicted, _MIN_REDUNDANCY * predicted)
+    half = 1.0 / np.maximum(spread * redundancy**2, _MIN_REDUNDANCY)  # half the degrees of freedom
     ends = [gammaincinv(half, p) / half for p in (0.5 + 0.5 * _LEVEL, 0.5 - 0.5 * _LEVEL)]
-    return tuple(np.where(told, np.maximum(seen / end - predicted, 0.0), np.nan) for end in ends)  # type: ignore[return-value]
+    return tuple(np.where(determined, np.maximum(seen / end - predicted, 0.0), np.nan) for end in ends)  # type: ignore[return-value]
 
 
 def total(group: Array, count: int, values: Array | None = None) -> Array:
-    """Return the sum of values (N, q) over each group (g,); their number by default."""
+    """Return the sum of the values (N, q) over each group (g,); without values, the number of errors per group."""
     number = np.where(group >= 0, group, count).ravel()
     return np.bincount(number, None if values is None else values.ravel(), count + 1)[:count].astype(float)
 
@@ -354,20 +364,13 @@ def total(group: Array, count: int, values: Array | None = None) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Tested:
-    """T = F' P F and t = F' P v for the columns F = [B, E], and what is left of the residuals.
+    """Test statistics T = F' P F and t = F' P v for the columns F = [B, E], and the chi-square of the residuals.
 
-    Parameters
-    ----------
-    matrix : array (N, q + c, q + c)
-        T.
-    vector : array (N, q + c)
-        t.
-    errors : int
-        q, the number of columns that are errors.
-    cost : array (N,)
-        v' P v, chi-square distributed with `dof` degrees of freedom.
-    dof : array (N,)
-        Rank of P.
+    - matrix (N, q + c, q + c): T.
+    - vector (N, q + c): t.
+    - errors: q, the number of columns of errors; the other c columns are offsets.
+    - cost (N,): v' P v, chi-square distributed with `dof` degrees of freedom.
+    - dof (N,): rank of P.
     """
 
     matrix: Array
@@ -383,42 +386,38 @@ class Tested:
 
     @property
     def sigmas(self) -> Array:
-        """Return the tests t / sqrt(T) of all columns (N, q + c); 0 where nothing can be tested."""
+        """Return the tests t / sqrt(T) of all columns (N, q + c), in standard deviations; 0 if no test is possible."""
         size = self.size
         return np.where(size > 0.0, self.vector / np.sqrt(np.where(size > 0.0, size, 1.0)), 0.0)
 
     def without(self, column: Array) -> Tested:
-        """Return the same with an error of unknown size along one column (N,) of each problem; -1 for none."""
+        """Return the tests with an unknown error along one column (N,) of each problem; -1 for no column."""
         items = np.flatnonzero(column >= 0)
         j = column[items]
         matrix, vector, cost, dof = self.matrix.copy(), self.vector.copy(), self.cost.copy(), self.dof.copy()
-        # An unknown along column j is eliminated: a Schur complement of one row and column.
+        # Eliminate the unknown of column j: a Schur complement of one row and column.
         along, own = matrix[items, :, j], matrix[items, j, j]
         vector[items] -= along * (self.vector[items, j] / own)[:, None]
         matrix[items] -= along[:, :, None] * along[:, None, :] / own[:, None, None]
         cost[items] -= self.vector[items, j] ** 2 / own
         dof[items] -= 1
-        # Columns that this one explains are not tested any more; rounding would make them outliers.
-        gone = np.diagonal(matrix[items], axis1=-2, axis2=-1) <= _NOTHING * self.size[items]
-        matrix[items] *= ~(gone[:, :, None] | gone[:, None, :])
-        vector[items] *= ~gone
+        # Column j explains these columns completely, so they cannot be tested any more; rounding would make them
+        # outliers.
+        explained = np.diagonal(matrix[items], axis1=-2, axis2=-1) <= _ROUNDING * self.size[items]
+        matrix[items] *= ~(explained[:, :, None] | explained[:, None, :])
+        vector[items] *= ~explained
         return Tested(matrix, vector, self.errors, cost, dof)
 
 
 def tested(made: Elements, variance: Array) -> Tested:
-    """Return what the residuals say of every error and offset.
+    """Return the test statistics of every error and offset of N problems.
 
-    Parameters
-    ----------
-    made : Elements
-        N problems.
-    variance : array (N, q) or ()
-        Theta, the variance of each error.
+    `variance` is theta, the variance of each error (N, q), or one value for all errors.
     """
     q = made.effect.shape[-1]
     scaled = made.effect * np.sqrt(np.broadcast_to(variance, made.of_effect.shape))[:, None]
     covariance = scaled @ np.swapaxes(scaled, 1, 2) + made.fixed
-    # P = W' (I - Q Q') W with W whitening V and Q an orthonormal basis of W J: no inverse of V is formed.
+    # P = W' (I - Q Q') W, where W whitens V and Q is an orthonormal basis of W J: no inverse of V is formed.
     whiten = linalg.whitening(covariance)
     columns = np.concatenate([made.effect, made.offset, made.residual[..., None]], axis=-1)
     white, known = whiten @ columns, whiten @ made.jacobian
@@ -426,19 +425,19 @@ def tested(made: Elements, variance: Array) -> Tested:
     basis = known @ root
     free = white - basis @ (np.swapaxes(basis, 1, 2) @ white)
     gram = np.swapaxes(free, 1, 2) @ free
-    # Rows that whitening keeps less unknowns that the Jacobian sees.
+    # Number of rows that whitening keeps, minus number of unknowns that the Jacobian determines.
     rank = (whiten != 0.0).any(-1).sum(-1) - (root != 0.0).any(-2).sum(-1)
     matrix = gram[:, :-1, :-1]
     size = np.diagonal(np.swapaxes(white, 1, 2) @ white, axis1=-2, axis2=-1)[:, :-1]
-    seen = np.diagonal(matrix, axis1=-2, axis2=-1) > _NOTHING * size
+    seen = np.diagonal(matrix, axis1=-2, axis2=-1) > _ROUNDING * size
     both = seen[:, :, None] & seen[:, None, :]
     return Tested(np.where(both, matrix, 0.0), np.where(seen, gram[:, :-1, -1], 0.0), q, gram[:, -1, -1], rank)
 
 
 def without(tests: Tested, gross: Array) -> Tested:
-    """Return tests without the errors (N, q) that are gross."""
+    """Return the test statistics after all gross errors (N, q) are estimated as unknowns."""
     items = np.arange(len(gross))
-    # As many turns as the problem with most gross errors has.
+    # One iteration per gross error of the problem with the most gross errors.
     order = np.argsort(~gross, axis=1, kind="stable")[:, : int(gross.sum(1).max(initial=0))]
     for column in order.T:
         tests = tests.without(np.where(gross[items, column] & (tests.size[items, column] > 0.0), column, -1))
@@ -446,10 +445,11 @@ def without(tests: Tested, gross: Array) -> Tested:
 
 
 def deviance(made: Elements, found: VarianceFit) -> float:
-    """Return twice the negative logarithm of the restricted likelihood; a gross row is a free unknown at a price.
+    """Return twice the negative logarithm of the restricted likelihood, with a penalty for each gross row.
 
-    It is the likelihood of K' v, K an orthonormal basis of the complement of J. The basis does not depend on the
-    variances, so that sets of groups can be compared (Harville 1977, section 3).
+    It is the likelihood of K' v, where K is an orthonormal basis of the complement of J. The basis does not depend on
+    the variances, so the values for different sets of groups are comparable (Harville 1977, section 3). A gross row is
+    an additional unknown.
     """
     variance = np.append(np.nan_to_num(found.variance), 0.0)[made.of_effect]
     scaled = made.effect * np.sqrt(variance)[:, None]
@@ -458,13 +458,14 @@ def deviance(made: Elements, found: VarianceFit) -> float:
     covariance += absent[:, :, None] * np.eye(covariance.shape[1])
     basis, sizes, _ = np.linalg.svd(made.jacobian)
     seen = np.zeros((len(basis), basis.shape[-1]), dtype=bool)
-    seen[:, : sizes.shape[1]] = sizes > _NOTHING * sizes[:, :1]
-    # Directions of the Jacobian become unit variances without residual.
+    seen[:, : sizes.shape[1]] = sizes > _ROUNDING * sizes[:, :1]
+    # Directions of the Jacobian get a unit variance and no residual.
     free = np.swapaxes(basis, 1, 2) * ~seen[:, :, None]
     inside = free @ covariance @ np.swapaxes(free, 1, 2) + seen[:, :, None] * np.eye(basis.shape[-1])
     doubled = float(np.linalg.slogdet(inside)[1].sum())
     tests = tested(made, variance)
-    # Each structure may leave out the rows that it explains worst, at one price: a row is no reason for a structure.
+    # With every noise structure the worst rows are excluded at the same penalty, so a single row does not favour a
+    # structure.
     cut = np.where(made.common[made.of_effect], np.inf, np.sqrt(ROW_PRICE))
     gross = snooped(tests, slice(0, tests.errors), cut).gross
     items = np.arange(len(variance))
@@ -480,30 +481,26 @@ def deviance(made: Elements, found: VarianceFit) -> float:
 
 
 def cleaned(made: Elements, variance: Array) -> tuple[Array, Tested]:
-    """Return which errors are gross (N, q), and the tests without them.
+    """Return the gross errors (N, q) and the tests without them.
 
-    A row is gross only where its error explains much more than an error in common. Without this rule epochs with a
-    large common error would be left out, and its variance would be too small.
+    A row is gross only if its error explains much more than a shared error. Without this rule, epochs with a large
+    shared error would be excluded, and the variance of the shared error would be too small.
     """
     tests = tested(made, variance)
     shared = made.common[made.of_effect] & (np.broadcast_to(variance, made.of_effect.shape) > 0.0)
-    cut = np.where(made.common[made.of_effect], _WIDE, CUT)
+    cut = np.where(made.common[made.of_effect], _CUT_SHARED, CUT)
     found = snooped(tests, slice(0, tests.errors), cut, shared if shared.any() else None)
     return found.gross, found.tests
 
 
 @dataclass(frozen=True, slots=True)
 class Snooped:
-    """Columns along which errors are gross, and what the tests say of all without them.
+    """Result of data snooping: gross errors, estimates of all errors, and the tests without the gross errors.
 
-    Parameters
-    ----------
-    gross : bool array (N, p)
-        Columns of the tests beyond the cut.
-    shift, sigma : array (N, p)
-        Size of an error along each column that the rest shows, and its standard deviation; NaN where nothing does.
-    tests : Tested
-        Without the gross ones.
+    - gross (N, p): True for a column whose test exceeds the limit.
+    - shift, sigma (N, p): size of an error along each column, estimated from the other rows, and its standard
+      deviation; NaN if the other rows do not determine it.
+    - tests: tests without the gross errors.
     """
 
     gross: Array
@@ -513,12 +510,12 @@ class Snooped:
 
 
 def snooped(tests: Tested, columns: slice, cut: float | Array, shared: Array | None = None) -> Snooped:
-    """Return the gross errors along some columns of tests, each with its cut or all with one.
+    """Return the gross errors along some columns of the tests, by data snooping (Baarda 1968, section 4).
 
-    Its squared test must exceed the tests of all `shared` columns (N, p) of its problem by a margin.
-
-    Of each problem the column with the largest test beyond the cut is left out, and the rest are tested anew, until
-    none is beyond it: data snooping (Baarda 1968, section 4).
+    In each problem, the column with the largest test above its limit `cut` is excluded, and the remaining columns are
+    tested again. The procedure ends when no test exceeds its limit. `cut` is one limit for all columns or one limit per
+    column. With `shared` (N, p), the squared test of a row must also exceed a limit: the squared tests of all shared
+    columns of its problem plus a margin.
     """
     n, first = len(tests.vector), range(tests.vector.shape[1])[columns].start
     shift, sigma = error_sizes(tests, columns)
@@ -536,14 +533,14 @@ def snooped(tests: Tested, columns: slice, cut: float | Array, shared: Array | N
         if not len(hit):
             return Snooped(gross, shift, sigma, tests)
         gross[hit, worst[hit]] = True
-        # One column a problem and turn: two that are beyond the cut may be one error, seen twice.
+        # Exclude one column per problem and iteration: two tests above the limit may come from the same error.
         column = np.full(n, -1)
         column[hit] = first + worst[hit]
         tests = tests.without(column)
 
 
 def error_sizes(tests: Tested, columns: slice) -> tuple[Array, Array]:
-    """Return the size of an error along each column that the rest shows, and its standard deviation; NaN for none."""
+    """Return the size of an error along each column and its standard deviation, from the other rows; NaN for none."""
     size, vector = tests.size[:, columns], tests.vector[:, columns]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(size > 0.0, vector / size, np.nan), np.where(size > 0.0, size**-0.5, np.nan)

@@ -1,4 +1,4 @@
-"""Trackers: fixes in time, started by the fixes of `optloc.solve`."""
+"""Trackers: filters that predict and update the state of a target scan by scan, started by fixes of `optloc.solve`."""
 
 from typing import TYPE_CHECKING
 

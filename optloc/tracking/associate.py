@@ -1,4 +1,4 @@
-"""Which measurement is whose: unlabelled rows and several targets that are predicted."""
+"""Data association: assignment of unlabelled rows to several predicted targets."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from optloc.tracking.track import State
 from optloc.tracking.updates import check_width, innovation
 
 Associate = Callable[[Problem, State, Array], Array]
-"""Maps a scan of one row a channel, predicted targets (..., t) and candidates (..., m, c) to picks, ints (..., t, m).
+"""Function of a scan with one row per channel, predicted targets (..., t) and candidates (..., m, c).
 
-A pick is the index of the candidate that is taken for a target in a channel, or -1 for none.
-"""
+It returns picks, ints (..., t, m). A pick is the index of the candidate of a target in a channel, or -1 for none."""
 
-# Sets of a target and scan that are followed at once: with m channels of c candidates in the gate there are (c + 1)^m,
-# and the best is lost only where a thousand beginnings of it score better.
+# Largest number of sets of a target and scan that are kept. With m channels of c candidates in the gate there are (c +
+# 1)^m sets. The best set is lost only if a thousand partial sets have a better score.
 _SETS = 1000
-# Best sets of a target among which an assignment chooses: rivals share few rows, so that one of the next sets is free.
+# Number of best sets of a target for an assignment: competing targets share few rows, so one of the next sets is free.
 _RIVALS = 200
-# What is left of a variance, as a share, where station pairs close a loop: rounding, which a quotient must not blow up.
+# Smallest conditional variance as a share of the variance. If station pairs form a loop, the variance is only rounding,
+# and a division by it must stay finite.
 _LEFT = 1e-12
 
 
-# Five sigmas, here and in all gates: of true rows one in two million is lost, and a false one is wrong by more.
+# Five sigmas, here and in all gates: one of two million true rows is lost, and a false row has a larger error.
 def nearest(width: float = 5.0) -> Associate:
     """Return the rule that takes, for each target and channel, the candidate nearest to the prediction.
 
-    Channels do not know of each other, nor targets: two targets may take the same row.
+    Channels and targets are independent: two targets may take the same row.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def nearest(width: float = 5.0) -> Associate:
 
     def rule(scan: Problem, ahead: State, z: Array) -> Array:
         apart, S = offsets(scan, ahead, z)
-        # argmin of a row without a candidate is 0: it is told from a real 0 by the infinite distance.
+        # argmin is also 0 for a row without a candidate; the infinite distance distinguishes this case.
         distance = distances(apart, S, width)
         return np.where(np.isfinite(distance).any(-1), distance.argmin(-1), -1)
 
@@ -54,11 +54,11 @@ def nearest(width: float = 5.0) -> Associate:
 
 
 def joint(clutter: Clutter) -> Associate:
-    """Return the rule that scores whole sets of rows, one or none of each channel, and takes each target's best.
+    """Return the rule that scores sets of rows, at most one row of each channel, and takes the best set of each target.
 
-    The score of a set of n rows of m channels is chi-square + ln|2 pi S| - 2 n ln(pd / density) - 2 (m - n) ln(1 - pd)
-    with the joint covariance S of its innovations: twice the negative logarithm of its likelihood against false rows.
-    Targets do not know of each other.
+    The score of a set of n rows of m channels is chi-square + ln|2 pi S| - 2 n ln(pd / density) - 2 (m - n) ln(1 - pd).
+    Here S is the joint covariance of its innovations. The score is twice the negative logarithm of the likelihood ratio
+    to false rows. Targets are independent: two targets may take the same row.
 
     Parameters
     ----------
@@ -78,10 +78,10 @@ def joint(clutter: Clutter) -> Associate:
 
 
 def assigned(clutter: Clutter) -> Associate:
-    """Return the rule that takes the best sets of all targets together, no row for more than one of them.
+    """Return the rule that takes the best sets of all targets together; no row belongs to more than one target.
 
-    The sum of the scores of `joint` is least, exactly: an assignment in several dimensions, solved as an integer
-    programme where targets compete for a row.
+    The sum of the scores of `joint` is the exact minimum: an assignment in several dimensions. If targets compete for a
+    row, an integer programme solves it.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def assigned(clutter: Clutter) -> Associate:
     """
 
     def rule(scan: Problem, ahead: State, z: Array) -> Array:
-        # Most scans need no programme: each target's own best set, where no row is wanted twice, is the least sum.
+        # Most scans need no integer programme: if the best sets of all targets share no row, their sum is the minimum.
         sets = scored(scan, ahead, z, clutter)
         pick = sets.chosen(sets.score.argmin(-1))
         for index in np.ndindex(pick.shape[:-2]):
@@ -108,19 +108,19 @@ def assigned(clutter: Clutter) -> Associate:
 
 
 def _compete(pick: Array) -> bool:
-    """Return whether any two targets take the same candidate, picks (t, m)."""
+    """Return whether any two targets take the same candidate, from picks (t, m)."""
     same = (pick[:, None] == pick[None]) & (pick[:, None] >= 0)
     return bool(same.any(-1).sum() > (pick >= 0).any(-1).sum())
 
 
 def _assign(sets: Sets) -> Array:
-    """Return the numbers (t,) of the sets with the least sum of scores, one for a target, that share no candidate."""
+    """Return the numbers (t,) of one set per target with the lowest sum of scores, without common candidates."""
     from scipy.optimize import Bounds, LinearConstraint, milp
     from scipy.sparse import csr_array
 
     owner, number, wanted = [], [], []
     for target, own in enumerate(sets.score):
-        # The empty set is the first, and never in anybody's way: a set that is worse need not be looked at.
+        # The empty set is the first set and conflicts with no set: sets with a higher score are not needed.
         better = np.flatnonzero(own < own[0])
         better = better[np.argsort(own[better], kind="stable")][:_RIVALS]
         numbers = np.concatenate([[0], better])
@@ -130,7 +130,7 @@ def _assign(sets: Sets) -> Array:
     who, which, pick = np.concatenate(owner), np.concatenate(number), np.concatenate(wanted)
     column, channel = np.nonzero(pick >= 0)
     _, row = np.unique(np.stack([channel, pick[column, channel]]), axis=1, return_inverse=True)
-    # One set for every target, the empty one among them; no row in two of the sets taken.
+    # Constraints: one set for every target, possibly the empty set; no row in two chosen sets.
     everyone = csr_array((np.ones(len(who)), (who, np.arange(len(who)))))
     once = csr_array((np.ones(len(row)), (row, column)), shape=(int(row.max()) + 1, len(who)))
     solved = milp(
@@ -139,25 +139,25 @@ def _assign(sets: Sets) -> Array:
         bounds=Bounds(0.0, 1.0),
         constraints=[LinearConstraint(everyone, 1.0, 1.0), LinearConstraint(once, -np.inf, 1.0)],
     )
-    assert solved.x is not None  # all targets with nothing is always allowed
+    assert solved.x is not None  # the empty sets of all targets are always feasible
     taken = np.flatnonzero(solved.x > 0.5)
     return np.asarray(which[taken[np.argsort(who[taken])]])
 
 
-# Whole sets of rows, one or none of each channel, scored against predicted targets.
+# Scores of sets of rows, at most one row of each channel, for predicted targets.
 
 
 @dataclass(frozen=True, slots=True)
 class Clutter:
-    """What is known of detections.
+    """Detection probability and density of false rows.
 
     Parameters
     ----------
     detection : float
-        Probability that a target is seen in a channel, between 0 and 1, both excluded.
+        Probability that a target is detected in a channel, between 0 and 1, both excluded.
     density : float or mapping of str to float
-        Mean number of false rows of a channel and scan per unit of what is measured (SI units or radians), for all
-        kinds or by kind.
+        Mean number of false rows of a channel and scan per unit of the measurement (SI units or radians), for all kinds
+        or by kind.
     width : float
         Half width of the gate of single rows, in standard deviations of the innovation.
     """
@@ -168,12 +168,12 @@ class Clutter:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.detection < 1.0:
-            what = f"a probability of detection of {self.detection}"
+            what = f"the probability of detection is {self.detection}"
             raise InvalidProblem(what, "detection", "give a number between 0 and 1")
         densities = self.density.values() if isinstance(self.density, Mapping) else (self.density,)
         if not all(np.isfinite(value) and value > 0.0 for value in densities):
             advice = "give the mean number of false rows of a channel and scan for each metre or radian, above 0"
-            raise InvalidProblem(f"a density of false rows of {self.density}", "density", advice)
+            raise InvalidProblem(f"the density of false rows is {self.density}", "density", advice)
         check_width(self.width)
 
     def of(self, scan: Problem) -> Array:
@@ -182,51 +182,39 @@ class Clutter:
         for block in scan.rows:
             density = self.density.get(block.kind) if isinstance(self.density, Mapping) else self.density
             if density is None:
-                raise InvalidProblem(f"no density of false {block.kind} rows is given", "density", "give one")
+                raise InvalidProblem(
+                    f"no density of false {block.kind} rows is given", "density", "add the kind to the mapping"
+                )
             values.append(np.full(block.count, float(density)))
         return np.concatenate(values)
 
 
 @dataclass(frozen=True, slots=True)
 class Sets:
-    """Sets of candidates and how well they explain each target; the first one is empty.
+    """Sets of candidates with their scores for each target; the first set is empty.
 
-    Parameters
-    ----------
-    score : array (..., t, q)
-        Twice the negative log-likelihood ratio; infinite for sets that a target cannot have.
-    picks : int array (..., t, q, m)
-        For each set and channel, which candidate it holds, or -1.
+    - score (..., t, q): twice the negative log-likelihood ratio; infinite for impossible sets of a target.
+    - picks (..., t, q, m): candidate of each set and channel, or -1.
     """
 
     score: Array
     picks: Array
 
     def chosen(self, number: Array) -> Array:
-        """Return the picks (..., t, m) of the sets of given numbers (..., t)."""
+        """Return the picks (..., t, m) of the sets with given numbers (..., t)."""
         return np.asarray(np.take_along_axis(self.picks, number[..., None, None], axis=-2)[..., 0, :])
 
 
 def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
     """Return the scores of all sets of candidates within their gates; see `optloc.tracking.associate.joint`.
 
-    Sets grow channel by channel: the density of the rows of a set is the product of those of each row given the rows
-    before it. Where there are too many, the best beginnings are followed.
-
-    Parameters
-    ----------
-    scan : Problem
-        One row for each channel.
-    ahead : State
-        Predicted targets (..., t).
-    z : array (..., m, c)
-        Candidates.
-    clutter : Clutter
-        Detection and false rows.
+    `scan` has one row for each channel, `ahead` holds the predicted targets (..., t), and `z` (..., m, c) the
+    candidates. Sets grow channel by channel: the density of a set is the product of the densities of each row given the
+    rows before it. If there are too many sets, only the best partial sets are kept.
     """
     apart, S = offsets(scan, ahead, z)
     distance = distances(apart, S, clutter.width)
-    # Candidates in the gate first: channels are cut to as many as the fullest one has.
+    # Candidates in the gate come first; then channels are cut to the largest number of candidates in a gate.
     kept = max(1, int(np.isfinite(distance).sum(-1).max(initial=0)))
     order = np.argsort(distance, axis=-1, kind="stable")[..., :kept]
     near = np.take_along_axis(np.where(np.isfinite(distance), apart, np.nan), order, axis=-1)
@@ -234,13 +222,13 @@ def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
     shape, m = near.shape[:-2], near.shape[-2]
     score, picks = np.zeros((*shape, 1)), np.zeros((*shape, 1, 0), dtype=np.int64)
     mean = np.zeros((*shape, 1, m))
-    # mean and V: of the rows that are still to come, given those that a set already holds; every set has its own.
+    # mean and V belong to the rows of the next channels, given the rows of a set; every set has separate values.
     V = np.broadcast_to(S, (*shape, m, m))[..., None, :, :]
     for i in range(m):
         s = np.maximum(V[..., i, i], _LEFT * S[..., None, i, i])
         away = near[..., None, i, :] - mean[..., i, None]
         seen = (score + np.log(2.0 * np.pi * s) - gain[i])[..., None] + away**2 / s[..., None]
-        # Option 0 of a channel is to miss it, option j + 1 its j-th nearest candidate.
+        # Option 0 of a channel is a missed detection, option j + 1 its j-th nearest candidate.
         both = np.concatenate([(score + missed)[..., None], np.where(np.isnan(seen), np.inf, seen)], axis=-1)
         number = _keep_best(both.reshape(*shape, -1))
         parent, option = np.divmod(number, kept + 1)
@@ -252,7 +240,7 @@ def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
         value = np.take_along_axis(near[..., i, :], np.maximum(option - 1, 0), axis=-1)
         used = (option > 0) & np.isfinite(score)
         across, s = V[..., :, i], np.take_along_axis(s, parent, axis=-1)
-        # A set that took a row conditions the rest on it; one that missed the channel learns nothing.
+        # A set with a row conditions the remaining channels on it; a missed detection has no information.
         share = np.where(used[..., None], across / s[..., None], 0.0)
         mean = mean + share * np.where(used, value - mean[..., i], 0.0)[..., None]
         V = V - share[..., :, None] * across[..., None, :]
@@ -260,30 +248,24 @@ def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
 
 
 def _keep_best(score: Array) -> Array:
-    """Return which of the sets (..., q) are kept, (..., p): the empty one first, and no more than can be followed."""
+    """Return the numbers (..., p) of the sets (..., q) that are kept: the empty set first, at most `_SETS` sets."""
     possible = np.flatnonzero(np.isfinite(score).any(tuple(range(score.ndim - 1))))
     if len(possible) <= _SETS:
         return np.broadcast_to(possible, (*score.shape[:-1], len(possible)))
-    # The empty set stays first: it is what every target can always have.
+    # The empty set stays first, because it is possible for every target.
     key = score.copy()
     key[..., 0] = -np.inf
     return np.argsort(key, axis=-1, kind="stable")[..., :_SETS]
 
 
-# Candidates against what is expected of a target.
+# Differences between candidates and predicted measurements.
 
 
 def offsets(scan: Problem, ahead: State, z: Array) -> tuple[Array, Array]:
-    """Return candidates less what is expected of each target (..., t, m, c), and S (..., t, m, m).
+    """Return candidates minus predicted measurements of each target (..., t, m, c), and S (..., t, m, m).
 
-    Parameters
-    ----------
-    scan : Problem
-        One row for each channel.
-    ahead : State
-        Predicted targets (..., t).
-    z : array (..., m, c)
-        Candidates.
+    `scan` has one row for each channel, `ahead` holds the predicted targets (..., t), and `z` (..., m, c) the
+    candidates.
     """
     expected = predict(scan, ahead.mean)
     apart = misfits(scan, z, expected)
@@ -292,7 +274,7 @@ def offsets(scan: Problem, ahead: State, z: Array) -> tuple[Array, Array]:
 
 
 def misfits(scan: Problem, z: Array, expected: Array) -> Array:
-    """Return candidates (..., m, c) less values expected of each target (..., t, m), angles wrapped: (..., t, m, c)."""
+    """Return candidates (..., m, c) minus predicted values (..., t, m) as (..., t, m, c), with angles wrapped."""
     apart = z[..., None, :, :] - expected[..., None]
     for block, start in zip(scan.rows, scan.starts, strict=True):
         if MODELS[block.kind].period is not None:
@@ -302,14 +284,9 @@ def misfits(scan: Problem, z: Array, expected: Array) -> Array:
 
 
 def distances(apart: Array, S: Array, width: float) -> Array:
-    """Return normalised distances (..., t, m, c), infinite outside the gate and where there is no candidate.
+    """Return normalised distances (..., t, m, c) in sigmas; infinite outside the gate `width` and without a candidate.
 
-    Parameters
-    ----------
-    apart, S : array
-        See `offsets`.
-    width : float
-        Half width of the gate in standard deviations of the innovation.
+    `apart` and `S` are the results of `offsets`.
     """
     distance = np.abs(apart) / np.sqrt(np.diagonal(S, axis1=-2, axis2=-1))[..., None]
     return np.where(distance <= width, distance, np.inf)

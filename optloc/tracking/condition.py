@@ -1,4 +1,4 @@
-"""Condition of a track between two scans: its state, and how its last scans fit."""
+"""Condition of a track between two scans: its state, the fit of its last scans, and the rules that end it."""
 
 from __future__ import annotations
 
@@ -15,38 +15,40 @@ from optloc.tracking.rivals import Rival
 from optloc.tracking.start import Beginning, Fit
 from optloc.tracking.track import State
 
-# Scans of the window by which a track is judged, over those of `Rules.patience`.
+# Length of the window for the judgement of a track, in units of `Rules.patience` scans.
 _WINDOW = 4
-# Mean squared innovation over the squared gate: a half where half of the rows are beyond the gate, as every place has
-# some by chance that agree; a quarter (5 sigma: two and a half times as large as stated) where no covariance covers.
+# Limits of the mean squared innovation, as a share of the squared gate. A half: half of the rows are beyond the gate,
+# because at any position some rows agree by chance; the track is lost. A quarter (5 sigma: two and a half times as
+# large as stated): no covariance is valid.
 _LOST, _DOUBTFUL = 0.5, 0.25
-# Lasting error of the stations, in standard deviations of their rows, that refutes the noise. On real tracks up to four
-# were found, and the wider covariances covered the errors.
+# Lasting error of the stations, in standard deviations of their rows, that refutes the stated noise. On real tracks,
+# errors up to four occurred, and the increased covariances covered them.
 _LASTING = 5.0
 
 
 class Recent:
-    """How the rows of the last scans fit the prediction: their windowed NIS, no row further than the gate."""
+    """Fit of the rows of the last scans to the prediction: their windowed NIS. Each row counts at most as the gate."""
 
     def __init__(self, rules: Rules) -> None:
-        # As many scans as tell the loss of a track from a few wild rows in a row, where a scan has a single one: if one
-        # row in ten is wild, ten of twenty are in one window of a million.
+        # The window must separate a lost track from a few gross errors in succession, even with one row per scan. If
+        # one row in ten is a gross error, ten of twenty occur in one window of a million.
         self.scans: deque[Fit] = deque(maxlen=_WINDOW * rules.patience)
         self.rules, self.most, self.since = rules, rules.most, 0
-        # The mean squared innovation as a share of the squared gate; 0 with too few rows.
+        # Mean squared innovation as a share of the squared gate; 0 with too few rows.
         self.share = 0.0
-        # Why the position is too vague; the lasting error of the stations in sigmas; other states of the start.
+        # Reason why the position is too uncertain; lasting error of the stations in sigmas; number of other states of
+        # the start.
         self.vague, self.lasting, self.rivals = "", 0.0, 0
 
     def begin(self, start: Beginning) -> None:
-        """Take the rows of a start; what did not fit before is forgotten where they agree, and else still counts."""
+        """Add the rows of a start. If they agree, the earlier scans are deleted; otherwise these still count."""
         if start.code == Status.OK:
             self.scans.clear()
         self.add(start.fit)
         self.since = 0
 
     def add(self, fit: Fit) -> None:
-        """Take how the rows of one more scan fit."""
+        """Add the fit of the rows of one scan."""
         square, count = fit
         if count > 0:
             self.scans.append((min(square, self.most * count), count))
@@ -59,64 +61,56 @@ class Recent:
 
     @property
     def lost(self) -> bool:
-        """Return whether a full window is as bad as if half of its rows were beyond the gate."""
+        """Return whether the window is full and as bad as with half of its rows beyond the gate."""
         return self.since >= len(self.scans) == self.scans.maxlen and self.share > _LOST
 
     @property
     def sentence(self) -> str:
-        """Return how large the innovations are."""
+        """Return a sentence about the size of the innovations."""
         times = np.sqrt(self.share * self.most)
-        return f"the innovations of the last {len(self.scans)} scans are {times:.2g} times as large as stated"
+        return (
+            f"the innovations of the last {len(self.scans)} scans are {times:.2g} times as large as their stated sigmas"
+        )
 
     def judge(self, entry: Entry) -> Entry:
-        """Return a scan with the status that those before it deserve, where its own is clean."""
-        found = objections(_RECENTLY, self) if entry.code == Status.OK else []
+        """Return the entry of a scan; if its status is ok, the status that follows from the last scans replaces it."""
+        found = objections(_FINDINGS, self) if entry.code == Status.OK else []
         return replace(entry, code=found[0][0], reason=found[0][1]) if found else entry
 
 
-_RECENTLY = (
+_FINDINGS = (
     Finding(Status.UNBOUNDED, lambda recent: recent.vague, lambda recent: [recent.vague]),
     Finding(Status.MISFIT, lambda recent: recent.share > _DOUBTFUL, lambda recent: [recent.sentence]),
     Finding(
         Status.MISFIT,
         lambda recent: recent.lasting > _LASTING,
-        lambda recent: [f"errors that last for many scans are {recent.lasting:.2g} times as large as stated"],
+        lambda recent: [f"errors that last for many scans are {recent.lasting:.2g} times as large as the stated noise"],
     ),
     Finding(
         Status.AMBIGUOUS,
         lambda recent: recent.rivals,
-        lambda recent: [f"{recent.rivals} other state{'s' * (recent.rivals > 1)} of the start may be the right one"],
+        lambda recent: [f"{recent.rivals} other state{'s' * (recent.rivals > 1)} of the start may be the right state"],
     ),
 )
-"""All findings against a scan by those before it."""
+"""Findings about a scan from the scans before it."""
 
 
 @dataclass(slots=True)
 class Condition:
     """Condition of a track between two scans.
 
-    Parameters
-    ----------
-    state : State or None
-        None before a start.
-    heard : float
-        Time of the last valid row.
-    recent : Recent
-        How the last scans fit.
-    lasting : LastingErrors
-        Errors that last from scan to scan.
-    rivals : tuple of Rival
-        Other states of the start that the scans do not refute.
-    why : str
-        Why the state before was given up.
-    missed : int
-        Scans in succession whose rows the gate mostly refused.
-    fresh : bool
-        Whether a given state has yet to meet its first row.
+    - state: None before a start.
+    - last_row: time of the last valid row, s.
+    - recent: fit of the last scans.
+    - lasting: errors that last from scan to scan.
+    - rivals: other states of the start that the scans do not refute.
+    - why: reason why the last state was given up.
+    - missed: number of successive scans in which the gate rejected most rows.
+    - fresh: True until a given state has its first row.
     """
 
     state: State | None
-    heard: float
+    last_row: float
     recent: Recent
     lasting: LastingErrors
     rivals: tuple[Rival, ...] = ()
@@ -125,22 +119,22 @@ class Condition:
     fresh: bool = False
 
     @classmethod
-    def of(cls, state: State | None, heard: float, rules: Rules) -> Condition:
-        """Return a track before its first scan."""
-        return cls(state, heard, Recent(rules), LastingErrors(_WINDOW * rules.patience))
+    def of(cls, state: State | None, last_row: float, rules: Rules) -> Condition:
+        """Return the condition of a track before its first scan."""
+        return cls(state, last_row, Recent(rules), LastingErrors(_WINDOW * rules.patience))
 
     def take(self, entry: Entry, fit: Fit, gated: int) -> None:
-        """Go on by a scan of whose rows the gate refused so many."""
-        # Rows that are not finite say nothing of the state: only those that the gate refused end a track. A scan
-        # without rows leaves the count as it was.
+        """Update the condition by a scan; `gated` is the number of rows that the gate rejected."""
+        # Rows that are not finite have no information about the state: only rows that the gate rejected end a track. A
+        # scan without rows does not change the count.
         used = int(entry.updated.count)
         self.missed = self.missed + 1 if gated > used else self.missed * int(used == 0)
-        self.heard = entry.time if used else self.heard
+        self.last_row = entry.time if used else self.last_row
         self.recent.add(fit)
         self.state = State(entry.time, entry.updated.mean, entry.updated.cov)
 
     def judged(self, entry: Entry, cov: Array, vague: str) -> Entry:
-        """Return a scan with its covariance (n, n) and status; `vague` is why its position is not followed."""
+        """Return the entry with its covariance (n, n) and status; `vague` is the reason not to follow the position."""
         self.recent.vague, self.recent.lasting, self.recent.rivals = vague, 0.0, len(self.rivals)
         if cov is not entry.updated.cov:
             self.recent.lasting = self.lasting.size
@@ -148,7 +142,7 @@ class Condition:
         return self.recent.judge(entry)
 
     def judge(self, vague: str) -> None:
-        """Give the state up where it is lost, or too vague to follow."""
+        """Give up the state if the track is lost, or if its position is too uncertain."""
         if vague:
             self.state, self.why = None, vague
         elif self.missed >= self.recent.rules.patience:

@@ -1,4 +1,4 @@
-"""Constant unknowns as states: an assumed height or a late clock, learnt while a target is tracked."""
+"""Constant unknowns as states: an assumed height or a late clock is estimated while a target is tracked."""
 
 from __future__ import annotations
 
@@ -23,38 +23,38 @@ def begun_with_constants(problem: Problem, dynamics: Dynamics, epochs: int) -> S
     Parameters
     ----------
     problem : Problem
-        Batch (...) of runs of one target. Biases are offsets, scales or rotations; what the first epochs leave open
-        needs a prior.
+        Batch (...) of runs of one target. Biases are offsets, scales or rotations. A bias that the first epochs do not
+        determine needs a prior.
     dynamics : Dynamics
         Gives the order of the state.
     epochs : int
-        Number of epochs to start from.
+        Number of first epochs for the start.
 
     Returns
     -------
     State
-        At the last epoch used: [p, v, a] and the biases as the layout has them; NaN where there is no fix.
+        At the last used epoch: [p, v, a], then the biases in the order of the layout; NaN if there is no fix.
     """
     _check(problem)
     time = float(problem.times[epochs - 1])
-    # The state is asked for at the last epoch used: from there on scans are new, none counts twice.
+    # The state is estimated at the last used epoch, so that no scan is used twice.
     fix = solve(replace(cut(problem, 0, epochs), motions=(Motion(dynamics.order, reference=time),)))
     mean, cov = fix.gaussian()
     return State(time, np.where(fix.answered[..., None], mean, np.nan), np.array(cov))
 
 
 def followed_with_constants(problem: Problem, start: State, dynamics: Dynamics, update: Update | str = "iekf") -> Track:
-    """Return the track of a target from a state on, biases of the run among its states.
+    """Return the track of a target from a given state, with the biases of the run as additional states.
 
-    A constant has no process noise: what all scans share of an error stays in the covariance, where white noise of the
+    A constant has no process noise. The common error of all scans stays in the covariance, whereas white noise of the
     same size would average out.
 
     Parameters
     ----------
     problem : Problem
-        Batch (...) of runs, see `begun_with_constants`; scans not later than the start are left out.
+        Batch (...) of runs, see `begun_with_constants`; scans at or before the start are ignored.
     start : State
-        [p, v, a] and the biases, at or before the first scan used.
+        [p, v, a] and the biases, at or before the first used scan.
     dynamics : Dynamics
         Model of motion.
     update : callable or str
@@ -63,12 +63,12 @@ def followed_with_constants(problem: Problem, start: State, dynamics: Dynamics, 
     Returns
     -------
     Track
-        Its means hold the biases behind [p, v, a].
+        Its means hold [p, v, a], then the biases.
 
     Raises
     ------
     InvalidProblem
-        For an unknown filter, a bias that drifts, or a state that does not fit.
+        If the filter is unknown, a bias drifts, or the state does not fit.
 
     References
     ----------
@@ -76,30 +76,31 @@ def followed_with_constants(problem: Problem, start: State, dynamics: Dynamics, 
     """
     _check(problem)
     d = problem.dimension
-    # Whatever the layout shares between epochs beside the states of motion is a constant of the run.
+    # All shared unknowns of the layout except the states of motion are constants of the run.
     constants = problem.layout.n_shared - sum((motion.order + 1) * d for motion in problem.motions)
     check_state(start, (dynamics.order + 1) * d + constants)
     return follow(problem, start, _with_constants(dynamics, constants), filter_of(update))
 
 
 def _check(problem: Problem) -> None:
+    """Raise InvalidProblem if a tracker cannot use the run, or if a bias changes with time."""
     check_trackable(replace(problem, biases=()))
-    # What changes with the seconds of the run is no constant of one scan: its model would need the time.
+    # A bias that changes with time is not constant within a scan: its model would need the time.
     changing = next((bias for bias in problem.biases if form_of(bias).changes), None)
     if changing is not None:
-        what = f"the {changing.form} {changing.name!r} changes in time"
-        raise InvalidProblem(what, "track", "learn it first, then `with_known_bias`")
+        what = f"the {changing.form} {changing.name!r} changes with time"
+        raise InvalidProblem(what, "track", "estimate it first, then call `with_known_bias`")
 
 
 def _with_constants(dynamics: Dynamics, constants: int) -> Dynamics:
-    """Return dynamics of a state that is followed by constants."""
+    """Return dynamics of a state with additional constants at its end."""
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
         n = mean.shape[-1] - constants
         F, Q, drive = dynamics.step(dt, mean[..., :n], d)
         none = [(0, 0)] * (Q.ndim - 2)
         pad = (0, constants)
-        # Constants stay as they are: identity in F, zero in Q and drive.
+        # Constants do not change: identity in F, zero in Q and drive.
         whole = np.pad(F, [(0, 0)] * (F.ndim - 2) + [pad, pad])
         whole[..., range(n, n + constants), range(n, n + constants)] = 1.0
         return whole, np.pad(Q, [*none, pad, pad]), np.pad(drive, [(0, 0)] * (drive.ndim - 1) + [pad])

@@ -1,4 +1,4 @@
-"""Arrivals with unknown emission times as differences: a tracker's state has no emission times."""
+"""Differences of arrival times, which replace arrivals with unknown emission times in trackers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from optloc.problem.problem import Problem
 def differences(run: Problem) -> Problem:
     """Return the run of one target with differences of arrivals in each epoch instead of the arrivals.
 
-    A tracker's state has no emission times, and differences with their covariance hold all information about positions.
+    The differences and their covariance hold all information of the arrivals about positions.
     """
     scans = [reduce(cut(run, k, k + 1)) for k in range(run.epochs)]
     kinds = dict.fromkeys(rows.kind for scan in scans for rows in scan.rows)
@@ -41,7 +41,7 @@ def differences(run: Problem) -> Problem:
 
 
 def _one_after_another(parts: list[Rows]) -> Rows:
-    """Return rows of one kind as one."""
+    """Return several blocks of rows of one kind as one block."""
 
     def of(name: str) -> Array:
         return np.concatenate([getattr(part, name) for part in parts])

@@ -1,4 +1,4 @@
-"""How a target moves from one scan to the next: transition, process noise and drive of a state [p, v, a]."""
+"""Models of motion from one scan to the next: transition F, process noise Q and drive of a state [p, v, a]."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 
 Step = Callable[[float, Array, int], tuple[Array, Array, Array]]
-"""Maps seconds, means (..., n) and dimension d to F (n, n), Q (..., n, n) and the drive (..., n) that is added."""
+"""Function of seconds, means (..., n) and dimension d; returns F (n, n), Q (..., n, n) and the added drive (..., n)."""
 
-# Accelerations nearer to the limit of the current statistical model than this share of it, or beyond, count as here: at
-# the limit the variance of the published rule is zero, and beyond it grows without bound.
+# Smallest distance of an acceleration from the limit of the current statistical model, as a share of the limit. At the
+# limit, the published variance is zero; beyond the limit, it is unbounded.
 _CLAMP = 0.05
-# Powers of the step in the answers of position, velocity and acceleration to an impulse of acceleration.
+# Powers of the time step in the responses of position, velocity and acceleration to an impulse of acceleration.
 _POWERS = np.array([2.0, 1.0, 0.0])
-# Share of the time constant below which steps are summed as power series: the closed form is a
-# difference of order x^5 of numbers of order 1: from here on it loses two digits at most.
+# Time step as a share of the time constant, below which power series are summed. The closed form is a difference of
+# order x^5 of numbers of order 1: above this limit it loses two digits at most.
 _SERIES = 1.0
-# Terms of the series: the next, x^18 / 18! at most, is below the rounding of the sum.
+# Number of terms of the series: the next term, x^18 / 18! at most, is below the rounding of the sum.
 _TERMS = 18
 
 
@@ -34,9 +34,9 @@ class Dynamics:
     Parameters
     ----------
     name : str
-        For reports.
+        Name for reports.
     order : 0, 1 or 2
-        Whether the state holds position; position and velocity; or position, velocity and acceleration.
+        The state holds position (0); position and velocity (1); or position, velocity and acceleration (2).
     step : callable
         See `Step`.
     """
@@ -47,15 +47,15 @@ class Dynamics:
 
 
 def polynomial(order: int, noise: float = 0.0) -> Dynamics:
-    """Return a static target (order 0), constant velocity (1) or constant acceleration (2), driven by white noise.
+    """Return the model of a static target (order 0), constant velocity (1) or acceleration (2), with white noise.
 
     Parameters
     ----------
     order : 0, 1 or 2
         Order of the polynomial.
     noise : float
-        Standard deviation of the next derivative, constant between scans: of the velocity of a static target, the
-        acceleration of constant velocity, the jerk of constant acceleration (SI units).
+        Standard deviation of the next derivative, which is constant between scans: the velocity of a static target, the
+        acceleration at constant velocity, or the jerk at constant acceleration (SI units).
 
     References
     ----------
@@ -64,7 +64,7 @@ def polynomial(order: int, noise: float = 0.0) -> Dynamics:
     if order not in (0, 1, 2):
         raise InvalidProblem(f"a motion of order {order}", "order", "use 0, 1 or 2")
     if not (np.isfinite(noise) and noise >= 0.0):
-        raise InvalidProblem(f"process noise of {noise}", "noise", "give a standard deviation of at least 0")
+        raise InvalidProblem(f"the process noise is {noise}", "noise", "give a standard deviation of at least 0")
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
         return *_polynomial(order, noise, dt, d), np.zeros(mean.shape)
@@ -78,7 +78,7 @@ def singer(time_constant: float, deviation: float) -> Dynamics:
     Parameters
     ----------
     time_constant : float
-        Seconds after which the correlation has fallen to 1/e.
+        Time in seconds after which the correlation is 1/e.
     deviation : float
         Standard deviation of the acceleration, m/s^2.
 
@@ -98,19 +98,19 @@ def singer(time_constant: float, deviation: float) -> Dynamics:
 
 
 def current_statistical(time_constant: float, limit: float, floor: float = 0.0) -> Dynamics:
-    """Return the current statistical model: Singer's about the present acceleration, with a variance that adapts.
+    """Return the current statistical model: Singer's model about the present acceleration, with an adaptive variance.
 
-    The prediction of the mean is that of constant acceleration; time constant and limit act through the covariance.
+    The mean is predicted with constant acceleration; time constant and limit affect only the covariance.
 
     Parameters
     ----------
     time_constant : float
         Seconds.
     limit : float
-        Largest acceleration of an axis, m/s^2; three or four times what is expected. Estimates near or beyond it count
-        as 5 % away from it, where the rule as published lets the variance vanish or grow without bound.
+        Largest acceleration of an axis, m/s^2; three or four times the expected acceleration. Estimates near the limit
+        or beyond it count as 5 % away from it, because the published variance is zero or unbounded there.
     floor : float
-        Least standard deviation of the acceleration, m/s^2.
+        Smallest standard deviation of the acceleration, m/s^2.
 
     References
     ----------
@@ -120,15 +120,15 @@ def current_statistical(time_constant: float, limit: float, floor: float = 0.0) 
     alpha = 1.0 / _positive(time_constant, "time_constant")
     _positive(limit, "limit")
     if not (np.isfinite(floor) and floor >= 0.0):
-        raise InvalidProblem(f"a floor of {floor}", "floor", "give a standard deviation of at least 0")
+        raise InvalidProblem(f"the floor is {floor}", "floor", "give a standard deviation of at least 0")
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
         F, Q, u = correlated(alpha, dt)
         present = mean[..., 2 * d :]
         gap = np.maximum(limit - np.abs(present), _CLAMP * limit)
-        # The variance of Rayleigh's density between the present acceleration and the limit.
+        # The variance of a Rayleigh density between the present acceleration and the limit.
         variance = np.maximum((4.0 - np.pi) / np.pi * gap**2, floor**2)
-        # Axes do not mix: Q of one axis times the variance of each, blocked as [p, v, a].
+        # Axes are independent: Q of one axis times the variance of each axis, in blocks [p, v, a].
         noise = np.einsum("ij,...c,cb->...icjb", Q, variance, np.eye(d))
         drive = (u[:, None] * present[..., None, :]).reshape(mean.shape)
         return np.kron(F, np.eye(d)), noise.reshape(*mean.shape, mean.shape[-1]), drive
@@ -136,13 +136,13 @@ def current_statistical(time_constant: float, limit: float, floor: float = 0.0) 
     return Dynamics("current statistical", 2, step)
 
 
-# Scans at equal distances have one step; a run of any others has some dozens that recur.
+# Scans at equal intervals have one time step; other runs have some dozens of recurring time steps.
 @lru_cache(maxsize=256)
 def _polynomial(order: int, noise: float, dt: float, d: int) -> tuple[Array, Array]:
-    """Return F and Q of a polynomial, which nobody can write into."""
+    """Return F and Q of a polynomial as read-only arrays, which the cache shares."""
     powers = np.array([dt**j / factorial(j) for j in range(order + 2)])
     F = sum(powers[j] * np.eye(order + 1, k=j) for j in range(order + 1))
-    # The next derivative is constant between scans: one number enters position, velocity, ... by dt^j / j!.
+    # The next derivative is constant between scans: it enters position, velocity, ... with the factor dt^j / j!.
     drive = noise * powers[order + 1 : 0 : -1]
     both = _blocked(np.asarray(F), np.outer(drive, drive), d)
     for array in both:
@@ -154,8 +154,8 @@ def _polynomial(order: int, noise: float, dt: float, d: int) -> tuple[Array, Arr
 def correlated(alpha: float, dt: float) -> tuple[Array, Array, Array]:
     """Return F (3, 3), Q (3, 3) for unit variance and U (3,) of an exponentially correlated acceleration of one axis.
 
-    With x = alpha dt and f(s) the answer of [p, v, a] to an impulse of acceleration after the share s of the step,
-    Q = 2 x int_0^1 f f' ds in units of the step. Its closed form loses all digits where x is small: there, f is
+    With x = alpha dt, let f(s) be the response of [p, v, a] to an impulse of acceleration after the share s of the
+    step. Then Q = 2 x int_0^1 f f' ds in units of the step. For small x the closed form loses all digits, so f is
     summed as a power series.
 
     References
@@ -174,7 +174,7 @@ def _series(x: float) -> tuple[Array, Array, Array]:
     """Return f at the end of the step, Q and U from power series in x."""
     n = np.arange(_TERMS)
     terms = (-x) ** n / np.array([[float(factorial(k + p)) for k in range(_TERMS)] for p in (2, 1, 0)])
-    # The product of two terms s^i and s^j of f, integrated over the step, is 1 / (i + j + 1).
+    # The integral of the product of the terms s^i and s^j of f over the step is 1 / (i + j + 1).
     order = n + _POWERS[:, None]
     lengths = order[:, None, :, None] + order[None, :, None, :] + 1.0
     Q = 2.0 * x * (terms[:, None, :, None] * terms[None, :, None, :] / lengths).sum((-2, -1))
@@ -193,12 +193,12 @@ def _closed(x: float) -> tuple[Array, Array, Array]:
 
 
 def _blocked(F: Array, Q: Array, d: int) -> tuple[Array, Array]:
-    """Return F and Q of one axis for a state [p, v, a] of d axes."""
+    """Return F and Q of a state [p, v, a] of d axes from F and Q of one axis."""
     return np.kron(F, np.eye(d)), np.kron(Q, np.eye(d))
 
 
 def _positive(value: float, name: str) -> float:
-    """Return a finite positive number; raise InvalidProblem for any other."""
+    """Return a finite positive number; raise InvalidProblem for other numbers."""
     if not (np.isfinite(value) and value > 0.0):
         raise InvalidProblem(f"{name} is {value}", name, "give a positive number")
     return float(value)

@@ -1,4 +1,4 @@
-"""Rules of a track, and what becomes of one scan."""
+"""Rules of a track, and the result of one scan."""
 
 from __future__ import annotations
 
@@ -8,29 +8,30 @@ from typing import Literal
 from optloc.base.types import Status
 from optloc.tracking.updates import Updated
 
-# Gate, standard deviations: of a good row one in two million is left out.
+# Gate in standard deviations: one of two million good rows is rejected.
 _USUAL = 5.0
 Event = Literal["starting", "started", "restarted", ""]
 
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """When a row is left out and when a track begins anew.
+    """Rules for the rejection of rows and for the restart of a track.
 
     Parameters
     ----------
     gate : float
-        Rows further than this many standard deviations from the prediction are left out; infinite for none.
+        Rows more than this many standard deviations from the prediction are rejected; infinite for no gate.
     patience : int
-        So many scans in succession of whose rows most were left out end a track; so do four times as many of whose
-        rows half were, or whose innovations are as large on the whole as if half were.
+        A track ends after this number of successive scans in which most rows were rejected. It also ends after four
+        times this number of scans if half of the rows were rejected, or if the innovations are as large as in this
+        case.
     gap : float, optional
-        Seconds without a valid row that end a track. Without it a gap ends a track where the predicted position has a
-        standard deviation beyond the spread of the stations, and beyond the range of the target.
+        Seconds without a valid row after which a track ends. Without this value, a track ends when the standard
+        deviation of the predicted position exceeds both the spread of the stations and the range of the target.
     speed, rate : float, optional
         Prior standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, for starts.
     starts : str
-        By which starts are solved, as `optloc.solve`: "robust" where rows may be gross errors.
+        Method of `optloc.solve` for starts: "robust" if rows may have gross errors.
     """
 
     gate: float = _USUAL
@@ -42,30 +43,31 @@ class Rules:
 
     @property
     def most(self) -> float:
-        """Return the squared innovation that a row counts as at most: that of the gate, or of the usual one."""
+        """Return the limit of the squared innovation of a row: the squared gate, at most the usual gate squared."""
         return float(min(self.gate, _USUAL) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What became of one scan.
+    """Result of one scan.
 
     Parameters
     ----------
     time : float
         Seconds.
     updated : Updated
-        State after the scan, with errors that last in its covariance; NIS and rows used; NaN before the first start.
+        State after the scan, NIS and number of used rows; NaN before the first start. The covariance includes errors
+        that last for many scans.
     code : Status
-        Ok; too few rows where none was valid and the state was only predicted; rejected where most rows did not pass
-        the gate or are not finite; misfit where innovations or lasting errors are much larger than stated; unbounded
-        where the position is too vague; ambiguous where a start has alternatives; numerical where the update failed.
+        Ok. Too few rows: no valid row, the state is only predicted. Rejected: most rows failed the gate or are not
+        finite. Misfit: innovations or lasting errors are much larger than stated. Unbounded: the position is too
+        uncertain. Ambiguous: the start has alternatives. Numerical: the update failed.
     rejected : int
-        Rows left out.
+        Number of rejected rows.
     event : "starting", "started", "restarted" or ""
-        The scan is one that a start needed; the state is a new fix; or nothing special.
+        "starting": the scan is part of a start. "started", "restarted": the state is a new fix. Empty: a normal update.
     reason : str
-        A sentence where the status or the event needs one.
+        A sentence that explains the status or the event, if necessary.
     """
 
     time: float
@@ -77,5 +79,5 @@ class Entry:
 
     @property
     def label(self) -> str:
-        """Return the event, else the status, in words; a start that is not clean is called by its status."""
+        """Return the event, or the status if there is no event or if a start is not ok."""
         return self.event if self.event and self.code == Status.OK else self.code.label

@@ -1,16 +1,17 @@
-"""Errors that last from scan to scan: found in the innovations of a track, with their share of its covariance.
+"""Errors that last from scan to scan: their detection in the innovations of a track, and their part of its covariance.
 
-A filter averages its rows as if their errors were independent. Delays of receivers, multipath and attitude stay for
-many scans, so that the average keeps them. The true covariance of a filter with such errors follows from its gain K,
-as in the consider analysis of Schmidt [1]_. Each station has an error b of s standard deviations of its rows, or all
-angles share one. It is a Gauss-Markov process that keeps the share phi from scan to scan. The rows measure
+A filter averages its rows as if their errors were independent. Delays of receivers, multipath and attitude last for
+many scans, so the average keeps them. The true covariance of a filter with lasting errors follows from its gain K, as
+in the consider analysis of Schmidt [1]_. Each station has an error b of s standard deviations of its rows, or all
+angles share one error. The error is a Gauss-Markov process that keeps the share phi from scan to scan. The rows measure
 h(x) + D b + v, with white noise v. The error e of the state has two steps:
 
     e <- F e + w,   e <- (I - K H) e - K (D b + v).
 
-Its covariance is the filter's, plus (c^2 - 1) times the part from v, plus s^2 times the part from b. The filter and its
-estimates stay the same. The covariance of the innovations of a scan, and their covariance with the innovations before,
-are linear in s^2 and c^2. Weighted least squares estimates both, and its score tests them [2]_.
+Its covariance is the covariance of the filter, plus (c^2 - 1) times the part from v, plus s^2 times the part from b.
+The filter and its estimates do not change. The covariance of the innovations of a scan is linear in s^2 and c^2, and so
+is their covariance with the innovations before. Weighted least squares estimates both factors, and its score tests them
+[2]_.
 
 References
 ----------
@@ -36,41 +37,42 @@ from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.scan_rows import Scans, touched
 from optloc.tracking.track import State, scan_at
 
-# Correlation times, scans: a decade apart. Measured on real tracks: one of 100 scans alone finds most errors, and finer
+# Correlation times in scans, a decade apart. On real tracks, the value of 100 scans alone finds most errors, and finer
 # steps find no more.
 _LASTS = np.array([1.0, 10.0, 100.0])
-# Weight of all earlier scans at each new scan: errors are estimated over some fifty scans. Measured: with 0.95 more
-# simulated scans are 5 sigma off (1.0 % instead of 0.5 %), and 0.99 follows changes of the surroundings later.
+# Weight of all earlier scans at each new scan: errors are estimated over some fifty scans. With 0.95, more simulated
+# scans are 5 sigma off (1.0 % instead of 0.5 %), and 0.99 follows changes of the surroundings later.
 _KEEP = 0.98
-# Standard deviations of the score beyond which errors last: 3 of 120 simulated clean tracks of 60 scans were beyond for
-# some scans, and NEES was between 1.01 and 1.08.
+# Standard deviations of the score above which errors last. Of 120 simulated tracks without lasting errors (60 scans
+# each), 3 exceeded it for some scans, and NEES was between 1.01 and 1.08.
 _SURE = 3.0
-# Standard deviations that are subtracted from the score of one error for all angles: a chi-square with one degree of
-# freedom has a long tail. Measured: without it 7 % of clean tracks have a common error for some scans.
+# Standard deviations that are subtracted from the score of one error for all angles. The reason is the long tail of a
+# chi-square with one degree of freedom. Without it, 7 % of tracks without lasting errors have a common error for some
+# scans.
 _SKEWED = 1.5
-# The same for larger errors that do not last: the heavy tails of real rows are no reason.
+# The same for larger errors that do not last: heavy tails of real rows must not trigger it.
 _LARGE = 4.0
-# Standard deviations of the screen in machine code that call this test, which costs a hundred times more. And
-# standard deviations of the score below which the test ends.
+# Standard deviations of the compiled screen above which this test runs; it takes a hundred times longer. And standard
+# deviations of the score below which the test ends.
 _CALL, _END = 3.5, 1.0
-# Standard deviations of the score of a start after which the next scans are tested, and the least number of them: on a
-# UWB flight the first scan after a start was 7 sigma off, and the score of the start was 2.3.
+# Standard deviations of the score of a start above which the next scans are tested, and the smallest number of these
+# scans. On a UWB flight the first scan after a start was 7 sigma off, and the score of the start was 2.3.
 _DOUBT, _FEW = 2.0, 5
-# Whitened innovations count as no larger than this: wild rows that pass the gate are no lasting errors.
+# Limit of whitened innovations: gross errors within the gate are not lasting errors.
 _WILD = 4.0
-# Least share of the stated variance that is left white, and turns of weights and estimate at a start.
+# Smallest share of the stated variance that stays white, and number of iterations of weights and estimate at a start.
 _LEAST, _TURNS = 0.05, 3
-# Rows of a start that are tested at most: the work grows with their third power, and 400 rows take a tenth of a second.
+# Largest number of tested rows of a start: the time grows with its third power, and 400 rows take a tenth of a second.
 _MOST = 400
-# Gate of the rows of a scan, in standard deviations, as of `Rules`.
+# Gate of the rows of a scan in standard deviations, as in `Rules`.
 _GATE = 5.0
-# Share of the mean variance of the rows that is added to each variance: where pairs close loops the noise is singular.
+# Share of the mean variance of the rows that is added to each variance: if pairs form loops, the noise is singular.
 _RIDGE = 1e-10
 
 
 @dataclass(frozen=True, slots=True)
 class _LastingRows:
-    """Rows that were used, linearised: H (m, n), residuals and scans (m,), R (m, m), lasting errors D (j, m, q)."""
+    """Used rows, linearised: H (m, n), residuals and scan numbers (m,), R (m, m), lasting errors D (j, m, q)."""
 
     H: Array
     residual: Array
@@ -80,7 +82,7 @@ class _LastingRows:
 
     @classmethod
     def of(cls, part: Problem, at: Array, cov: Array | None) -> _LastingRows:
-        """Return the rows of scans at a state that pass the gate; without a covariance, of residuals after a fit."""
+        """Return the rows of scans at a state that pass the gate; without a covariance, the residuals of a fit."""
         linear = linearise(part, at, ())
         R = noises.dense(with_station_noise(part, at).noise, np.arange(part.count))
         spread = np.diagonal(R) + (0.0 if cov is None else ((linear.shared @ cov) * linear.shared).sum(-1))
@@ -90,7 +92,7 @@ class _LastingRows:
 
     @classmethod
     def written(cls, rows: ScanRows, item: int, memory: Array, n: int, stations: int) -> _LastingRows:
-        """Return the rows of a scan as machine code wrote them to a memory, see `optloc.kernels.filter`."""
+        """Return the rows of a scan from the memory of the compiled filter, see `optloc.kernels.filter`."""
         m = rows.z.shape[2]
         line = memory[len(memory) - m * (n + 2) :].reshape(m, n + 2)
         R = rows.covariance[item if len(rows.covariance) > 1 else 0]
@@ -103,14 +105,15 @@ class _LastingRows:
 
 
 def _errors(R: Array, columns: Array, sign: Array, stations: int) -> Array:
-    """Return the derivatives D (j, m, q) of rows by lasting errors, which make up the stated variance of each row.
+    """Return the derivatives D (j, m, q) of rows by lasting errors, scaled to the stated variance of each row.
 
     `_Recursion` has the hypotheses j. Only angles share an error: an attitude. A common offset of ranges to stations in
-    one direction is the same as an error of the position. With it, real tracks lost a fifth of their `ok` scans.
+    one direction is the same as an error of the position. With this hypothesis, real tracks lost a fifth of their `ok`
+    scans.
     """
     two = columns[:, 1] >= 0
     size = np.sqrt(np.diagonal(R) / np.where(two, 2.0, 1.0))
-    # all stations have the first error of the kind
+    # the first error of the kind is common to all stations
     shared = np.where(sign == 0.0, columns[:, 0] // stations * stations, columns[:, 0])
     D = np.zeros((2, len(R), 1 + int(columns.max(initial=0))))
     for one, first in zip(D, (columns[:, 0], shared), strict=True):
@@ -123,8 +126,8 @@ def _errors(R: Array, columns: Array, sign: Array, stations: int) -> Array:
 class _Recursion:
     """The parts of a filter's covariance, and the accumulated score of lasting errors.
 
-    The hypotheses j are the correlation times of `_LASTS`. The first half has an error for each station, the other half
-    one error for all angles of a kind.
+    The hypotheses j are the correlation times of `_LASTS`. The first half of the hypotheses has an error for each
+    station, the other half one error for all angles of a kind.
     """
 
     def __init__(self, n: int) -> None:
@@ -134,28 +137,28 @@ class _Recursion:
         self.best, self.sure, self.scans = 0, 0.0, 0
         self.reset(np.zeros((n, n)))
         self.size, self.excess = 0.0, 0.0
-        """Squared lasting error, and what the white variance exceeds the stated one by, both in stated variances."""
+        """Squared lasting error, and excess of the white variance over the stated one, in stated variances."""
 
     @property
     def active(self) -> bool:
-        """Return whether errors are found."""
+        """Return whether an error was found."""
         return self.size > 0.0 or self.excess > 0.0
 
     def reset(self, white: Array) -> None:
-        """Take a state of whose covariance (n, n) a part comes from white noise, and none from lasting errors."""
+        """Start with a state without lasting errors; `white` (n, n) is the part of its covariance from white noise."""
         J, n = len(self.phi), len(white)
-        # Covariance from white noise, from lasting errors, and of the state with these errors.
+        # Covariance from white noise, covariance from lasting errors, and covariance of the state with these errors.
         self.white, self.lasting, self.cross = white.copy(), np.zeros((J, n, n)), np.zeros((J, n, 0))
-        # Whitened innovations of the scan before, and what the next ones share with them.
+        # Whitened innovations of the scan before, and their covariances with the next innovations.
         self.before: tuple[Array, Array, Array, Array] | None = None
 
     def covariance(self, cov: Array) -> Array:
-        """Return the covariance (n, n) of a filter with what errors add; it is never less than the filter's."""
+        """Return the covariance (n, n) of a filter including the errors, at least the covariance without them."""
         wide = cov + max(self.excess, 0.0) * self.white + self.size * self.lasting[self.best]
         return np.asarray(0.5 * (wide + wide.T))
 
     def begin(self, rows: _LastingRows, cov: Array) -> None:
-        """Take the fix of a stretch of scans, with the covariance (n, n) of its state."""
+        """Add the fix of a stretch of scans, with the covariance (n, n) of its state."""
         self.reset(cov)
         self.scans = 0
         if 0 < len(rows.residual) <= _MOST:
@@ -165,6 +168,7 @@ class _Recursion:
                 self.reset(cov)
 
     def _test_start(self, rows: _LastingRows, cov: Array) -> None:
+        """Estimate lasting errors from the residuals of a start; later iterations weight by the estimate."""
         H, R, D = rows.H, rows.R, rows.D
         gain = _solved(R, H @ cov).T
         left = np.eye(len(R)) - H @ gain
@@ -182,13 +186,13 @@ class _Recursion:
             self._estimate()
 
     def step(self, F: Array) -> None:
-        """Take a prediction."""
+        """Propagate the parts of the covariance by a prediction with the transition F."""
         self.white = F @ self.white @ F.T
         self.lasting = F @ self.lasting @ F.T
         self.cross = self.phi * (F @ self.cross)
 
     def take(self, rows: _LastingRows, F: Array, cov: Array) -> None:
-        """Take a scan with the predicted covariance (n, n), after its prediction."""
+        """Add a scan after its prediction; `cov` is the predicted covariance (n, n)."""
         self.scans += 1
         self._widen(rows.D.shape[-1])
         H, R, D = rows.H, rows.R, np.pad(rows.D, [(0, 0), (0, 0), (0, self.cross.shape[-1] - rows.D.shape[-1])])
@@ -222,7 +226,7 @@ class _Recursion:
         self._estimate()
 
     def _widen(self, columns: int) -> None:
-        """Make room for stations that were not there before; they were in no scan, so nothing is lost."""
+        """Add columns for stations that were in no earlier scan; nothing is lost."""
         more = columns - self.cross.shape[-1]
         if more > 0:
             self.cross = np.pad(self.cross, [(0, 0), (0, 0), (0, more)])
@@ -231,17 +235,17 @@ class _Recursion:
                 self.before = w, white, lasting, np.pad(seen, [(0, 0), (0, more), (0, 0)])
 
     def _add(self, unit: Array, w: Array, stated: Array, noise: Array, errors: Array) -> None:
-        """Add what the size of the innovations of a scan says; `unit` whitens them as they are estimated now."""
+        """Add the information from the size of a scan's innovations; `unit` whitens them by the present estimate."""
         w = np.clip(w, -_WILD, _WILD)
         stated, noise, errors = (unit @ each @ unit.T for each in (stated, noise, errors))
         self._sum(0.5, np.outer(w, w) - stated, noise[None], errors)
 
     def _repeat(self, w: Array, last: Array, noise: Array, errors: Array) -> None:
-        """Add what the innovations of this scan and of the scan before say together."""
+        """Add the information of the correlation between the innovations of this scan and of the scan before."""
         self._sum(1.0, np.outer(w, last), noise[None], errors)
 
     def _sum(self, times: float, found: Array, noise: Array, errors: Array) -> None:
-        """Add a matrix that is found and its derivatives (j or 1, ...) by the white and by the lasting variance."""
+        """Add an observed matrix, with its derivatives (j or 1, ...) by the white and by the lasting variance."""
         one, mixed, two = ((a * b).sum((-1, -2)) for a, b in ((noise, noise), (noise, errors), (errors, errors)))
         self.info[:, 0, 0] += times * one
         self.info[:, 0, 1] += times * mixed
@@ -251,7 +255,7 @@ class _Recursion:
         self.score[:, 1] += times * (found * errors).sum((-1, -2))
 
     def _estimate(self) -> None:
-        """Choose the correlation time whose score is highest; errors count where it is beyond chance."""
+        """Choose the correlation time with the highest score; errors count only if the score is significant."""
         info = self.info
         alone = np.maximum(info[:, 1, 1] - info[:, 0, 1] ** 2 / np.maximum(info[:, 0, 0], 1e-12), 1e-12)
         value = (self.score[:, 1] - info[:, 0, 1] * self.score[:, 0] / np.maximum(info[:, 0, 0], 1e-12)) / alone
@@ -267,13 +271,13 @@ class _Recursion:
 
 
 def _solved(matrix: Array, right: Array) -> Array:
-    """Return the inverse of a covariance (m, m), made regular by a small ridge, times a matrix."""
+    """Return the inverse of a covariance (m, m), regularised by a small ridge, times a matrix."""
     ridge = _RIDGE * float(np.trace(matrix)) / len(matrix)
     return np.asarray(np.linalg.solve(matrix + ridge * np.eye(len(matrix)), right))
 
 
 def _whitening(cov: Array, other: Array | None = None) -> Array:
-    """Return the inverse root of a covariance (m, m), or of another where rounding makes it none."""
+    """Return the inverse root of a covariance (m, m), or of `other` if rounding makes the covariance indefinite."""
     scale = _RIDGE * float(np.trace(cov)) / len(cov) * np.eye(len(cov))
     try:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(cov + scale)))
@@ -284,7 +288,7 @@ def _whitening(cov: Array, other: Array | None = None) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """A start as it was taken: rows, covariance, and the sums of scores before it."""
+    """A start: its rows, its covariance, and the sums of scores before it."""
 
     rows: _LastingRows
     cov: Array
@@ -293,20 +297,15 @@ class _Start:
 
 
 Taken = tuple[Scans, int, State]
-"""A scan that a track has taken: the scans of its run, its number, and the state before its prediction."""
+"""A scan of a track: the scans of its run, its number, and the state before its prediction."""
 
 
 class LastingErrors:
     """The lasting errors of a track, and its covariance with them.
 
-    Machine code screens each scan, see `REPEATS` and `EXCESS` of `optloc.kernels.filter`. Where the screen finds an
-    error, `_Recursion` takes the last scans again. From then on it takes each scan, until no error is left. It always
-    takes scans of the general form.
-
-    Parameters
-    ----------
-    window : int
-        Scans that are taken again.
+    The compiled filter screens each scan, see `REPEATS` and `EXCESS` of `optloc.kernels.filter`. If the screen finds an
+    error, `_Recursion` processes the last `window` scans again. From then on it processes each scan, until no error is
+    left. It always processes scans that the compiled filter does not support.
     """
 
     def __init__(self, window: int) -> None:
@@ -317,14 +316,14 @@ class LastingErrors:
         self._memory = np.zeros(COLUMNS)
 
     def memory(self, size: int) -> Array:
-        """Return the memory of the screen with at least so large a size, see `optloc.kernels.filter.filter_scan`."""
+        """Return the memory of the screen with at least this size, see `optloc.kernels.filter.filter_scan`."""
         if len(self._memory) < size:
             self._memory = np.zeros(size)
         return self._memory
 
     @property
     def size(self) -> float:
-        """Return the lasting error of each station in standard deviations of its rows; 0 where none is found."""
+        """Return the lasting error of each station in standard deviations of its rows; 0 if no error was found."""
         found = self._found
         alone = self._on and found is not None and found.best < len(_LASTS)
         return float(np.sqrt(found.size)) if alone and found is not None else 0.0
@@ -332,12 +331,7 @@ class LastingErrors:
     def begin(self, stretch: Problem, state: State) -> Array:
         """Return the covariance (n, n) of a new state, the fix of a stretch of scans.
 
-        Parameters
-        ----------
-        stretch : Problem
-            The scans, with a target that moves by the order of the state.
-        state : State
-            At the last of them.
+        `stretch` holds the scans with a motion of the order of the state; `state` belongs to the last scan.
         """
         found = self._found or _Recursion(len(state.mean))
         rows = _LastingRows.of(stretch, state.mean, None)
@@ -349,18 +343,10 @@ class LastingErrors:
         return found.covariance(state.cov)
 
     def take(self, taken: Taken, dynamics: Dynamics, cov: Array, screen: tuple[float, float, float] | None) -> Array:
-        """Return the covariance (n, n) of the state after a scan.
+        """Return the covariance (n, n) of the state after a scan, lasting errors included.
 
-        Parameters
-        ----------
-        taken : Taken
-            The scan.
-        dynamics : Dynamics
-            Model of motion.
-        cov : array (n, n)
-            Covariance of the filter after the scan.
-        screen : tuple of three float
-            REPEATS, EXCESS and SPREAD of the scan; None for a scan of the general form.
+        `cov` (n, n) is the covariance of the filter after the scan. `screen` holds REPEATS, EXCESS and SPREAD of the
+        scan; None for a scan that the compiled filter does not support.
         """
         self._recent.append(taken)
         if not self._on:
@@ -378,19 +364,19 @@ class LastingErrors:
         return found.covariance(cov)
 
     def _restored(self, n: int) -> _Recursion:
-        """Return the recursion as it was before the scans that are taken again."""
+        """Return the recursion before the scans that are processed again."""
         found, start = _Recursion(n), self._start
         if start is not None and len(self._recent) < (self._recent.maxlen or 0):
             found.info, found.score = start.info, start.score
             found.begin(start.rows, start.cov)
         else:
-            # what the covariance of an old state comes from is not known: from rows for the most part
+            # the parts of the covariance of an old state are not known: assume that it comes from white noise
             found.reset(self._recent[0][2].cov)
         return found
 
 
 def _go_on(found: _Recursion, taken: Taken, dynamics: Dynamics, memory: Array | None) -> None:
-    """Take a scan, whose rows are in a memory unless it takes the general form or is taken again."""
+    """Process a scan with the rows in `memory`; without `memory`, the rows are linearised again."""
     scans, k, before = taken
     problem, written = scans.problem, scans.rows[k]
     dt = float(problem.times[k]) - before.time
@@ -411,5 +397,5 @@ def _go_on(found: _Recursion, taken: Taken, dynamics: Dynamics, memory: Array | 
         return
     try:
         found.take(rows, F, cov)
-    except NUMERICAL:  # the status of the filter names the problem; the recursion starts again
+    except NUMERICAL:  # the status of the filter reports the failure; the recursion starts again
         found.reset(np.zeros_like(before.cov))

@@ -1,4 +1,4 @@
-"""Smoothing where measurements are exact: a polynomial through the rows of a run, turned into places at the end."""
+"""Smoothing in measurement space: polynomials through the rows of a run, and a fix of their values."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from optloc.solvers.solution import solve
 from optloc.solvers.starts.angles import course_starts, pair
 from optloc.tracking.track import Track, check_trackable, status_of_scans
 
-# What a scan of the simplified recursion holds, in the order of its state: range, azimuth, elevation.
+# Kinds of a scan of the simplified recursion, in the order of its state: range, azimuth, elevation.
 _KINDS = ("range_sum", "azimuth", "elevation")
-# Pivot of a normal matrix of powers, as a share of its diagonal, below which the window leaves the polynomial open.
+# Smallest relative pivot of a normal matrix of powers: below it the window does not determine the polynomial.
 _SINGULAR = 1e-12
 
 
@@ -29,33 +29,33 @@ _SINGULAR = 1e-12
 
 
 def lines(problem: Problem, order: int = 1, window: int | None = None) -> Track:
-    """Return the track of a slow target seen by stations that stay, from polynomials fitted to its measurements.
+    """Return the track of a slow target from static stations, by polynomials that are fitted to its measurements.
 
-    At each epoch a polynomial in time goes through every row of the epochs so far, and its present values are solved
-    like the scan of one epoch, without a guess. Nothing is linearised before the noise is averaged; but the
-    measurements of a target must not bend more than the polynomial does. Order 0 is the maximum-likelihood fix of a
-    target that stays, wherever one epoch has as many rows as the place has coordinates.
+    At each epoch, a polynomial in time is fitted to every row of the epochs so far. Its present values are solved like
+    the scan of one epoch, without a guess. The noise is averaged before any linearisation. But the measurements must be
+    close to the polynomial. Order 0 is the maximum-likelihood fix of a static target if one epoch has
+    at least one row per coordinate of the position.
 
     Parameters
     ----------
     problem : Problem
-        Batch (...) of runs of one target. Every row type must occur once an epoch; absent rows have weight zero.
+        Batch (...) of runs of one target. Every row type must occur once per epoch; absent rows have weight zero.
     order : int
         Order of the polynomial: 0, 1 or 2.
     window : int, optional
-        Number of past epochs that count; None: all.
+        Number of past epochs in the fit; None for all epochs.
 
     Returns
     -------
     Track
-        From the first epoch at which `order` + 1 epochs of every row are there: position, and with an order above 0
-        velocity. The covariance is that of the polynomial's values and rates, to first order. Status: that of the fix
-        of each epoch; "too few rows" where the window does not determine the polynomial.
+        From the first epoch with `order` + 1 epochs of every row: position, and velocity for an order above 0. The
+        covariance follows to first order from the values and rates of the polynomial. The status is the status of the
+        fix of each epoch, or "too few rows" if the window does not determine the polynomial.
 
     Raises
     ------
     InvalidProblem
-        For stations that move, priors or constraints, and runs that are not one target's.
+        If stations move, there are priors or constraints, or the run has several targets.
 
     References
     ----------
@@ -63,10 +63,10 @@ def lines(problem: Problem, order: int = 1, window: int | None = None) -> Track:
     """
     check_trackable(problem)
     _check_lines(problem, order, window)
-    # Every epoch as a problem of its own: the rows of one are solved as if the target stood still.
+    # Make a separate problem of every epoch: its rows are solved as if the target were static.
     apart = by_epoch(replace(problem, motions=(Motion(0, "epoch"),)))
     z, weight = _unwrap(apart), _weights(apart)
-    # One estimator for each length of the past: it depends on times and weights alone, not on what was measured.
+    # Compute one estimator for each length of the past: it depends on times and weights alone, not on measurements.
     values, covs, known = [], [], []
     for k in range(order, problem.epochs):
         past = slice(0 if window is None else max(0, k + 1 - window), k + 1)
@@ -79,29 +79,30 @@ def lines(problem: Problem, order: int = 1, window: int | None = None) -> Track:
 
 
 def _check_lines(problem: Problem, order: int, window: int | None) -> None:
+    """Raise InvalidProblem if polynomials of measurements do not apply to the run."""
     if order not in (0, 1, 2):
-        raise InvalidProblem(f"a polynomial of order {order}", "order", "use 0, 1 or 2")
+        raise InvalidProblem(f"the order of the polynomial is {order}", "order", "use 0, 1 or 2")
     if problem.stations.position.shape[-3] > 1:
         raise InvalidProblem(
-            "the stations move", "lines", "their measurements bend even of a still target: use a filter"
+            "the stations move", "lines", "their measurements are no polynomials in time: use a filter"
         )
     if problem.constraints or problem.priors:
-        raise InvalidProblem("there are constraints or priors", "lines", "leave them out, or use a filter")
+        raise InvalidProblem("there are constraints or priors", "lines", "remove them, or use a filter")
     if problem.stations.errors:
         raise InvalidProblem("station positions or velocities have errors", "lines", "use a filter")
     if problem.epochs <= order or (window is not None and window <= order):
         raise InvalidProblem(
-            f"too few epochs for a polynomial of order {order}", "lines", "give more, or a wider window"
+            f"too few epochs for a polynomial of order {order}", "lines", "give more epochs, or a longer window"
         )
 
 
 def _unwrap(apart: Problem) -> Array:
-    """Return the measured values (..., k, m) less their corrections, angles without jumps, absent ones repeated."""
+    """Return the measurements (..., k, m) minus corrections, with unwrapped angles; absent values are filled in."""
     weight = _weights(apart)
     columns = []
     period = [MODELS[rows.kind].period for rows in apart.rows for _ in range(rows.count)]
     for i, full in enumerate(period):
-        # An absent row repeats the last present one, so that the angle makes no turn there; its weight is zero.
+        # An absent row repeats the last present row, so that the angle makes no turn there; its weight is zero.
         there = np.broadcast_to(weight[..., i] > 0.0, apart.observed.shape[:-1])
         last = np.maximum.accumulate(np.where(there, np.arange(there.shape[-1]), -1), axis=-1)
         first = there.argmax(-1)[..., None]
@@ -111,22 +112,22 @@ def _unwrap(apart: Problem) -> Array:
 
 
 def _weights(apart: Problem) -> Array:
-    """Return weights (..., k, m) over variances; zero for rows that are absent or not finite."""
+    """Return weights divided by variances (..., k, m); zero for rows that are absent or not finite."""
     variance = noises.variances(apart.noise, apart.count)
     weight = np.asarray(np.where(np.isfinite(apart.z), apart.weight, 0.0) / variance)
-    # Weights that all runs of a batch share are kept once: the estimator is then made once, too.
+    # Store weights that all runs of a batch share once, so that the estimator is computed once.
     one = weight[(0,) * (weight.ndim - 2)]
     return one if np.array_equal(np.broadcast_to(one, weight.shape), weight) else weight
 
 
 def _estimator(since: Array, weight: Array, order: int) -> tuple[Array, Array]:
-    """Return what maps values (..., k, m) to value and rate now, (..., 1 or 2, k, m), and where it exists (...)."""
-    # Times as shares of the window: powers of seconds would ruin the condition of the normal matrix.
+    """Return the linear estimator (..., 1 or 2, k, m) of present value and rate, and a mask (...) of its existence."""
+    # Times as shares of the window: powers of seconds would make the normal matrix ill-conditioned.
     span = float(np.abs(since).max(initial=0.0)) or 1.0
     powers = (since / span)[:, None] ** np.arange(order + 1)
     information = np.einsum("kqr,...km->...mqr", powers[:, :, None] * powers[:, None, :], weight)
     inverse, ok = linalg.inverse(information, _SINGULAR)
-    # Value and rate now; a curvature is fitted, but places need no more than these two.
+    # Keep value and rate now; a curvature is fitted, but positions do not need it.
     kept = min(order, 1) + 1
     both = (inverse[..., :kept, :] @ powers.T).swapaxes(-1, -3).swapaxes(-1, -2)  # (..., k, m, q)
     scale = np.array([1.0, 1.0 / span])[:kept]
@@ -145,17 +146,18 @@ def _propagate(estimator: Array, apart: Problem, past: slice) -> Array:
 
 
 def _line_track(problem: Problem, apart: Problem, fitted: Array, cov: Array, ok: Array) -> Track:
-    """Return places and velocities of fitted values (..., k, q, m) with covariance (..., k, q, m, q, m)."""
+    """Return the track of fitted values (..., k, q, m) with covariance (..., k, q, m, q, m)."""
     d, m, batch = problem.dimension, apart.count, fitted.shape[:-2]
     n = fitted.shape[-2] * d
-    # The fitted values as a scan: their covariance is its noise; a unit matrix where there is no fit.
+    # The fitted values form a scan, and their covariance is its noise; the unit matrix if there is no fit.
     alone = np.where(ok[..., None, None], cov[..., 0, :, 0, :], np.eye(m))
     rows = tuple(replace(block, correction=np.zeros(block.count)) for block in apart.rows)
     scan = replace(apart, rows=rows, noise=Noise((Block(np.arange(m)[None], alone[..., None, :, :]),)))
     scan = scan.with_rows(z=fitted[..., 0, :], weight=np.ones(m))
     position, code = _solve_scans(scan)
     linear = linearise(scan, position)
-    # d place / d value of least squares with this noise maps rates to a velocity, and covariances to those of states.
+    # The derivative of the least-squares position by the values maps rates to a velocity, and covariances to
+    # covariances of states.
     W = np.concatenate([w.apply(np.broadcast_to(np.eye(m), (*batch, m, m))) for w in linear.noise], axis=-2)
     white = W @ linear.shared
     back, _ = linalg.solve(np.swapaxes(white, -1, -2) @ white, np.swapaxes(white, -1, -2) @ W)
@@ -163,14 +165,14 @@ def _line_track(problem: Problem, apart: Problem, fitted: Array, cov: Array, ok:
     mean = np.concatenate([position, rates.reshape(*batch, n - d)], axis=-1)
     spread = np.einsum("...ai,...qirj,...bj->...qarb", back, cov, back, optimize=True).reshape(*batch, n, n)
     good = np.broadcast_to(ok, batch)
-    heard = (_weights(apart) > 0.0).sum(-1)[..., problem.epochs - batch[-1] :]
+    observed = (_weights(apart) > 0.0).sum(-1)[..., problem.epochs - batch[-1] :]
     none = np.zeros(batch)
     return Track(
         problem.times[problem.epochs - batch[-1] :],
         np.where(good[..., None], mean, np.nan),
         np.where(good[..., None, None], spread, np.nan),
         none + np.nan,
-        np.broadcast_to(heard, batch),
+        np.broadcast_to(observed, batch),
         none,
         np.where(good, code, int(Status.TOO_FEW_ROWS)).astype(np.int8),
         d,
@@ -178,21 +180,21 @@ def _line_track(problem: Problem, apart: Problem, fitted: Array, cov: Array, ok:
 
 
 def _solve_scans(scan: Problem) -> tuple[Array, Array]:
-    """Return position (..., k, d) and status (..., k); solved at the last epoch, which starts the others."""
+    """Return positions (..., k, d) and statuses (..., k); the fix of the last epoch is the start of the others."""
     shape, flat = scan.batch_shape, scan.flat()
     size, count = int(np.prod(shape)), shape[-1]
     course, doubt = course_starts(flat), np.zeros(size, dtype=bool)
-    if course is not None:  # one bistatic pair: in closed form, and there is no other place
+    if course is not None:  # one bistatic pair: a closed form without another solution
         start = course[:, 0]
     else:
-        # The last epoch has the longest past, so the best values; its place starts the iterations at the others.
+        # The last epoch has the longest past, so the best values; its position starts the iterations of the others.
         last = solve(flat.take(np.arange(count - 1, size, count)))
         start, doubt = np.repeat(last.position, count, axis=0), np.repeat(last.has(Status.AMBIGUOUS), count)
     fix = solve(flat, "lsr", start=np.where(np.isfinite(start), start, 0.0))
     position, code = np.array(fix.position), status_of_scans(fix)
-    # Another place that explains the last epoch may explain the others.
+    # If another position explains the last epoch, it may explain the others.
     code = np.where((code == Status.OK) & doubt, Status.AMBIGUOUS, code)
-    # Early epochs may be too far from there: these are solved without a start.
+    # Early epochs may be too far from this start: solve them again without a start.
     again = np.flatnonzero((code != Status.OK) & (code != Status.AMBIGUOUS))
     if len(again):
         redone = solve(flat.take(again))
@@ -204,28 +206,29 @@ def _solve_scans(scan: Problem) -> tuple[Array, Array]:
 
 
 def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, floor: float = 0.0) -> Track:
-    """Return the track of a target by the simplified recursion: running means of the angles, a scalar gain in range.
+    """Return the track of a target by the simplified recursion: running means of the angles and a scalar gain in range.
 
-    Angles are averaged; the range follows, by a scalar least-squares gain, what the excess path says beyond the step of
-    the angles. For a target that stays its variance in range tends to twice that of the maximum-likelihood fix; a
-    target that moves is followed late, which the covariance does not tell.
+    Angles are averaged. The range is updated with a scalar least-squares gain, by the part of the excess path that the
+    step of the angles does not explain. For a static target, its variance in range approaches twice the variance of the
+    maximum-likelihood fix. For a moving target, the track lags, and the covariance does not include this error.
 
     Parameters
     ----------
     problem : Problem
-        Batch (...) of runs: range sums of one pair of stations that stay, azimuth and elevation at one of them, each
-        once an epoch. Epochs without all three leave the state as it was.
+        Batch (...) of runs: range sums of one pair of static stations, azimuth and elevation at one of them, each once
+        per epoch. An epoch without all three does not change the state.
     restart : int, optional
-        Begin anew every so many epochs; None: never.
+        Number of epochs after which the recursion starts again; None for never.
     mean : int
-        Begin from the mean measurement of so many epochs, the present one and those before it.
+        Number of epochs, including the present one, whose mean measurement gives the start.
     floor : float
-        Least gain of angles and range, from 0 (none) to 1 (every fix alone).
+        Smallest gain of angles and range, from 0 (no floor) to 1 (independent fixes).
 
     Returns
     -------
     Track
-        Positions, one for each epoch. The covariance is that of the recursion for a target that stays, to first order.
+        Positions, one for each epoch. The covariance is the first-order covariance of the recursion for a static
+        target.
 
     Raises
     ------
@@ -235,7 +238,7 @@ def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, f
     References
     ----------
     M. I. Skolnik, "An analysis of bistatic radar", IRE Trans. Aerosp. Navig. Electron. ANE-8 (1961) (the ellipse). The
-    recursion is that of the paper `bistatic`, its signs and indices corrected.
+    recursion is taken from the paper `bistatic`, with corrected signs and indices.
     """
     check_trackable(problem)
     _check_smoothing(restart, mean, floor)
@@ -247,24 +250,26 @@ def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, f
     steps = []
     for k in range(epochs):
         scan = apart.take(np.arange(k, size * epochs, epochs))
-        heard = np.asarray((np.isfinite(scan.z) & (scan.weight > 0.0)).all(-1))
-        # Begin anew while the first mean is not full, at every restart, and wherever the state is lost.
-        again = heard & ((k < mean or (restart is not None and k % restart == 0)) | ~np.isfinite(state.value).all(-1))
+        observed = np.asarray((np.isfinite(scan.z) & (scan.weight > 0.0)).all(-1))
+        # Start again while the first mean is not full, at every restart, and for every lost state.
+        again = observed & (
+            (k < mean or (restart is not None and k % restart == 0)) | ~np.isfinite(state.value).all(-1)
+        )
         with np.errstate(invalid="ignore"):
             moved = _advance(state, scan, home, floor)
-        state = _choose(heard & ~again, moved, state)
+        state = _choose(observed & ~again, moved, state)
         if again.any():
             begun = _restart(cut(flat, max(0, k + 1 - mean), k + 1), scan, home)
             state = _choose(again, begun, state)
         at, axes, _, _ = _linearise_at(state.value, scan, home)
-        code = np.where(heard, np.where(np.isfinite(at).all(-1), Status.OK, Status.NUMERICAL), Status.TOO_FEW_ROWS)
-        steps.append((at, axes @ state.cov @ np.swapaxes(axes, -1, -2), np.where(heard, 3, 0), code))
+        code = np.where(observed, np.where(np.isfinite(at).all(-1), Status.OK, Status.NUMERICAL), Status.TOO_FEW_ROWS)
+        steps.append((at, axes @ state.cov @ np.swapaxes(axes, -1, -2), np.where(observed, 3, 0), code))
     return _bistatic_track(problem, steps)
 
 
 @dataclass(frozen=True, slots=True)
 class _SpaceState:
-    """Range, azimuth and elevation (N, 3), their covariance, the recursion's own weight P (N,), and epochs used."""
+    """Range, azimuth and elevation (N, 3), their covariance, the recursion's weight P (N,), and used epochs (N,)."""
 
     value: Array
     cov: Array
@@ -273,6 +278,7 @@ class _SpaceState:
 
 
 def _check_smoothing(restart: int | None, mean: int, floor: float) -> None:
+    """Raise InvalidProblem for options of `simplified` out of range."""
     if restart is not None and restart < 1:
         raise InvalidProblem(f"restart is {restart}", "restart", "give a number of epochs, or None")
     if mean < 1:
@@ -282,14 +288,16 @@ def _check_smoothing(restart: int | None, mean: int, floor: float) -> None:
 
 
 def _receiver(problem: Problem) -> int:
+    """Return the number of the receiver of a bistatic pair; raise InvalidProblem for other rows."""
     found = pair(problem)
     if found is None:
-        advice = "give range_sum of one pair of stations that stay, azimuth and elevation at one of them, once an epoch"
-        raise InvalidProblem("the rows are not those of one receiver and one illuminator", "simplified", advice)
+        advice = "give range_sum of one pair of static stations, azimuth and elevation at one of them, once per epoch"
+        raise InvalidProblem("the rows do not belong to one receiver and one illuminator", "simplified", advice)
     return found[0]
 
 
 def _choose(mask: Array, one: _SpaceState, other: _SpaceState) -> _SpaceState:
+    """Return the state `one` for problems in a mask (N,), and `other` for the rest."""
     return _SpaceState(
         np.where(mask[:, None], one.value, other.value),
         np.where(mask[:, None, None], one.cov, other.cov),
@@ -299,12 +307,13 @@ def _choose(mask: Array, one: _SpaceState, other: _SpaceState) -> _SpaceState:
 
 
 def _rows(scan: Problem) -> list[int]:
+    """Return the indices of range sum, azimuth and elevation in a scan."""
     kinds = [block.kind for block in scan.rows]
     return [kinds.index(kind) for kind in _KINDS]
 
 
 def _linearise_at(value: Array, scan: Problem, home: int) -> tuple[Array, Array, Array, Array]:
-    """Return, at (range, azimuth, elevation), the place (N, 3), its partials (N, 3, 3), residuals and path partials."""
+    """Return position (N, 3) and its derivatives (N, 3, 3) at (range, azimuth, elevation), residuals, path slopes."""
     r, azimuth, elevation = value.T
     ahead = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     u = np.stack(ahead, axis=-1)
@@ -313,25 +322,25 @@ def _linearise_at(value: Array, scan: Problem, home: int) -> tuple[Array, Array,
     at = scan.stations.position[..., 0, home, :] + r[:, None] * u
     linear, order = linearise(scan, at), _rows(scan)
     H = linear.shared[:, order]
-    # Range, azimuth and elevation grow along three orthogonal directions: the inverse needs no elimination.
+    # Range, azimuth and elevation increase along three orthogonal directions: the inverse needs no elimination.
     outward = np.concatenate([u[:, None], H[:, 1:]], axis=1)
     axes = np.swapaxes(outward / (outward**2).sum(-1, keepdims=True), -1, -2)
     return at, axes, linear.residual[:, order], (H[:, :1] @ axes)[:, 0]
 
 
 def _advance(state: _SpaceState, scan: Problem, home: int, floor: float) -> _SpaceState:
-    """Return the state after one more scan: a step of the angles, and one of the range by what the path says beyond."""
+    """Return the state after one more scan: a step of the angles, then a step of the range by the rest of the path."""
     _, _, residual, slopes = _linearise_at(state.value, scan, home)
     x, across = slopes[:, 0], slopes[:, 1:]
-    # Running means of the angles: the n-th has a share of 1/n, and never less than the floor.
+    # Running means of the angles: the n-th value has a share of 1/n, but at least the floor.
     share = np.maximum(1.0 / (state.count + 1.0), floor)
     turned = share[:, None] * residual[:, 1:]
-    # What the path says beyond what the turn of the angles already explains.
+    # The residual of the path that the step of the angles does not explain.
     y = residual[:, 0] - (across * turned).sum(-1)
     optimal = state.P * x / (1.0 + x * state.P * x)
     gain = np.maximum(optimal, floor / np.where(x > 0.0, x, np.inf))
     value = state.value + np.concatenate([(gain * y)[:, None], turned], axis=-1)
-    # New error = A old error + B noise, to first order; the first row is the range, coupled to the angles.
+    # New error = A old error + B noise, to first order; the first row is the range, which depends on the angles.
     A = np.eye(3) * (1.0 - share)[:, None, None]
     B = np.eye(3) * share[:, None, None]
     A[:, 0, 0], B[:, 0, 0] = 1.0 - gain * x, gain
@@ -343,11 +352,11 @@ def _advance(state: _SpaceState, scan: Problem, home: int, floor: float) -> _Spa
 
 
 def _restart(stretch: Problem, scan: Problem, home: int) -> _SpaceState:
-    """Return the state of the mean measurement of a stretch, solved in closed form and refined."""
+    """Return the state of the mean measurement of a stretch of scans, solved in closed form and refined."""
     track = lines(stretch, 0)
     start, used = track.last, (track.count > 0).sum(-1)
     at = scan.stations.position[..., 0, home, :]
-    # Where nothing was solved any direction serves: the value is set to NaN below.
+    # Without a solution, use any direction: the value is set to NaN below.
     away = np.where(np.isfinite(start.mean), start.mean - at, 1.0)
     r = np.sqrt((away**2).sum(-1))
     linear = linearise(scan, at + away)
@@ -360,6 +369,7 @@ def _restart(stretch: Problem, scan: Problem, home: int) -> _SpaceState:
 
 
 def _bistatic_track(problem: Problem, steps: list[tuple[Array, Array, Array, Array]]) -> Track:
+    """Return position, covariance, count and status of all scans as a track."""
     batch, k = problem.batch_shape, len(steps)
     mean, cov, count, code = (np.stack([step[i] for step in steps], axis=1) for i in range(4))
     none = np.zeros((*batch, k))

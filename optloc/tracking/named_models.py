@@ -1,4 +1,4 @@
-"""Models of motion by name: the tracker's choices `cv`, `ca`, `static`, `singer` and `csm`."""
+"""Models of motion by name: `cv`, `ca`, `static`, `singer` and `csm`."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ class MotionModel:
     Parameters
     ----------
     noise : float
-        Standard deviation of the driving noise by default, SI units.
+        Default standard deviation of the driving noise, SI units.
     summary : str
         One line for listings.
     make : callable
-        Returns dynamics for a standard deviation of the noise and the seconds over which accelerations last.
+        Function of the standard deviation of the noise and the duration of accelerations in seconds; returns
+        `Dynamics`.
     """
 
     noise: float
@@ -28,16 +29,16 @@ class MotionModel:
     make: Callable[[float, float], Dynamics]
 
 
-# Of the order of ordinary traffic, which brakes and turns by 1 m/s^2. The noise of csm is the largest acceleration,
-# about 1 g.
+# Values for ordinary traffic, which brakes and turns by 1 m/s^2. The noise of csm is the largest acceleration, about 1
+# g.
 MOTIONS = {
     "cv": MotionModel(1.0, "constant velocity, driven by an acceleration", lambda noise, _: polynomial(1, noise)),
     "ca": MotionModel(1.0, "constant acceleration, driven by a jerk", lambda noise, _: polynomial(2, noise)),
-    "static": MotionModel(0.0, "a target that stays, driven by a velocity", lambda noise, _: polynomial(0, noise)),
-    "singer": MotionModel(1.0, "Singer's: an acceleration that lasts", lambda noise, memory: singer(memory, noise)),
+    "static": MotionModel(0.0, "a static target, driven by a velocity", lambda noise, _: polynomial(0, noise)),
+    "singer": MotionModel(1.0, "Singer: a correlated acceleration", lambda noise, memory: singer(memory, noise)),
     "csm": MotionModel(
         10.0,
-        "current statistical: Singer's about the present acceleration; the noise is its largest acceleration",
+        "current statistical: Singer about the present acceleration; the noise is the largest acceleration",
         lambda noise, memory: current_statistical(memory, noise),
     ),
 }
@@ -45,23 +46,23 @@ MOTIONS = {
 
 
 def motion_named(name: str, noise: float | None = None, memory: float = 10.0, where: str = "model") -> Dynamics:
-    """Return a model of motion.
+    """Return a model of motion by name.
 
     Parameters
     ----------
     name : str
         See `MOTIONS`.
     noise : float, optional
-        Standard deviation of the driving noise, SI units; by default from the table.
+        Standard deviation of the driving noise, SI units; default from `MOTIONS`.
     memory : float
-        Seconds over which an acceleration lasts (``singer`` and ``csm``).
+        Duration of an acceleration in seconds (``singer`` and ``csm``).
     where : str
-        The argument that an error names.
+        Name of the argument for error messages.
 
     Raises
     ------
     InvalidProblem
-        For an unknown name.
+        If the name is unknown.
     """
     if name not in MOTIONS:
         raise InvalidProblem(f"unknown model {name!r}", where, nearest(name, list(MOTIONS)))

@@ -1,4 +1,4 @@
-"""Other states of an ambiguous start, which are followed with the track until the scans refute them."""
+"""Other states of an ambiguous start: they are tracked too, until the scans refute them."""
 
 from __future__ import annotations
 
@@ -12,23 +12,20 @@ from optloc.solvers.policy import AMBIGUOUS_GAP
 from optloc.tracking.entry import Entry
 from optloc.tracking.track import State
 
-# Gap from which a rival is refuted: five standard deviations. Errors that last count again in every scan, so that the
-# gap of a fix, three of them, would come too early.
+# Gap above which a rival is refuted: five standard deviations. Lasting errors count again in every scan, so the gap of
+# a fix (three standard deviations) would refute rivals too early.
 _REFUTED = 25.0
-# Squared distance of two states, in both covariances together, below which they are one.
+# Squared distance of two states, normalised by the sum of their covariances, below which the states are equal.
 _SAME = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Rival:
-    """A state that may be the right one in the place of a track's.
+    """A state that may be right instead of the state of the track.
 
-    Parameters
-    ----------
-    state : State
-        After the last scan.
-    gap : float
-        Twice the logarithm of its likelihood ratio to the track: of the rows of the start and of all scans since.
+    - state: the state after the last scan.
+    - gap: twice the logarithm of the likelihood ratio of the track to this state, over the rows of the start and all
+      later scans; negative if the scans prefer this state.
     """
 
     state: State
@@ -36,23 +33,15 @@ class Rival:
 
     @property
     def leads(self) -> bool:
-        """Return whether the scans prefer it to the track."""
+        """Return whether the scans prefer this state to the track."""
         return self.gap < -AMBIGUOUS_GAP
 
 
 def remaining(rivals: Sequence[Rival], entry: Entry, others: Sequence[Entry | None], most: float) -> tuple[Rival, ...]:
-    """Return the rivals that a scan neither refutes nor merges with the track.
+    """Return the rivals that a scan does not refute and that do not merge with the track.
 
-    Parameters
-    ----------
-    rivals : sequence of Rival
-        Before the scan.
-    entry : Entry
-        The track after the scan.
-    others : sequence of Entry or None
-        Each rival after the scan; None where it cannot be followed.
-    most : float
-        Squared innovation of a row that was left out.
+    `entry` is the track after the scan, and `others` are the rivals after it; None for a rival that cannot be followed.
+    `most` is the squared innovation that a rejected row counts with.
     """
     found = []
     for rival, other in zip(rivals, others, strict=True):
@@ -65,12 +54,12 @@ def remaining(rivals: Sequence[Rival], entry: Entry, others: Sequence[Entry | No
 
 
 def _cost(entry: Entry, most: float) -> float:
-    """Return twice the negative logarithm of the likelihood of a scan, each row that was left out at the gate."""
+    """Return twice the negative log-likelihood of a scan; each rejected row counts as `most`."""
     return -2.0 * float(entry.updated.loglikelihood) + most * entry.rejected
 
 
 def _distance(one: Entry, other: Entry) -> float:
-    """Return the squared distance of two states in both covariances together."""
+    """Return the squared distance of two states, normalised by the sum of their covariances."""
     apart = one.updated.mean - other.updated.mean
     solved, _ = linalg.solve(one.updated.cov + other.updated.cov, apart[:, None])
     return float(np.sum(apart * solved[:, 0]))

@@ -1,4 +1,4 @@
-"""A whole run as a track: started without a guess, gated, and restarted where the model cannot follow."""
+"""Track of a whole run: started by a fix, gated, and restarted if the model of motion cannot follow the target."""
 
 from __future__ import annotations
 
@@ -46,8 +46,9 @@ from optloc.tracking.track import (
 )
 from optloc.tracking.updates import Filter, Update, Updated, filter_of, innovation, read, weights_within
 
-# A given state whose first scan is less likely than this contradicts it: the run is refused, so this is nearly sure.
-_ABSURD = 1e-9
+# If the first scan is less likely than this, it contradicts the given state. The run is then refused, so the limit is
+# very small.
+_CONTRADICTORY = 1e-9
 Screen = tuple[float, float, float]
 
 
@@ -72,7 +73,7 @@ def track(
     start : State, optional
         Known state at or before the first scan.
     rules : Rules, optional
-        When rows are left out and tracks restart.
+        Rules for the rejection of rows and for restarts.
 
     Returns
     -------
@@ -82,8 +83,8 @@ def track(
     Raises
     ------
     InvalidProblem
-        For an unknown model or filter, times that do not increase, several targets, and a start that does not
-        fit. Several targets are separated by `optloc.tracking.alone`.
+        If the model or the filter is unknown, the times do not increase, there are several targets, or the start does
+        not fit. `optloc.tracking.alone` separates several targets.
     """
     dynamics = motion_named(model) if isinstance(model, str) else model
     run = differences(problem) if problem.emitting else problem
@@ -99,29 +100,29 @@ def tracked(
     start: State | None = None,
     rules: Rules | None = None,
 ) -> Iterator[Entry]:
-    """Yield what becomes of each scan of a run, one by one: what was yielded stays, whatever goes wrong later.
+    """Yield the result of each scan of a run. Later errors do not change results that were already yielded.
 
-    The track starts from the first stretch of scans that determine the state, without a guess. Scans without a valid
-    row keep the prediction.
+    The track starts from the first scans that determine the state, without a guess. A scan without a valid row keeps
+    the prediction.
 
     Parameters
     ----------
     problem : Problem
-        A single run of one target, see `followed`; an exact height is held by every update.
+        A single run of one target, see `followed`; every update keeps an exact height.
     dynamics : Dynamics
         Model of motion.
     update : callable or str
         A filter, or its name in `UPDATES`.
     start : State, optional
-        Known state at or before the first scan, in the place of a fix.
+        Known state at or before the first scan; replaces the first fix.
     rules : Rules, optional
-        When rows are left out and tracks restart.
+        Rules for the rejection of rows and for restarts.
 
     Raises
     ------
     InvalidProblem
-        For an unknown filter, times that do not increase, a run that is not one target's, and a given state that does
-        not fit the dynamics or contradicts the first scan.
+        If the filter is unknown, the times do not increase, the run has several targets, or the given state does not
+        fit the dynamics or contradicts the first scan.
     """
     rule = filter_of(update)
     check_trackable(problem)
@@ -129,20 +130,20 @@ def tracked(
     if start is not None:
         _check_start(start, problem, dynamics)
     cleaned, broken = _clean(problem)
-    # The checks above are made at the call, not at the first scan.
+    # This function is no generator, so the checks above run at the call and not at the first scan.
     rules = rules or Rules()
-    course = Condition.of(start, float(problem.times[0]) if start is None else start.time, rules)
-    course.fresh = start is not None
-    return _TrackRun.of(cleaned, broken, dynamics, rule, rules).entries(course)
+    condition = Condition.of(start, float(problem.times[0]) if start is None else start.time, rules)
+    condition.fresh = start is not None
+    return _TrackRun.of(cleaned, broken, dynamics, rule, rules).entries(condition)
 
 
 def collected(entries: Sequence[Entry], dimension: int) -> Track:
-    """Return entries as one track.
+    """Return the entries as one track.
 
     Parameters
     ----------
     entries : sequence of Entry
-        In the order of time.
+        Entries in the order of time.
     dimension : int
         2 or 3.
     """
@@ -152,22 +153,15 @@ def collected(entries: Sequence[Entry], dimension: int) -> Track:
 
 @dataclass(frozen=True, slots=True)
 class _TrackRun:
-    """One run, or a stretch of it, with its rules.
+    """A run or a part of it, with its model, filter and rules.
 
-    Parameters
-    ----------
-    problem : Problem
-        The run.
-    scans : Scans
-        Its scans as arrays.
-    bad : list of int
-        Rows of each scan that are not finite.
-    dynamics, rule, rules
-        As of `tracked`.
-    how : Filtering or None
-        The filter with the gate, as machine code takes it.
-    near : float
-        Total variance below which a prediction is followed: it is nearer than the stations are spread, squared.
+    - problem: the run.
+    - scans: its scans as arrays.
+    - bad: number of rows of each scan that are not finite.
+    - dynamics, rule, rules: as in `tracked`.
+    - how: the filter with the gate for the compiled code; None for other filters.
+    - near: a prediction with a total variance below this limit (m^2) is followed. It is the squared half extent of the
+      stations.
     """
 
     problem: Problem
@@ -181,55 +175,55 @@ class _TrackRun:
 
     @classmethod
     def of(cls, problem: Problem, broken: Array, dynamics: Dynamics, rule: Update, rules: Rules) -> _TrackRun:
-        """Return a run whose rows (m,) are `broken` where they are not finite."""
+        """Return the prepared run; `broken` (m,) marks rows that are not finite."""
         bad = np.bincount(problem.epoch[broken], minlength=problem.epochs).tolist()
         problem = with_height_rows(problem)
-        # An infinite gate refuses NaN: the largest number does what infinity does for innovations.
+        # An infinite gate would not reject rows with a NaN innovation; the largest number rejects only these.
         gate, how = min(rules.gate, float(np.finfo(float).max)), None
         if isinstance(rule, Filter):
             own = min(gate, rule.how.gate)
             how = rule.how._replace(gate=float(own), most=rules.most, d=problem.dimension)
-        # From any centre, a station is at least half of the largest extent away.
+        # Whatever the position of the centre, one station is at least half of the largest extent away from it.
         near = 0.5 * float(np.ptp(problem.stations.places.reshape(-1, problem.dimension), axis=0).max())
         return cls(problem, Scans.of(problem, dynamics.order), bad, dynamics, rule, rules, how, near**2)
 
-    def entries(self, course: Condition, *, ends: bool = True) -> Iterator[Entry]:
-        """Yield all entries, one for each scan, from where a track stands; `ends` as of `begin`."""
+    def entries(self, condition: Condition, *, ends: bool = True) -> Iterator[Entry]:
+        """Yield one entry per scan, from the present condition of the track; `ends` as in `begin`."""
         times, k = self.problem.times.tolist(), 0
         while k < len(times):
-            if course.state is None:
+            if condition.state is None:
                 r = self.rules
                 start_here = begin(self.problem, k, self.dynamics, r.speed, r.rate, r.starts, ends=ends)
-                yield from self._starting(start_here, k, course)
-                k, course.state, course.missed = start_here.last + 1, start_here.state, 0
-                course.rivals = start_here.rivals
-                course.recent.begin(start_here)
-                course.heard = times[start_here.last]
+                yield from self._starting(start_here, k, condition)
+                k, condition.state, condition.missed = start_here.last + 1, start_here.state, 0
+                condition.rivals = start_here.rivals
+                condition.recent.begin(start_here)
+                condition.last_row = times[start_here.last]
                 continue
-            before = course.state
-            found = self._update(k, before, times[k] - course.heard, course.lasting.memory(self.scans.memory))
+            before = condition.state
+            found = self._update(k, before, times[k] - condition.last_row, condition.lasting.memory(self.scans.memory))
             if isinstance(found, str):
-                course.why, course.state = found, None
+                condition.why, condition.state = found, None
                 continue
-            course.why = ""
+            condition.why = ""
             entry, fit, screen = found
-            if course.fresh and entry.updated.count + entry.rejected > 0:
+            if condition.fresh and entry.updated.count + entry.rejected > 0:
                 _check_agrees(entry)
-                course.fresh = False
-            course.take(entry, fit, entry.rejected - self.bad[k])
-            course.rivals = self._remaining(course.rivals, k, entry, times[k] - course.heard)
-            cov = course.lasting.take((self.scans, k, before), self.dynamics, entry.updated.cov, screen)
+                condition.fresh = False
+            condition.take(entry, fit, entry.rejected - self.bad[k])
+            condition.rivals = self._remaining(condition.rivals, k, entry, times[k] - condition.last_row)
+            cov = condition.lasting.take((self.scans, k, before), self.dynamics, entry.updated.cov, screen)
             k += 1
             wide = screen is None or screen[2] > self.near or cov is not entry.updated.cov
             vague = out_of_sight(self.problem, entry.updated.mean, cov) if wide else ""
-            yield course.judged(entry, cov, vague)
-            course.judge(vague)
+            yield condition.judged(entry, cov, vague)
+            condition.judge(vague)
 
-    def _starting(self, begun: Beginning, k: int, course: Condition) -> Iterator[Entry]:
-        """Yield the scans of a start, of which the last one has the state."""
+    def _starting(self, begun: Beginning, k: int, condition: Condition) -> Iterator[Entry]:
+        """Yield the scans of a start; only the last scan has a state."""
         n = (self.dynamics.order + 1) * self.problem.dimension
-        # Scans of a start have no state of their own: the fix of all of them holds at the last one.
-        why = course.why
+        # Scans of a start have no separate states: their common fix is valid at the last scan.
+        why = condition.why
         none = Updated(np.full(n, np.nan), np.full((n, n), np.nan), np.array(np.nan), np.array(0.0), np.array(0))
         for i in range(k, begun.last + 1):
             time = float(self.problem.times[i])
@@ -237,7 +231,7 @@ class _TrackRun:
                 yield Entry(time, none, begun.waiting, self.bad[i], "starting", begun.reason)
                 continue
             count = np.array(int((self.problem.weight[self.problem.epoch == i] > 0.0).sum()) - begun.left_out)
-            cov = course.lasting.begin(self._stretch(begun), begun.state)
+            cov = condition.lasting.begin(self._stretch(begun), begun.state)
             done = replace(none, mean=begun.state.mean, cov=cov, count=count)
             reason = "; ".join(filter(None, (why, begun.reason)))
             out = self.bad[i] + begun.left_out
@@ -250,7 +244,7 @@ class _TrackRun:
         return remaining(rivals, entry, others, self.rules.most)
 
     def _stretch(self, begun: Beginning) -> Problem:
-        """Return the scans of a start."""
+        """Return the scans of a start as a problem."""
         motion = Motion(self.dynamics.order, reference=float(self.problem.times[begun.last]))
         return replace(cut(self.problem, begun.first, begun.last + 1), motions=(motion,))
 
@@ -259,7 +253,7 @@ class _TrackRun:
     ) -> tuple[Entry, Fit, Screen | None] | str:
         """Return the entry of a scan, the fit of all rows to the prediction and the screen for lasting errors.
 
-        Where the state is not followed the result is the reason.
+        If the state cannot be followed, return the reason instead.
         """
         if self.rules.gap is not None and silence > self.rules.gap:
             return f"no valid row for {silence:.6g} s"
@@ -270,7 +264,7 @@ class _TrackRun:
             if found is not None and found.values[CODE] != GENERAL:
                 values = found.values.tolist()
                 if values[SPREAD] > self.near and self.rules.gap is None:
-                    why = self._unbridged(predicted(state, self.dynamics, time, self.problem.dimension), silence)
+                    why = self._too_uncertain(predicted(state, self.dynamics, time, self.problem.dimension), silence)
                     if why:
                         return why
                 entry = self._entry(k, read(found), int(values[CODE]), int(values[REJECTED_ROWS]), [])
@@ -280,34 +274,35 @@ class _TrackRun:
                     (values[REPEATS], values[EXCESS], values[SPREAD]),
                 )
         ahead = predicted(state, self.dynamics, time, self.problem.dimension)
-        return ("" if self.rules.gap is not None else self._unbridged(ahead, silence)) or self._general(k, ahead)
+        return ("" if self.rules.gap is not None else self._too_uncertain(ahead, silence)) or self._general(k, ahead)
 
-    def _unbridged(self, ahead: State, silence: float) -> str:
-        """Return why a prediction is not worth following; empty where it is."""
+    def _too_uncertain(self, ahead: State, silence: float) -> str:
+        """Return the reason why a prediction is too uncertain to follow; empty if it is not."""
         d = self.problem.dimension
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(ahead.cov[:d, :d])[-1], 0.0)))
-        # Where a prediction may be anywhere between the stations, a fix without a guess tells more.
+        # If the prediction is uncertain by more than the spread of the stations, a new fix without a guess is better.
         limit = reach(self.problem, ahead.mean[:d])
         return f"the prediction was uncertain by {sigma:.3g} m after {silence:.6g} s" if sigma > limit else ""
 
     def _general(self, k: int, ahead: State) -> tuple[Entry, Fit, None]:
-        """Return the update of a prediction by any filter with the rows of a scan that pass the gate."""
+        """Return the update of a prediction by any filter, with the rows of a scan that pass the gate."""
         scan = scan_at(self.problem, k, self.dynamics.order)
-        # Gate first, update then: an iterated update would be drawn by what it should not believe.
+        # Apply the gate before the update: a gross error would pull an iterated update.
         off = innovation(scan, ahead.mean, ahead.cov).normalised[scan.weight > 0.0] if scan.rows else np.zeros(0)
-        lost = int((~(np.abs(off) <= self.rules.gate)).sum())
+        gated = int((~(np.abs(off) <= self.rules.gate)).sum())
         used = scan
-        if lost:
+        if gated:
             used = scan.with_rows(weight=weights_within(scan, ahead.mean, ahead.cov, self.rules.gate))
-        # How wild a row is says nothing of the others: none counts further than the gate, nor NaN less.
+        # The size of one gross error has no information about the other rows, so each row counts at most as the gate.
+        # NaN also counts as the gate.
         fit = float(np.nan_to_num(np.minimum(off**2, self.rules.most), nan=self.rules.most).sum()), len(off)
         causes: list[str] = []
         done, code = take_scan(used, ahead, self.rule, causes)
-        return self._entry(k, done, int(code), lost, causes), fit, None
+        return self._entry(k, done, int(code), gated, causes), fit, None
 
-    def _entry(self, k: int, done: Updated, code: int, lost: int, causes: list[str]) -> Entry:
-        """Return the entry of an update, of which a number of rows (`lost`) did not pass the gate."""
-        rejected = lost + self.bad[k]
+    def _entry(self, k: int, done: Updated, code: int, gated: int, causes: list[str]) -> Entry:
+        """Return the entry of an update; `gated` is the number of rows that failed the gate."""
+        rejected = gated + self.bad[k]
         found = objections(_FINDINGS, _Taken(Status(code), rejected, int(done.count), causes))
         status, reason = found[0] if found else (Status(code), "")
         return Entry(float(self.problem.times[k]), done, status, rejected, "", reason)
@@ -315,7 +310,7 @@ class _TrackRun:
 
 @dataclass(frozen=True, slots=True)
 class _Taken:
-    """A scan after its update: status, rows left out and used, and causes of a failure."""
+    """A scan after its update: status, numbers of rejected and used rows, and causes of a numerical failure."""
 
     status: Status
     rejected: int
@@ -332,7 +327,7 @@ _FINDINGS = (
     Finding(
         Status.REJECTED,
         lambda t: t.rejected > t.count,
-        lambda t: [f"{t.rejected} of {t.rejected + t.count} rows were left out"],
+        lambda t: [f"{t.rejected} of {t.rejected + t.count} rows were rejected"],
     ),
     Finding(
         Status.NUMERICAL,
@@ -340,19 +335,18 @@ _FINDINGS = (
         lambda t: ["; ".join([*t.causes, "the update failed: the state was only predicted"])],
     ),
 )
-"""All findings against one scan by itself."""
+"""Findings about a single scan."""
 
 
-# Scans that wait for a start, at most: a stretch of 63 is the tenth that is tried, and what so many leave open is not
-# a matter of the next few.
+# Largest number of scans that wait for a start. A stretch of 63 scans is the tenth attempt; if it is ambiguous, a few
+# more scans do not help.
 _WAITING = 64
 
 
 class Follower:
-    """A track that goes on as scans come: what it says of them is what `tracked` says of the whole run.
+    """A track that continues as scans arrive. Its results equal the results of `tracked` for the whole run.
 
-    Only a start that many scans leave open is told earlier than there: it is given up after 64 of them, as at the end
-    of a run.
+    The only exception is a start that remains ambiguous for many scans: it ends after 64 scans, as at the end of a run.
 
     Parameters
     ----------
@@ -361,62 +355,62 @@ class Follower:
     update : callable or str
         A filter, or its name in `UPDATES`.
     rules : Rules, optional
-        When rows are left out and tracks restart.
+        Rules for the rejection of rows and for restarts.
     """
 
     def __init__(self, dynamics: Dynamics, update: Update | str = "iekf", rules: Rules | None = None) -> None:
         self._dynamics, self._rule, self._rules = dynamics, filter_of(update), rules or Rules()
-        self._course: Condition | None = None
+        self._condition: Condition | None = None
         self._waiting: list[Problem] = []
-        self._needed = 1  # scans, for the next try of a start
+        self._needed = 1  # number of scans that the next attempt of a start needs
         self.last = -np.inf
         """Time of the last scan, seconds."""
 
     @property
     def lost(self) -> str:
-        """Return why the last state was given up while there is no new one; empty where there is one, or never was."""
-        return self._course.why if self._course is not None and self._course.state is None else ""
+        """Return the reason why the track lost its state; empty if there is a state, or if there was no state yet."""
+        return self._condition.why if self._condition is not None and self._condition.state is None else ""
 
     def take(self, scan: Problem) -> list[Entry]:
-        """Return what became of the scans up to this one that were left open; nothing where a start needs more.
+        """Return the results of all pending scans up to this scan; empty if a start needs more scans.
 
         Parameters
         ----------
         scan : Problem
-            One epoch of the run, later than those before; the same stations and target.
+            One epoch of the run, later than all earlier scans; with the same stations and target.
 
         Raises
         ------
         InvalidProblem
-            Where it is not later, or not one target's; the track stays as it was.
+            If the scan is not later, or has several targets; the track does not change.
         """
         check_trackable(scan)
         if scan.batch_shape or scan.epochs != 1:
-            raise InvalidProblem("this is not a single scan", "track", "give one epoch after the other")
+            raise InvalidProblem("the problem is not a single scan", "track", "give one epoch per call")
         time = float(scan.times[0])
         if not time > self.last:
-            what = f"the scan at {time:.10g} s follows one at {self.last:.10g} s"
-            raise InvalidProblem(what, "times", "give scans in the order of time, and one for each time")
+            what = f"the scan at {time:.10g} s follows the scan at {self.last:.10g} s"
+            raise InvalidProblem(what, "times", "give scans in the order of time, one scan per time")
         run = [*self._waiting, scan]
         if len(run) < self._needed:
             self._waiting, self.last = run, time
             return []
         cleaned, broken = _clean(reduce(joined, run))
         stretch = _TrackRun.of(cleaned, broken, self._dynamics, self._rule, self._rules)
-        course = self._course or Condition.of(None, float(run[0].times[0]), self._rules)
+        condition = self._condition or Condition.of(None, float(run[0].times[0]), self._rules)
         done: list[Entry] = []
         self._needed = 1
         try:
-            for entry in stretch.entries(course, ends=len(run) >= _WAITING):
-                done.append(entry)  # noqa: PERF402  # those before a start that is left open stay
+            for entry in stretch.entries(condition, ends=len(run) >= _WAITING):
+                done.append(entry)  # noqa: PERF402  # entries before an undecided start are kept
         except Undecided as undecided:
             self._needed = undecided.scans - len(done)
-        self._course, self._waiting, self.last = course, run[len(done) :], time
+        self._condition, self._waiting, self.last = condition, run[len(done) :], time
         return done
 
 
 def _clean(problem: Problem) -> tuple[Problem, Array]:
-    """Return the run with weight zero for rows that are not finite, and which of the present ones these are (m,)."""
+    """Return the run with weight zero for rows that are not finite, and a mask (m,) of these rows."""
     broken = ~np.isfinite(problem.z) & (problem.weight > 0.0)
     if not broken.any():
         return problem, broken
@@ -425,26 +419,28 @@ def _clean(problem: Problem) -> tuple[Problem, Array]:
 
 
 def _check_run(problem: Problem) -> None:
+    """Raise InvalidProblem for a batch of runs, or for times that do not increase."""
     if problem.batch_shape:
-        raise InvalidProblem("there are several runs", "track", "take them one by one, or use `followed`")
+        raise InvalidProblem("a batch of runs was given", "track", "call it for each run, or use `followed`")
     steps = np.flatnonzero(~(np.diff(problem.times) > 0.0))
     if len(steps):
         one, two = problem.times[steps[0]], problem.times[steps[0] + 1]
-        what = f"the scan at {two:.10g} s follows one at {one:.10g} s"
-        raise InvalidProblem(what, "times", "sort the scans by time, and give one scan for each time")
+        what = f"the scan at {two:.10g} s follows the scan at {one:.10g} s"
+        raise InvalidProblem(what, "times", "sort the scans by time, and give one scan per time")
 
 
 def _check_start(start: State, problem: Problem, dynamics: Dynamics) -> None:
+    """Raise InvalidProblem for a given state that does not fit the model, or is after the first scan."""
     check_state(start, (dynamics.order + 1) * problem.dimension)
     if start.time > problem.times[0]:
-        what = f"the state holds at {start.time:.10g} s, after the first scan at {problem.times[0]:.10g} s"
+        what = f"the state belongs to {start.time:.10g} s, after the first scan at {problem.times[0]:.10g} s"
         raise InvalidProblem(what, "start", "give the state at or before the first scan")
 
 
 def _check_agrees(entry: Entry) -> None:
-    """Refuse a given state that its first scan contradicts: by its chi-square, or as no row passed the gate."""
-    p_value = tail_probability(entry.updated.nis, entry.updated.count)  # NaN without a row
-    if entry.code == Status.REJECTED or p_value < _ABSURD:
+    """Raise InvalidProblem if the first scan contradicts a given state by its chi-square, or fails the gate."""
+    p_value = tail_probability(entry.updated.nis, entry.updated.count)  # NIS is NaN without a row
+    if entry.code == Status.REJECTED or p_value < _CONTRADICTORY:
         what = f"the initial state contradicts the first scan, at {entry.time:.10g} s"
-        advice = "correct it, make its standard deviation larger, or leave it out: a start needs no guess"
+        advice = "correct it, increase its standard deviation, or remove it: a start needs no guess"
         raise InvalidProblem(what, "start", advice)

@@ -1,4 +1,4 @@
-"""The rows of the scans of a run as arrays, made once, so that each scan is one call of machine code."""
+"""Rows of the scans of a run as arrays, prepared once, so that each scan is one call of compiled code."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from optloc.problem.epochs import cut, has_correlated_epochs
 from optloc.problem.noise import gathered, variances
 from optloc.problem.problem import Problem
 
-# Scans that come one by one: a network has a few sets of rows that observe a target together, of some kilobytes each.
+# Cache for scans that arrive one by one: a network has a few sets of rows that observe a target together, of some
+# kilobytes each.
 _KEPT = Cache["ScanRows | None"](256)
 
 
@@ -29,22 +30,15 @@ _KEPT = Cache["ScanRows | None"](256)
 class Scans:
     """The scans of a run of one target for the compiled update.
 
-    All shipped filters take this form. The general form of `optloc.tracking.updates` serves kinds without a tape,
-    biases among the states, and station errors whose noise depends on the position. It also serves noise that ties
-    epochs, batches in which stations or noise differ, and arrays of other libraries.
+    All shipped filters use these arrays. The general form of `optloc.tracking.updates` handles all other cases: kinds
+    without a tape, biases among the states, and station errors whose noise depends on the position. It also handles
+    noise that correlates epochs, batches with different stations or noise, and arrays of other libraries.
 
-    Parameters
-    ----------
-    problem : Problem
-        The run, see `optloc.tracking.track.scans`; what it says of the motion does not matter.
-    order : int
-        Order of the states.
-    rows : list of k (ScanRows or None)
-        Rows of each scan; None for a scan of the general form, or without rows.
-    item : list of k int
-        Number of each scan among the scans of its structure.
-    memory : int
-        Numbers that the memory of a track has, see `filter_scan`.
+    - problem: the run, see `optloc.tracking.track.scans`; its model of motion is ignored.
+    - order: order of the states.
+    - rows: rows of each of k scans; None for a scan of the general form, or without rows.
+    - item: number of each scan among the scans with the same structure.
+    - memory: length of the memory array of a track, see `filter_scan`.
     """
 
     problem: Problem
@@ -80,22 +74,11 @@ class Scans:
         more: tuple[Array, Array] | None = None,
         memory: Array | None = None,
     ) -> Filtered | None:
-        """Return states (..., n) after a scan, or None where it takes the general form.
+        """Return states (..., n) after scan k, or None if the scan needs the general form.
 
-        Parameters
-        ----------
-        k : int
-            Which scan.
-        mean, cov : array (..., n), array (..., n, n)
-            States before the move.
-        how : Filtering
-            The filter.
-        move : Move
-            From their time to the time of the scan; None for states that hold then.
-        more : tuple of array (..., m), optional
-            Measurements less corrections, and weights, that replace the scan's.
-        memory : array, optional
-            Of the track of a single state, see `filter_scan`.
+        `mean` (..., n) and `cov` (..., n, n) are the states before the prediction `move`; None for states at the time
+        of the scan. `how` is the filter. `more` replaces the measurements minus corrections (..., m) and the weights
+        (..., m). `memory` is the array of a track with a single state, see `filter_scan`.
         """
         rows, n = self.rows[k], mean.shape[-1]
         if rows is None or type(mean) is not np.ndarray or rows.tables.shared != n:
@@ -126,7 +109,7 @@ class Scans:
     def _spread(
         self, rows: ScanRows, item: int, more: tuple[Array, Array] | None, shape: tuple[int, ...]
     ) -> tuple[ScanRows, tuple[int, ...]]:
-        """Return the rows with the measurements and weights (1, N or 1, m) of states (...), and the shape of all."""
+        """Return the rows with measurements and weights (1, N or 1, m) for states (...), and the common shape."""
         batch, m = self.problem.batch_shape, rows.z.shape[2]
         if more is None:
             own = (part[item if len(part) > 1 else 0] for part in (rows.z, rows.weight))
@@ -138,12 +121,12 @@ class Scans:
 
 
 def owned(values: Array) -> Array:
-    """Return values as arrays of the type that machine code is made for: floats, C order, writable."""
+    """Return an array of the type that the compiled code accepts: float, C order, writable."""
     return values if values.flags.carray and values.dtype == float else np.array(values, dtype=float, order="C")
 
 
 def _each(values: Array, core: int, shape: tuple[int, ...]) -> Array:
-    """Return values (..., core axes) of states (...) as (N, core axes), or as (1, core axes) where they are shared."""
+    """Return values (..., core axes) of states (...) as (N, core axes), or (1, core axes) if all states share them."""
     if values.ndim == core:
         return owned(values)[None]
     inner = values.shape[values.ndim - core :]
@@ -155,28 +138,28 @@ _SIGNS = {"range_sum": 1.0, "azimuth": 0.0, "elevation": 0.0}
 
 
 def touched(problem: Problem) -> tuple[Array, Array]:
-    """Return the stations of rows (m, 2) as numbers of their errors, -1 for none, and the sign of the second (m,).
+    """Return the error numbers of the stations of rows (m, 2), -1 for none, and the sign of the second station (m,).
 
-    The sign is 0 for angles, which have one station.
-
-    A station has one error for each kind of rows, in the order of their names.
+    A station has one error for each kind of rows, in the order of the names of the kinds. The sign is 0 for angles,
+    which have one station.
     """
     names = sorted({rows.kind for rows in problem.rows})
     count = problem.stations.places.shape[-2]
     first = np.repeat([names.index(rows.kind) * count for rows in problem.rows], [rows.count for rows in problem.rows])
     pairs = np.concatenate([np.stack([rows.a, rows.b], axis=1) for rows in problem.rows])
-    # a ratio errs like a difference
+    # a ratio has the same signs as a difference
     sign = np.concatenate([np.full(rows.count, _SIGNS.get(rows.kind, -1.0)) for rows in problem.rows])
     return np.where(pairs >= 0, first[:, None] + pairs, -1).astype(np.int64), sign
 
 
 @cache
 def _stay(n: int) -> Move:
+    """Return the prediction step for no elapsed time."""
     return Move(np.eye(n), np.zeros((n, n)), np.zeros(n))
 
 
 def _is_plain(problem: Problem) -> bool:
-    """Return whether only the state of a target is unknown, and a batch shares all except measurements and weights."""
+    """Return whether the state is the only unknown, and a batch differs only in measurements and weights."""
     stations = problem.stations
     shared = [(stations.position, 3), (stations.velocity, 3), (stations.axes, 4)]
     shared += [(covariance, 3) for _, _, covariance in stations.errors]
@@ -192,7 +175,7 @@ def _is_plain(problem: Problem) -> bool:
 
 
 def _structures(problem: Problem, order: int) -> Iterator[tuple[Array, Array, ScanRows | None]]:
-    """Yield the epochs (G,) of each structure, the rows (G, m) of each of them, and what is made of these."""
+    """Yield, for each structure of scans, its epochs (G,), their rows (G, m), and the prepared rows."""
     if problem.epochs == 1:
         one = np.zeros(1, dtype=np.int64), np.arange(problem.count)[None]
         made = _KEPT.find(_key(problem, order), lambda: _made(problem, order, *one) if _is_plain(problem) else None)
@@ -203,7 +186,7 @@ def _structures(problem: Problem, order: int) -> Iterator[tuple[Array, Array, Sc
 
 
 def _key(scan: Problem, order: int) -> Hashable:
-    """Return a key of all of a scan but its time, measurements and weights."""
+    """Return a cache key of a scan without its time, measurements and weights."""
     s = scan.stations
     arrays = [s.position, s.velocity, s.axes, s.covariance, s.velocity_covariance]
     arrays += [array for block in scan.noise.blocks for array in (block.covariance, block.row)]
@@ -214,7 +197,7 @@ def _key(scan: Problem, order: int) -> Hashable:
 
 
 def _alike(problem: Problem) -> list[tuple[Array, Array]]:
-    """Return the epochs (G,) of each structure, and the rows (G, m) of each of them."""
+    """Return the epochs (G,) of each structure, and their rows (G, m)."""
     epoch = problem.epoch
     order = np.argsort(epoch, kind="stable")
     start = np.searchsorted(epoch[order], np.arange(problem.epochs + 1))
@@ -234,7 +217,7 @@ def _alike(problem: Problem) -> list[tuple[Array, Array]]:
 
 
 def _by_scan(values: Array, index: Array) -> Array:
-    """Return numbers (..., m) of rows (G, r) as (G, N, r), the leading axes flattened."""
+    """Return values (..., m) at rows (G, r) as (G, N, r), with flattened leading axes."""
     if index.shape[0] == 1 and values.ndim == 1:
         return values[index][None]
     picked = np.moveaxis(values[..., index], -2, 0)
@@ -242,7 +225,7 @@ def _by_scan(values: Array, index: Array) -> Array:
 
 
 def _made(problem: Problem, order: int, epochs: Array, index: Array) -> ScanRows | None:
-    """Return scans without measurements and weights, or None where one of their kinds has no tape."""
+    """Return prepared scans without measurements and weights, or None if a kind has no tape."""
     problem, m = with_station_noise(problem), index.shape[1]
     scan = _first_of(problem, order, epochs)
     found = tables(scan, (np.arange(m)[None],))
@@ -265,7 +248,7 @@ def _made(problem: Problem, order: int, epochs: Array, index: Array) -> ScanRows
 
 
 def _first_of(problem: Problem, order: int, epochs: Array) -> Problem:
-    """Return the first of some scans with the stations of all of them, as a batch."""
+    """Return the first of some scans with the stations of all these scans, as a batch."""
     first, s = int(epochs[0]), problem.stations
     one = cut(replace(problem, motions=(Motion(order),), priors=(), constraints=()), first, first + 1)
     every = ((name, getattr(s, name)) for name in ("position", "velocity", "axes"))
@@ -275,9 +258,9 @@ def _first_of(problem: Problem, order: int, epochs: Array) -> Problem:
 
 
 def size_of(white: Array) -> Array:
-    """Return the rank of covariances R whose whitening matrices (..., r, r) are given, and ln det(2 pi R), (..., 2).
+    """Return rank and ln det(2 pi R), (..., 2), of covariances R from their whitening matrices (..., r, r).
 
-    For a singular covariance the determinant follows from the singular values of the matrix that are not zero.
+    For a singular covariance, the determinant follows from the nonzero singular values of the matrix.
     """
     pivots = np.diagonal(white, axis1=-2, axis2=-1)
     if np.triu(white, 1).any():

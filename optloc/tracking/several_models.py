@@ -1,4 +1,4 @@
-"""Several models of motion for one target: side by side, or interacting where it changes its motion."""
+"""Several models of motion for one target: in parallel, or interacting (IMM) for a target that changes its motion."""
 
 from __future__ import annotations
 
@@ -15,21 +15,16 @@ from optloc.tracking.scan_rows import Scans
 from optloc.tracking.track import State, Track, check_state, check_trackable, collect, followed, step
 from optloc.tracking.updates import Update, Updated, filter_of
 
-# Side by side from one start: the data say which model is right.
+# Parallel models from one start: the likelihoods of the data decide between the models.
 
 
 @dataclass(frozen=True, slots=True)
 class Parallel:
     """Tracks of one target by several models.
 
-    Parameters
-    ----------
-    models : tuple of q Dynamics
-        Models of motion.
-    tracks : tuple of q Track
-        One for each; all have the same scans.
-    score : array (..., k, q)
-        Logarithm of the likelihood of all scans so far; minus infinity from the scan on where a model lost the state.
+    - models: q models of motion.
+    - tracks: one track for each model; all have the same scans.
+    - score (..., k, q): log-likelihood of all scans so far; minus infinity after a model has lost the state.
     """
 
     models: tuple[Dynamics, ...]
@@ -38,17 +33,17 @@ class Parallel:
 
     @property
     def choice(self) -> Array:
-        """Return which model (..., k) explains the scans so far best."""
+        """Return the number of the most likely model (..., k) for the scans so far."""
         return np.asarray(self.score.argmax(-1))
 
     @property
     def probability(self) -> Array:
-        """Return the probability (..., k, q) of each model, all being equally likely before the first scan."""
+        """Return the probability (..., k, q) of each model; all models are equally likely before the first scan."""
         return softmax(self.score)
 
     @property
     def position(self) -> Array:
-        """Return the positions (..., k, d) of the model that is chosen at each scan, metres."""
+        """Return the positions (..., k, d) of the most likely model at each scan, metres."""
         every = np.stack([track.position for track in self.tracks], axis=-2)
         return np.asarray(np.take_along_axis(every, self.choice[..., None, None], axis=-2)[..., 0, :])
 
@@ -64,27 +59,27 @@ def parallel(
 ) -> Parallel:
     """Return the tracks of several models from one start, and the likelihood of each.
 
-    The prior of velocity and acceleration is what keeps a larger model from being preferred to a smaller one that
-    explains the data as well.
+    Without a prior of velocity and acceleration, a larger model would be preferred to a smaller model that explains the
+    data equally well.
 
     Parameters
     ----------
     problem : Problem
         Batch (...) of runs of one target.
     start : State
-        A position, with velocity and acceleration where they are known.
+        A position, with velocity and acceleration if they are known.
     models : sequence of Dynamics
         For instance ``[polynomial(0), polynomial(1), polynomial(2)]``.
     speed, rate : float, optional
-        Prior standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, where the
-        start does not hold them.
+        Prior standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, if the start
+        does not hold them.
     update : callable or str
         A filter, or its name in `UPDATES`.
 
     Raises
     ------
     InvalidProblem
-        Where there are no models, or a prior that is needed is missing.
+        If there are no models, or a necessary prior is missing.
 
     References
     ----------
@@ -100,22 +95,18 @@ def parallel(
     return Parallel(tuple(models), tracks, np.stack([np.cumsum(value, axis=-1) for value in each], axis=-1))
 
 
-# Interacting: the model may change from scan to scan.
+# Interacting models: the model may change from scan to scan.
 
 
 @dataclass(frozen=True, slots=True)
 class Mixed:
-    """The track of a target by models that interact.
+    """The track of a target by interacting models.
 
-    Parameters
-    ----------
-    models : tuple of q Dynamics
-        Models of motion.
-    track : Track
-        Mean and covariance over the models, of the largest order; a model without velocity or acceleration says zero.
-        Its innovations squared are weighed by the probabilities, its likelihood is that of the mixture.
-    probability : array (..., k, q)
-        Of each model after each scan.
+    - models: q models of motion.
+    - track: mean and covariance over all models, in the largest order; the missing velocity or acceleration of a model
+      is zero. The squared innovations are weighted by the probabilities, and the likelihood is the likelihood of the
+      mixture.
+    - probability (..., k, q): probability of each model after each scan.
     """
 
     models: tuple[Dynamics, ...]
@@ -135,29 +126,29 @@ def imm(
 ) -> Mixed:
     """Return the track of a target that may change its model of motion from scan to scan.
 
-    Models may differ in order. What a smaller model lacks is mixed into a larger one from the larger one's own state:
-    zeros would pull its velocity or acceleration to zero.
+    Models may differ in order. When a smaller model is mixed into a larger model, its missing components come from the
+    larger model: zeros would pull the velocity or acceleration to zero.
 
     Parameters
     ----------
     problem : Problem
         Batch (...) of runs of one target.
     start : State
-        A position, with velocity and acceleration where they are known.
+        A position, with velocity and acceleration if they are known.
     models : sequence of q Dynamics
-        Any.
+        Models of motion.
     transition : array (q, q)
-        Probability that the model of a row is followed by that of a column, from one scan to the next.
+        Probability of a change from the model of a row to the model of a column, from one scan to the next.
     speed, rate : float, optional
-        Prior standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, where the
-        start does not hold them.
+        Prior standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, if the start
+        does not hold them.
     update : callable or str
         A filter, or its name in `UPDATES`.
 
     Raises
     ------
     InvalidProblem
-        Where there are no models, a prior that is needed is missing, or the transition is none.
+        If there are no models, a necessary prior is missing, or the transition is not a table of probabilities.
 
     References
     ----------
@@ -172,7 +163,7 @@ def imm(
     states = [resized(start, model.order, d, speed=speed, rate=rate) for model in models]
     for model, state in zip(models, states, strict=True):
         check_state(state, (model.order + 1) * d)
-    # Before the first scan nothing speaks for one model.
+    # Before the first scan, all models are equally likely.
     weight = np.full((*start.mean.shape[:-1], len(models)), 1.0 / len(models))
     steps, times, weights = [], [], []
     check_trackable(problem)
@@ -180,7 +171,7 @@ def imm(
     for k, time in enumerate(problem.times.tolist()):
         if time <= start.time:
             continue
-        # Mixing comes before prediction: each model starts from what all of them believe.
+        # Mixing precedes prediction: each model starts from a mixture of all states.
         states, coming = mixed(states, weight, chain)
         both = zip(states, models, strict=True)
         done = [step(given[model.order], k, state, model, rule) for state, model in both]
@@ -193,32 +184,19 @@ def imm(
 
 
 def mixed(states: Sequence[State], weight: Array, transition: Array) -> tuple[list[State], Array]:
-    """Return what each model starts the next step from, and its probability before the next scan.
+    """Return the mixed state of each model before the next prediction, and the predicted probabilities (..., q).
 
-    Parameters
-    ----------
-    states : sequence of q State
-        After the last scan; they may differ in order.
-    weight : array (..., q)
-        Probabilities after the last scan.
-    transition : array (q, q)
-        See `imm`.
-
-    Returns
-    -------
-    states : list of q State
-        Of the same orders.
-    coming : array (..., q)
-        Probabilities.
+    `states` are the states of q models after the last scan, possibly of different orders. `weight` (..., q) are the
+    probabilities after the last scan, and `transition` (q, q) is the table of `imm`. The mixed states keep the orders.
     """
     coming = weight @ transition
-    # Probability that the model was i, given that it is j now; a model nobody leads to divides nothing by nothing.
+    # Probability that the model was i, given that it is j now; for an unreachable model, avoid 0 / 0.
     share = weight[..., :, None] * transition / np.maximum(coming, np.finfo(float).tiny)[..., None, :]
     out = []
     for j, own in enumerate(states):
-        parts = [_lend(state, own) for state in states]
+        parts = [_in_order_of(state, own) for state in states]
         mean, cov = moments([p.mean for p in parts], [p.cov for p in parts], share[..., j])
-        # A model that no other leads to, and that is itself impossible, keeps its state.
+        # An unreachable model keeps its state.
         kept = coming[..., j] <= 0.0
         mean = np.where(kept[..., None], own.mean, mean)
         out.append(State(own.time, mean, np.where(kept[..., None, None], own.cov, cov)))
@@ -226,37 +204,40 @@ def mixed(states: Sequence[State], weight: Array, transition: Array) -> tuple[li
 
 
 def _transition(transition: Array, count: int) -> Array:
+    """Return the transition as an array (q, q); raise InvalidProblem if it is no table of probabilities."""
     chain = np.asarray(transition, dtype=float)
     good = chain.shape == (count, count) and bool(np.all(chain >= 0.0))
-    # Rows written with three digits, such as 0.333, do not add up to one: they are refused, not scaled.
+    # Rows with three digits, such as 0.333, do not add up to one: they are refused, not scaled.
     if not good or not np.allclose(chain.sum(-1), 1.0, atol=1e-9):
         raise InvalidProblem(
-            f"the transition is no {count} x {count} table of probabilities", "transition", "let each row add up to one"
+            f"the transition is not a {count} x {count} table of probabilities",
+            "transition",
+            "make the sum of each row 1",
         )
     return chain
 
 
-def _lend(state: State, own: State) -> State:
-    """Return a state in the order of another one, what it lacks taken from there."""
-    n, held = own.mean.shape[-1], state.mean.shape[-1]
-    if held >= n:
+def _in_order_of(state: State, own: State) -> State:
+    """Return a state in the order of another state, which also provides missing components."""
+    n, present = own.mean.shape[-1], state.mean.shape[-1]
+    if present >= n:
         return State(state.time, state.mean[..., :n], state.cov[..., :n, :n])
     batch = np.broadcast_shapes(state.mean.shape[:-1], own.mean.shape[:-1])
     mean, cov = np.broadcast_to(own.mean, (*batch, n)).copy(), np.zeros((*batch, n, n))
-    mean[..., :held] = state.mean
-    cov[..., :held, :held], cov[..., held:, held:] = state.cov, own.cov[..., held:, held:]
+    mean[..., :present] = state.mean
+    cov[..., :present, :present], cov[..., present:, present:] = state.cov, own.cov[..., present:, present:]
     return State(state.time, mean, cov)
 
 
 def _weigh(done: Sequence[tuple[Updated, Array]], coming: Array) -> tuple[Array, Array]:
-    """Return the probabilities (..., q) after a scan, and the logarithm (...) of its likelihood."""
+    """Return the probabilities (..., q) after a scan, and the log-likelihood (...) of the scan."""
     fit = [np.where(code == Status.NUMERICAL, -np.inf, each.loglikelihood) for each, code in done]
     with np.errstate(divide="ignore"):
         score = np.log(coming) + np.stack(fit, axis=-1)
-    # The greatest score is taken out before the exponential: likelihoods of many rows underflow.
+    # Subtract the highest score before the exponential: likelihoods of many rows underflow.
     top = score.max(-1)
     known = np.isfinite(top)
-    # Where no model has a likelihood the scan says nothing of them.
+    # If no model has a likelihood, the scan does not change the probabilities.
     weight = np.where(known[..., None], softmax(score), coming)
     peak = np.where(known, top, 0.0)
     total = peak + np.log(np.where(known[..., None], np.exp(score - peak[..., None]), 1.0 / score.shape[-1]).sum(-1))
@@ -264,107 +245,94 @@ def _weigh(done: Sequence[tuple[Updated, Array]], coming: Array) -> tuple[Array,
 
 
 def _combine(done: Sequence[tuple[Updated, Array]], weight: Array, total: Array) -> tuple[Updated, Array]:
-    """Return the update over all models, and its status: the best one of the models."""
+    """Return the update over all models, and its status: the best status of the models."""
     n = max(each.mean.shape[-1] for each, _ in done)
-    both = [_widened(each, n) for each, _ in done]
+    both = [_padded(each, n) for each, _ in done]
     mean, cov = moments([one for one, _ in both], [around for _, around in both], weight)
     nis = np.stack([each.nis for each, _ in done], axis=-1)
     used = np.where(weight > 0.0, nis, 0.0)
     count = np.max([np.broadcast_to(each.count, total.shape) for each, _ in done], axis=0)
-    # Ok is the least code: one model that follows the target is enough.
+    # Ok is the lowest code: one model that follows the target is enough.
     code = np.min([code for _, code in done], axis=0).astype(np.int8)
     return Updated(mean, cov, (weight * used).sum(-1), total, count), code
 
 
-def _widened(done: Updated, n: int) -> tuple[Array, Array]:
-    """Return mean (..., n) and covariance: a model without velocity or acceleration is sure that they are zero."""
-    held = done.mean.shape[-1]
-    if held == n:
+def _padded(done: Updated, n: int) -> tuple[Array, Array]:
+    """Return mean (..., n) and covariance (..., n, n); missing velocity or acceleration is zero without variance."""
+    present = done.mean.shape[-1]
+    if present == n:
         return done.mean, done.cov
     mean, cov = np.zeros((*done.mean.shape[:-1], n)), np.zeros((*done.cov.shape[:-2], n, n))
-    mean[..., :held], cov[..., :held, :held] = done.mean, done.cov
+    mean[..., :present], cov[..., :present, :present] = done.mean, done.cov
     return mean, cov
 
 
-# What both are made of.
+# Functions of both methods.
 
 
 def check_models(models: Sequence[Dynamics]) -> None:
-    """Refuse an empty list of models; raise InvalidProblem."""
+    """Raise InvalidProblem for an empty list of models."""
     if not models:
-        raise InvalidProblem("there are no models of motion", "models", "give at least one")
+        raise InvalidProblem("there are no models of motion", "models", "give at least one model")
 
 
 def resized(
     state: State, order: int, dimension: int, *, speed: float | None = None, rate: float | None = None
 ) -> State:
-    """Return a state of another order: parts that are too many are left out, missing ones are added as priors.
+    """Return a state of another order: extra components are removed, and missing components get priors about zero.
 
     Parameters
     ----------
     state : State
-        Of any order.
+        State of any order.
     order : 0, 1 or 2
-        Order wanted.
+        Order of the result.
     dimension : int
         2 or 3.
     speed, rate : float, optional
-        Standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, where they are
+        Standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, if they are
         missing.
 
     Raises
     ------
     InvalidProblem
-        Where a missing part has no prior.
+        If a missing component has no prior.
     """
-    n, held = (order + 1) * dimension, state.mean.shape[-1]
-    if held >= n:
+    n, present = (order + 1) * dimension, state.mean.shape[-1]
+    if present >= n:
         return State(state.time, state.mean[..., :n], state.cov[..., :n, :n])
     sizes = {1: ("velocity", "speed", speed), 2: ("acceleration", "rate", rate)}
     variance = []
-    for part in range(held // dimension, order + 1):
+    for part in range(present // dimension, order + 1):
         name, argument, size = sizes[part]
         if size is None:
             raise InvalidProblem(f"the start has no {name}", argument, "give its prior standard deviation")
         variance += [float(size) ** 2] * dimension
     batch = np.broadcast_shapes(state.mean.shape[:-1], state.cov.shape[:-2])
     mean, cov = np.zeros((*batch, n)), np.zeros((*batch, n, n))
-    mean[..., :held], cov[..., :held, :held] = state.mean, state.cov
-    # Priors of single coordinates, independent of what the start holds.
-    cov[..., range(held, n), range(held, n)] = variance
+    mean[..., :present], cov[..., :present, :present] = state.mean, state.cov
+    # Priors of single coordinates are independent of the components of the start.
+    cov[..., range(present, n), range(present, n)] = variance
     return State(state.time, mean, cov)
 
 
 def spread(state: State, batch: tuple[int, ...]) -> State:
-    """Return a state with at least the leading axes of a batch.
-
-    Parameters
-    ----------
-    state : State
-        With leading axes that fit.
-    batch : tuple of int
-        Leading axes.
-    """
+    """Return a state with at least the leading axes `batch`, by broadcasting."""
     shape, n = np.broadcast_shapes(state.mean.shape[:-1], state.cov.shape[:-2], batch), state.mean.shape[-1]
     return State(state.time, np.broadcast_to(state.mean, (*shape, n)), np.broadcast_to(state.cov, (*shape, n, n)))
 
 
 def softmax(score: Array) -> Array:
-    """Return exp(score) over its sum along the last axis; equal shares where all are minus infinity."""
+    """Return exp(score) divided by its sum along the last axis; equal shares if all scores are minus infinity."""
     top = score.max(-1, keepdims=True)
     weight = np.where(np.isfinite(top), np.exp(score - np.where(np.isfinite(top), top, 0.0)), 1.0)
     return np.asarray(weight / weight.sum(-1, keepdims=True))
 
 
 def moments(means: Sequence[Array], covs: Sequence[Array], weight: Array) -> tuple[Array, Array]:
-    """Return mean (..., n) and covariance (..., n, n) of a Gaussian mixture.
+    """Return mean (..., n) and covariance (..., n, n) of a Gaussian mixture of q components.
 
-    Parameters
-    ----------
-    means, covs : sequence of q arrays (..., n) and (..., n, n)
-        Components.
-    weight : array (..., q)
-        Their probabilities.
+    `means` (..., n) and `covs` (..., n, n) belong to the components, and `weight` (..., q) are their probabilities.
     """
     centre, each = np.stack(means, axis=-2), np.stack(covs, axis=-3)
     mean = (weight[..., None, :] @ centre)[..., 0, :]

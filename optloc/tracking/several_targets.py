@@ -1,4 +1,4 @@
-"""Several targets at once from rows without labels, or one of several by its own rows."""
+"""Tracks of several targets from rows without labels, and runs of single targets from labelled rows."""
 
 from __future__ import annotations
 
@@ -22,19 +22,16 @@ from optloc.tracking.track import State, Track, check_state, collect, predicted,
 from optloc.tracking.updates import Update, filter_of
 
 Missing = Literal["drop", "expect"]
-"""What a channel without a row does; see `associated`."""
+"""Treatment of a channel without a row; see `associated`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Associated:
-    """Tracks of several targets, and the rows that each took.
+    """Tracks of several targets, and the rows of each target.
 
-    Parameters
-    ----------
-    track : Track
-        With leading axes (..., t).
-    picks : tuple of int array (..., t, m)
-        For each scan of the track, which candidate of each of its m channels a target took; -1 for none.
+    - track: a track with leading axes (..., t).
+    - picks: for each scan of the track, the candidate (..., t, m) of each target in each of its m channels; -1 for
+      none.
     """
 
     track: Track
@@ -50,14 +47,14 @@ def associated(
     *,
     missing: Missing = "drop",
 ) -> Associated:
-    """Return the tracks of several targets from rows that do not say whose they are.
+    """Return the tracks of several targets from unlabelled rows.
 
     Parameters
     ----------
     given : RowCandidates
-        Measurements; scans not later than the start are left out.
+        Measurements; scans at or before the start are ignored.
     start : State
-        All targets (..., t).
+        States of all targets (..., t).
     dynamics : Dynamics
         Model of motion.
     rule : callable
@@ -65,20 +62,20 @@ def associated(
     update : callable or str
         A filter, or its name in `UPDATES`.
     missing : "drop" or "expect"
-        What a channel without a row does: nothing; or, as one paper has it, it repeats the prediction and so makes
-        the filter believe in it. "expect" is for comparison only.
+        Treatment of a channel without a row. "drop" ignores it. "expect", as in one paper, uses the prediction as a
+        measurement, so that the covariance is too small; it is for comparison only.
 
     Raises
     ------
     InvalidProblem
-        For an unknown filter, a state that does not fit the dynamics or has no axis of targets.
+        If the filter is unknown, the state does not fit the dynamics, or the state has no axis of targets.
     """
     given, filtering = _check(given), filter_of(update)
     d = given.channels.dimension
     check_state(start, (dynamics.order + 1) * d)
     if start.mean.ndim < 2:
         raise InvalidProblem("the state has no axis of targets", "start", "give means (..., t, n)")
-    # The start gets the leading axes of the candidates, and its axis of targets behind them.
+    # The start gets the leading axes of the candidates, with its axis of targets behind them.
     state, steps, times, picks = spread(start, (*given.z.shape[:-2], 1)), [], [], []
     runs = Scans.of(given.channels, dynamics.order)
     for k, (time, scan, z) in enumerate(given.scans(dynamics.order)):
@@ -90,11 +87,11 @@ def associated(
         if scan.rows:
             found = np.take_along_axis(z[..., None, :, :], np.maximum(pick, 0)[..., None], axis=-1)[..., 0]
             expected = predict(scan, ahead.mean)
-            # A channel that "expects" has the prediction as its row: an innovation of zero shrinks the covariance.
+            # With "expect", the prediction is the row of the channel: an innovation of zero shrinks the covariance.
             weight = (pick >= 0).astype(float) if missing == "drop" else np.ones(pick.shape)
             more = np.where(pick >= 0, found, expected), weight
         done, code = step(runs, k, ahead, dynamics, filtering, more)
-        # Rows that no target took were there, but did not fit: that is another status than silence.
+        # If rows were present but no target took one, the status is rejected and not too few rows.
         seen = np.asarray(np.isfinite(z).any((-1, -2)))[..., None]
         code = np.where((code == Status.TOO_FEW_ROWS) & seen, Status.REJECTED, code).astype(np.int8)
         state = State(time, done.mean, done.cov)
@@ -104,27 +101,27 @@ def associated(
     return Associated(collect(np.array(times), steps, d), tuple(picks))
 
 
-# Unlabelled measurements: for each channel of each scan, the values one of which may be a target's.
+# Unlabelled measurements: the candidate values of each channel of each scan.
 
 
 @dataclass(frozen=True, slots=True)
 class RowCandidates:
-    """What may belong to one of several targets.
+    """Measurements that may belong to one of several targets.
 
     Parameters
     ----------
     channels : Problem
-        A run of one target with one row for each channel (kind and stations) and epoch; its measurements do not
-        matter, and it has no batch axes.
+        A run of one target with one row for each channel (kind and stations) and epoch. Its measurements are ignored,
+        and it has no batch axes.
     z : array (..., m, c)
-        Values measured in the channel of each row, SI units or radians; NaN where there are fewer than c.
+        Values measured in the channel of each row, SI units or radians; NaN if there are fewer than c values.
     """
 
     channels: Problem
     z: Array
 
     def scans(self, order: int) -> Iterator[tuple[float, Problem, Array]]:
-        """Yield time, channels and candidates (..., m, c) of each scan; the unknown is a state of an order."""
+        """Yield time, channels and candidates (..., m, c) of each scan; the unknown is a state of the given order."""
         for k, (time, scan) in enumerate(scans(self.channels, order)):
             yield time, scan, self.z[..., self.channels.epoch == k, :]
 
@@ -132,27 +129,27 @@ class RowCandidates:
 def candidates(problem: Problem) -> RowCandidates:
     """Return the rows of a run as candidates: rows of one kind, epoch and pair of stations are one channel.
 
-    Known corrections are taken off.
+    Known corrections are subtracted.
 
     Parameters
     ----------
     problem : Problem
-        A single run, or a batch (...) with common stations and noise. The targets of its rows, usually -1, do not
-        matter; a channel has the noise of its first row.
+        A single run, or a batch (...) with common stations and noise. The target numbers of its rows, usually -1, are
+        ignored; a channel has the noise of its first row.
 
     Raises
     ------
     InvalidProblem
-        Where stations or noise differ between the runs of a batch.
+        If stations or noise differ between the runs of a batch.
     """
     first, members = channels_of(problem)
     rows, values = [], []
     width = max((len(found) for found in members), default=0)
-    # Absent rows are no candidates.
+    # Absent rows are not candidates.
     z = np.where(problem.weight > 0.0, problem.observed, np.nan)
     for found in members:
         column = z[..., found]
-        # All channels have room for as many values as the fullest one; the rest is NaN.
+        # All channels have the length of the longest one; the rest is NaN.
         gap = np.full((*column.shape[:-1], width - len(found)), np.nan)
         values.append(np.concatenate([column, gap], axis=-1))
     start = 0
@@ -165,13 +162,13 @@ def candidates(problem: Problem) -> RowCandidates:
 
 
 def _check(given: RowCandidates) -> RowCandidates:
-    """Return candidates that fit their channels, known corrections taken off; raise InvalidProblem for others."""
+    """Return candidates minus known corrections; raise InvalidProblem if they do not fit their channels."""
     if given.channels.batch_shape != ():
-        advice = "track runs with stations or noise of their own one by one"
+        advice = "track runs with different stations or noise separately"
         raise InvalidProblem("the channels have batch axes", "candidates", advice)
     if given.z.ndim < 2 or given.z.shape[-2] != given.channels.count or not given.z.shape[-1]:
-        what = f"candidates of shape {given.z.shape} for {given.channels.count} channels"
-        raise InvalidProblem(what, "candidates", "give (..., m, c), c at least 1")
+        what = f"the candidates have shape {given.z.shape}, but there are {given.channels.count} channels"
+        raise InvalidProblem(what, "candidates", "give shape (..., m, c) with c at least 1")
     correction = np.concatenate([block.correction for block in given.channels.rows])
     if not correction.any():
         return given
@@ -180,8 +177,8 @@ def _check(given: RowCandidates) -> RowCandidates:
 
 
 def channels_of(problem: Problem) -> tuple[Array, list[Array]]:
-    """Return the first row of each channel, ascending, and all rows of each."""
-    # A channel is a kind at its stations in one epoch; a row of b against a is another one than a against b.
+    """Return the first row of each channel in ascending order, and all rows of each channel."""
+    # A channel is a kind at its stations in one epoch; a row of b against a is a different channel from a against b.
     keys = [
         (kind, int(epoch), int(a), int(b))
         for kind, block in enumerate(problem.rows)
@@ -195,6 +192,7 @@ def channels_of(problem: Problem) -> tuple[Array, list[Array]]:
 
 
 def _row(block: Rows, kept: Array) -> Rows:
+    """Return the kept rows of a block as channels, without measurements."""
     nan, none = np.full(len(kept), np.nan), np.zeros(len(kept), dtype=np.int64)
     sure = np.ones(len(kept))
     return Rows(block.kind, nan, block.a[kept], block.b[kept], block.epoch[kept], none, sure, np.zeros(len(kept)))
@@ -209,33 +207,33 @@ def _with_noise(problem: Problem, made: Problem, first: Array) -> Problem:
     return replace(made, noise=noises.Noise(tuple(blocks)))
 
 
-# One target of several: its own rows and scans as a run.
+# One of several targets: its rows and scans as a run.
 
 
 def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
-    """Return the run of one target: some rows of a problem, and the epochs that they belong to.
+    """Return the run of one target: some rows of a problem, and the epochs of these rows.
 
     Parameters
     ----------
     problem : Problem
-        Any run; what it says of motions, and constraints of other targets, is left out.
+        Any run; its models of motion, and constraints of other targets, are removed.
     kept : bool array (m,)
-        Rows of the target, of all kinds.
+        Rows of the target, over all kinds.
     times : array (k,), optional
-        Seconds of the epochs of `problem`, in the place of its own.
+        Times in seconds that replace the times of the epochs of `problem`.
 
     Returns
     -------
     Problem
-        Of one target that is free at each epoch, to be given to `tracked`.
+        Run of one target with a free position at each epoch, for `tracked`.
 
     Raises
     ------
     InvalidProblem
-        Where no row is left.
+        If no row is kept.
     """
     if not kept.any():
-        raise InvalidProblem("the target has no rows", "track", "name a target that was measured")
+        raise InvalidProblem("the target has no rows", "track", "select a target with measurements")
     epochs = np.unique(problem.epoch[kept])
     number = np.full(problem.epochs, -1)
     number[epochs] = np.arange(len(epochs))
@@ -261,17 +259,18 @@ def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
 
 
 def _rows(block: Rows, own: Array, number: Array) -> Rows:
+    """Return the rows of one target from a block, with new epoch numbers."""
     picked = {name: getattr(block, name)[..., own] for name in ("z", "weight", "correction")}
     a, b = block.a[own], block.b[own]
     return replace(block, **picked, a=a, b=b, epoch=number[block.epoch[own]], target=np.zeros_like(a))
 
 
 def _blocks(noise: Noise, kept: Array) -> list[Block]:
-    """Return the noise of the rows that are kept: of a group that loses some, the covariance of the others."""
+    """Return the noise of the kept rows; a group that loses rows keeps the covariance of its other rows."""
     place, found = np.cumsum(kept) - 1, []
     for block in noise.blocks:
         inside = kept[block.row]
-        # Groups that lose the same rows stay one block; what is left of a group has the covariance of its rows.
+        # Groups that lose the same rows stay in one block.
         for pattern in np.unique(inside, axis=0):
             if not pattern.any():
                 continue

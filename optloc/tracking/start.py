@@ -1,4 +1,4 @@
-"""Initial states: a fix of one epoch, or of as many as it takes to see a velocity."""
+"""Initial states of tracks: a fix of one epoch, or of several epochs that determine a velocity."""
 
 from __future__ import annotations
 
@@ -21,25 +21,26 @@ from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.rivals import Rival
 from optloc.tracking.track import State, check_trackable
 
-# Metres: below every other error; of ECEF coordinates a millimetre has too few digits to converge on.
+# Metres. It is below every other error; a millimetre has too few digits in ECEF coordinates for convergence.
 _EXACT = 1e-2
-# Rows of a start whose chi-square is less likely than this contradict each other: the next scan is tried. One good
-# start in ten thousand is passed over, which costs a scan; a wrong one costs the track.
+# If the chi-square of the rows of a start is less likely than this, the rows contradict each other. The next scan is
+# then tried as a start. One of ten thousand good starts is rejected, which costs a scan; a wrong start costs the track.
 _PLAUSIBLE = 1e-4
-# Scans that starts are tried from before one that contradicts itself is taken: every try costs a fix, and a run that is
-# wrong for longer deserves a status more than a search. The distance grows by half each time, and eleven tries reach
-# over forty scans: who is heard badly at first (a drone on the floor) has moved by then.
+# Largest number of first scans that are tried before a contradictory start is accepted: every attempt needs a fix, and
+# for a longer contradiction a status is better than a longer search. The distance grows by half each time, and eleven
+# attempts reach over forty scans. A target with bad reception at first (a drone on the floor) has moved by then.
 _TRIES = 11
-# Scans of a stretch that is made longer until its state is clear: a longer one asks more of the model of motion, which
-# has no noise here, than of the rows.
+# Largest number of scans of a start that is extended until its state is unique: in a longer start, the fit depends more
+# on the model of motion, which has no noise here, than on the rows.
 _CLEAR = 24
-# Standard deviation of a position, in spreads of the stations and as a share of its distance from them, where both
-# together end a track. Three standard deviations then reach the stations, and far away all level differences are alike:
-# a track by level differences ran 650 m away from a flat of 9 m. With three spreads it goes one scan farther.
+# Limits of the standard deviation of a position, in spreads of the stations and as a share of its distance from them.
+# If both are exceeded, the track ends. Three standard deviations then reach the stations, and far away all level
+# differences are alike: a track by level differences moved 650 m away from a flat of 9 m. With three spreads the track
+# lasts one scan longer.
 _SPREADS, _SHARE = 2.0, 1.0 / 3.0
 
 Fit = tuple[float, int]
-"""Sum of the squared innovations (or residuals) of rows in their standard deviations, and how many these are."""
+"""Sum of the squared innovations (or residuals) of rows in their standard deviations, and the number of rows."""
 
 
 def begun(
@@ -51,10 +52,10 @@ def begun(
     rate: float | None = None,
     method: str = "auto",
 ) -> State:
-    """Return the initial state of a run's target, without a guess.
+    """Return the initial state of the target of a run, without a guess.
 
-    The first epochs are solved as one problem of the order of the dynamics: as many as it takes until position,
-    velocity and acceleration are determined. With prior standard deviations the first epoch alone may do.
+    The first epochs are solved as one problem of the order of the dynamics. Epochs are added until position, velocity
+    and acceleration are determined. With prior standard deviations, the first epoch alone may be enough.
 
     Parameters
     ----------
@@ -63,23 +64,23 @@ def begun(
     dynamics : Dynamics
         Gives the order of the state.
     epochs : int, optional
-        Number of epochs to start from; None: the fewest that determine the state.
+        Number of first epochs for the start; None for the smallest number that determines the state.
     speed, rate : float, optional
         Prior standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero.
     method : str
-        By which the epochs are solved, as `optloc.solve`; "robust" where rows may be gross errors.
+        Method of `optloc.solve` for the epochs; "robust" if rows may have gross errors.
 
     Returns
     -------
     State
-        At the time of the last epoch used.
+        State at the time of the last used epoch.
 
     Raises
     ------
     InvalidProblem
-        Where the run is not one target's.
+        If the run has several targets.
     NoSolution
-        Where no number of epochs determines the state; it carries the last fix.
+        If no number of epochs determines the state; the exception has the last fix.
     """
     check_trackable(problem)
     order = dynamics.order
@@ -94,9 +95,9 @@ def begun(
 
 
 def is_one_gaussian(fix: Fix) -> bool:
-    """Return whether a fix is one place with a covariance that covers: what a filter begins with.
+    """Return whether a fix is one position with a valid covariance, as a filter requires for its start.
 
-    That no other place exists is proven of single scans at most; of runs it is enough that none was found.
+    A proof of uniqueness exists for single scans at most; for runs it is enough that no other position was found.
     """
     against = (Status.MISFIT, Status.UNBOUNDED, Status.AMBIGUOUS, Status.CURVED)
     return bool(fix.answered) and not bool(fix.has(*against))
@@ -115,17 +116,19 @@ def two_point(first: Fix, second: Fix, times: tuple[float, float]) -> State:
     Raises
     ------
     InvalidProblem
-        Where the second fix is not later than the first.
+        If the second fix is not later than the first.
 
     References
     ----------
     Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), eq.
     5.5.3-4, with the covariance of each fix.
     """
-    # The error of the second fix is in both parts of the state: its covariance is what ties velocity to position.
+    # The error of the second fix is in both parts of the state, so its covariance correlates velocity and position.
     T = times[1] - times[0]
     if not T > 0.0:
-        raise InvalidProblem(f"fixes at {times[0]} and {times[1]} s", "times", "give the earlier fix first")
+        raise InvalidProblem(
+            f"the fixes at {times[0]} and {times[1]} s are not in order", "times", "give the earlier fix first"
+        )
     one, two = first.covariance(), second.covariance()
     mean = np.concatenate([second.position, (second.position - first.position) / T], axis=-1)
     upper = np.concatenate([two, two / T], axis=-1)
@@ -134,14 +137,14 @@ def two_point(first: Fix, second: Fix, times: tuple[float, float]) -> State:
 
 
 def counts(epochs: int, order: int, speed: float | None = None, rate: float | None = None) -> list[int]:
-    """Return the numbers of first epochs, of so many, that a start tries: each next by half more; as `begun`."""
-    # With a prior of every rate one epoch may do; else a state of order q has q + 1 scans at the least.
+    """Return the numbers of first epochs that a start tries, each half larger than the number before; see `begun`."""
+    # With a prior of every rate, one epoch may be enough; otherwise a state of order q needs at least q + 1 scans.
     known = speed is not None and (order < 2 or rate is not None)
     count = 1 if order == 0 or known else order + 1
     out = []
     while count < epochs:
         out.append(count)
-        # Half more each time: the work of all tries together is some three times that of the last.
+        # Half more each time: all attempts together take about three times as long as the last attempt.
         count = max(count + 1, count * 3 // 2)
     return [*out, epochs]
 
@@ -155,11 +158,12 @@ def first_fix(
     rate: float | None = None,
     method: str = "auto",
 ) -> Fix:
-    """Return the fix of the first epochs of a run, a target that moves by the order of the dynamics; as `begun`."""
+    """Return the fix of the first `count` epochs of a run, with a motion of the order of the dynamics; see `begun`."""
     return solve(_first(problem, count, dynamics.order, speed, rate), method)
 
 
 def _first(problem: Problem, count: int, order: int, speed: float | None, rate: float | None) -> Problem:
+    """Return the first epochs of a run as one problem, with priors of velocity and acceleration."""
     part = cut(problem, 0, count)
     d = problem.dimension
     priors = [
@@ -167,21 +171,21 @@ def _first(problem: Problem, count: int, order: int, speed: float | None, rate: 
         for name, sigma in (("velocity", speed), ("acceleration", rate))[:order]
         if sigma is not None
     ]
-    # The state is asked for at the last scan used, where tracking goes on.
+    # The state is estimated at the last used scan, where tracking continues.
     motion = Motion(order, reference=float(problem.times[count - 1]))
     return replace(part, motions=(motion,), priors=tuple(priors))
 
 
 def state_of(problem: Problem, fix: Fix, used: int) -> State:
-    """Return the `first_fix` of so many epochs as a state at the last of them."""
+    """Return the `first_fix` of the first `used` epochs as a state at the last of these epochs."""
     mean, cov = fix.gaussian()
     return State(float(problem.times[used - 1]), np.array(mean), np.array(cov))
 
 
 def with_height_rows(problem: Problem) -> Problem:
-    """Return a run whose exact height, if it has one, is measured at every epoch within a centimetre.
+    """Return a run whose exact height, if there is one, is a measurement of every epoch with a sigma of a centimetre.
 
-    Bounds stay: they tell starts apart. Epochs without rows stay without.
+    Bounds remain, because they separate starts. Epochs without rows do not get a height.
 
     Parameters
     ----------
@@ -191,53 +195,42 @@ def with_height_rows(problem: Problem) -> Problem:
     Raises
     ------
     InvalidProblem
-        For an equality other than that of the height: updates would not hold it.
+        For another equality than an exact height, because updates would not keep it.
     """
-    # An exact height as a row of every scan, so that updates hold it as starts do.
+    # An exact height becomes a row of every scan, so that updates keep it as starts do.
     exact = [c for c in problem.constraints if isinstance(c, Band) and np.array_equal(c.lower, c.upper)]
     if not exact:
         return problem
     other = next((c for c in exact if c.kind != "height"), None)
     if other is not None:
-        advice = "give bounds, or solve the run as one problem"
+        advice = "replace it by bounds, or solve the run as one problem"
         raise InvalidProblem(f"the constraint {other.name!r} is an equality", "track", advice)
-    heard = np.unique(problem.epoch[problem.weight > 0.0])
-    m, none = len(heard), np.full(len(heard), -1)
+    observed = np.unique(problem.epoch[problem.weight > 0.0])
+    m, none = len(observed), np.full(len(observed), -1)
     rise = problem.motions[0].rise
-    z = np.broadcast_to(exact[0].lower, (m,)) if rise is None else exact[0].lower[..., None] + rise[..., heard, 0]
-    rows = Rows("height", z, none, none, heard, np.zeros_like(heard), np.ones(m), np.zeros(m))
+    z = np.broadcast_to(exact[0].lower, (m,)) if rise is None else exact[0].lower[..., None] + rise[..., observed, 0]
+    rows = Rows("height", z, none, none, observed, np.zeros_like(observed), np.ones(m), np.zeros(m))
     block = Block(problem.count + np.arange(m)[:, None], np.full((1, 1, 1), _EXACT**2))
     kept = tuple(c for c in problem.constraints if not any(c is e for e in exact))
     return replace(problem, rows=(*problem.rows, rows), noise=Noise((*problem.noise.blocks, block)), constraints=kept)
 
 
-# Where a track begins: the first scans that determine a state and do not contradict each other.
+# Start of a track: the first scans that determine a state and do not contradict each other.
 
 
 @dataclass(frozen=True, slots=True)
 class Beginning:
-    """A start, or why there is none.
+    """A start, or the reason why there is no start.
 
-    Parameters
-    ----------
-    last : int
-        Last scan that was used, or given up.
-    state : State or None
-        At that scan.
-    code : Status
-        Ok; ambiguous where the state has alternatives; rejected where the rows contradict each other.
-    waiting : Status
-        Of the scans before: ok where a start follows.
-    reason : str
-        A sentence where the status is not ok.
-    fit : tuple of float and int
-        Chi-square of the rows of the start, and its degrees of freedom.
-    left_out : int
-        Rows of the last scan that a robust start leaves out.
-    first : int
-        First scan that was used.
-    rivals : tuple of Rival
-        Other states at the last scan, where the start is ambiguous.
+    - last: last scan that was used or given up.
+    - state: state at this scan, or None.
+    - code: ok; ambiguous if the state has alternatives; rejected if the rows contradict each other.
+    - waiting: status of the scans before; ok if a start follows.
+    - reason: a sentence if the status is not ok.
+    - fit: chi-square of the rows of the start, and its degrees of freedom.
+    - left_out: number of rows of the last scan that a robust start excludes.
+    - first: first used scan.
+    - rivals: other states at the last scan if the start is ambiguous.
     """
 
     last: int
@@ -251,8 +244,8 @@ class Beginning:
     rivals: tuple[Rival, ...] = ()
 
 
-class Undecided(Exception):  # noqa: N818  # no failure: more scans are to come
-    """A start that needs more scans than have come: so many of the run."""
+class Undecided(Exception):  # noqa: N818  # no error: more scans follow
+    """Raised if a start needs more scans than have arrived; `scans` is the necessary number of scans of the run."""
 
     def __init__(self, scans: int) -> None:
         super().__init__(scans)
@@ -261,7 +254,7 @@ class Undecided(Exception):  # noqa: N818  # no failure: more scans are to come
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """Scans that determine a state: fix, first and last scan, state there; rows left out, of all and of the last."""
+    """Scans that determine a state: fix, first and last scan, final state, excluded rows of all and of the last."""
 
     fix: Fix
     first: int
@@ -272,7 +265,7 @@ class _Stretch:
 
     @property
     def p(self) -> float:
-        """Return the p-value of the rows; 1 without redundancy, where nothing contradicts."""
+        """Return the p-value of the rows; 1 without redundancy, because no row contradicts the others then."""
         p = float(self.fix.p_value)
         return 1.0 if np.isnan(p) else p
 
@@ -288,13 +281,13 @@ class _Stretch:
 
     @property
     def clean(self) -> bool:
-        """Return whether a filter may begin with it."""
-        # With less redundancy than that other rows might be the wrong ones, see `optloc.solvers.suspects`.
+        """Return whether a filter can start with this state."""
+        # With less redundancy, other rows might be the wrong rows, see `optloc.solvers.suspects`.
         sure = not self.left_out or int(self.fix.dof) > self.left_out
         return sure and self.p >= _PLAUSIBLE and is_one_gaussian(self.fix)
 
     def beginning(self, code: Status, reason: str = "") -> Beginning:
-        """Return it as a start."""
+        """Return the stretch as a start."""
         return Beginning(self.last, self.state, code, Status.OK, reason, self.fit, self.left_out_last, self.first)
 
 
@@ -308,35 +301,22 @@ def begin(
     *,
     ends: bool = True,
 ) -> Beginning:
-    """Return a start from the scan `first` on, without a guess.
+    """Return a start at scan `first` or later, without a guess.
 
-    The fewest scans that determine the state are solved as one problem. Where their rows contradict each other the
-    stretch begins one scan later, where several states explain them it is made longer.
-
-    Parameters
-    ----------
-    problem : Problem
-        A single run of one target.
-    first : int
-        First scan that may be used.
-    dynamics : Dynamics
-        Gives the order of the state.
-    speed, rate : float, optional
-        Prior standard deviations, see `begun`.
-    method : str
-        See `begun`.
-    ends : bool
-        Whether these are all scans. Otherwise what a start asks of scans that are still to come is `Undecided`.
+    The smallest number of scans that determines the state is solved as one problem. If their rows contradict each
+    other, the stretch of scans starts one scan later. If several states explain the rows, the stretch is extended.
+    `speed`, `rate` and `method` are as in `begun`. With `ends`, `problem` has all scans of the run; otherwise a start
+    that needs later scans raises `Undecided`.
     """
     doubtful: list[_Stretch] = []
     verdict, last = Status.TOO_FEW_ROWS, first
-    heard = _heard(problem, first)
-    for i in _slides(len(heard) if ends else np.inf):
-        if i >= len(heard):
+    observed = _scans_with_rows(problem, first)
+    for i in _slides(len(observed) if ends else np.inf):
+        if i >= len(observed):
             raise Undecided(problem.epochs + 1)
-        last = int(heard[i])
+        last = int(observed[i])
         run = cut(problem, last, problem.epochs)
-        # Of a run that goes on, the numbers up to the next one after what is there.
+        # For a run that continues, add the next numbers of scans beyond the present length.
         tries = counts(run.epochs if ends else 2 * run.epochs + 2, dynamics.order, speed, rate)
         fixed = partial(first_fix, run, dynamics, speed=speed, rate=rate, method=method)
         found, verdict = _stretch(run, last, tries, fixed)
@@ -345,7 +325,7 @@ def begin(
         if found is not None:
             doubtful.append(found)
         elif verdict != Status.CONTRADICTORY:
-            break  # what all later scans leave open, fewer of them do too
+            break  # if all later scans leave the state open, fewer scans do so too
         if found is not None and found.p >= _PLAUSIBLE:
             break
     if doubtful:
@@ -356,19 +336,19 @@ def begin(
         run = cut(problem, best.first, problem.epochs)
         posed = _first(run, best.last - best.first + 1, dynamics.order, speed, rate)
         return replace(start, rivals=tuple(_rivals(posed, best)))
-    if verdict == Status.CONTRADICTORY:  # of these scans; later ones may agree
+    if verdict == Status.CONTRADICTORY:  # these scans contradict each other; later scans may agree
         return Beginning(last, None, Status.REJECTED, Status.REJECTED, "the rows of the scans contradict each other")
-    reason = f"the scans that are left do not determine a state: {verdict.label}"
+    reason = f"the remaining scans do not determine a state: {verdict.label}"
     return Beginning(problem.epochs - 1, None, verdict, verdict, reason)
 
 
 def _doubtful(best: _Stretch) -> Beginning:
-    """Return a start that is not clean, with a status that says what is wrong with it."""
+    """Return a start with a doubtful state, and the status that names the problem."""
     return best.beginning(*objections(_FINDINGS, best)[0])
 
 
 def _rivals(posed: Problem, best: _Stretch) -> Iterator[Rival]:
-    """Yield the other minima of a start as states, of its problem and the rows that it keeps."""
+    """Yield the other minima of a start as states, from its problem with the kept rows."""
     kept = posed.with_rows(weight=posed.weight * (best.fix.weights > 0.0))
     others = best.fix.alternatives
     for x, gap in zip(others.x, others.gap, strict=True):
@@ -389,14 +369,14 @@ _FINDINGS = (
         lambda start: start.others,
         lambda start: [f"the start has {start.others} alternative{'s' if start.others > 1 else ''}"],
     ),
-    # no other reason is left
-    Finding(Status.CURVED, lambda start: True, lambda start: ["the covariance of the start does not cover"]),
+    # the last possible reason
+    Finding(Status.CURVED, lambda start: True, lambda start: ["the covariance of the start is not valid"]),
 )
-"""All findings against a start that is not clean."""
+"""Findings about a start with a doubtful state."""
 
 
 def _slides(count: float) -> Iterator[int]:
-    """Yield which of so many scans starts are tried from: the next few, then ever farther apart."""
+    """Yield the numbers of the scans at which starts are tried: the next few scans, then at increasing distances."""
     i = 0
     for _ in range(_TRIES):
         if i < count:
@@ -405,7 +385,7 @@ def _slides(count: float) -> Iterator[int]:
 
 
 def _stretch(run: Problem, k: int, tries: Sequence[int], fixed: Callable[[int], Fix]) -> tuple[_Stretch | None, Status]:
-    """Return the first clear start of a run from scan k on, else the first that is answered, and the last verdict."""
+    """Return the first unique start of a run from scan k, else the first start with an answer, and the last status."""
     ambiguous, verdict = None, Status.TOO_FEW_ROWS
     for count in tries:
         if ambiguous is not None and count > _CLEAR:
@@ -414,7 +394,8 @@ def _stretch(run: Problem, k: int, tries: Sequence[int], fixed: Callable[[int], 
             raise Undecided(k + count)
         fix = fixed(count)
         verdict = Status(int(fix.code))
-        # More scans do not mend rows that contradict each other; NaN without redundancy, where nothing does.
+        # More scans do not repair contradictory rows; the p-value is NaN without redundancy, and then no row
+        # contradicts.
         contradicted = bool(fix.p_value < _PLAUSIBLE)
         state = state_of(run, fix, count) if bool(fix.answered) else None
         if state is None or _is_vague(run, state):
@@ -433,33 +414,33 @@ def _stretch(run: Problem, k: int, tries: Sequence[int], fixed: Callable[[int], 
 
 
 def _is_vague(problem: Problem, state: State) -> bool:
-    """Return whether a state is vaguer than the range of the target, so that it begins nothing; NaN is vague, too."""
+    """Return whether a state is more uncertain than the range of the target; NaN counts as uncertain."""
     d = problem.dimension
     sigma = float(np.sqrt(np.linalg.eigvalsh(state.cov[:d, :d])[-1]))
     return not sigma <= reach(problem, state.mean[:d])
 
 
-def _heard(problem: Problem, first: int) -> Array:
-    """Return the scans from `first` on that have a valid row."""
+def _scans_with_rows(problem: Problem, first: int) -> Array:
+    """Return the scans from `first` on that have a valid row, in ascending order."""
     scans = np.unique(problem.epoch[problem.weight > 0.0])
     return np.asarray(scans[scans >= first])
 
 
 def reach(problem: Problem, position: Array) -> float:
-    """Return the spread of the stations, or the range of a position (d,) from their centre if that is more, metres."""
+    """Return the larger of the spread of the stations and the distance of a position (d,) from their centre, m."""
     centre, spread = centre_and_spread(problem.stations.places.reshape(-1, problem.dimension))
     return max(float(spread), float(np.linalg.norm(position - centre)))
 
 
 def out_of_sight(problem: Problem, mean: Array, cov: Array) -> str:
-    """Return why a position is too vague to follow, by mean and covariance (n, n) of the state; empty where it is not.
+    """Return the reason why a position is too uncertain to follow; empty if it is not.
 
-    Its standard deviation is then more than twice the spread of the stations. It is also more than a third of the
-    distance from their centre.
+    The standard deviation is then more than twice the spread of the stations, and more than a third of the distance
+    from their centre. `mean` (n,) and `cov` (n, n) belong to the state.
     """
     d = problem.dimension
     sigma = float(np.sqrt(max(np.linalg.eigvalsh(cov[:d, :d])[-1], 0.0)))
     centre, spread = centre_and_spread(problem.stations.places.reshape(-1, d))
     if sigma <= max(_SPREADS * float(spread), _SHARE * float(np.linalg.norm(mean[:d] - centre))):
         return ""
-    return f"the position is uncertain by {sigma:.3g} m, and the stations are spread by {float(spread):.3g} m"
+    return f"the position is uncertain by {sigma:.3g} m, but the spread of the stations is {float(spread):.3g} m"

@@ -1,4 +1,4 @@
-"""Fixes in time: predict, update, scan by scan."""
+"""Prediction and update of the state of a target, scan by scan, and the types `State` and `Track`."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.scan_rows import Scans
 from optloc.tracking.updates import Filter, Update, Updated, filter_of, read
 
-# Eigenvalue below zero, as a share of the largest entry, that rounding makes of a covariance which is singular.
+# Smallest eigenvalue of a singular covariance after rounding, as a share of its largest entry.
 _NEGATIVE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """Where a target is believed to be.
+    """Estimated state of a target at one time.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class State:
     mean : array (..., n)
         State [p, v, a].
     cov : array (..., n, n)
-        Covariance.
+        Covariance of the state.
     """
 
     time: float
@@ -44,25 +44,25 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """A target over time; a batch of targets has leading axes.
+    """States of a target over time; a batch of targets has leading axes.
 
     Parameters
     ----------
     times : array (k,)
-        Seconds of the scans.
+        Times of the scans, seconds.
     mean : array (..., k, n)
         State after each scan.
     cov : array (..., k, n, n)
-        Covariance.
+        Covariance after each scan.
     nis : array (..., k)
-        Normalised innovation squared; NaN where no row was used.
+        Normalised innovation squared; NaN if no row was used.
     count : int array (..., k)
-        Rows used.
+        Number of rows used.
     loglikelihood : array (..., k)
-        Of each scan given the prediction.
+        Log-likelihood of each scan given the prediction.
     code : int array (..., k)
-        `Status` of each scan: ok; too few rows where none was valid and the state was only predicted; rejected where
-        rows did not pass the gate or are not finite; numerical where the state is lost.
+        `Status` of each scan. Ok. Too few rows: no valid row, the state is only predicted. Rejected: rows failed the
+        gate or are not finite. Numerical: the state is lost.
     dimension : int
         2 or 3.
     """
@@ -85,7 +85,7 @@ class Track:
     def velocity(self) -> Array:
         """Return the velocities (..., k, d), metres per second; raise InvalidProblem for a static target."""
         if self.mean.shape[-1] < 2 * self.dimension:
-            raise InvalidProblem("the state has no velocity", "velocity", "track with a moving model")
+            raise InvalidProblem("the state has no velocity", "velocity", "use a model of motion with velocity")
         return self.mean[..., self.dimension : 2 * self.dimension]
 
     def states(self, order: str) -> tuple[Array, Array]:
@@ -94,12 +94,12 @@ class Track:
         Parameters
         ----------
         order : str
-            Names of components, such as "x vx y vy". The order of `mean` is x y z vx vy vz ax ay az.
+            Names of components, for example "x vx y vy". The order of `mean` is x y z vx vy vz ax ay az.
 
         Raises
         ------
         InvalidProblem
-            For a component that the state does not have.
+            If the state has no component of this name.
         """
         return in_order(order, self.dimension, self.mean, self.cov)
 
@@ -110,14 +110,14 @@ class Track:
 
 
 def followed(problem: Problem, start: State, dynamics: Dynamics, update: Update | str = "iekf") -> Track:
-    """Return the track of a target from a state on.
+    """Return the track of a target from a given state.
 
     Parameters
     ----------
     problem : Problem
-        Batch (...) of runs, see `scans`; scans not later than the start are left out.
+        Batch (...) of runs, see `scans`; scans at or before the start are ignored.
     start : State
-        At or before the first scan used.
+        State at or before the first used scan.
     dynamics : Dynamics
         Model of motion.
     update : callable or str
@@ -126,7 +126,7 @@ def followed(problem: Problem, start: State, dynamics: Dynamics, update: Update 
     Raises
     ------
     InvalidProblem
-        For an unknown filter, a state that does not fit the dynamics, or a run that is not one target's.
+        If the filter is unknown, the state does not fit the dynamics, or the run has several targets.
     """
     check_state(start, (dynamics.order + 1) * problem.dimension)
     check_trackable(problem)
@@ -134,7 +134,7 @@ def followed(problem: Problem, start: State, dynamics: Dynamics, update: Update 
 
 
 def follow(problem: Problem, start: State, dynamics: Dynamics, rule: Update) -> Track:
-    """Return the track of a state through the scans of a run; those not later than the start are left out."""
+    """Return the track of a state through the scans of a run; scans at or before the start are ignored."""
     given, state, steps, times = Scans.of(problem, dynamics.order), start, [], []
     for k, time in enumerate(problem.times.tolist()):
         if time <= start.time:
@@ -154,22 +154,10 @@ def step(
     rule: Update,
     more: tuple[Array, Array] | None = None,
 ) -> tuple[Updated, Array]:
-    """Return the update of a state by a scan, and its status (...), as of `take_scan`.
+    """Return the state after prediction to scan k and update, and its status (...) as in `take_scan`.
 
-    Parameters
-    ----------
-    given : Scans
-        Of the run.
-    k : int
-        Which scan; it is not before the state.
-    state : State
-        Before the prediction.
-    dynamics : Dynamics
-        Model of motion.
-    rule : callable
-        The filter.
-    more : tuple of array (..., m), optional
-        Measurements less corrections, and weights, that replace the scan's.
+    The scan is not before the state. `more` replaces the measurements minus corrections (..., m) and the weights (...,
+    m) of the scan. One call of compiled code does the update if possible.
     """
     problem = given.problem
     time, d = float(problem.times[k]), problem.dimension
@@ -186,7 +174,7 @@ def step(
 
 
 def move_of(state: State, dynamics: Dynamics, time: float, dimension: int) -> Move | None:
-    """Return the prediction of a state (...) for a later time, or None where no time passes."""
+    """Return the prediction step of a state (...) to a later time, or None for the same time."""
     dt = _elapsed(state, time)
     if dt == 0.0:
         return None
@@ -194,71 +182,64 @@ def move_of(state: State, dynamics: Dynamics, time: float, dimension: int) -> Mo
 
 
 def _elapsed(state: State, time: float) -> float:
-    """Return the seconds from a state to a later time; raise InvalidProblem for an earlier one."""
+    """Return the seconds from a state to a later time; raise InvalidProblem for an earlier time."""
     if time < state.time:
         raise InvalidProblem(f"the scan at {time} s is before the state at {state.time} s", "times", "sort the scans")
     return time - state.time
 
 
 def predicted(state: State, dynamics: Dynamics, time: float, dimension: int) -> State:
-    """Return a state at a later time.
+    """Return the predicted state at a later time.
 
     Parameters
     ----------
     state : State
-        Its order is that of the dynamics.
+        State of the order of the dynamics.
     dynamics : Dynamics
         Model of motion.
     time : float
-        Seconds, not before the state's.
+        Time of the prediction in seconds, not before the state.
     dimension : int
         2 or 3.
     """
     dt = _elapsed(state, time)
-    # Two scans of one instant: models that divide by the step are not asked.
+    # Two scans at the same time: some models divide by the time step, so skip them.
     if dt == 0.0:
         return state
-    # The drive is what the model adds to the mean beyond F: the present acceleration of the current statistical model.
+    # The model adds the drive to the mean after F: for the current statistical model, the effect of the present
+    # acceleration.
     F, Q, drive = dynamics.step(dt, state.mean, dimension)
     cov = F @ state.cov @ F.T + Q
     return State(time, (F @ state.mean[..., None])[..., 0] + drive, 0.5 * (cov + np.swapaxes(cov, -1, -2)))
 
 
 def take_scan(scan: Problem, ahead: State, rule: Update, causes: list[str] | None = None) -> tuple[Updated, Array]:
-    """Return the update of a predicted state by a scan, and its status (...): bad scans leave the prediction.
+    """Return the update of a predicted state (...) by a scan, and its status (...); a bad scan keeps the prediction.
 
-    Parameters
-    ----------
-    scan : Problem
-        One epoch.
-    ahead : State
-        At its time, (...).
-    rule : callable
-        The filter.
-    causes : list of str, optional
-        Takes a sentence of each state whose update fails numerically; they keep the prediction.
+    `scan` is a problem of one epoch at the time of the state. If an update fails numerically, its cause is appended to
+    `causes`.
     """
     shape = ahead.mean.shape[:-1]
     if not scan.rows or not scan.count:
         return _keep(ahead), np.full(shape, int(Status.TOO_FEW_ROWS), dtype=np.int8)
     usable, broken = scan, np.zeros((), dtype=bool)
     if not np.isfinite(scan.z).all():
-        # One scan may serve many targets, and one target many runs: weights take the axes of both.
+        # One scan may serve many targets, and one target many runs, so the weights have the axes of both.
         weight = np.broadcast_to(scan.weight, np.broadcast_shapes((*shape, scan.count), scan.z.shape))
         bad = ~np.isfinite(scan.z) & (weight > 0.0)
         usable, broken = scan.with_rows(z=np.where(bad, 0.0, scan.z), weight=weight * ~bad), np.asarray(bad.any(-1))
-    # A lost state is a status, not a warning: it is found out below.
+    # A lost state gets a status below, so it needs no warning.
     with np.errstate(all="ignore"):
         done = _contained(usable, ahead, rule, [] if causes is None else causes)
     if not broken.any() and np.isfinite(done.cov).all() and np.isfinite(done.mean).all() and np.all(done.count > 0):
         return done, np.zeros(done.mean.shape[:-1], dtype=np.int8)
     lost = ~(np.isfinite(done.mean).all(-1) & np.isfinite(done.cov).all((-1, -2)))
-    silent = done.count == 0
-    # What is lost outweighs what is silent, and that outweighs rows that were not finite.
-    code = np.where(lost, Status.NUMERICAL, np.where(silent, Status.TOO_FEW_ROWS, Status.OK))
+    empty = done.count == 0
+    # Order of severity: a lost state, then rows that are not finite, then a scan without rows.
+    code = np.where(lost, Status.NUMERICAL, np.where(empty, Status.TOO_FEW_ROWS, Status.OK))
     code = np.where(broken & ~lost, Status.REJECTED, code).astype(np.int8)
-    # Without a row, or with a wrong one, the prediction is the best there is.
-    kept = lost | silent
+    # Without a usable row, the prediction is the best estimate.
+    kept = lost | empty
     mean = np.where(kept[..., None], ahead.mean, done.mean)
     cov = np.where(kept[..., None, None], ahead.cov, done.cov)
     return Updated(
@@ -267,7 +248,7 @@ def take_scan(scan: Problem, ahead: State, rule: Update, causes: list[str] | Non
 
 
 def _contained(scan: Problem, ahead: State, rule: Update, causes: list[str]) -> Updated:
-    """Return the update of states, NaN of those (and no others of a batch) for which it fails numerically."""
+    """Return the update of states; only a state of a batch whose update fails numerically is NaN."""
     try:
         return rule(scan, ahead.mean, ahead.cov)
     except NUMERICAL as error:
@@ -293,16 +274,16 @@ def _contained(scan: Problem, ahead: State, rule: Update, causes: list[str]) -> 
 
 
 def _keep(ahead: State) -> Updated:
-    """Return the prediction as an update by nothing."""
+    """Return the prediction as an update without rows."""
     shape = ahead.mean.shape[:-1]
     none = np.zeros(shape)
     return Updated(ahead.mean, ahead.cov, np.full(shape, np.nan), none, none)
 
 
 def collect(times: Array, steps: list[tuple[Updated, Array]], dimension: int) -> Track:
-    """Return updates and their status, scan by scan, as a track."""
+    """Return the updates and statuses of all scans as a track."""
     if not steps:
-        raise InvalidProblem("no scan is later than the start", "start", "start before the last scan")
+        raise InvalidProblem("no scan is later than the start", "start", "give a start before the last scan")
 
     def stacked(name: str, core: int) -> Array:
         return np.stack([getattr(done, name) for done, _ in steps], axis=-1 - core)
@@ -319,17 +300,18 @@ def collect(times: Array, steps: list[tuple[Updated, Array]], dimension: int) ->
     )
 
 
-# Scans of a run, and what a tracker of one target can take.
+# Scans of a run, and checks of runs and states.
 
 
 def scans(problem: Problem, order: int) -> Iterator[tuple[float, Problem]]:
-    """Yield the times and the scans of a run: problems of one epoch whose only unknown is a state at that time.
+    """Yield the times (seconds) and the scans of a run.
+
+    A scan is a problem of one epoch. Its only unknown is the state at the time of the epoch.
 
     Parameters
     ----------
     problem : Problem
-        A run of one target without biases; what it says of the motion does not matter. Rows of arrival times are
-        taken as differences.
+        A run of one target without biases; its model of motion is ignored. Convert arrival times to differences first.
     order : int
         Order of the state.
     """
@@ -339,42 +321,44 @@ def scans(problem: Problem, order: int) -> Iterator[tuple[float, Problem]]:
 
 
 def scan_at(problem: Problem, k: int, order: int) -> Problem:
-    """Return one scan of a run, see `scans`; it has no rows where the epoch has none."""
+    """Return one scan of a run, see `scans`; it has no rows if the epoch has no rows."""
     if not (problem.epoch == k).any():
         return replace(problem, rows=())
-    # The unknown of a scan is the state at its own time: with the time as reference rows see no motion within it.
+    # The unknown of a scan is the state at the time of the scan, so this time is the reference of the motion.
     scan = cut(replace(problem, motions=(Motion(order),)), k, k + 1)
     return replace(scan, motions=(Motion(order, reference=float(problem.times[k])),))
 
 
 def check_trackable(problem: Problem) -> None:
-    """Refuse runs that a tracker of one target cannot take; raise InvalidProblem that says what to do."""
+    """Raise InvalidProblem with advice if a tracker of one target cannot use the run."""
     if len(problem.motions) > 1:
-        raise InvalidProblem("there are several targets", "track", "track them one by one")
+        raise InvalidProblem("there are several targets", "track", "track each target separately")
     if problem.biases:
-        advice = "learn it first, then `with_known_bias`"
+        advice = "estimate it first, then call `with_known_bias`"
         raise InvalidProblem(f"the bias {problem.biases[0].name!r} is unknown", "track", advice)
     if problem.emitting:
-        raise InvalidProblem("emission times are unknown", "track", "take differences with `optloc.engine.reduce`")
+        raise InvalidProblem(
+            "emission times are unknown", "track", "convert to differences with `optloc.engine.reduce`"
+        )
     if problem.stations.unknown_for:
         raise InvalidProblem("station offsets are unknown", "stations", 'give their errors span = "noise"')
 
 
 def check_state(state: State, n: int) -> None:
-    """Refuse states of the wrong size, or whose covariance is none; raise InvalidProblem."""
+    """Raise InvalidProblem for a state of the wrong size, or with an invalid covariance."""
     if state.mean.shape[-1:] != (n,) or state.cov.shape[-2:] != (n, n):
         raise InvalidProblem(
-            f"a state of {state.mean.shape[-1]} numbers and a covariance of {state.cov.shape[-2:]} for {n} unknowns",
+            f"{n} unknowns, but a state of {state.mean.shape[-1]} numbers and a covariance {state.cov.shape[-2:]}",
             "start",
-            "give position, velocity and acceleration as the dynamics have them",
+            "give position, velocity and acceleration as in the dynamics",
         )
     if not (np.isfinite(state.mean).all() and np.isfinite(state.cov).all()):
-        raise InvalidProblem("the state is not finite", "start", "start from a fix that has an answer")
+        raise InvalidProblem("the state is not finite", "start", "start from a fix with an answer")
     if (np.linalg.eigvalsh(state.cov)[..., 0] < -_NEGATIVE * np.abs(state.cov).max((-1, -2))).any():
-        raise InvalidProblem("the covariance is not positive semidefinite", "start", "give a true covariance")
+        raise InvalidProblem("the covariance is not positive semidefinite", "start", "give a valid covariance")
 
 
 def status_of_scans(fix: Fix) -> Array:
-    """Return the statuses (...) of fixes as those of a track's scans: a place that is alone needs no proof."""
+    """Return the statuses (...) of fixes as statuses of scans, which need no proof that a position is unique."""
     alone = fix.answered & ~fix.has(Status.MISFIT, Status.UNBOUNDED, Status.AMBIGUOUS)
     return np.where(alone, int(Status.OK), fix.code).astype(np.int8)

@@ -1,4 +1,4 @@
-"""What one scan says about a predicted state: all filters update from the same linearised rows."""
+"""Update of a predicted state by one scan: all filters use the same linearised rows."""
 
 from __future__ import annotations
 
@@ -37,8 +37,9 @@ from optloc.problem.problem import Problem
 from optloc.solvers.robust.reweighting import Doubt, fold_signs
 from optloc.tracking.scan_rows import Scans, size_of
 
-# Turns of weights and updates, and the change of all weights that ends them: it moves a state by less than a thousandth
-# of a sigma. A turn costs what a plain update does and takes about two thirds off the change: seven as a rule.
+# Largest number of iterations of weights and updates, and the change of all weights that ends them. This change moves a
+# state by less than a thousandth of a sigma. An iteration takes as long as a plain update and reduces the change by
+# about two thirds: typically seven iterations.
 _TURNS, _SETTLED = 30, 1e-4
 
 
@@ -55,9 +56,9 @@ class Updated:
     nis : array (...)
         Normalised innovation squared at the prediction; chi-square distributed with `count` degrees of freedom.
     loglikelihood : array (...)
-        Of the scan given the prediction.
+        Log-likelihood of the scan given the prediction.
     count : array (...)
-        Rows used.
+        Number of rows used.
     """
 
     mean: Array
@@ -68,26 +69,27 @@ class Updated:
 
 
 Update = Callable[[Problem, Array, Array], Updated]
-"""Maps a scan (a problem of one epoch whose only unknown is the state), means and covariances to the updated state."""
+"""Function of a scan (a problem of one epoch with the state as unknown), means and covariances; returns `Updated`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """A shipped filter: an `Update` that one call of machine code does for each scan.
+    """A shipped filter: an `Update` with one call of compiled code for each scan.
 
     - The extended Kalman filter linearises once, at the prediction [1]_. It is the same as the "log-likelihood
       pseudo-linear" update of angle trackers: normal equations of the rows, with the prediction as prior.
     - The iterated filter takes Gauss-Newton steps to the maximum a posteriori point [2]_. It halves a step that raises
       the cost.
-    - The modified gain has the state of the first with another covariance [3]_. This covariance uses a g with
-      h(x) - h(y) = g (x - y) exactly, y the prediction and x the updated state: the mean of the derivative over the way
-      from one to the other, which is such a g for every kind of measurement.
-    - The modified covariance has the state of the first, and a covariance linearised after the step.
+    - The modified-gain filter has the state of the extended Kalman filter but another covariance [3]_. This covariance
+      uses a matrix g with h(x) - h(y) = g (x - y) exactly. Here y is the prediction and x the updated state. The mean
+      derivative between y and x is such a g for every kind of measurement.
+    - The modified-covariance filter has the state of the extended Kalman filter, and a covariance linearised after the
+      step.
 
     Parameters
     ----------
     summary : str
-        One line.
+        One line for listings.
     how : Filtering
         Form, steps and gate.
 
@@ -104,7 +106,7 @@ class Filter:
     how: Filtering
 
     def __call__(self, scan: Problem, mean: Array, cov: Array) -> Updated:
-        """Return the update of states (..., n) that hold at the time of a scan."""
+        """Return the update of states (..., n) at the time of a scan."""
         motion = scan.motions[0]
         if scan.epochs == 1 and motion.known is None and motion.reference in (None, scan.times[0]):
             found = Scans.of(scan, motion.order).filtered(0, mean, cov, self.how._replace(d=scan.dimension))
@@ -113,7 +115,7 @@ class Filter:
         return self._general(scan, mean, cov)
 
     def _general(self, scan: Problem, mean: Array, cov: Array) -> Updated:
-        """Return the update in NumPy: for what `optloc.tracking.scan_rows.Scans` does not serve."""
+        """Return the update in NumPy, for scans that `optloc.tracking.scan_rows.Scans` does not support."""
         form, gate = self.how.form, self.how.gate
         if np.isfinite(gate):
             scan = scan.with_rows(weight=weights_within(scan, mean, cov, gate))
@@ -133,7 +135,7 @@ class Filter:
 
 ekf = Filter("the extended Kalman filter: one linearisation at the prediction", Filtering(EKF))
 """The extended Kalman filter."""
-# Gauss-Newton converges in two to four steps near its answer; a step of a millionth of a sigma is none.
+# Gauss-Newton converges in two to four steps near its solution; a step of a millionth of a sigma ends it.
 iekf = Filter(
     "the iterated extended Kalman filter: Gauss-Newton to the maximum a posteriori point", Filtering(IEKF, 20, 1e-6)
 )
@@ -146,11 +148,11 @@ mvekf = Filter("the modified-covariance extended Kalman filter: linearised after
 UPDATES: Registry[Update] = Registry(
     "optloc.trackers", callable, {"ekf": ekf, "iekf": iekf, "mgekf": mgekf, "mvekf": mvekf}
 )
-"""Filters by name: add one function and one line, or from another package an entry point of ``optloc.trackers``."""
+"""Filters by name. Add one function and one line, or, in another package, an entry point of ``optloc.trackers``."""
 
 
 def filter_of(update: Update | str) -> Update:
-    """Return a filter by name; raise InvalidProblem for an unknown one."""
+    """Return a filter by name; raise InvalidProblem for an unknown name."""
     if not isinstance(update, str):
         return update
     if update not in UPDATES:
@@ -159,7 +161,7 @@ def filter_of(update: Update | str) -> Update:
 
 
 def gated(update: Update | str, width: float = 5.0) -> Update:
-    """Return a filter that leaves out the rows whose innovation is too large to be true.
+    """Return a filter with a gate: it rejects rows with an innovation that is too large.
 
     Parameters
     ----------
@@ -186,11 +188,11 @@ def gated(update: Update | str, width: float = 5.0) -> Update:
 
 
 def reweighted(update: Update | str, loss: Loss | str) -> Update:
-    """Return a filter whose update is repeated with rows weighed by a loss of their residuals, until the weights stay.
+    """Return a filter that iterates its update with rows weighted by a loss of their residuals.
 
-    The first weights are those of the innovations in their own standard deviations, prediction included; later ones
-    those of the residuals at the updated state, as in `optloc.solve` with this loss. With "iekf" the state is then a
-    stationary point of prior and loss together; the covariance is that of least squares with these weights.
+    The first weights come from the innovations in their standard deviations, prediction included. Later weights come
+    from the residuals at the updated state, as in `optloc.solve` with this loss. With "iekf", the state is a stationary
+    point of prior and loss together. The covariance is the covariance of least squares with these weights.
 
     Parameters
     ----------
@@ -217,21 +219,22 @@ def reweighted(update: Update | str, loss: Loss | str) -> Update:
     chosen: Loss = loss
 
     def robust(scan: Problem, mean: Array, cov: Array) -> Updated:
-        # Scan and state may each have the leading axes that the other lacks; the loss works on a flat batch.
+        # Scan and state may have different leading axes; the loss works on a flat batch.
         many = np.broadcast_shapes(scan.batch_shape, mean.shape[:-1])
         x, flat = np.broadcast_to(mean, (*many, mean.shape[-1])).reshape(-1, mean.shape[-1]), scan.flat()
         doubt = Doubt.of(flat, x)
-        # An innovation has the prediction's uncertainty: a row is not doubted for what the state is unsure of.
+        # An innovation includes the uncertainty of the prediction, so an uncertain state does not reduce the weight of
+        # a row.
         residual, H = differentiate(flat, x)
         spread = ((H @ np.broadcast_to(cov, (*many, *cov.shape[-2:])).reshape(-1, *cov.shape[-2:])) * H).sum(-1)
         u = np.where(doubt.base > 0.0, residual, 0.0) / np.sqrt(doubt.own + spread)
         weight = chosen.weight(fold_signs(chosen, u, doubt.sided))
         for _ in range(_TURNS):
             found = rule(scan.with_rows(weight=doubt.row_weight(weight).reshape(*many, -1)), mean, cov)
-            # From here on residuals at the updated state, as in a fix: the update has taken what it believes.
+            # From here on, use residuals at the updated state, as in a fix.
             u = doubt.residual(flat, found.mean.reshape(x.shape), weight)
             fresh = chosen.weight(fold_signs(chosen, u, doubt.sided))
-            # each of a batch stops by itself
+            # each problem of a batch stops separately
             moving = np.abs(fresh - weight).max(-1, initial=0.0) >= _SETTLED
             if not moving.any():
                 break
@@ -242,28 +245,22 @@ def reweighted(update: Update | str, loss: Loss | str) -> Update:
 
 
 def read(found: Filtered) -> Updated:
-    """Return states after a scan as machine code writes them."""
+    """Return the states after a scan from the output of the compiled filter."""
     values = found.values
     return Updated(found.mean, found.cov, values[..., NIS], values[..., LOGLIKELIHOOD], values[..., COUNT])
 
 
-# Rows of a scan, whitened, and what all filters make of them.
+# Whitened rows of a scan, and the functions of all filters.
 
 
 @dataclass(frozen=True, slots=True)
 class White:
     """The rows of one scan, linearised, with unit covariance.
 
-    Parameters
-    ----------
-    residual : array (..., m)
-        Whitened z - h(x).
-    H : array (..., m, n)
-        Whitened derivative.
-    count : array (...)
-        Number of rows that are present.
-    logdet : array (...)
-        Logarithm of the determinant of 2 pi R of the rows that are present.
+    - residual (..., m): whitened z - h(x).
+    - H (..., m, n): whitened derivative.
+    - count (...): number of present rows.
+    - logdet (...): logarithm of the determinant of 2 pi R of the present rows.
     """
 
     residual: Array
@@ -273,7 +270,7 @@ class White:
 
 
 def whitened(scan: Problem, x: Array, noise: tuple[Whitener, ...] | None = None) -> White:
-    """Return the rows of a scan linearised at states x (..., n), whitened; absent rows are zero."""
+    """Return the rows of a scan linearised at states x (..., n) and whitened; absent rows are zero."""
     linear = linearise(scan, x, noise)
     both = np.concatenate([linear.shared, linear.residual[..., None]], axis=-1)
     white = np.concatenate([w.apply(both) for w in linear.noise], axis=-2)
@@ -282,32 +279,34 @@ def whitened(scan: Problem, x: Array, noise: tuple[Whitener, ...] | None = None)
 
 
 def _size_of(noise: tuple[Whitener, ...], shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """Return the number of rows that are present, and the logarithm of the determinant of 2 pi R, each (...)."""
+    """Return the number of present rows and the logarithm of the determinant of 2 pi R, each (...)."""
     total = np.zeros((*shape, 2))
     for w in noise:
-        # A block that is common to many groups of rows is stored once.
+        # A block that many groups of rows share is stored once.
         total = total + (len(w.row) if w.matrix.shape[-3] == 1 else 1) * size_of(w.matrix).sum(-2)
     return total[..., 0], total[..., 1]
 
 
 def joseph(H: Array, gain: Array, cov: Array) -> Array:
     """Return (I - K H) P (I - K H)' + K K', (..., n, n), for whitened rows: symmetric and positive for any gain."""
-    # The short form (I - K H) P is right for the optimal gain alone, and loses symmetry by rounding.
+    # The short form (I - K H) P is correct only for the optimal gain, and rounding makes it asymmetric.
     left = np.eye(cov.shape[-1]) - gain @ H
     out = left @ cov @ np.swapaxes(left, -1, -2) + gain @ np.swapaxes(gain, -1, -2)
     return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))
 
 
 def _gain(H: Array, cov: Array) -> Array:
-    # Whitened rows: S is regular whatever the prior is, even where a state is known exactly.
+    """Return the Kalman gain (..., n, m) for whitened rows."""
+    # With whitened rows, S is regular for any prior, even for an exactly known state.
     S = H @ cov @ np.swapaxes(H, -1, -2) + np.eye(H.shape[-2])
     solved, _ = linalg.solve(S, H @ cov)
     return np.swapaxes(solved, -1, -2)
 
 
 def _finish(white: White, cov: Array, mean: Array, after: Array) -> Updated:
+    """Return the updated state with its NIS and log-likelihood, from the rows at the prediction."""
     S = white.H @ cov @ np.swapaxes(white.H, -1, -2) + np.eye(white.H.shape[-2])
-    # ln|2 pi S| of the rows as measured: that of the whitened ones, and what whitening took out.
+    # ln|2 pi S| of the rows as measured: the value of the whitened rows plus the logarithm of the whitening.
     lower, _ = linalg.factor(S)
     solved, _ = linalg.solve(S, white.residual[..., None])
     nis = (white.residual * solved[..., 0]).sum(-1)
@@ -316,8 +315,8 @@ def _finish(white: White, cov: Array, mean: Array, after: Array) -> Updated:
 
 
 def _converged(scan: Problem, mean: Array, cov: Array, white: White, how: Filtering) -> Array:
-    """Return the maximum a posteriori states by Gauss-Newton, from the rows at the predictions on."""
-    # The prior is one more whitened row block: the cost that steps may not raise is that of rows and prior together.
+    """Return the maximum a posteriori states by Gauss-Newton, starting from the predictions."""
+    # The prior is one more block of whitened rows: steps must not increase the cost of rows and prior together.
     prior = linalg.whitening(cov)
     x, cost, moving = mean, (white.residual**2).sum(-1), np.ones(mean.shape[:-1], dtype=bool)
     for _ in range(how.limit):
@@ -330,12 +329,12 @@ def _converged(scan: Problem, mean: Array, cov: Array, white: White, how: Filter
             white = whitened(scan, tried)
             away = (prior @ (tried - mean)[..., None])[..., 0]
             now = (white.residual**2).sum(-1) + (away**2).sum(-1)
-            # NaN counts as worse: a step beyond where h is defined is halved, too.
+            # NaN counts as worse: a step to a point where h is undefined is halved, too.
             worse = moving & ~(now <= cost + RISE * (1.0 + np.abs(cost)))
             if not worse.any():
                 break
             share = np.where(worse, 0.5 * share, share)
-        # Each target of a batch stops by itself, at a step of a millionth of a standard deviation.
+        # Each target of a batch stops separately, at a step of a millionth of a standard deviation.
         length = np.sqrt(((prior @ (tried - x)[..., None])[..., 0] ** 2).sum(-1))
         x, cost, moving = tried, np.where(moving, now, cost), moving & (length > how.tolerance)
         if not moving.any():
@@ -343,19 +342,15 @@ def _converged(scan: Problem, mean: Array, cov: Array, white: White, how: Filter
     return x
 
 
-# Gates: which rows of a scan can be those of a predicted state.
+# Gates: tests of the rows of a scan against a predicted state.
 
 
 @dataclass(frozen=True, slots=True)
 class Innovation:
-    """What a scan measures less what a predicted state lets expect.
+    """Measurements of a scan minus their predictions, with the covariance of the difference.
 
-    Parameters
-    ----------
-    value : array (..., m)
-        z - h(x) of each row in its SI unit, angles wrapped; zero for absent rows.
-    covariance : array (..., m, m)
-        S = H P H' + R.
+    - value (..., m): z - h(x) of each row in its SI unit, angles wrapped; zero for absent rows.
+    - covariance (..., m, m): S = H P H' + R.
     """
 
     value: Array
@@ -363,7 +358,7 @@ class Innovation:
 
     @property
     def normalised(self) -> Array:
-        """Return each row's innovation in units of its own standard deviation, (..., m)."""
+        """Return each row's innovation divided by its standard deviation, (..., m)."""
         return np.asarray(self.value / np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
 
 
@@ -377,28 +372,30 @@ def innovation(scan: Problem, mean: Array, cov: Array) -> Innovation:
     mean : array (..., n)
         Predicted states.
     cov : array (..., n, n)
-        Their covariances.
+        Covariances of the predicted states.
 
     References
     ----------
     Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), eq.
     5.2.3-9.
     """
-    linear = linearise(scan, mean, ())  # nothing is whitened here
+    linear = linearise(scan, mean, ())  # no whitening is needed here
     H = linear.shared
-    # Station errors are part of the noise, and grow with the place of the target.
+    # Station errors are part of the noise, and their effect depends on the position of the target.
     R = noises.dense(with_station_noise(scan, mean).noise, np.arange(scan.count))
     return Innovation(linear.residual, H @ cov @ np.swapaxes(H, -1, -2) + R)
 
 
 def weights_within(scan: Problem, mean: Array, cov: Array, width: float) -> Array:
-    """Return the weights (..., m) of a scan's rows, zero where the innovation is outside a gate."""
-    with np.errstate(invalid="ignore"):  # a state that is lost has no row in its gate
+    """Return the weights (..., m) of a scan's rows; zero for an innovation outside the gate of `width` sigmas."""
+    with np.errstate(invalid="ignore"):  # a lost state has no row in its gate
         inside = np.abs(innovation(scan, mean, cov).normalised) <= width
     return np.asarray(np.where(inside, scan.weight, 0.0))
 
 
 def check_width(width: float) -> None:
-    """Refuse a gate that is not open; raise InvalidProblem."""
+    """Raise InvalidProblem if the width of a gate is not positive."""
     if not width > 0.0:
-        raise InvalidProblem(f"the gate is {width} wide", "width", "give a number of standard deviations above 0")
+        raise InvalidProblem(
+            f"the width of the gate is {width}", "width", "give a number of standard deviations above 0"
+        )

@@ -1,4 +1,4 @@
-"""Whole-run fits: one polynomial course through all scans at once, without a guess."""
+"""Whole-run fits: one polynomial course through all scans together, without a guess; and the posterior bound."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from optloc.tracking.updates import Updated, joseph, whitened
 def fitted(problem: Problem, order: int, *, reference: float | None = None, method: str = "auto") -> Fix:
     """Return the maximum-likelihood polynomial course through all scans of a run.
 
-    Where the target really moves so, no filter with process noise comes near it.
+    If the target really moves along a polynomial, this fit is far more accurate than any filter with process noise.
 
     Parameters
     ----------
     problem : Problem
-        Batch (...) of runs of one target without biases; what it says of the motion does not matter.
+        Batch (...) of runs of one target without biases; its model of motion is ignored.
     order : 0, 1 or 2
         Static, constant velocity, constant acceleration.
     reference : float, optional
-        Time at which the state holds, seconds; None: the last scan.
+        Time of the state in seconds; None for the last scan.
     method : str
-        Of `optloc.solve`.
+        Method of `optloc.solve`.
 
     Returns
     -------
     Fix
-        Of the batch; failure is a status.
+        Fixes of the batch; a failure is a status.
 
     Raises
     ------
     InvalidProblem
-        For an unknown order, or a run that is not one target's.
+        If the order is unknown, or the run has several targets.
     """
     if order not in (0, 1, 2):
         raise InvalidProblem(f"a motion of order {order}", "order", "use 0, 1 or 2")
@@ -51,23 +51,12 @@ def fitted(problem: Problem, order: int, *, reference: float | None = None, meth
 
 
 def along(state: State, times: Array, dimension: int) -> tuple[Array, Array]:
-    """Return states and covariances along a polynomial course, before or after the state.
+    """Return states (..., k, n) and covariances (..., k, n, n) along a polynomial course.
 
-    Parameters
-    ----------
-    state : State
-        Mean (..., n) and covariance; position, and velocity and acceleration if it has them.
-    times : array (k,)
-        Seconds.
-    dimension : int
-        2 or 3.
-
-    Returns
-    -------
-    tuple of array
-        Means (..., k, n) and covariances (..., k, n, n).
+    The order of the course follows from the length n of the state: position, and velocity and acceleration if present.
+    `times` (k,) are in seconds, before or after the state.
     """
-    # Without process noise the transition is exact in either direction of time.
+    # Without process noise, the transition is exact forward and backward in time.
     model = polynomial(state.mean.shape[-1] // dimension - 1)
     F = np.stack([model.step(float(t) - state.time, state.mean, dimension)[0] for t in np.asarray(times)])
     mean = (F @ state.mean[..., None, :, None])[..., 0]
@@ -82,28 +71,28 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
     problem : Problem
         See `fitted`.
     order : 0, 1 or 2
-        Of the course.
+        Order of the course.
     method : str
-        Of `optloc.solve`.
+        Method of `optloc.solve`.
 
     Returns
     -------
     Track
-        States at the scans given all of them. `nis` is what the rows of a scan add to the chi-square of the fit, and
-        the status of all scans is that of the fit (see `optloc.tracking.track.status_of_scans`), but for those without
-        a row.
+        States at the scans given all scans. `nis` is the contribution of the rows of a scan to the chi-square of the
+        fit. The status of a scan is the status of the fit (see `optloc.tracking.track.status_of_scans`), or too few
+        rows for a scan without a row.
 
     Raises
     ------
     InvalidProblem
-        For an unknown order, or a run that is not one target's.
+        If the order is unknown, or the run has several targets.
     """
     fix = fitted(problem, order, method=method)
-    told = status_of_scans(fix)
+    status = status_of_scans(fix)
     state = State(float(problem.times[-1]), *(np.asarray(part) for part in (fix.x, fix.cov)))
     mean, cov = along(state, problem.times, problem.dimension)
     steps = []
-    # All states come from one fit: what a scan adds to its chi-square is that of its rows at its own state.
+    # All states come from one fit: the contribution of a scan to its chi-square comes from its rows at its state.
     for k, (_, scan) in enumerate(scans(problem, order)):
         at, spread = mean[..., k, :], cov[..., k, :, :]
         none = np.zeros(at.shape[:-1])
@@ -115,44 +104,45 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
             white = whitened(scan, at)
             square = (white.residual**2).sum(-1)
         found = Updated(at, spread, square, -0.5 * (square + white.logdet), np.broadcast_to(white.count, none.shape))
-        code = np.where(white.count > 0, told, int(Status.TOO_FEW_ROWS)).astype(np.int8)
+        code = np.where(white.count > 0, status, int(Status.TOO_FEW_ROWS)).astype(np.int8)
         steps.append((found, np.broadcast_to(code, none.shape)))
     return collect(np.asarray(problem.times), steps, problem.dimension)
 
 
 def posterior_bound(problem: Problem, truth: Array, start: State, dynamics: Dynamics) -> Array:
-    """Return the posterior Cramer-Rao bound of the state after each scan that is later than the start.
+    """Return the posterior Cramer-Rao bound of the state after each scan later than the start.
 
-    In covariance form, so that process noise may be singular: the extended Kalman filter's covariance with rows
-    linearised at the truth. With noise, it averages over the tracks of the model: a smoother track can beat it.
+    The bound is the covariance of the extended Kalman filter with rows linearised at the true states. The covariance
+    form allows singular process noise. With process noise, the bound is an average over the tracks of the model: on a
+    smoother track, an estimate can have a smaller error.
 
     Parameters
     ----------
     problem : Problem
-        A run of k epochs, see `optloc.tracking.track.scans`; its measurements do not matter.
+        A run of k epochs, see `optloc.tracking.track.scans`; its measurements are ignored.
     truth : array (..., k, n)
         True state [p, v, a] at every epoch.
     start : State
-        Its covariance is the prior's.
+        Its covariance is the covariance of the prior.
     dynamics : Dynamics
-        Model of motion; where its noise depends on the state, it is that of the true one.
+        Model of motion. Noise that depends on the state is computed at the true state.
 
     Returns
     -------
     array (..., q, n, n)
-        Covariance bound at the q epochs that are later than the start.
+        Covariance bound at the q epochs later than the start.
 
     References
     ----------
     P. Tichavsky, C. H. Muravchik, A. Nehorai, "Posterior Cramer-Rao bounds for discrete-time nonlinear filtering",
-    IEEE Trans. Signal Process. 46 (1998), eq. 21 with the truth for the average.
+    IEEE Trans. Signal Process. 46 (1998), eq. 21 with the true value instead of the average.
     """
     cov, at, now, out = start.cov, start.mean, start.time, []
     for k, (time, scan) in enumerate(scans(problem, dynamics.order)):
         if time <= start.time:
             continue
         F, Q, _ = dynamics.step(time - now, at, problem.dimension)
-        # Noise that depends on the state is that of the true one, at the time before.
+        # Noise that depends on the state is computed at the true state of the epoch before.
         cov, at, now = F @ cov @ F.T + Q, truth[..., k, :], time
         if scan.count:
             H = whitened(scan, at).H

@@ -133,7 +133,7 @@ def test_stations_in_space_have_no_distance_from_a_plane() -> None:
     scene = draw(0, late=False, far=0.5)
     heights = np.arange(len(scene.stations)) ** 2.0
     problem = replace(scene, stations=scene.stations + heights[:, None] * (0, 0, 1)).problem()
-    with pytest.raises(InvalidProblem, match="no plane fit alike"):
+    with pytest.raises(InvalidProblem, match="no plane of symmetry"):
         optloc.model_checks.distance_from_plane(problem, optloc.solve(problem))
 
 

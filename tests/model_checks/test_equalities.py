@@ -109,7 +109,7 @@ def test_a_command_tells_misfits_under_an_exact_height(tmp_path):
     said = " ".join(done.output.split()).lower()
     assert done.exit_code == 1, done.output
     assert "epoch 0: misfit" in said
-    assert "the noise level is the suspect: 6 of 6 fixes accuse somebody" in said
+    assert "the noise level is the suspect: 6 of 6 fixes do not fit" in said
     # the equality decides between a place and its mirror image already
     assert "mirror image" not in said
     free = CliRunner().invoke(app, words)

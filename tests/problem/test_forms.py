@@ -120,7 +120,7 @@ def test_one_entry_adds_a_form(monkeypatch):
     assert why_unsupported(data.flat()) == f"the bend 'clock' {reason}"
     assert not fix.status & Status.OK or fix.certificate.proof != "global"
     moving = with_bias(run_of(Motion(1)), "clock", form="bend", members=["B"])
-    with pytest.raises(InvalidProblem, match="the bend 'clock' changes in time"):
+    with pytest.raises(InvalidProblem, match="the bend 'clock' changes with time"):
         begun_with_constants(moving, polynomial(1, 1.0), 3)
 
 

@@ -94,7 +94,7 @@ def test_fixes_that_stand_on_late_rows_are_marked():
     assert found.carried[:6].sum() >= 4
     assert not found.carried[6:].any()
     assert (found.late[6:12] == 1).sum() >= 5
-    assert "fixes stand on late rows" in found.sentence
+    assert "fixes depend on late rows" in found.sentence
 
 
 def written(folder, problem):
@@ -132,7 +132,7 @@ def test_rows_late_alike_are_an_offset(tmp_path):
     words = told("fix", path)
     assert "an offset of all range rows" in words.lower()
     assert 'form = "offset"' in words
-    assert "all range rows are late alike" in words.lower()
+    assert "all range rows are late by the same" in words.lower()
     assert "fixes with that" not in words
     problem, _ = late(2, 0.0, 1.0, alike=100.0 * STATED)
     found = late_signals(problem)

@@ -70,7 +70,7 @@ def test_a_station_that_is_wrong_in_all_fixes_is_no_noise():
         level = found(seed, bias=10.0 * STATED)
         assert not level.suspect
         assert level.alone == "S3"
-        assert "what is wrong is S3" in level.sentence
+        assert "the suspect is S3" in level.sentence
 
 
 def test_the_kind_that_is_understated_is_rescaled():

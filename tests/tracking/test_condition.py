@@ -57,7 +57,7 @@ def test_scans_that_the_gate_refuses_in_a_row_end_a_track():
     found = condition()
     found.take(entry(count=1, time=1.0), (1.0, 1), gated=3)
     found.take(entry(count=0, time=2.0), (0.0, 0), gated=0)  # a scan without rows leaves the count as it was
-    assert (found.missed, found.heard, found.state.time) == (1, 1.0, 2.0)
+    assert (found.missed, found.last_row, found.state.time) == (1, 1.0, 2.0)
     found.judge("")
     assert found.state is not None
     found.take(entry(count=1, time=3.0), (1.0, 1), gated=3)

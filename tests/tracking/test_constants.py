@@ -40,5 +40,5 @@ def test_exact_measurements_give_the_offset_from_the_first_scans_on():
 
 
 def test_what_changes_in_time_is_no_constant():
-    with pytest.raises(InvalidProblem, match="'clock' changes in time"):
+    with pytest.raises(InvalidProblem, match="'clock' changes with time"):
         begun_with_constants(run(8, "drift"), polynomial(1), 4)

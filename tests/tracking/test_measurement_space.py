@@ -300,7 +300,7 @@ MOVING = assemble(
         (lambda: lines(MOVING), "stations move"),
         (lambda: lines(replace(draw(5, 1, 1), constraints=box([0, 0, 0], [9e9] * 3))), "constraints or priors"),
         (lambda: simplified(replace(draw(5, 1, 1), constraints=box([0, 0, 0], [9e9] * 3))), "constraints or priors"),
-        (lambda: lines(draw(5, 1, 1), 3), "order 3"),
+        (lambda: lines(draw(5, 1, 1), 3), "order of the polynomial is 3"),
         (lambda: lines(draw(5, 1, 1), 1, window=1), "too few epochs"),
         (lambda: lines(draw(1, 1, 1), 1), "too few epochs"),
         (lambda: lines(replace(draw(5, 1, 1), motions=(Motion(), Motion()))), "several targets"),

@@ -342,7 +342,7 @@ def test_constants_that_cannot_be_are_refused():
     with pytest.raises(InvalidProblem, match="6 numbers"):
         followed_with_constants(problem, State(1.0, start.mean[:, :6], start.cov[:, :6, :6]), DYNAMICS)
     drifting = with_bias(run(5), "height", per="kind", kind="height", form="drift", sigma=1.0)
-    with pytest.raises(InvalidProblem, match="changes in time"):
+    with pytest.raises(InvalidProblem, match="changes with time"):
         begun_with_constants(drifting, DYNAMICS, 2)
     with pytest.raises(InvalidProblem, match="several targets"):
         begun_with_constants(replace(problem, motions=(Motion(), Motion())), DYNAMICS, 2)

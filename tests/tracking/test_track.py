@@ -103,7 +103,7 @@ def test_station_errors_of_each_scan_are_weighed():
         (lambda p, s: followed(optloc.with_bias(p, "clock", members=["S1"]), s, polynomial(1)), "'clock' is unknown"),
         (lambda p, s: predicted(s, polynomial(1), s.time - 1.0, 2), "before the state"),
         (lambda p, s: polynomial(3), "a motion of order 3"),
-        (lambda p, s: polynomial(1, -1.0), "process noise of -1"),
+        (lambda p, s: polynomial(1, -1.0), "process noise is -1"),
     ],
 )
 def test_what_makes_no_track_is_refused(act, words):
