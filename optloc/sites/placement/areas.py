@@ -1,4 +1,4 @@
-"""Areas and ground: polygons of GeoJSON, convex parts of them, and what the ground hides."""
+"""Polygons of GeoJSON files, their convex parts, and lines of sight over terrain."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from formulations.placement import PlacementGround, PlacementRegion
 from optloc.files import DataTable, json_of, read_text, table_of
 from optloc.problem import Array, Frame, InvalidProblem
 
-# Points between a site and a place at which the ground is looked at, and nodes of a side that a spline needs.
+# Points between a site and a place at which the line is compared with the ground, and grid points per side that
+# a spline needs.
 _SAMPLES, _NODES = 200, 4
 
 
 def polygons_of(path: Path) -> list[Array]:
-    """Return the outer rings (q, 2) of the polygons of a GeoJSON file (RFC 7946), without their repeated ends."""
+    """Return the outer rings (q, 2) of the polygons of a GeoJSON file (RFC 7946), without the repeated last corner."""
     source = path.name
     data = json_of(read_text(path), source)
     items = data.get("features", [data]) if isinstance(data, dict) else []
@@ -39,7 +40,7 @@ def polygons_of(path: Path) -> list[Array]:
 
 
 def corners_in_frame(ring: Array, frame: Frame, where: str) -> Array:
-    """Return corners (q, 2) in coordinates of the frame: from longitudes and latitudes on Earth, else as they are."""
+    """Return corners (q, 2) in frame coordinates, metres; a geodetic frame converts longitudes and latitudes."""
     if not frame.geodetic:
         return ring
     if frame.kind != "enu":
@@ -48,7 +49,7 @@ def corners_in_frame(ring: Array, frame: Frame, where: str) -> Array:
 
 
 def inside(points: Array, ring: Array) -> Array:
-    """Return which points (q, 2) are inside a ring (v, 2), by the number of edges that a ray crosses."""
+    """Return a mask of the points (q, 2) inside a ring (v, 2): their rays cross an odd number of edges."""
     a, b = ring, np.roll(ring, -1, axis=0)
     x, y = points[:, :1], points[:, 1:]
     span = (a[:, 1] > y) != (b[:, 1] > y)
@@ -58,7 +59,7 @@ def inside(points: Array, ring: Array) -> Array:
 
 
 def visible(ground: PlacementGround, places: Array, stations: Array) -> Array:
-    """Return 1 for pairs (P, s) of a place and a station whose line stays above the ground, else 0."""
+    """Return an array (P, s): 1 if the line between place and station stays above the ground, otherwise 0."""
     share = np.linspace(0.0, 1.0, _SAMPLES + 2)[1:-1, None]
     out = np.ones((len(places), len(stations)))
     for p, place in enumerate(places):
@@ -69,7 +70,7 @@ def visible(ground: PlacementGround, places: Array, stations: Array) -> Array:
 
 
 def ground_of(path: Path, where: str) -> PlacementGround:
-    """Return the ground of a CSV file with x, y, z on a full grid."""
+    """Return the terrain of a CSV file that has columns x, y, z on a full grid, metres."""
     table = table_of(DataTable(file=path.name), path.parent, where)
     x, y, z = (table.numbers(key) for key in "xyz")
     xs, ys = np.unique(x), np.unique(y)
@@ -84,19 +85,19 @@ def ground_of(path: Path, where: str) -> PlacementGround:
 
 
 def region_of(ring: Array, low: float, high: float) -> PlacementRegion:
-    """Return a convex ring (v, 2), counted counter-clockwise, as half-planes."""
+    """Return a convex counter-clockwise ring (v, 2) as half-planes, with heights between `low` and `high`, metres."""
     along = np.roll(ring, -1, axis=0) - ring
     normal = np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
     return PlacementRegion(normal, (normal * ring).sum(1), low, high)
 
 
 def _crosses(ring: Array) -> bool:
-    """Return whether two edges of a ring (v, 2) cross at a point inside both; edges that touch do not."""
+    """Return whether two edges of a ring (v, 2) cross at a point inside both; edges that only touch do not cross."""
     ends = np.roll(ring, -1, axis=0)
     along = ends - ring
 
     def side(points: Array) -> Array:
-        """Return on which side of the line through edge i (rows) each point (columns) is: -1, 0 or 1."""
+        """Return the side (-1, 0 or 1) of each point (columns) from the line through edge i (rows)."""
         away = points - ring[:, None]
         return np.asarray(np.sign(along[:, :1] * away[..., 1] - along[:, 1:] * away[..., 0]))
 
@@ -105,7 +106,9 @@ def _crosses(ring: Array) -> bool:
 
 
 def convex_parts(ring: Array) -> list[Array]:
-    """Return convex rings that make up a simple one (v, 2): itself, or its triangles by cutting ears.
+    """Return convex rings that together cover a simple polygon (v, 2).
+
+    A convex polygon is returned unchanged; any other polygon is cut into triangles (ear clipping).
 
     G. H. Meisters, "Polygons have ears", Amer. Math. Monthly 82 (1975).
     """

@@ -1,4 +1,4 @@
-"""How many sites the groups of a placement allow and need: a count that cannot be met is refused before a search."""
+"""Limits on the number of sites in groups, checked before the search starts."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 
 from optloc.problem import Array, InvalidProblem
 
-# Members of a group, and groups, that are named; the others are counted.
+# Members of a group, and groups, that a message names; it counts the others.
 _NAMED, _GROUPS = 8, 3
 
 
 @dataclass(frozen=True, slots=True)
 class CountGroup:
-    """A rule about some of the sites.
+    """A rule for the number of sites that are taken from a group.
 
     Parameters
     ----------
     members : tuple of str
-        Names of sites.
+        Names of the sites in the group.
     most, least : int, optional
-        How many of them may, or must, be taken, those that are kept included.
+        Largest and smallest number of members that are taken, kept sites included.
     """
 
     members: tuple[str, ...]
@@ -34,25 +34,15 @@ class CountGroup:
 def check_groups(
     groups: Sequence[CountGroup], members: Array, names: Sequence[str], state: Array, choose: int | None
 ) -> None:
-    """Refuse groups that no set of sites meets, and a number of sites that is too large or too small for them.
+    """Raise if no set of sites meets the groups, or if the wanted number of sites does not fit the groups.
 
-    Parameters
-    ----------
-    groups : sequence of CountGroup
-        The rules.
-    members : bool array (G, n)
-        Which sites belong to each.
-    names : sequence of n str
-        Of the sites.
-    state : int array (n,)
-        -1 for free sites, 0 and 1 for those that are left out and taken.
-    choose : int, optional
-        How many free sites are wanted; None: as many as the budget allows.
+    `members` (G, n) marks the sites of each group. `state` (n,) is -1 for free, 0 for forbidden and 1 for kept
+    sites. `choose` is the wanted number of free sites; None means as many as the budget allows.
 
     Raises
     ------
     InvalidProblem
-        Naming the groups and how many sites are possible.
+        The message names the groups and the possible number of sites.
     """
     for i, group in enumerate(groups):
         _check_one(f"groups, entry {i + 1}", group, members[i], names, state)
@@ -74,7 +64,7 @@ def check_groups(
 
 
 def _check_one(where: str, group: CountGroup, own: Array, names: Sequence[str], state: Array) -> None:
-    """Refuse a group that cannot be met whatever the others say."""
+    """Raise if no set of sites can meet this group, independent of the other groups."""
     kept, able, who = int((own & (state == 1)).sum()), int((own & (state != 0)).sum()), _listed(own, names)
     if group.most is not None and kept > group.most:
         what = f"at most {group.most} of {who} may be taken, and {kept} of them are kept"
@@ -88,7 +78,7 @@ def _check_one(where: str, group: CountGroup, own: Array, names: Sequence[str], 
 
 
 def _count(groups: Sequence[CountGroup], members: Array, state: Array, sign: float) -> int | None:
-    """Return the greatest (-1) or least (1) number of free sites that meets the groups; None where no set does."""
+    """Return the largest (sign -1) or smallest (sign 1) number of free sites that meets the groups, or None."""
     low = np.array([-np.inf if g.least is None else g.least for g in groups], dtype=float)
     high = np.array([np.inf if g.most is None else g.most for g in groups], dtype=float)
     rules = [LinearConstraint(members.astype(float), low, high)] if len(groups) else []
@@ -99,7 +89,11 @@ def _count(groups: Sequence[CountGroup], members: Array, state: Array, sign: flo
 
 
 def _binding(groups: Sequence[CountGroup], members: Array, state: Array, most: int) -> list[int]:
-    """Return the groups without which more sites were possible: a single one if that is enough, else all that limit."""
+    """Return the indices of the groups that limit the number of sites to `most`.
+
+    If the removal of one group allows more sites, the list has only this group. Otherwise it has all groups with
+    an upper limit.
+    """
     limiting = [i for i, group in enumerate(groups) if group.most is not None and group.most < members[i].sum()]
     for i in limiting:
         kept = [k for k in range(len(groups)) if k != i]

@@ -1,4 +1,9 @@
-"""Which sites to take for which places: the selection as it is given, and the linearised rows of each candidate."""
+"""The definition of a site selection, and its rows, rules and priors as arrays.
+
+A site is a possible position of a station. A place is a possible position of the target. `candidates_of`
+linearises the rows of all sites at all places, so that the search (`optloc.sites.placement.best_set`) needs
+no measurement model.
+"""
 
 from __future__ import annotations
 
@@ -22,63 +27,65 @@ __all__ = ["LETTER", "Candidates", "CountGroup", "Name", "SiteSelection", "candi
 LETTER: dict[str, Criterion] = {"rms": "A", "volume": "D", "axis": "E"}
 """The criteria's names in the literature."""
 
-# Where the direction from a site to a place means nothing any more, metres.
+# Least distance of a site and a place, metres: closer, the direction between them has no meaning.
 _SAME = 1e-3
-# Variance of an arrival, as a share of the mean, below which it was made up: `as_arrivals` gives an exact one 1e-6.
+# Share of the mean variance below which the variance of an arrival is artificial: `as_arrivals` gives an exact
+# arrival 1e-6.
 _EXACT = 1e-5
-# The emission time is known to this many half extents of the area: far less than any arrival says.
+# Standard deviation of the emission time, in half extents of the area: so wide that any arrival is far more
+# precise.
 _EMISSION = 10.0
-# The least area that a prior is made of, metres: a single place has no extent.
+# Smallest half extent of the area that becomes a prior, metres: a single place has no extent.
 _EXTENT = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class SiteSelection:
-    """The question which of some sites to take: candidates, places, rules and the criterion.
+    """A site selection: candidate sites, places of the target, rules and criterion.
 
     Parameters
     ----------
     problem : Problem
-        One epoch and one target at rest or with a state of its own; every station that measures is a site, and its rows
-        are those it would add. The measured values do not matter. Priors are what is known without any site; where
-        there is none of the position it is the area of sites and places.
+        One epoch with one target, at rest or with a velocity. Each station that measures is a site and has the
+        rows that it would add. The measured values are not used. The priors describe the target before any site
+        measures; the default prior of the position covers the area of sites and places.
     places : array (p, d), or (p, n)
-        Where the target may be, metres; or whole parameter vectors, for states with a velocity.
+        Possible positions of the target, metres; for states with a velocity, whole parameter vectors.
     weights : array (p,), optional
-        How much each place counts, positive; alike by default.
+        Positive weight of each place in the mean; equal by default.
     choose : int, optional
-        How many sites to take beyond those that are kept; with a budget, at most so many.
+        Number of sites to take in addition to the kept sites; with a budget, the largest number.
     budget : float, optional
-        What the sites that are taken may cost together, kept ones not counted.
+        Largest total cost of the new sites; kept sites are free.
     cost : array (s,), optional
-        Of each station, not negative.
+        Cost of each station, not negative.
     kept, forbidden : tuple of str
-        Sites that are taken, and that are not, in any case.
+        Sites that are always taken, and sites that are never taken.
     groups : tuple of CountGroup
         Further rules.
     criterion : "rms", "volume" or "axis"
         Mean-square error (A), determinant (D) or largest eigenvalue (E) of the covariance of the position.
     worst : bool
-        The worst place counts, in place of the mean.
+        Whether the criterion is the maximum over the places, instead of the weighted mean.
     fail_one : bool
-        The worst loss of any one site counts.
+        Whether the criterion is the value after the worst loss of one site.
     sight : array (p, s), optional
-        Factor, 1 or more, by which the standard deviations of a station's rows grow at a place; 0 where it is out of
+        Factor, 1 or more, on the standard deviations of a station's rows at a place; 0 if the place is out of
         sight.
     reach : array (m,), optional
-        Distance to the target beyond which a row is not measured, metres.
+        Largest distance to the target at which a row is measured, metres.
     gap : float
-        Share of the value that the bound may be below it.
+        Relative gap between value and bound at which the search stops.
     seconds : float
-        After which the search stops.
+        Time limit of the search, seconds.
     alternatives : int
-        How many of the best sets are told.
+        Number of best sets in the result.
     by : "station" or "row"
-        Whether stations are chosen, or single rows.
+        Whether the selection takes whole stations or single rows.
     names : tuple of p str
-        Of the places.
+        Names of the places.
     seed : int
-        Decides the random sets.
+        Seed of the random sets.
     """
 
     problem: Problem
@@ -105,26 +112,27 @@ class SiteSelection:
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """The candidate sites of a selection as numbers: their rows at each place, the rules and the states.
+    """The candidate sites of a selection as arrays: rows at each place, rules and states.
 
     Parameters
     ----------
     selection : SiteSelection
-        As it was given.
+        The selection as given.
     problem : Problem
-        A batch of P problems: that of all sites for a target at each place, with priors, rows out of sight left out.
+        A batch of P problems, one for each place, with the rows of all sites and with priors. Rows out of sight
+        have weight 0.
     vectors : array (P, size)
-        Their parameter vectors.
+        Parameter vector of the target at each place.
     site : int array (m,)
         Site of each row.
     names : tuple of n str
-        Of the sites.
+        Names of the sites.
     design : Design
-        Rows and prior information of each place.
+        Whitened rows and prior information at each place.
     rules, limits : array (R, n), (R,)
-        rules @ w <= limits; the first counts or costs.
+        Linear rules rules @ w <= limits; the first rule is the count or the cost.
     state : int array (n,)
-        -1 for a free site, 0 for one that is forbidden, 1 for one that is kept.
+        -1 for a free site, 0 for a forbidden site, 1 for a kept site.
     """
 
     selection: SiteSelection
@@ -138,18 +146,18 @@ class Candidates:
     state: Array
 
     def assembled(self, chosen: Array) -> Problem:
-        """Return the batch of P problems that is left where the sites (n,) are taken: what `optloc.crlb` takes."""
+        """Return the batch of P problems with the rows of the taken sites (n,), as input of `optloc.crlb`."""
         taken = np.asarray(chosen, dtype=float)[self.site]
         return self.problem.with_rows(weight=self.problem.weight * taken)
 
 
 def candidates_of(selection: SiteSelection) -> Candidates:
-    """Return the candidate sites of a selection as numbers.
+    """Return the candidate sites of a selection as arrays.
 
     Raises
     ------
     InvalidProblem
-        Naming the argument, site or place that cannot be right.
+        If an argument, site or place is invalid; the message names it.
     """
     selection = _checked(selection)
     problem = _arrivals(selection.problem)
@@ -186,7 +194,10 @@ def _checked(selection: SiteSelection) -> SiteSelection:
 
 
 def _arrivals(problem: Problem) -> Problem:
-    """Return the problem with arrival times for range differences: what a difference says depends on the whole set."""
+    """Return the problem with arrival times instead of range differences.
+
+    The information of a difference depends on the other sites of a set; the information of arrival times adds up.
+    """
     if problem.epochs != 1 or len(problem.motions) != 1 or problem.motions[0].known is not None:
         what = "a placement is for one target at one epoch whose position is unknown"
         raise InvalidProblem(what, "problem", "give one epoch of one target, and places as an argument")
@@ -194,7 +205,8 @@ def _arrivals(problem: Problem) -> Problem:
     if not pairs:
         return problem
     made = as_arrivals(problem.flat()) if pairs == ["tdoa"] else None
-    # pairs that are independent have a reference without noise, which no station is
+    # The rows of independent pairs are equal to arrivals with one noise-free reference. No station is such a
+    # reference.
     if made is None or (variance := variances(made.problem.noise, made.problem.count)).min() < _EXACT * variance.mean():
         what = f"{pairs[0]} rows pair stations, and a set of stations has other pairs than another"
         raise InvalidProblem(what, "measurements", "give toa rows, or tdoa rows with an arrival_sigma")
@@ -202,7 +214,7 @@ def _arrivals(problem: Problem) -> Problem:
 
 
 def _sites(problem: Problem, selection: SiteSelection) -> tuple[Array, tuple[str, ...]]:
-    """Return the site of each row, and the names of the sites."""
+    """Return the site (m,) of each row, and the names (n,) of the sites."""
     a, b = (np.concatenate([getattr(rows, end) for rows in problem.rows]) for end in ("a", "b"))
     stations = problem.stations.names
     if (a < 0).any():
@@ -249,7 +261,7 @@ def _weight(selection: SiteSelection, count: int) -> Array:
 
 
 def _weights(selection: SiteSelection, problem: Problem, places: Array) -> Array:
-    """Return the weights (P, m) of the rows: rows out of sight or range have none, less exact ones less."""
+    """Return the weights (P, m) of the rows: 0 out of sight or reach, and smaller where `sight` raises sigma."""
     count, stations = len(places), problem.stations.count
     weight = np.broadcast_to(problem.weight, (count, problem.count)).copy()
     end = np.concatenate([rows.a for rows in problem.rows])
@@ -271,7 +283,11 @@ def _weights(selection: SiteSelection, problem: Problem, places: Array) -> Array
 
 
 def _with_prior(problem: Problem, places: Array) -> Problem:
-    """Return the problem with priors that leave nothing unknown: the area of sites and places, and ten times that."""
+    """Return the problem with priors for position and emission time, so that the information is never singular.
+
+    The default prior of the position is half the extent of sites and places; for the emission time it is ten
+    times that length.
+    """
     known = {prior.name for prior in problem.priors}
     points = np.concatenate([places, problem.stations.position.reshape(-1, problem.dimension)])
     half = max(0.5 * float(np.ptp(points, axis=0).max()), _EXTENT)
@@ -284,7 +300,7 @@ def _with_prior(problem: Problem, places: Array) -> Problem:
 
 
 def _rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
-    """Return the whitened rows (P, r, m, n) of each site, filled up with zeros."""
+    """Return the whitened rows (P, r, m, n) of each site; sites with fewer than r rows are padded with zeros."""
     linear = linearise(problem, vectors)
     jacobian = np.concatenate([linear.shared, linear.local], axis=-1)
     found: list[list[Array]] = [[] for _ in range(count)]
@@ -305,7 +321,7 @@ def _rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
 
 
 def _prior(problem: Problem, vectors: Array) -> Array:
-    """Return the information (P, m, m) of the priors."""
+    """Return the prior information (P, m, m) at each place."""
     n, length, size = problem.layout.n_shared, problem.layout.n_local, len(vectors)
     none = Normal(
         np.zeros((size, n, n)),
@@ -326,7 +342,10 @@ def _prior(problem: Problem, vectors: Array) -> Array:
 
 
 def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tuple[Array, Array, Array]:
-    """Return rules, limits and states of the sites; what is kept counts in groups alone."""
+    """Return rules (R, n), limits (R,) and states (n,) of the sites.
+
+    Only the group rules count the kept sites.
+    """
     n, place = len(names), {name: i for i, name in enumerate(names)}
 
     def where(wanted: Sequence[str], argument: str) -> Array:
@@ -356,7 +375,8 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
     inside = np.array(own, dtype=bool).reshape(-1, n)
     check_groups(selection.groups, inside, names, state, selection.choose)
     if selection.choose is not None and selection.budget is None and selection.groups:
-        # one site more is always better, but for groups: there so many sites are a rule of their own
+        # Without groups, a full set is always best, so the upper limit is enough. Groups need the exact number as a
+        # second rule.
         rules.append(-free)
         limits.append(-float(selection.choose))
     for group, taken in zip(selection.groups, inside, strict=True):
@@ -367,7 +387,8 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
         if group.least is not None:
             rules.append(-members)
             limits.append(-float(group.least))
-    # in units of their largest entries: budgets and counts are alike to the interior point
+    # Divide each rule by its largest entry: then budgets and counts have the same scale for the interior-point
+    # method.
     size = np.array([np.abs(rule).max() or 1.0 for rule in rules])
     return np.array(rules) / size[:, None], np.array(limits) / size, state
 
@@ -389,7 +410,7 @@ def _costs(selection: SiteSelection, n: int, site: Array) -> Array:
 
 
 def _check_seen(candidates: Candidates) -> None:
-    """Refuse a place at which all sites together leave the position open: no choice has a fix there."""
+    """Raise if all sites together do not determine the position at a place: then no set of sites has a fix there."""
     heard = (candidates.design.rows != 0.0).any(axis=(1, 2)) & (candidates.state != 0)
     rows = candidates.design.rows[..., candidates.state != 0]
     places, r, m, n = rows.shape
@@ -397,7 +418,7 @@ def _check_seen(candidates: Candidates) -> None:
     prior = candidates.design.prior
     scale = 1.0 / np.sqrt(np.diagonal(prior, axis1=1, axis2=2))
     for p in range(places):
-        # In units of what the prior knows, a direction that rows know no better than it is open.
+        # Scale each direction by the prior: if the rows determine it no better than the prior does, it is open.
         singular = np.linalg.svd(flat[p] * scale[p], compute_uv=False)
         known = int((singular > 1.0).sum())
         if known < m:
