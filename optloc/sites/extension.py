@@ -1,4 +1,4 @@
-"""Commands and kernels of sites: `optloc place` and `optloc calibrate`."""
+"""Command line and kernel list of this package: `optloc place` and `optloc calibrate`."""
 
 from __future__ import annotations
 
@@ -57,9 +57,10 @@ def place(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Choose where stations go: which of many sites give the best fixes, with a bound of what any choice can reach.
+    """Choose the best station sites from a list of candidates, with a proven bound for any other choice.
 
-    FILE is a selection file (choice, candidates, targets), or a problem file, whose stations are the candidates.
+    FILE is a selection file (choice, candidates, targets), or a problem file. The stations of a problem file are
+    the candidates.
     """
     from optloc.sites.commands.place import PlaceOptions, run_place
 
@@ -84,7 +85,7 @@ def _place() -> None:
     from optloc.cli import TARGET, problem_of
     from optloc.sites.placement import SiteSelection, place as chosen
 
-    # the criteria differ by numbers, not by types
+    # one criterion is enough: the criteria differ in argument values, not in types
     chosen(SiteSelection(problem_of("toa"), TARGET[None], choose=4, gap=0.5))
 
 

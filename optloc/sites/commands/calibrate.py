@@ -1,4 +1,4 @@
-"""What ``optloc calibrate`` does: stations, clocks and pulses from measurements alone."""
+"""The command ``optloc calibrate``: stations, clocks and pulses from measurements alone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NETWORKS = (
     "optloc calibrate hall.toml",
     "optloc calibrate hall.toml --gauge A1,A2,A3 --out surveyed.toml --plot network.png",
 )
-# Stations that a table shows: what a screen holds.
+# Largest number of stations in the table, so that it fits on a screen.
 _LINES = 40
 
 Gauge = Annotated[str | None, typer.Option(metavar="A1,A2,A3", help="Stations that define the frame.")]
@@ -41,9 +41,9 @@ def calibrate(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Find where stations are, and their clocks, from pulses at unknown places: no first guess, and a verdict.
+    """Find positions and clocks of stations from pulses at unknown positions, without a first guess, and check them.
 
-    FILE lists stations, with the coordinates that are known and no others, and what they measured of each pulse.
+    FILE lists the stations, with coordinates only where these are known, and the measurements of each pulse.
     """
     raise typer.Exit(_run(file, gauge, seed, out, plot, robust=robust, as_json=as_json, quiet=quiet))
 

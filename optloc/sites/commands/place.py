@@ -1,4 +1,4 @@
-"""What ``optloc place`` does: which sites to take, how far from the best that is, what each loss costs, and maps."""
+"""The command ``optloc place``: choice of sites, gap to the best possible set, effect of each loss, and maps."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from optloc.sites.placement.selection_file import (
     write_chosen,
 )
 
-# Lines of a table of places or stations: what a screen holds.
+# Largest number of lines in a table of places or stations, so that the table fits on a screen.
 _LINES = 20
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceOptions:
-    """What the command line says in the place of the file, None where it says nothing.
+    """Options of the command line that replace settings of the file; None keeps the setting of the file.
 
     Parameters
     ----------
     choose, budget, criterion, worst, fail_one, gap, seconds
-        As of `SiteSelection`.
+        See `SiteSelection`.
     at : str, optional
-        The one place of interest.
+        The only place of interest.
     rows : bool
-        Single rows are chosen.
+        Whether single rows are chosen instead of stations.
     draws : int
         Simulated fixes at each place.
     """
@@ -58,7 +58,10 @@ class PlaceOptions:
 def run_place(
     file: Path, wanted: PlaceOptions, *, plot: Path | None, out: Path | None, as_json: bool = False, quiet: bool = False
 ) -> int:
-    """Choose sites, print and write what was chosen, and return the exit code: 1 where the gap did not close."""
+    """Choose sites, print and write the result, and return the exit code.
+
+    The code is 1 if the gap did not close or too many simulated fixes are ambiguous, otherwise 0.
+    """
     claim_outputs(out, picture=plot, inputs=[file])
     loaded = read_selection(file) if is_selection(file) else _of_problem(file, wanted)
     selection = _with(loaded.selection, wanted)
@@ -88,7 +91,7 @@ def run_place(
 
 
 def _of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
-    """Return the selection of stations of an ordinary problem file, for a target at a place or the fix."""
+    """Return the stations of a problem file as candidates, for a target at `--at` or at the fix of the file."""
     loaded = read(file, values=False)
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
     problem = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
@@ -107,7 +110,7 @@ def _of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
 
 
 def _with(selection: SiteSelection, wanted: PlaceOptions) -> SiteSelection:
-    """Return a selection with the options of the command line."""
+    """Return the selection with the options of the command line."""
     given: dict[str, Any] = {
         key: value
         for key in ("choose", "budget", "worst", "fail_one", "gap", "seconds")

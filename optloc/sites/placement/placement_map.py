@@ -1,4 +1,4 @@
-"""A map of the bound before and after a choice of stations, on one scale, and how the gap closed."""
+"""Maps of the accuracy bound before and after a choice of stations, and the gap during the search."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Taken stations that are named, and side of a map from which it is in kilometres, metres.
+# Largest number of taken stations with a label, and side of a map from which its axes are in kilometres,
+# metres.
 _NAMED, _FAR = 16, 5e3
 
 
@@ -27,22 +28,22 @@ def plot_placement(
     course: Array,
     titles: Sequence[str],
 ) -> Figure:
-    """Return two maps of the bound on one scale, and below them value and bound against time.
+    """Return a figure: two maps of the bound on one scale, above value and bound over time.
 
     Parameters
     ----------
     maps : sequence of 2 BoundMap
         Before and after; their stations are all candidates.
     taken : sequence of 2 bool array (s,)
-        Which of them are taken.
+        Taken stations of each map.
     places : array (P, 2)
-        Places of interest, as the maps' x and y.
+        Places of interest, in the coordinates of the maps.
     weights : array (P,)
-        How much they count.
+        Weights of the places.
     course : array (q, 3)
         Seconds, bound and value (both as standard deviations, metres).
     titles : sequence of 2 str
-        Of the maps.
+        Titles of the maps.
     """
     from matplotlib.colors import LogNorm
 

@@ -1,4 +1,4 @@
-"""Site selections as files: candidates, places, kinds and rules in tables; and the problem file of the chosen sites."""
+"""Selection files: candidates, places, measurements and rules; output of the chosen sites as a problem file."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from optloc.sites.placement.areas import (
 )
 from optloc.sites.placement.sites import CountGroup, Name, SiteSelection
 
-# Columns of stations and candidates that a problem file knows.
+# Columns of stations and candidates that a problem file accepts.
 _PLACE = (
     "x",
     "y",
@@ -70,14 +70,14 @@ _PLACE = (
     "tilt",
     "roll",
 )
-# What says where rows come from.
+# Keys for the source of rows.
 _ROWS = {"file", "rows", "columns", "separator"}
-# Places that an area may become.
+# Largest number of places in an area.
 _MANY = 10_000
 
 
 class _SelectionTable(BaseModel):
-    """A table of the file; keys that it does not know are refused."""
+    """A table of the file; unknown keys are an error."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -85,7 +85,7 @@ class _SelectionTable(BaseModel):
 
 
 class ChoiceTable(_SelectionTable):
-    """What to choose, by what, and when to stop."""
+    """Number of sites, criterion and limits of the search."""
 
     choose: int | None = Field(default=None, ge=1)
     """How many candidates to take, beyond the stations that are there."""
@@ -125,21 +125,21 @@ class TargetsTable(DataTable):
 
 
 class ExpectedTable(MeasurementsTable):
-    """What each station would measure: as in a problem file, without values; by default every station has a row."""
+    """Expected measurements, as in a problem file but without values; the default is one row per station."""
 
     range_max: Amount | None = None
     """Distance beyond which there is no measurement."""
 
 
 class SightTable(DataTable):
-    """What is in sight. Columns: candidate, place, sight (0, 1 or a factor on sigma); pairs left out are in sight."""
+    """Lines of sight. Columns: candidate, place, sight (0, 1 or a factor on sigma); the default of a pair is 1."""
 
     terrain: str | None = None
     """CSV file with columns x, y, z on a grid, metres of the frame: what is behind the ground is out of sight."""
 
 
 class GroupTable(_SelectionTable):
-    """How many of some candidates: those of a mast, of a region, of an owner."""
+    """A rule for the number of candidates from a group, for instance of one mast, region or owner."""
 
     group: str | None = None
     """Those with this word in their column group."""
@@ -152,7 +152,7 @@ class GroupTable(_SelectionTable):
 
 
 class RefineTable(_SelectionTable):
-    """Where stations may move for the refinement."""
+    """Region of the stations during continuous refinement."""
 
     polygon: str
     """GeoJSON file with a polygon."""
@@ -163,7 +163,7 @@ class RefineTable(_SelectionTable):
 
 
 class SelectionFile(_SelectionTable):
-    """A site selection: which of these candidates to take."""
+    """A site selection: candidates, places, measurements and rules."""
 
     format: Literal[1]
     """Version of the format."""
@@ -195,13 +195,13 @@ class LoadedSelection:
     selection : SiteSelection
         Candidates, places and rules.
     source, title : str
-        Name of the file, and what it says it is.
+        Name of the file, and its title.
     settings : dict
-        Tables of the problem file of all sites.
+        Tables of a problem file with all sites.
     regions : tuple of PlacementRegion
-        Where stations may move; none without a refinement.
+        Regions of the stations in the refinement; empty without a refinement.
     ground : PlacementGround, optional
-        What their heights are above.
+        Terrain; with it, the heights of the regions are heights above the ground.
     """
 
     selection: SiteSelection
@@ -224,7 +224,7 @@ def read_selection(path: Path) -> LoadedSelection:
     Raises
     ------
     InvalidProblem
-        Naming the file, the row and the column or key.
+        If the file is invalid; the message names file, row and column or key.
     """
     source, folder = name_of(path), path.parent
     file = conform(SelectionFile, parse_toml(read_text(path), source), source)
@@ -276,7 +276,7 @@ def _bare(section: StationsTable) -> DataTable:
 def _settings(
     file: SelectionFile, tables: Sequence[tuple[Table, StationsTable]], folder: Path, source: str
 ) -> dict[str, Any]:
-    """Return the tables of a problem file with all stations and the rows that each would have."""
+    """Return the tables of a problem file with all stations and the rows that each station would have."""
     units = {(section.unit, section.speed_unit) for _, section in tables}
     if len(units) > 1:
         raise InvalidProblem("stations and candidates are in different units", source, "give both the same")
@@ -323,7 +323,7 @@ def _own_sigma(table: Table) -> tuple[Sequence[str], Sequence[float]]:
 def _expected_rows(
     section: ExpectedTable, stations: Sequence[dict[str, Any]], own: dict[str, float], folder: Path, where: str
 ) -> list[dict[str, Any]]:
-    """Return the rows that a section lists, or one of each station but the other end."""
+    """Return the rows that a section lists; without a list, one row for each station except its second station."""
     if section.kind is None:
         raise InvalidProblem("the key 'kind' is missing", where, 'write kind = "toa"')
     kind_model(section.kind, join(where, "key 'kind'"))
@@ -346,7 +346,7 @@ def _expected_rows(
 
 
 def _column(candidates: Table, key: str, problem: Problem) -> Array:
-    """Return a column of the candidates for all stations, zero for those that are there."""
+    """Return a candidate column (s,) for all stations of the problem, 0 for existing stations."""
     given = dict(zip(candidates.labels("name").tolist(), candidates.numbers(key).tolist(), strict=True))
     return np.array([given.get(name, 0.0) for name in problem.stations.names])
 
@@ -370,7 +370,7 @@ def _group(table: GroupTable, candidates: Table, where: str) -> CountGroup:
 def _places(
     section: TargetsTable, wanted: FrameTable, problem: Problem, folder: Path, source: str
 ) -> tuple[Array, tuple[str, ...], Array | None]:
-    """Return places (P, d), their names, and weights, None where they count alike."""
+    """Return places (P, d), metres, their names, and their weights (P,); the weights are None if they are equal."""
     where = join(source, "[targets]")
     if section.polygon is not None:
         if section.file is not None or section.rows is not None or section.spacing is None:
@@ -396,7 +396,7 @@ def _places(
 
 
 def _area(section: TargetsTable, frame: Frame, dimension: int, folder: Path, where: str) -> Array:
-    """Return places (P, d) on a square grid inside a polygon."""
+    """Return places (P, d) on a square grid inside a polygon, metres."""
     assert section.polygon is not None
     step = Units("length").plain(section.spacing or 0.0, section.unit, join(where, "key 'spacing'"))
     if not step > 0.0:
@@ -418,10 +418,10 @@ def _area(section: TargetsTable, frame: Frame, dimension: int, folder: Path, whe
 
 
 def _reach(file: SelectionFile, counts: Sequence[int], source: str) -> Array | None:
-    """Return the greatest range (m,) of each row, metres; None where all are without end."""
+    """Return the largest range (m,) of each row, metres; None if no section has a limit."""
     if all(section.range_max is None for section in file.measurements):
         return None
-    # blocks of rows stand in the order of the kinds' first appearance: `assemble` has put equal kinds together
+    # `assemble` orders the blocks of rows by the first appearance of their kind and joins equal kinds
     kinds: dict[str, list[float]] = {}
     for i, (section, count) in enumerate(zip(file.measurements, counts, strict=True)):
         place = join(source, f"[[measurements]] {i + 1}", "key 'range_max'")
@@ -435,7 +435,7 @@ def _reach(file: SelectionFile, counts: Sequence[int], source: str) -> Array | N
 def _sight(
     section: SightTable | None, problem: Problem, places: Array, labels: Sequence[str], folder: Path, source: str
 ) -> Array | None:
-    """Return the factor (P, s) of each pair, 0 where it is out of sight; None where all are in sight."""
+    """Return the sight factor (P, s) of each place and station, 0 if out of sight; None if all pairs are in sight."""
     if section is None:
         return None
     where, names = join(source, "[sight]"), problem.stations.names
@@ -479,7 +479,7 @@ def _regions(
 
 
 def write_chosen(loaded: LoadedSelection, taken: Sequence[str], out: Path, source: Path) -> None:
-    """Write an ordinary problem file with the taken stations and their rows, ready for `crlb --map` and studies."""
+    """Write a problem file with the taken stations and their rows, as input of `crlb --map` and studies."""
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("the chosen stations are written as a problem file", str(out), "let its name end in .toml")
     claim(out, inputs=[source])
@@ -497,7 +497,7 @@ def write_chosen(loaded: LoadedSelection, taken: Sequence[str], out: Path, sourc
 
 
 def criterion_name(name: str) -> Name:
-    """Return the name of a criterion; raise InvalidProblem for an unknown one."""
+    """Return the name of a criterion, or raise InvalidProblem if it is unknown."""
     known: tuple[Name, ...] = ("rms", "volume", "axis")
     for one in known:
         if name == one:
