@@ -1,4 +1,4 @@
-"""An initiator of Stone Soup that needs no guess: it gathers scans until they determine the state."""
+"""An initiator of Stone Soup without a first guess: it collects scans until they determine a state."""
 
 from __future__ import annotations
 
@@ -36,25 +36,26 @@ from optloc.solvers import solve
 from optloc.tracking import is_one_gaussian
 from optloc.uncertainty import mixture
 
-# Chains that wait for more scans: of those that no detection has continued for long the oldest are forgotten.
+# Largest number of chains that wait for more scans; the chains that were not continued for the longest time are
+# dropped.
 _REMEMBERED = 40
 
 
 def mixture_state(
     problem: Problem, fix: Fix, mapping: Sequence[int], prior_state: GaussianState, timestamp: dt.datetime | None = None
 ) -> GaussianMixture:
-    """Return what the data say of a position, other minima included, as a Gaussian mixture of Stone Soup.
+    """Return the position and its alternatives as a Gaussian mixture of Stone Soup.
 
     Parameters
     ----------
     problem, fix : Problem, Fix
-        One static position and its single fix, as `optloc.uncertainty.mixture` takes them.
+        One static position and its single fix, as for `optloc.uncertainty.mixture`.
     mapping : sequence of int
-        Places of the position in the state.
+        Indices of the position in the state.
     prior_state : GaussianState
         Mean and covariance of the rest of the state.
     timestamp : datetime, optional
-        Of the state.
+        Time of the state.
     """
     found, place = mixture(problem, fix), list(mapping)
     components = []
@@ -75,12 +76,13 @@ def mixture_state(
 
 
 class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
-    """Begins tracks with optloc's fix of as many scans as it takes, with its covariance.
+    """Starts tracks with the fix and covariance of optloc, from as many scans as the fix needs.
 
-    Every detection is a scan of one target, its measurement model one of this plug-in, and its stations, which may
-    move, the same throughout. Detections of several targets are told apart by the chi-square of the fix that they would
-    have together. A chain of them becomes a track once position and velocity are determined, unique and nearly
-    Gaussian: no other minimum within a cost gap of 25, standard deviation below 5 % of the nearest range.
+    Each detection is a scan of one target with a measurement model of this plug-in. Stations can move, but their
+    number must stay the same. The initiator separates targets by chi-square: detections of two targets do not fit
+    one position and velocity. A chain of detections becomes a track if position and velocity are determined,
+    unique and nearly Gaussian. Unique means no other minimum within a cost gap of 25; nearly Gaussian means a
+    standard deviation below 5 % of the nearest range.
     """
 
     velocity_mapping: Sequence[int] | None = Property(
@@ -112,19 +114,19 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         self._chains: list[DetectionChain] = []
 
     def initiate(self, detections: Any, timestamp: dt.datetime, **kwargs: Any) -> set[Track]:
-        """Return the tracks that begin with some of the detections that belong to no track yet.
+        """Return the new tracks from detections that do not belong to a track yet.
 
         Raises
         ------
         InvalidProblem
-            For a detection whose measurement model is not one of this plug-in.
+            If the measurement model of a detection is not from this plug-in.
         """
         for detection in detections:
             if not isinstance(detection.measurement_model, StationMeasurement):
                 what = f"a detection has the measurement model {type(detection.measurement_model).__name__}"
                 raise InvalidProblem(what, "initiator", "use a model of this plug-in, such as TDOA")
         work, tracks = ChainWork(float(self.work)), set()
-        # In an order of their own, so that a set that is iterated in another one begins the same tracks.
+        # Sort the detections: the order of a set is random, and the tracks must not depend on it.
         ordered = sorted(detections, key=lambda d: (d.timestamp, tuple(values_of(d))))
         for _, scan in groupby(ordered, key=lambda d: d.timestamp):
             waiting = []
@@ -138,14 +140,14 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         return tracks
 
     def _continued(self, scan: list[Any], work: ChainWork) -> list[DetectionChain]:
-        """Return the chains that the detections of a scan continue, which are taken, and those that they begin."""
+        """Return new chains from a scan: extended chains (they replace the old chains), and single detections."""
         terms = ChainTerms(self.order, self.speed, self.least_p)
-        # Where the rows of a detection do not fit together no chain with it would fit.
+        # If the rows of one detection do not fit together, no chain with this detection fits.
         singles = [single for single in alone(scan, terms) if single.p >= self.least_p]
         pairs = [
             (share, self._chains[i], single) for single in singles for share, i in near(self._chains, single, terms)
         ]
-        # What has fitted many scans is continued before what has fitted one, which in clutter is mostly false.
+        # Extend long chains first: in clutter, most chains of one detection are false.
         pairs.sort(key=lambda pair: (-len(pair[1]), pair[0]))
         fitting = grown([(chain, single) for _, chain, single in pairs], terms, work)
         fitting.sort(key=lambda found: (-len(found[0]), -found[0].p))
@@ -159,15 +161,15 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         return [*out, *(single for single in singles if id(single) not in taken)]
 
     def _proven(self, chain: DetectionChain, work: ChainWork) -> Fix | None:
-        """Return the fix of a chain that is long enough where it is the only one, and nearly Gaussian; else None."""
+        """Return the fix of a chain that is long enough, if the fix is unique and nearly Gaussian; otherwise None."""
         size = len(chain.detections[-1].measurement_model.mapping) * (self.order + 1)
-        # Another place is looked for where all else speaks for a track: that takes as long as hundreds of descents.
+        # Test the cheap conditions first: the search for other minima takes as long as hundreds of descents.
         if len(chain) < self.confirm or chain.cov is None or len(chain.cov) != size or not work.take(LONG):
             return None
         problem, z = posed([chain.detections], ChainTerms(self.order, self.speed, self.least_p))
         fix = solve(problem.with_rows(z=z[0]))
         known = is_one_gaussian(fix) and not (fix.alternatives.gap < GAP).any()
-        # Without redundancy nothing speaks against the chain.
+        # Without redundancy, the p-value is NaN and the chain passes this test.
         if not known or fix.p_value < self.least_p:
             return None
         return fix if is_flat(fix.covariance(), fix.position, chain.detections[-1]) else None

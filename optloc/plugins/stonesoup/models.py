@@ -1,7 +1,7 @@
-"""Measurement models of Stone Soup whose functions, derivatives and inverses are those of optloc, and their feeder.
+"""Measurement models of Stone Soup with functions, derivatives and inverses of optloc, and a feeder for pairs.
 
-A model is one scan of several rows. The feeder makes such scans of detections of single pairs, with the covariance that
-rows share where they share a station.
+One measurement of a model is one scan with several rows. The feeder joins detections of single pairs to such
+scans. Rows that share a station have correlated errors; the feeder computes their covariance.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from optloc.problem import (
 )
 from optloc.solvers import solve
 
-# A detection with one of these has no position of its own.
+# A detection with one of these statuses has no usable position.
 _NOT_ONE_PLACE = (Status.CONTRADICTORY, Status.MISFIT, Status.UNBOUNDED, Status.AMBIGUOUS)
 _TYPES = {"azimuth": Bearing, "elevation": Elevation}
 
@@ -48,16 +48,16 @@ Row = tuple[str, int, int]
 
 
 def arrival_covariance(pairs: Any, sigma: Any, stations: int) -> Array:
-    """Return the covariance (m, m) of differences of what stations measure: rows that share a station correlate.
+    """Return the covariance (m, m) of differences between stations: rows that share a station are correlated.
 
     Parameters
     ----------
     pairs : int array (m, 2)
         Stations a and b of each row.
     sigma : float or array (s,)
-        Standard deviation of each station's arrival, metres; of its range rate, m/s.
+        Standard deviation of the arrival of each station, metres, or of its range rate, m/s.
     stations : int
-        Number of stations s.
+        Number s of stations.
     """
     index = np.atleast_2d(np.asarray(pairs, dtype=int))
     variance = np.broadcast_to(np.asarray(sigma, dtype=float) ** 2, (stations,))
@@ -65,15 +65,17 @@ def arrival_covariance(pairs: Any, sigma: Any, stations: int) -> Array:
 
 
 class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  # type: ignore[misc]  # untyped bases
-    """What stations at given positions measure of a target; base of the models below.
+    """Base class of the models below: measurements of a target by stations at given positions.
 
-    Moving stations: give each detection a model of its own. Azimuths go from +x towards +y, elevations up from the
-    plane, ranges and their differences are in metres, range rates and theirs in metres per second.
+    If stations move, give each detection a separate model. Azimuths are measured from +x towards +y, elevations
+    upwards from the plane. Ranges and range differences are in metres, range rates and their differences in
+    metres per second.
 
     Raises
     ------
     InvalidProblem
-        Where stations, mapping or rows do not fit together, or for a rotation offset: turn the frame instead.
+        If stations, mapping or rows do not fit together. A rotation offset is an error too: turn the frame
+        instead.
     """
 
     stations: np.ndarray = Property(doc="Positions (s, d) of the stations, metres.")
@@ -108,23 +110,23 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
 
     @property
     def sites(self) -> Array:
-        """Return where the stations are (s, d): their positions from the translation offset on."""
+        """Return the station positions (s, d), metres: `stations` plus the translation offset."""
         offset = self.translation_offset
         return self.stations if offset is None else self.stations + np.asarray(offset, dtype=float).ravel()
 
     @property
     def places(self) -> list[int]:
-        """Return the places in the state of what the measurement depends on: the position."""
+        """Return the state indices that the measurement depends on: the position."""
         return list(self.mapping)
 
     @property
     def rates(self) -> Array | None:
-        """Return the velocities (s, d) of the stations, metres per second, where they matter."""
+        """Return the station velocities (s, d), m/s, or None if the measurement does not depend on velocities."""
         return None
 
     @clearable_cached_property("stations", "translation_offset", "noise_covar")  # type: ignore[untyped-decorator]
     def problem(self) -> Problem:
-        """Return the optloc problem of one measurement: an unknown position, values of zero."""
+        """Return the optloc problem of one measurement, with an unknown position and all values zero."""
         return self._posed(Motion())
 
     def _posed(self, motion: Motion) -> Problem:
@@ -133,7 +135,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         return problem_of(self.sites[None], [self.rows], [covariance], velocity=rates, motions=(motion,))
 
     def function(self, state: Any, noise: Any = False, **kwargs: Any) -> Any:
-        """Return the measurement (m, 1) of a state, or (m, N) of N of them, with noise if wanted."""
+        """Return the measurement (m, 1) of a state, or (m, N) of N states, with noise if requested."""
         vector = np.asarray(state.state_vector, dtype=float)[self.places].T  # (N, d or 2 d)
         values = self._ordered(predict(self.problem, vector).T)
         if isinstance(noise, bool) or noise is None:
@@ -148,14 +150,14 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         return out
 
     def inverse_function(self, detection: Any, **kwargs: Any) -> Any:
-        """Return the state (n, 1) whose `places` fit a detection best, found without a guess; zeros elsewhere.
+        """Return the state (n, 1) that fits a detection best, without a first guess; zero outside `places`.
 
-        Of a detection with several measurements (m, N) it returns their states (n, N), each found by itself.
+        For a detection with N measurements (m, N), the result is N independent states (n, N).
 
         Raises
         ------
         NotImplementedError
-            Where one has no clean fix of its own; initiators of Stone Soup can skip such ones.
+            If a measurement has no clean and unique fix; initiators of Stone Soup can skip such measurements.
         """
         z = np.asarray(detection.state_vector, dtype=float)[self.order].T
         fix = solve(self.problem.with_rows(z=z if len(z) > 1 else z[0])).flat()
@@ -172,7 +174,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         return self._typed(drawn.reshape(self.ndim_meas, num_samples))
 
     def logpdf(self, state1: Any, state2: Any, **kwargs: Any) -> Any:
-        """Return the logarithm of the density of a measurement given a state, angles wrapped."""
+        """Return the logarithm of the density of a measurement given a state; angles are wrapped."""
         from scipy.stats import multivariate_normal
 
         off = np.asarray(state1.state_vector - self.function(state2), dtype=float)
@@ -180,21 +182,21 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
 
     @property
     def order(self) -> Array:
-        """Return the place in the measurement of each row of `problem`, which keeps kinds together."""
+        """Return the index in the measurement of each row of `problem`, which sorts the rows by kind."""
         return rows_by_kind([self.rows])[1]
 
     def _ordered(self, values: Array) -> Array:
-        """Return values (m, N) of the rows of `problem` in the order of the measurement."""
+        """Return values (m, N) of the rows of `problem` in the row order of the measurement."""
         out = np.empty_like(values)
         out[self.order] = values
         return out
 
     def _typed(self, values: Array) -> Any:
-        """Return values (m, N) with the angles among them as angles."""
+        """Return values (m, N) with angle rows as Stone Soup angles."""
         kind: Any = StateVector if values.shape[1] == 1 else StateVectors
         if not any(row[0] in _TYPES for row in self.rows):
             return kind(values)
-        typed = values.astype(object)  # Stone Soup wraps differences of its own angle types only
+        typed = values.astype(object)  # Stone Soup wraps only its angle types
         for i, (name, _, _) in enumerate(self.rows):
             if name in _TYPES:
                 typed[i] = [_TYPES[name](value) for value in values[i]]
@@ -238,12 +240,12 @@ class AOATDOA(StationMeasurement):
 
 
 class RateMeasurement(StationMeasurement, ABC):
-    """What depends on the velocity of the target as well; base of the models below.
+    """Base class of the models below, whose measurements also depend on the velocity of the target.
 
     Raises
     ------
     InvalidProblem
-        Where velocities do not fit the stations, or the state has no place for the target's.
+        If the velocities do not fit the stations, or if the state has no velocity of the target.
     """
 
     velocities: np.ndarray | None = Property(
@@ -270,18 +272,18 @@ class RateMeasurement(StationMeasurement, ABC):
 
     @property
     def places(self) -> list[int]:
-        """Return the places in the state of the position, then of the velocity."""
+        """Return the state indices of the position, then of the velocity."""
         own = self.velocity_mapping
         return [*self.mapping, *([i + 1 for i in self.mapping] if own is None else own)]
 
     @property
     def rates(self) -> Array | None:
-        """Return the velocities (s, d) of the stations."""
+        """Return the station velocities (s, d), metres per second."""
         return np.zeros_like(self.stations) if self.velocities is None else self.velocities
 
     @clearable_cached_property("stations", "translation_offset", "noise_covar", "velocities")  # type: ignore[untyped-decorator]
     def problem(self) -> Problem:
-        """Return the optloc problem of one measurement: an unknown position and velocity, values of zero."""
+        """Return the optloc problem of one measurement, with an unknown position and velocity and all values zero."""
         return self._posed(Motion(1))
 
 
@@ -319,10 +321,11 @@ class TDOAFDOA(RateMeasurement):
 
 
 class AnyRows(RateMeasurement):
-    """Any mixture of kinds in one measurement, with one inverse of all of them together.
+    """Any mixture of kinds in one measurement, with one inverse from all rows together.
 
-    Stone Soup's combined model of several sums their inverses, which is a state of none: name the rows here instead.
-    Elements follow `optloc.models.MODELS`: metres, radians, ratios, metres per second.
+    The combined model of Stone Soup adds the inverses of its models, so the sum is no valid state. Use this class
+    with a table of rows instead. The units of the elements are those of `optloc.models.MODELS`: metres, radians,
+    ratios, metres per second.
     """
 
     table: Sequence[Row] = Property(doc="Kind, first and second station of each row; -1 where a kind takes none.")
@@ -339,17 +342,17 @@ class AnyRows(RateMeasurement):
 
     @property
     def places(self) -> list[int]:
-        """Return the places in the state of the position and, where a row depends on it, of the velocity."""
+        """Return the state indices of the position and, if a row depends on the velocity, of the velocity."""
         return super().places if self.moving else list(self.mapping)
 
     @property
     def rates(self) -> Array | None:
-        """Return the velocities (s, d) of the stations, where they matter."""
+        """Return the station velocities (s, d), metres per second, or None if no row depends on velocities."""
         return super().rates if self.moving else None
 
     @clearable_cached_property("stations", "translation_offset", "noise_covar", "velocities", "table")  # type: ignore[untyped-decorator]
     def problem(self) -> Problem:
-        """Return the optloc problem of one measurement: an unknown position, or position and velocity."""
+        """Return the optloc problem of one measurement, with an unknown position, or position and velocity."""
         return self._posed(Motion(int(self.moving)))
 
 
@@ -359,7 +362,7 @@ def values_of(detection: Any) -> Array:
 
 
 def rows_by_kind(scans: Sequence[Sequence[Row]]) -> tuple[dict[str, list[tuple[int, int, int]]], Array]:
-    """Return (a, b, scan) of the rows of each kind, and the place of each in the scans one after the other."""
+    """Return (a, b, scan) of the rows of each kind, and the index of each row in the concatenated scans."""
     found: dict[str, list[tuple[int, int, int]]] = {}
     places: dict[str, list[int]] = {}
     every = [(k, row) for k, rows in enumerate(scans) for row in rows]
@@ -377,18 +380,18 @@ def problem_of(
     velocity: Array | None = None,
     **more: Any,
 ) -> Problem:
-    """Return the problem of some scans, with values of zero.
+    """Return the problem of several scans, with all values zero.
 
     Parameters
     ----------
     stations : array (..., k, s, d)
-        Positions at each scan.
+        Station positions at each scan, metres.
     scans : sequence of k sequences of (kind, a, b)
-        Rows.
+        Rows of each scan.
     covariances : sequence of k arrays (..., m, m)
-        Of the rows of each scan.
+        Covariance of the rows of each scan.
     velocity : array (..., k, s, d), optional
-        Of the stations at each scan.
+        Station velocities at each scan, m/s.
     **more
         Further arguments of `optloc.assemble`.
     """
@@ -397,7 +400,7 @@ def problem_of(
     for kind, rows in kinds.items():
         a, b, k = np.array(rows).T
         parts.append(measured(kind, np.zeros(len(rows)), a=a, b=b, epoch=k, sigma=1.0))
-    place = np.argsort(order)  # where each row of the scans stands among those sorted by kind
+    place = np.argsort(order)  # index of each scan row in the order by kind
     ends = np.cumsum([0, *(len(rows) for rows in scans)])
     blocks = [
         Block(place[None, first:last], np.asarray(covariance, dtype=float)[..., None, :, :])
@@ -409,10 +412,11 @@ def problem_of(
 
 
 class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
-    """Groups the TDOA detections of an instant to one vector detection of each target.
+    """Joins the TDOA detections of one time to one vector detection for each target.
 
-    Rows that share a station share the error of its arrival: their covariance is D diag(arrival_sigma^2) D' plus that
-    of each row's own noise. Without such own noise, pairs that close a loop say nothing new and are left out.
+    Rows that share a station share the error of its arrival. Their covariance is D diag(arrival_sigma^2) D' plus
+    the independent noise of each row. Without independent noise, a pair that closes a loop adds no information
+    and is left out.
     """
 
     arrival_sigma: float = Property(doc="Standard deviation of each station's arrival, metres.")
@@ -423,12 +427,12 @@ class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
 
     @BufferedGenerator.generator_method  # type: ignore[untyped-decorator]
     def data_gen(self) -> Iterator[tuple[dt.datetime, set[Detection]]]:
-        """Yield the times and the vector detections.
+        """Yield each time with its vector detections.
 
         Raises
         ------
         InvalidProblem
-            For a detection that is no TDOA, or stations that differ within an instant.
+            If a detection is not a TDOA, or if stations differ between detections of one time.
         """
         for time, detections in self.reader:
             groups: dict[Any, list[Detection]] = {}
@@ -448,7 +452,7 @@ class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
             raise InvalidProblem("stations differ within an instant", "PairFeeder", "give all pairs the same stations")
         pairs = np.concatenate([np.atleast_2d(model.pairs) for model in models])
         z = np.concatenate([values_of(detection) for detection in group])
-        # Noise of arrivals alone is singular on closed loops: their rows are sums of the others.
+        # The covariance of arrival noise is singular on closed loops: such rows are sums of others.
         kept = np.ones(len(z), dtype=bool) if self.row_sigma > 0.0 else _forest(pairs, len(first.stations))
         covariance = arrival_covariance(pairs[kept], self.arrival_sigma, len(first.stations))
         model = TDOA(
@@ -463,8 +467,8 @@ class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
 
 
 def _forest(pairs: Array, stations: int) -> Array:
-    """Return which pairs (m,) link stations that those before leave apart."""
-    # Groups of linked stations, each named by one of its members.
+    """Return a mask (m,) of the pairs that connect two groups of stations which earlier pairs do not connect."""
+    # Label of the connected group of each station.
     group, kept = np.arange(stations), np.zeros(len(pairs), dtype=bool)
     for i, (a, b) in enumerate(pairs):
         if group[a] != group[b]:

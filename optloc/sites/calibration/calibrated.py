@@ -1,4 +1,9 @@
-"""Networks from nothing: starts until three agree, moves of single blocks, and a verdict with its reasons."""
+"""Self-calibration of a network: search, block moves with proofs, and a result with status and findings.
+
+`calibrate` searches with up to 60 pulses, adds the other pulses as fixes, and refines everything together.
+Then it tests the result: open motions, mirror images, misfit, alternatives and proofs of single stations and
+pulses.
+"""
 
 from __future__ import annotations
 
@@ -27,22 +32,25 @@ from optloc.sites.calibration.outliers import PRICE, outliers
 from optloc.sites.calibration.rounds import laid
 from optloc.solvers import AMBIGUOUS_GAP, LISTED_GAP, REFUTED, Finding, objections
 
-# Pulses that starts are made from: those with most rows. More find nothing that so many do not.
+# Pulses in the search, those with the most rows: more pulses did not find other networks.
 _CORE = 60
-# Method that places the other pulses; their proof comes with that of all.
+# Method for the other pulses; their proof follows with the proofs of all pulses.
 _QUICK = "gtrs+lsr"
-# Share of pulses with two places that the others outvote: of more, the cheapest combination of their sides is chosen
-# among so many that it feigns a shape of the stations (flat ones come out 0.1 to 0.3 m thick at 3 cm).
+# Largest share of pulses with two possible positions. If more pulses have two, the search chooses among so many
+# combinations of sides that it can simulate a shape of the stations (flat stations appear 0.1 to 0.3 m thick at
+# 3 cm noise).
 _TWOFOLD = 0.5
-# Share of the size by which distances differ in networks that are not the same.
+# Difference of distances, as a share of the size, from which two networks are different.
 _ALIKE = 1e-3
-# Probability beyond the ellipsoid in which two networks are one answer.
+# Two networks are one result if their difference has at least this probability under the covariance.
 _WITHIN = 0.05
-# Share of the largest variance below which a change of distances is none that stations can make.
+# Variances below this share of the largest belong to changes of distances that no motion of stations can make.
 _ZERO = 1e-9
-# Share of the largest move of a pulse above which others are elsewhere, too, and do not just follow the stations.
+# Share of the largest pulse displacement from which another pulse has a different position too, and does not
+# only follow the stations.
 _GIVES_WAY = 0.1
-# Share of squared errors that another network with nearly the same stations may add: 10 % of a deviation.
+# Largest share that another network with nearly the same stations may add to the squared errors: 10 % of a
+# standard deviation.
 _COVERS = 0.2
 
 
@@ -53,13 +61,13 @@ class Alternative:
     Parameters
     ----------
     what : str
-        How it differs, for instance "pulse 7 elsewhere".
+        The difference, for instance "pulse 7 elsewhere".
     gap : float
-        Its cost beyond that of the network found.
+        Its cost minus the cost of the network found.
     stations : array (M, d)
-        Where it has the stations, metres, in the same frame.
+        Station positions in the same frame, metres.
     pulses : array (N, d)
-        Where it has the pulses that can be placed.
+        Positions of the pulses that have enough rows, metres.
     """
 
     what: str
@@ -70,45 +78,45 @@ class Alternative:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A network with its covariance and verdict.
+    """A network with its covariance and status.
 
     Parameters
     ----------
     network : Network
-        What was measured.
+        Measurements and prior knowledge.
     stations : array (M, d)
-        Places, metres, in the frame `gauge`.
+        Station positions in the frame `gauge`, metres.
     clocks : array (M,)
-        Offsets times the speed of propagation, metres; zeros where stations share a clock.
+        Clock offsets times the propagation speed, metres; zeros if the stations share a clock.
     pulses : array (N, d)
-        Places, metres; NaN where a pulse has too few rows, or is not proven to fit at one place alone.
+        Pulse positions, metres; NaN if a pulse has too few rows, or if its position is not proven to be unique.
     emission : array (N,)
-        Times of emission times the speed of propagation, metres.
+        Emission times multiplied by the propagation speed, metres.
     covariance : array (P, P)
-        Of the M d station coordinates, then the clocks where these are sought, square metres, in that frame.
+        Covariance of the M d station coordinates, then of unknown clocks, in that frame, square metres.
     gauge : str
-        What defines the frame: "known places", "centre and main axes of the stations" or the names of stations.
+        Definition of the frame: "known places", "centre and main axes of the stations" or names of stations.
     status : Status
-        The verdict.
+        `ok`, or the most serious problem.
     findings : tuple of str
-        All that speaks against the network, a sentence each; empty for `ok`.
+        One sentence for each problem; empty for `ok`.
     proof : "blockwise" or "unknown"
-        "blockwise": with the others held, no other place of any one station or pulse costs less, and none of a station
-        costs up to 9 more, proven. It does not exclude that several move together.
+        "blockwise": if all others are fixed, no other position of a single station or pulse has a lower cost, and
+        no other position of a station costs up to 9 more. The proof does not exclude that several move together.
     cost : float
         Weighted sum of squared residuals.
     dof : int
         Degrees of freedom.
     p_value : float
-        Chi-square probability of a cost at least this large.
+        Probability of a cost at least as large, from the chi-square distribution.
     agreeing, starts : int
-        How many starts arrived here, and how many were made.
+        Number of starts that reached this network, and of all starts.
     alternatives : tuple of Alternative
-        Other networks within 25 of the cost, cheapest first.
+        Other networks with a cost at most 25 higher, cheapest first.
     residuals : array (N, R)
-        Whitened residuals; NaN where nothing was measured.
+        Whitened residuals; NaN if there is no measurement.
     left_out : int array (k, 2)
-        Pulse and column of `network.z` of each row that was left out as gross, with `robust`.
+        Pulse and column of `network.z` of each row that `robust` left out as gross.
     """
 
     network: Network
@@ -132,33 +140,33 @@ class Calibration:
 
     @property
     def sigma(self) -> Array:
-        """Return the standard deviations (M, d) of the stations' coordinates in the frame, metres."""
+        """Return the standard deviations (M, d) of the station coordinates in the frame, metres."""
         m, d = self.stations.shape
         return np.asarray(np.sqrt(np.diag(self.covariance)[: m * d]).reshape(m, d))
 
     def distances(self) -> tuple[Array, Array, Array]:
-        """Return distances between stations, which no frame changes, and their covariance.
+        """Return the distances between stations, which do not depend on the frame, and their covariance.
 
         Returns
         -------
         pairs : int array (q, 2)
             All pairs of stations.
         distance : array (q,)
-            Metres.
+            Distances, metres.
         covariance : array (q, q)
-            Square metres.
+            Covariance of the distances, square metres.
         """
         pairs, length, flat = spans(self.stations)
         size = flat.shape[1]
         return pairs, length, flat @ self.covariance[:size, :size] @ flat.T
 
     def require(self, allow: tuple[str, ...] = ()) -> Calibration:
-        """Return this where its status is `ok` or one that is allowed.
+        """Return this calibration if its status is `ok` or in `allow`.
 
         Raises
         ------
         NoSolution
-            With the findings.
+            For any other status; the exception has the findings.
         """
         if self.status is not Status.OK and self.status.label not in allow:
             raise NoSolution(self.network, self)
@@ -166,7 +174,7 @@ class Calibration:
 
 
 def spans(stations: Array) -> tuple[Array, Array, Array]:
-    """Return all pairs of stations (q, 2), their distances (q,) and the derivatives of these (q, M d)."""
+    """Return all pairs of stations (q, 2), their distances (q,), metres, and the derivatives (q, M d)."""
     m, d = stations.shape
     pairs = np.array([(i, k) for i in range(m) for k in range(i)], dtype=int).reshape(-1, 2)
     line = stations[pairs[:, 0]] - stations[pairs[:, 1]]
@@ -187,33 +195,33 @@ def calibrate(
     robust: bool = False,
     tell: Callable[[str], None] | None = None,
 ) -> Calibration:
-    """Find stations, clocks and pulses together, without a guess.
+    """Estimate stations, clocks and pulses together, without a first guess.
 
     Parameters
     ----------
     network : Network
-        What was measured and what is known.
+        Measurements and prior knowledge.
     gauge : tuple of str
-        Names of d stations that define the frame of a free network; by default all do.
+        Names of d stations that define the frame of a free network; by default all stations define it.
     seed : int
-        Decides the starts.
+        Seed of the random starts.
     starts : int, optional
-        Starts after which the search ends, agreed or not.
+        Largest number of starts, even if they do not agree.
     robust : bool
-        Whether rows that most others contradict are left out first: they are named, and the network is `unproven` at
-        best, as no proof says that these are the wrong ones.
+        Whether to leave out and list rows that most other rows contradict. The best possible status is then
+        `unproven`: no proof shows that these rows are wrong.
     tell : callable, optional
-        Called with a sentence on each round.
+        Called with a progress message after each round.
 
     Returns
     -------
     Calibration
-        Network, covariance, verdict.
+        Network, covariance, status and findings.
 
     Raises
     ------
     InvalidProblem
-        For stations of `gauge` that are not there, or where known places define the frame.
+        If `gauge` names an unknown station, or if known positions already define the frame.
     """
     named = _named(network, gauge)
     if robust:
@@ -239,14 +247,14 @@ def calibrate(
 def _without_gross(
     network: Network, gauge: tuple[str, ...], seed: int, starts: int | None, tell: Callable[[str], None] | None
 ) -> Calibration:
-    """Return the network of the rows that agree, and name those that do not."""
+    """Return the network of the rows that agree, with a list of the rows that were left out."""
     core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])
     gross = np.zeros(network.z.shape, dtype=bool)
     gross[core] = outliers(network.take(core), seed)
     found = calibrate(
         replace(network, sigma=np.where(gross, np.inf, network.sigma)), gauge=gauge, seed=seed, starts=starts, tell=tell
     )
-    # all rows are asked again, those of pulses that the search did not have too
+    # test all rows again, also of pulses that were not in the search
     residual = _all_residuals(network, found)
     again = network.given & (residual**2 > PRICE)
     if (again != gross).any() and np.isfinite(found.stations).all():
@@ -268,13 +276,13 @@ def _without_gross(
 
 
 def _all_residuals(network: Network, found: Calibration) -> Array:
-    """Return whitened residuals (N, R) of all rows; zeros of pulses without a place."""
+    """Return whitened residuals (N, R) of all rows; zeros for pulses without a position."""
     at = NetworkEstimate(found.stations[None], found.clocks[None], found.pulses[None], found.emission[None])
     return np.asarray(np.nan_to_num(likelihood(network).residual(at)[0]))
 
 
 def _with_rest(network: Network, at: NetworkEstimate, core: Array, rest: Array) -> NetworkEstimate:
-    """Return an estimate of all pulses that can be placed: the core's, and fixes of the others."""
+    """Return an estimate of all pulses with enough rows: the pulses of the search, and fixes of the others."""
     n, d = network.pulses, network.dimension
     pulses, emission = np.zeros((1, n, d)), np.zeros((1, n))
     pulses[0, core], emission[0, core] = at.pulses[0], at.emission[0]
@@ -285,7 +293,7 @@ def _with_rest(network: Network, at: NetworkEstimate, core: Array, rest: Array) 
     return NetworkEstimate(at.stations, at.clocks, whole.pulses[:, every], whole.emission[:, every])
 
 
-# The verdict.
+# Status and findings.
 
 
 def _judged(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, named: tuple[int, ...]) -> Calibration:
@@ -353,24 +361,24 @@ def _curved_words(far: float) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Facts:
-    """The facts that decide about a network.
+    """The quantities that decide the status of a network.
 
     Parameters
     ----------
     net, found, motions : Network, NetworkSearchResult, GaugeRank
-        The network, its starts, and the motions that the data determine.
+        The network, its search, and its determined and open motions.
     p : float
-        Probability of residuals as large.
+        Probability of residuals at least as large.
     sides : tuple of str
-        Sentences on stations, or pulses, in one plane.
+        Sentences about stations, or pulses, in one plane.
     departure : float
-        See `optloc.sites.calibration.gauge.departure`; NaN where a motion is open.
+        See `optloc.sites.calibration.gauge.departure`; NaN if a motion is open.
     blocks : tuple of StationBlock
         Stations and pulses with their proofs.
     elsewhere : tuple of Alternative
-        Networks with other stations that fit about as well.
+        Networks with other stations that fit about equally well.
     twofold : bool array (N,)
-        Pulses without a single place.
+        Pulses without a unique position.
     """
 
     net: Network
@@ -385,12 +393,12 @@ class _Facts:
 
     @property
     def refuted(self) -> list[str]:
-        """Return the names of blocks that cost less elsewhere."""
+        """Return the names of blocks that have a lower cost at another position."""
         return [block.name for block in self.blocks if block.refuted]
 
     @property
     def unproven(self) -> list[str]:
-        """Return the names of blocks without a proof; a pulse may be elsewhere at the same cost."""
+        """Return the names of blocks without a proof; for a pulse, another position may have the same cost."""
         return [block.name for block in self.blocks if not (block.proven if block.station else block.cheapest)]
 
 
@@ -439,19 +447,19 @@ def _few(names: list[str]) -> str:
 
 
 def refuted_blocks(network: Network, at: NetworkEstimate) -> tuple[StationBlock, ...]:
-    """Return the stations and pulses that cost less elsewhere with the others held, proven.
+    """Return the stations and pulses with a lower cost at another position while all others are fixed.
 
     Parameters
     ----------
     network : Network
-        What was measured.
+        Measurements and prior knowledge.
     at : NetworkEstimate
-        One network, S = 1, for instance one with a station on the wrong side.
+        One network, S = 1, for instance with a station on the wrong side.
 
     Returns
     -------
     tuple of StationBlock
-        Empty where none is.
+        Empty if no block has a lower cost elsewhere.
     """
     return tuple(block for block in blocks(likelihood(network), at) if block.refuted)
 
@@ -463,10 +471,10 @@ def _alternatives(
     found: NetworkSearchResult,
     others: list[tuple[str, NetworkEstimate]],
 ) -> tuple[Alternative, ...]:
-    """Return other minima within `LISTED_GAP`: blocks elsewhere, ends of other starts, and the mirror image."""
+    """Return other minima within `LISTED_GAP`: moved blocks, minima of other starts, and the mirror image."""
     net = lik.network
     soft = bool(np.isfinite(net.place_sigma).any())
-    if at.pulses.shape[1] == found.best.pulses.shape[1]:  # else starts are of the core alone
+    if at.pulses.shape[1] == found.best.pulses.shape[1]:  # otherwise the starts contain only a part of the pulses
         near = found.ends.cost < found.cost + LISTED_GAP
         _, first = np.unique(np.round(found.ends.cost[near], 3), return_index=True)
         others = others + [("another network", found.ends.at.take(np.flatnonzero(near)[[i]])) for i in first]
@@ -479,11 +487,12 @@ def _alternatives(
     out: list[Alternative] = []
     shapes = [_shape(at, soft)]
     scale = max(float(np.abs(shapes[0]).max()), 1e-300)
-    # of the same network, refined twice, the first name says more
+    # The same network can occur twice. A stable sort keeps the first name, which is the most specific.
     for i in np.argsort(np.round(costs, 3), kind="stable"):
         one, gap = ends.take(np.array([i])), float(costs[i] - cost)
         shape = _shape(one, soft)
-        # a thousandth of the size, or where costs agree to what is left of the digits, is the same network
+        # Networks that differ by less than `_ALIKE` of the size are the same: equal costs allow a difference from
+        # rounding.
         if gap < LISTED_GAP and all(np.abs(shape - other).max() > _ALIKE * scale for other in shapes):
             shapes.append(shape)
             words = others[i][0]
@@ -494,9 +503,10 @@ def _alternatives(
 
 
 def _same_stations(at: NetworkEstimate, other: Alternative, covariance: Array) -> bool:
-    """Return whether another network has the stations where this one has them, as far as its covariance tells.
+    """Return whether another network has the same stations, within the covariance.
 
-    They are within its 95 % ellipsoid, and what the other's share of the likelihood adds to squared errors is covered.
+    The stations are within the 95 % ellipsoid, and the covariance covers the squared error that the other network
+    adds in proportion to its likelihood.
     """
     if not np.isfinite(covariance).all():
         return False
@@ -512,19 +522,19 @@ def _same_stations(at: NetworkEstimate, other: Alternative, covariance: Array) -
 
 
 def _moved_pulses(at: NetworkEstimate, other: Alternative) -> Array:
-    """Return which pulses another network has elsewhere (N,): the rest gives way a little."""
+    """Return a mask (N,) of the pulses that another network has at different positions; others move a little."""
     apart = np.linalg.norm(other.pulses - at.pulses[0], axis=1)
     return np.asarray(apart > _GIVES_WAY * apart.max())
 
 
 def _shape(at: NetworkEstimate, soft: bool) -> Array:
-    """Return distances between stations and to the pulses, which no frame changes; places too where these are known."""
+    """Return distances of stations to stations and pulses, which need no frame; with priors, also positions."""
     points = np.concatenate([at.stations[0], at.pulses[0]])
     apart = np.linalg.norm(points[:, None] - at.stations[0][None], axis=-1).ravel()
     return np.concatenate([apart, at.stations.ravel()]) if soft else apart
 
 
-# What surrounds a search.
+# Preparation and completion of a search.
 
 
 def _named(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
@@ -541,7 +551,7 @@ def _named(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
 
 
 def _placeable(network: Network) -> Array:
-    """Return which pulses have as many rows as unknowns (N,)."""
+    """Return a mask (N,) of the pulses with at least as many rows as unknowns."""
     needed = network.dimension + network.emission
     return np.asarray(network.given.sum(axis=1) >= needed)
 
@@ -572,7 +582,7 @@ def _refused(network: Network, status: Status, words: str) -> Calibration:
 
 
 def _whole(made: Calibration, network: Network, enough: Array) -> Calibration:
-    """Return a calibration of all pulses, NaN for those that have too few rows."""
+    """Return a calibration of all pulses, with NaN for pulses that have too few rows."""
     pulses = np.full((network.pulses, network.dimension), np.nan)
     emission, residuals = np.full(network.pulses, np.nan), np.full(network.z.shape, np.nan)
     pulses[enough], emission[enough], residuals[enough] = made.pulses, made.emission, made.residuals

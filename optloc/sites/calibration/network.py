@@ -1,4 +1,4 @@
-"""A network whose stations, clocks and emitters are unknown together: what was measured, and what is known."""
+"""A network of stations, clocks and emitters that are unknown together: measurements and prior knowledge."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ KINDS = (*CLOCKED, "range")
 
 @dataclass(frozen=True, slots=True)
 class NetworkSlot:
-    """Which stations measure what: one column of the table of measurements.
+    """The stations of one measurement: a column of the table of measurements.
 
     Parameters
     ----------
     kind : str
         "toa", "tdoa" or "range".
     a, b : int
-        Stations; `b` is -1 where the kind takes one.
+        Stations; `b` is -1 for kinds with one station.
     """
 
     kind: str
@@ -38,28 +38,29 @@ class NetworkSlot:
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """Measurements between stations and pulses, none of whose places need be known.
+    """Measurements between stations and pulses at unknown positions.
 
     Parameters
     ----------
     names : tuple of M str
-        Stations.
+        Names of the stations.
     slots : tuple of R NetworkSlot
         Columns of `z`.
     z : array (N, R)
-        Measured values of N pulses, metres (times multiplied by the speed of propagation).
+        Measured values of N pulses, metres (times are multiplied by the propagation speed).
     sigma : array (N, R)
-        Standard deviations, metres; infinite where nothing was measured.
+        Standard deviations, metres; infinite if there is no measurement.
     place : array (M, d)
-        What is known of the stations' places, metres.
+        Prior coordinates of the stations, metres.
     place_sigma : array (M, d)
-        Its standard deviations: infinite where a coordinate is free, zero where it is known.
+        Standard deviations of the prior coordinates, metres: infinite for a free coordinate, zero for an exact
+        one.
     synchronised : bool
-        Whether the stations share a clock; else each has an unknown offset.
+        Whether the stations share a clock; otherwise each station has an unknown offset.
     between : int array (q, 2)
-        Pairs of stations whose distance was measured.
+        Pairs of stations with a measured distance.
     distance, distance_sigma : array (q,)
-        That distance and its standard deviation, metres.
+        The measured distances and their standard deviations, metres.
     labels : tuple of N str
         Names of the pulses.
     """
@@ -78,45 +79,45 @@ class Network:
 
     @property
     def dimension(self) -> int:
-        """Return 2 or 3."""
+        """Return the number of dimensions, 2 or 3."""
         return int(self.place.shape[1])
 
     @property
     def stations(self) -> int:
-        """Return the number of stations, M."""
+        """Return the number M of stations."""
         return len(self.names)
 
     @property
     def pulses(self) -> int:
-        """Return the number of pulses, N."""
+        """Return the number N of pulses."""
         return int(self.z.shape[0])
 
     @property
     def given(self) -> Array:
-        """Return which entries of `z` were measured, (N, R)."""
+        """Return a mask (N, R) of the measured entries of `z`."""
         return np.isfinite(self.sigma)
 
     @property
     def emission(self) -> Array:
-        """Return which pulses have an unknown time of emission, (N,)."""
+        """Return a mask (N,) of the pulses with an unknown emission time."""
         emitting = np.array([MODELS[slot.kind].emission for slot in self.slots])
         return np.asarray((self.given & emitting).any(axis=1))
 
     @property
     def rows(self) -> int:
-        """Return how many numbers were measured or known before, exact ones not counted."""
+        """Return the number of measurements and of prior coordinates that are not exact."""
         soft = np.isfinite(self.place_sigma) & (self.place_sigma > 0.0)
         return int(self.given.sum() + len(self.distance) + soft.sum())
 
     @property
     def unknowns(self) -> int:
-        """Return how many numbers are sought, the frame included."""
+        """Return the number of unknowns, frame included."""
         free = int((self.place_sigma > 0.0).sum())
         clocks = 0 if self.synchronised else self.stations
         return free + clocks + self.pulses * self.dimension + int(self.emission.sum())
 
     def take(self, pulses: Array) -> Network:
-        """Return the network of some pulses (mask or indices)."""
+        """Return the network with a selection of the pulses (mask or indices)."""
         labels = tuple(np.array(self.labels, dtype=object)[pulses])
         return Network(
             self.names,
@@ -147,26 +148,26 @@ def network_of(
     distances: Sequence[tuple[int, int, float, float]] = (),
     labels: Sequence[str] | None = None,
 ) -> Network:
-    """Return a network of one kind of measurements.
+    """Return a network with one kind of measurements.
 
     Parameters
     ----------
     z : array (N, M), or (N, R) with `pairs`
-        Arrival times times the speed of propagation (or ranges) of N pulses at M stations, metres; NaN where there is
-        none.
+        Arrival times multiplied by the propagation speed, or ranges, of N pulses at M stations, metres; NaN if
+        there is no measurement.
     sigma : float or array like `z`
         Standard deviations, metres.
     kind : str
-        "toa" (unknown time of emission), "range" (two-way) or, with `pairs`, "tdoa".
+        "toa" (unknown emission time), "range" (two-way) or, with `pairs`, "tdoa".
     pairs : sequence of (a, b), optional
         Stations of each column of differences ``r_a - r_b``.
     names : sequence of M str, optional
-        Stations; "A1", "A2" and so on by default.
+        Names of the stations; "A1", "A2" and so on by default.
     dimension : 2 or 3, optional
-        Of space; by default the columns of `place`, or 3.
+        Number of dimensions; by default the number of columns of `place`, or 3.
     place, place_sigma : array (M, d), optional
-        What is known of the stations' places, metres: sigma zero is exact, infinite (or a place that is NaN) is free.
-        By default everything is.
+        Prior coordinates of the stations and their standard deviations, metres. Zero sigma is exact; an infinite
+        sigma (or a NaN coordinate) is free. By default all coordinates are free.
     synchronised : bool
         Whether the stations share a clock.
     distances : sequence of (a, b, distance, sigma)
@@ -177,12 +178,12 @@ def network_of(
     Returns
     -------
     Network
-        To be given to `calibrate`.
+        The input of `calibrate`.
 
     Raises
     ------
     InvalidProblem
-        Naming the argument that cannot be right.
+        If an argument is invalid; the message names it.
     """
     kind = kind_named(kind)
     if kind not in KINDS:
@@ -223,12 +224,12 @@ def network_of(
 
 
 def checked(made: Network) -> Network:
-    """Return a network whose parts fit together.
+    """Return the network unchanged after checks that its parts fit together.
 
     Raises
     ------
     InvalidProblem
-        Naming the part that does not.
+        If a part does not fit; the message names it.
     """
     m, (n, r) = made.stations, made.z.shape
     if made.dimension not in (2, 3):

@@ -1,4 +1,4 @@
-"""Networks as files: stations with coordinates left out, pulses, distances; and the problem file of what is found."""
+"""Network files: stations with unknown coordinates, pulses and distances; output of a result as a problem file."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from optloc.problem import SPEED_OF_LIGHT, Amount, Array, InvalidProblem, neares
 from optloc.sites.calibration.calibrated import Calibration
 from optloc.sites.calibration.network import KINDS, Network, NetworkSlot, checked
 
-# Deviation that stations of the frame get in a file, metres: as good as exact.
+# Smallest standard deviation of stations in the output file, metres: as good as exact.
 _EXACT = 1e-6
 
 BETWEEN = "station_range"
@@ -44,7 +44,7 @@ BETWEEN = "station_range"
 
 
 class _NetworkTable(BaseModel):
-    """A table of the file; keys that it does not know are refused."""
+    """A table of the file; unknown keys are an error."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -52,7 +52,7 @@ class _NetworkTable(BaseModel):
 
 
 class NetworkStations(DataTable):
-    """The stations. Columns: name; x, y, z where something is known of them, sigma where not exactly."""
+    """The stations. Columns: name; x, y, z (empty if unknown); sigma of known coordinates."""
 
     unit: str = "m"
     """Unit of x, y, z and sigma."""
@@ -65,7 +65,7 @@ class NetworkStations(DataTable):
 
 
 class NetworkRows(DataTable):
-    """Measurements of one kind. Columns: epoch (the pulse), a, z; b of two stations; sigma."""
+    """Measurements of one kind. Columns: epoch (the pulse), a, b (for pairs of stations), z, sigma."""
 
     kind: str
     """toa, tdoa, range; station_range is the distance of stations a and b, without epoch."""
@@ -76,7 +76,7 @@ class NetworkRows(DataTable):
 
 
 class NetworkFile(_NetworkTable):
-    """A network whose stations are to be found."""
+    """A network with unknown stations."""
 
     format: Literal[1, 2]
     """Version of the format; nothing that a network holds differs between them."""
@@ -94,7 +94,7 @@ def read_network(path: Path) -> Network:
     Raises
     ------
     InvalidProblem
-        Naming the file, the row and the column or key.
+        If the file is invalid; the message names file, row and column or key.
     """
     source, folder = name_of(path), path.parent
     data = parse_toml(read_text(path), source, formats=(1, 2))
@@ -149,7 +149,7 @@ def read_network(path: Path) -> Network:
 
 
 def _places(section: NetworkStations, table: Table, where: str) -> tuple[Array, Array]:
-    """Return what is known of places (M, d), and how well: infinite where a cell is empty."""
+    """Return prior station coordinates (M, d) and their standard deviations, metres; infinite if a cell is empty."""
     unit = Units("length").conversion(section.unit, where)
     keys = ("x", "y", "z")[: section.dimension]
     if section.dimension == 2 and table.has("z"):
@@ -168,7 +168,7 @@ def _optional(table: Table, key: str) -> Array:
 
 
 def _values(read: Context, name: str) -> tuple[Array, Array]:
-    """Return the values (m,) of rows and their standard deviations, metres; `name` is their unit."""
+    """Return values (m,) and standard deviations (m,) of rows, metres; `name` is the unit in the file."""
     units = Units("length", read.speed)
     unit = units.conversion(name, join(read.where, "key 'unit'"))
     z = values_of(read, unit, np.ones(read.table.count))
@@ -182,9 +182,9 @@ def _values(read: Context, name: str) -> tuple[Array, Array]:
 def _by_pulse(
     rows: list[tuple[str, Array, Array, Array, Array, Array]],
 ) -> tuple[tuple[str, ...], tuple[NetworkSlot, ...], Array, Array]:
-    """Return labels of pulses, slots, and tables (N, R) of values and deviations.
+    """Return labels of pulses, slots, and tables (N, R) of values and standard deviations.
 
-    What the same stations measure of one pulse more than once has a slot for each time.
+    If the same stations measure a pulse several times, each repetition has its own slot.
     """
     labels, _, pulse = distinct(np.concatenate([one[1] for one in rows]))
     slots: dict[tuple[str, int, int, int], int] = {}
@@ -207,18 +207,18 @@ def _by_pulse(
 
 
 def check_name(out: Path) -> None:
-    """Refuse a name for what is found that is not that of a problem file, before anything is searched."""
+    """Raise if the output file does not have the ending of a problem file, before the search starts."""
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("what was found is written as a problem file", str(out), "let its name end in .toml")
 
 
 def write_calibrated(found: Calibration, title: str, out: Path, source: Path) -> None:
-    """Write a problem file with the stations that were found, their deviations, and the rows of the pulses.
+    """Write a problem file with the estimated stations, their standard deviations, and the rows of the pulses.
 
     Raises
     ------
     InvalidProblem
-        Where there is no network to write, or the file's name does not end in .toml.
+        If there is no finite network to write, or if the file name does not end in .toml.
     """
     check_name(out)
     if not np.isfinite(found.covariance).all():
