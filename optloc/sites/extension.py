@@ -41,14 +41,20 @@ def place(
     choose: Choose = None,
     budget_: Costs = None,
     criterion: Criterion = None,
-    worst: Annotated[bool | None, typer.Option("--worst/--mean", help="The worst place counts, or the mean.")] = None,
+    worst: Annotated[
+        bool | None, typer.Option("--worst/--mean", help="Use the worst place, or the mean of all places.")
+    ] = None,
     fail_one: FailOne = None,
-    gap: Annotated[float | None, typer.Option(metavar="SHARE", help="Stop when the bound is as close.")] = None,
-    time: Annotated[float | None, typer.Option(metavar="SECONDS", help="Stop after so long.")] = None,
+    gap: Annotated[
+        float | None, typer.Option(metavar="SHARE", help="Stop at this relative gap between value and bound.")
+    ] = None,
+    time: Annotated[float | None, typer.Option(metavar="SECONDS", help="Time limit of the search.")] = None,
     at: PlaceOfInterest = None,
-    rows: Annotated[bool, typer.Option("--rows", help="Choose single measurements, not stations.")] = False,
+    rows: Annotated[bool, typer.Option("--rows", help="Choose single measurements instead of stations.")] = False,
     draws: AmbiguityDraws = 20,
-    out: Annotated[Path | None, typer.Option(metavar="OUT.toml", help="Write the chosen stations.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="OUT.toml", help="Write a problem file with the chosen stations.")
+    ] = None,
     plot: PlacementMap = None,
     as_json: Json = False,
     outside: Outside = False,

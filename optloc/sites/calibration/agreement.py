@@ -20,7 +20,7 @@ from optloc.sites.calibration.rounds import RoundEnds, joined, rounds, starts_of
 from optloc.solvers import REFUTED, equal_cost
 
 AGREEING = 3
-"""Starts that must arrive at the least cost: with fewer, one network in ten was found in another minimum."""
+"""Number of starts that must reach the least cost: with fewer, 10 % of networks ended in another minimum."""
 
 # Largest number of starts, after which the best network is accepted: 90 % of networks of six stations need
 # fewer.

@@ -17,8 +17,8 @@ from optloc.sites.calibration.network import Network
 from optloc.solvers import AMBIGUOUS_GAP, equal_cost, solve
 
 MOVED = 16.0
-"""Cost that a block's other place may have beyond its present one for all to be refined from there: what is dearer by
-four sigma with the others held hardly ends below when they move as well."""
+"""Largest extra cost of a block at another position for a refinement of the whole network from there. If the cost rises
+by more than four sigma while the others are fixed, a joint refinement hardly ever ends below the present cost."""
 
 # Steps of a single block, and step length in standard deviations at which it ends: most blocks are then close
 # to their minimum, and the joint refinement does the rest.

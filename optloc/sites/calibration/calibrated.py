@@ -233,7 +233,7 @@ def calibrate(
     core = core[enough[core]]
     found = search(network.take(core), seed, starts, tell)
     if found is None:
-        return _refused(network, Status.NUMERICAL, "No start led to a network.")
+        return _refused(network, Status.NUMERICAL, "No start converged to a network.")
     at = found.best
     rest = enough.copy()
     rest[core] = False
@@ -270,7 +270,7 @@ def _without_gross(
     if not len(left):
         return found
     names = [f"{network.names[network.slots[r].a]} of pulse {network.labels[j]}" for j, r in left]
-    words = f"Left out as gross, which no proof confirms: {_few(names)}."
+    words = f"These rows were left out as gross errors, without a proof: {_few(names)}."
     status = min(found.status, Status.UNPROVEN, key=PRECEDENCE.index) if found.status in PRECEDENCE else found.status
     return replace(found, network=network, status=status, findings=(*found.findings, words), left_out=left)
 
@@ -349,14 +349,14 @@ def _open_words(net: Network, told: GaugeRank) -> str:
     largest = [net.names[i] for i in np.argsort(-share, kind="stable")[:3]]
     count = told.open.shape[1]
     return (
-        f"{count} motion{'s' if count > 1 else ''} of the network beyond the frame change no measurement, mostly of "
-        f"{', '.join(largest)}; add pulses off their plane, distances between stations, or known places."
+        f"The measurements do not determine {count} motion{'s' if count > 1 else ''} of the network, mostly of "
+        f"{', '.join(largest)}; add pulses outside their plane, distances between stations, or known positions."
     )
 
 
 def _curved_words(far: float) -> str:
-    words = f"three deviations away the cost is up to {np.exp(far):.2g} times more or less than it says"
-    return f"The covariance does not cover: {words}."
+    words = f"three standard deviations away, the rise of the cost differs by a factor of up to {np.exp(far):.2g}"
+    return f"The covariance does not cover the error: {words}."
 
 
 @dataclass(frozen=True, slots=True)
@@ -414,32 +414,35 @@ _FINDINGS = (
     Finding(
         Status.AMBIGUOUS,
         lambda e: e.elsewhere,
-        lambda e: [f"{other.what} costs {other.gap:.2g} more: both fit the data." for other in e.elsewhere],
+        lambda e: [
+            f"Another network fits the data: {other.what[0].lower()}{other.what[1:]}, cost + {other.gap:.2g}."
+            for other in e.elsewhere
+        ],
     ),
     Finding(
         Status.AMBIGUOUS,
         lambda e: e.twofold.mean() > _TWOFOLD,
         lambda e: [
-            f"{e.twofold.sum()} of {len(e.twofold)} pulses have no single place, as near a plane of all stations."
+            f"{e.twofold.sum()} of {len(e.twofold)} pulses have no unique position: the stations may be near one plane."
         ],
     ),
     Finding(
         Status.UNPROVEN,
         lambda e: e.refuted,
-        lambda e: [f"Another place costs less for {_few(e.refuted)}, the others held."],
+        lambda e: [f"With all others fixed, another position costs less: {_few(e.refuted)}."],
     ),
     Finding(
         Status.UNPROVEN,
         lambda e: e.unproven and not e.refuted,
-        lambda e: [f"That no other place fits as well is not proven of {_few(e.unproven)}."],
+        lambda e: [f"A proof that no other position fits equally well is missing for {_few(e.unproven)}."],
     ),
     Finding(
         Status.SEARCHED,
         lambda e: e.found.agreeing < AGREEING,
-        lambda e: [f"{e.found.agreeing} of {e.found.made} starts arrived at this network; {AGREEING} must agree."],
+        lambda e: [f"Only {e.found.agreeing} of {e.found.made} starts reached this network; {AGREEING} must agree."],
     ),
 )
-"""All findings against networks."""
+"""Findings of a network: status, condition and sentences; the first that applies sets the status."""
 
 
 def _few(names: list[str]) -> str:
@@ -541,9 +544,11 @@ def _named(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
     if not gauge:
         return ()
     if np.isfinite(network.place_sigma).any():
-        raise InvalidProblem("known places define the frame already", "gauge", "leave it out")
+        raise InvalidProblem("known places define the frame already", "gauge", "remove this argument")
     if len(gauge) != network.dimension or len(set(gauge)) != len(gauge):
-        raise InvalidProblem(f"a frame needs {network.dimension} stations", "gauge", "name so many, each once")
+        raise InvalidProblem(
+            f"a frame needs {network.dimension} stations", "gauge", f"name {network.dimension} different stations"
+        )
     for name in gauge:
         if name not in network.names:
             raise no_station(name, "gauge", network.names)

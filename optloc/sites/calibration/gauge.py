@@ -243,13 +243,17 @@ def flat(lik: Likelihood, at: NetworkEstimate, covariance: Array) -> list[str]:
     m, d = net.stations, net.dimension
     places = covariance[: m * d, : m * d].reshape(m, d, m, d)
     if _in_one_plane(at.stations[0], lambda normal: np.einsum("c,icje,e->ij", normal, places, normal)):
-        out.append("The stations are in one plane as far as the data tell: which side of it pulses are on is open.")
+        out.append(
+            "The stations are in one plane within their errors: the data do not show on which side the pulses are."
+        )
     placed = np.flatnonzero(net.given.sum(axis=1) > d)
     pulses = at.pulses[0, placed]
     if _in_one_plane(pulses, lambda normal: _of_pulses(lik, at, covariance, placed, normal)) and _may_be_mirrored(
         net, at.stations[0], pulses
     ):
-        out.append("The pulses are in one plane as far as the data tell: which side of it stations are on is open.")
+        out.append(
+            "The pulses are in one plane within their errors: the data do not show on which side the stations are."
+        )
     return out
 
 

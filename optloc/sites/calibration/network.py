@@ -13,7 +13,7 @@ from optloc.models import MODELS, kind_named
 from optloc.problem import Array, InvalidProblem, check_once, nearest
 
 CLOCKED = ("toa", "tdoa")
-"""Kinds that a station's clock enters; a two-way range has none."""
+"""Kinds that depend on the station clock; a two-way range does not."""
 
 KINDS = (*CLOCKED, "range")
 """Kinds of rows between stations and pulses."""
@@ -189,10 +189,12 @@ def network_of(
     if kind not in KINDS:
         raise InvalidProblem(f"networks have no rows of kind {kind!r}", "kind", nearest(kind, list(KINDS)))
     if (kind == "tdoa") != (pairs is not None):
-        raise InvalidProblem("pairs of stations belong to time differences", "pairs", 'give them with kind="tdoa"')
+        raise InvalidProblem(
+            "the argument pairs and the kind tdoa need each other", "pairs", 'give pairs with kind="tdoa" only'
+        )
     values = np.asarray(numbers(np.where(np.isnan(z := np.asarray(z, dtype=float)), 0.0, z), "z"))
     if values.ndim != 2 or not values.size:
-        raise InvalidProblem(f"the measurements have shape {values.shape}", "z", "give one line a pulse")
+        raise InvalidProblem(f"the measurements have shape {values.shape}", "z", "give one row for each pulse")
     count = values.shape[1] if pairs is None else 1 + max(max(pair) for pair in pairs)
     names = tuple(names) if names is not None else tuple(f"A{i + 1}" for i in range(count))
     if pairs is None:
@@ -236,22 +238,30 @@ def checked(made: Network) -> Network:
         raise InvalidProblem(f"a network has {made.dimension} dimensions", "dimension", "give 2 or 3")
     check_once(made.names, "station name {!r} is used twice", "names")
     if len(made.slots) != r or len(made.labels) != n or made.sigma.shape != (n, r):
-        raise InvalidProblem("measurements, deviations and labels differ in number", "z", "give one for each")
+        raise InvalidProblem(
+            "slots, labels and standard deviations do not fit the measurements", "z", "give one for each measurement"
+        )
     ends = np.array([[slot.a, slot.b] for slot in made.slots]).reshape(-1, 2)
     two = np.array([MODELS[slot.kind].stations == 2 for slot in made.slots])
     if (ends[:, 0] < 0).any() or (ends >= m).any() or (ends[two, 1] < 0).any() or (ends[:, 0] == ends[:, 1]).any():
-        raise InvalidProblem("a row names a station that is not there", "pairs", f"give two of 0 to {m - 1}")
+        raise InvalidProblem(
+            "a row has an unknown station, or the same station twice", "pairs", f"give two numbers from 0 to {m - 1}"
+        )
     if np.isnan(made.sigma).any() or (made.sigma <= 0.0).any():
         raise InvalidProblem("a standard deviation is not positive", "sigma", "give metres above zero")
     if made.place.shape != (m, made.dimension) or made.place_sigma.shape != made.place.shape:
         raise InvalidProblem(f"places have shape {made.place.shape}", "place", f"give ({m}, {made.dimension})")
     if np.isnan(made.place_sigma).any() or (made.place_sigma < 0.0).any() or not np.isfinite(made.place).all():
-        raise InvalidProblem("a place or its deviation is no number", "place_sigma", "give zero, metres or infinity")
+        raise InvalidProblem(
+            "a place or its standard deviation is not a number", "place_sigma", "give zero, metres or infinity"
+        )
     b = made.between
     if len(b) and ((b < 0).any() or (b >= m).any() or (b[:, 0] == b[:, 1]).any()):
-        raise InvalidProblem("a distance names a station that is not there", "distances", f"give two of 0 to {m - 1}")
+        raise InvalidProblem(
+            "a distance has an unknown station or one twice", "distances", f"give two numbers from 0 to {m - 1}"
+        )
     if (made.distance < 0.0).any() or not np.isfinite(made.distance).all():
-        raise InvalidProblem("a distance between stations is not positive", "distances", "give metres")
+        raise InvalidProblem("a distance between stations is negative or infinite", "distances", "give metres")
     if not np.isfinite(made.distance_sigma).all() or (made.distance_sigma <= 0.0).any():
-        raise InvalidProblem("a distance has no deviation", "distances", "give metres above zero")
+        raise InvalidProblem("a distance has no positive standard deviation", "distances", "give metres above zero")
     return made

@@ -40,7 +40,7 @@ from optloc.sites.calibration.network import KINDS, Network, NetworkSlot, checke
 _EXACT = 1e-6
 
 BETWEEN = "station_range"
-"""Kind of rows that are distances between two stations."""
+"""Kind of the rows with a distance between two stations."""
 
 
 class _NetworkTable(BaseModel):
@@ -59,31 +59,31 @@ class NetworkStations(DataTable):
     sigma: Amount | None = None
     """Standard deviation of known coordinates; None: exact."""
     synchronised: bool = True
-    """Whether the stations share a clock; else each has an unknown offset."""
+    """Whether the stations share a clock; otherwise each station has an unknown offset."""
     dimension: Literal[2, 3] = 3
-    """Of space."""
+    """Number of dimensions."""
 
 
 class NetworkRows(DataTable):
     """Measurements of one kind. Columns: epoch (the pulse), a, b (for pairs of stations), z, sigma."""
 
     kind: str
-    """toa, tdoa, range; station_range is the distance of stations a and b, without epoch."""
+    """toa, tdoa or range; station_range is the distance between stations a and b and has no epoch."""
     unit: str = "m"
-    """Unit of z, or of time."""
+    """Unit of z: a length or a time."""
     sigma: Amount | None = None
-    """Standard deviation of each row, where there is no column sigma."""
+    """Standard deviation of each row, if there is no column sigma."""
 
 
 class NetworkFile(_NetworkTable):
     """A network with unknown stations."""
 
     format: Literal[1, 2]
-    """Version of the format; nothing that a network holds differs between them."""
+    """Version of the format; network files are the same in both versions."""
     title: str | None = None
-    """What it is."""
+    """Title of the network."""
     propagation_speed: Amount | None = None
-    """Metres per second, or an amount such as "1480 m/s"; light by default."""
+    """Metres per second, or an amount such as "1480 m/s"; the speed of light by default."""
     stations: NetworkStations
     measurements: list[NetworkRows] = Field(min_length=1)
 
@@ -100,7 +100,7 @@ def read_network(path: Path) -> Network:
     data = parse_toml(read_text(path), source, formats=(1, 2))
     foreign = [key for key in ProblemFile.model_fields if key in data and key not in NetworkFile.model_fields]
     if foreign:
-        what = f"the key {foreign[0]!r} is that of a problem whose stations are known, not of a network"
+        what = f"the key {foreign[0]!r} belongs to a problem with known stations, not to a network"
         raise InvalidProblem(what, source, "use optloc fix, or see optloc new calibration")
     file = conform(NetworkFile, data, source)
     stated, where = file.propagation_speed, join(source, "key 'propagation_speed'")
@@ -114,8 +114,8 @@ def read_network(path: Path) -> Network:
         place_of = join(source, f"[[measurements]] {i + 1}")
         own = table_of(section, folder, place_of)
         if section.kind != BETWEEN and not own.has("epoch"):
-            advice = "add a column epoch; of stations that are known, optloc fix takes the file"
-            raise InvalidProblem("the rows do not say of which pulse they are", own.source, advice)
+            advice = "add a column epoch; for known stations, use optloc fix"
+            raise InvalidProblem("the rows have no column epoch for the pulse", own.source, advice)
         between = section.kind == BETWEEN
         kind = BETWEEN if between else kind_named(section.kind, place_of)
         if not between and kind not in KINDS:
@@ -128,7 +128,7 @@ def read_network(path: Path) -> Network:
         else:
             rows.append((kind, own.labels("epoch"), a, b, z, sigma))
     if not rows:
-        raise InvalidProblem("there are no pulses", source, 'add [[measurements]] of kind "toa", "tdoa" or "range"')
+        raise InvalidProblem("the file has no pulses", source, 'add [[measurements]] of kind "toa", "tdoa" or "range"')
     labels, slots, table_z, table_sigma = _by_pulse(rows)
     ends = np.array([[a, b] for one in apart for a, b in zip(one[0], one[1], strict=True)], dtype=np.int64)
     return checked(
@@ -153,13 +153,15 @@ def _places(section: NetworkStations, table: Table, where: str) -> tuple[Array, 
     unit = Units("length").conversion(section.unit, where)
     keys = ("x", "y", "z")[: section.dimension]
     if section.dimension == 2 and table.has("z"):
-        raise InvalidProblem("a network in the plane has no column z", where, "leave it out, or write dimension = 3")
+        raise InvalidProblem(
+            "a network of dimension 2 has no column z", where, "remove the column, or write dimension = 3"
+        )
     place = np.array([_optional(table, key) for key in keys]).T * unit.factor
     own = _optional(table, "sigma") * unit.factor
     common = 0.0 if section.sigma is None else Units("length").plain(section.sigma, section.unit, where)
     sigma = np.where(np.isnan(own), common, own)[:, None]
     if (sigma < 0.0).any():
-        raise InvalidProblem("a standard deviation is negative", where, "give zero where a place is exact")
+        raise InvalidProblem("a standard deviation is negative", where, "give zero for an exact position")
     return np.where(np.isnan(place), 0.0, place), np.where(np.isnan(place), np.inf, sigma)
 
 
@@ -209,7 +211,7 @@ def _by_pulse(
 def check_name(out: Path) -> None:
     """Raise if the output file does not have the ending of a problem file, before the search starts."""
     if out.suffix.lower() != ".toml":
-        raise InvalidProblem("what was found is written as a problem file", str(out), "let its name end in .toml")
+        raise InvalidProblem("the output is a problem file, so its name must end in .toml", str(out), "change the name")
 
 
 def write_calibrated(found: Calibration, title: str, out: Path, source: Path) -> None:
@@ -222,7 +224,9 @@ def write_calibrated(found: Calibration, title: str, out: Path, source: Path) ->
     """
     check_name(out)
     if not np.isfinite(found.covariance).all():
-        raise InvalidProblem(f"the network is {found.status.label}", str(out), "see its findings")
+        raise InvalidProblem(
+            f"the network has the status {found.status.label} and cannot be written", str(out), "see its findings"
+        )
     claim(out, inputs=[source])
     net, sigma = found.network, np.sqrt(np.mean(found.sigma**2, axis=1))
     stations = []

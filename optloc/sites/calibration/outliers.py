@@ -22,7 +22,7 @@ from optloc.sites.calibration.network import Network
 from optloc.sites.calibration.rounds import Starts, starts_of
 
 PRICE = 16.0
-"""Cost of a row that is left out: beyond four sigma it is cheaper than what it says, as with suspects of a fix."""
+"""Cost of a row that is left out: a residual beyond four sigma costs more. Suspects of a fix have the same price."""
 
 # Starts, and number of best starts that continue. In 15 simulated halls of 12 x 20 with 10 % wrong rows, forty
 # starts with three continued missed the stations of three halls; sixty with four missed none.

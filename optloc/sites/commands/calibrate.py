@@ -21,9 +21,9 @@ NETWORKS = (
 _LINES = 40
 
 Gauge = Annotated[str | None, typer.Option(metavar="A1,A2,A3", help="Stations that define the frame.")]
-Seed = Annotated[int, typer.Option(min=0, help="Decides the starts.")]
-Robust = Annotated[bool, typer.Option("--robust", help="Leave out rows that most others contradict, and name them.")]
-Out = Annotated[Path | None, typer.Option(metavar="OUT.toml", help="Write a problem file with the stations found.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the random starts.")]
+Robust = Annotated[bool, typer.Option("--robust", help="Leave out and list rows that contradict most others.")]
+Out = Annotated[Path | None, typer.Option(metavar="OUT.toml", help="Write a problem file with the estimated stations.")]
 Picture = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw plan, elevation and residuals.")]
 
 
@@ -81,7 +81,7 @@ def _run(
     elif not quiet:
         _show(found)
         if out is not None:
-            say(Screen(), f"The stations are in {out}: try optloc fix {out}.")
+            say(Screen(), f"The stations are in {out}. Next step: optloc fix {out}.")
     return 0 if found.status is Status.OK else 1
 
 
@@ -100,7 +100,7 @@ def _show(found: Calibration) -> None:
     table = Table(title="Stations, m", title_justify="left")
     axes = "xyz"[: net.dimension]
     clocks = [] if net.synchronised else ["clock"]
-    for heading in ("station", *(f"{c} ±" for c in axes), *clocks, "residual, sigma"):
+    for heading in ("station", *(f"{c} ±" for c in axes), *clocks, "rms residual, sigma"):
         table.add_column(heading, justify="left" if heading == "station" else "right")
     with np.errstate(invalid="ignore"):
         sigma = found.sigma

@@ -77,7 +77,9 @@ def run_place(
             found = refined(selection, found, loaded.regions, loaded.ground)
     if out is not None:
         if not loaded.settings or selection.by == "row":
-            raise InvalidProblem("only the choice of a selection file is written", str(out), "leave --out out")
+            raise InvalidProblem(
+                "only a selection file with a choice of stations can be written as a problem", str(out), "remove --out"
+            )
         write_chosen(loaded, (*found.chosen, *found.kept), out, file)
     if plot is not None:
         write_picture(picture(selection, found), plot)
@@ -96,7 +98,7 @@ def _of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
     problem = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
     if wanted.choose is None:
-        what = "the file has no table [choice], and nothing says how many stations to take"
+        what = "the file has no table [choice], so the number of stations to take is missing"
         raise InvalidProblem(what, loaded.source, "give -k, such as -k 4")
     if wanted.at is not None:
         places = vector(problem, wanted.at, None, False)[None, : problem.dimension]
@@ -105,7 +107,9 @@ def _of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
 
         places = solve(read(file).problem).position.reshape(-1, problem.dimension)[:1]
         if not np.isfinite(places).all():
-            raise InvalidProblem("the file has no fix to choose stations for", loaded.source, "give a place with --at")
+            raise InvalidProblem(
+                "the file has no fix, so the position of the target is unknown", loaded.source, "give a place with --at"
+            )
     return LoadedSelection(SiteSelection(problem, places, choose=wanted.choose), loaded.source, loaded.title, {})
 
 
@@ -188,7 +192,7 @@ def _record(loaded: LoadedSelection, selection: SiteSelection, found: Placement)
 
 def _show(loaded: LoadedSelection, selection: SiteSelection, found: Placement) -> None:
     console = Screen()
-    sure = "" if found.closed else " (open)"
+    sure = "" if found.closed else " (not closed)"
     say(console, f"{loaded.title}: take {', '.join(found.chosen) or 'nothing'}.")
     words = {"rms": "mean bound", "volume": "mean axis of the ellipsoid", "axis": "longest axis of the ellipsoid"}
     least = f"{words[found.criterion]} {found.sigma:.4g} m, no choice below {np.sqrt(max(found.bound, 0.0)):.4g} m"
@@ -215,9 +219,9 @@ def _places_table(selection: SiteSelection, found: Placement) -> Table:
 
 
 def _losses_table(found: Placement) -> Table:
-    table = Table(title="What the loss of a station costs, m", title_justify="left")
-    for heading in ("station", "without it", "best in its place", "then"):
-        table.add_column(heading, justify="left" if heading in ("station", "best in its place") else "right")
+    table = Table(title="Bound after the loss of a station, m", title_justify="left")
+    for heading in ("station", "without it", "best replacement", "with replacement"):
+        table.add_column(heading, justify="left" if heading in ("station", "best replacement") else "right")
     for swap in found.swaps[:_LINES]:
         then = f"{np.sqrt(swap.replaced):.4g}" if swap.replacement else ""
         table.add_row(swap.name, f"{np.sqrt(swap.value):.4g}", swap.replacement or "-", then)
@@ -228,10 +232,10 @@ def _remarks(selection: SiteSelection, found: Placement) -> list[str]:
     names, out = _names_of(selection), []
     weak = [names[i] for i in np.flatnonzero(found.share_of_prior > PRIOR)]
     if weak:
-        out.append(f"No fix of its own, the prior holds it: {', '.join(weak)}.")
+        out.append(f"The stations do not determine the position, only the prior does: {', '.join(weak)}.")
     bare = [names[i] for i in np.flatnonzero(found.redundancy <= 0)]
     if bare:
-        out.append(f"No spare row, a wrong one would not be noticed: {', '.join(bare)}.")
+        out.append(f"Without a spare row, a wrong measurement is not detected: {', '.join(bare)}.")
     if found.following:
         name, value = found.following[0]
         out.append(f"The best station to add next is {name}: {np.sqrt(value):.4g} m.")
@@ -241,10 +245,12 @@ def _remarks(selection: SiteSelection, found: Placement) -> list[str]:
         text = f"{share:.2g} % of simulated fixes are ambiguous, most at {worst}"
         out.append(text + ("." if found.draws.clean else "; add a height, a constraint or a station off the plane."))
         coverage = np.nanmean(found.draws.coverage) if np.isfinite(found.draws.coverage).any() else np.nan
-        out.append(f"Of the others {100 * coverage:.3g} % are in their 95 % ellipse.")
+        out.append(f"For {100 * coverage:.3g} % of the other fixes, the 95 % ellipse contains the place.")
     if found.banned:
-        out.append(f"Better sets were given up, their fixes are ambiguous: {'; '.join(map(', '.join, found.banned))}.")
+        out.append(
+            f"Better sets were rejected because their fixes are ambiguous: {'; '.join(map(', '.join, found.banned))}."
+        )
     if found.refined is not None:
         spots = "; ".join(", ".join(f"{v:.1f}" for v in row) for row in found.refined)
-        out.append(f"Refined to {np.sqrt(found.refined_value):.4g} m, a local optimum, at {spots}.")
+        out.append(f"The refinement reaches {np.sqrt(found.refined_value):.4g} m, a local optimum, at {spots}.")
     return out

@@ -32,10 +32,12 @@ def polygons_of(path: Path) -> list[Array]:
             except (TypeError, ValueError, IndexError, KeyError):
                 ring = np.zeros((0, 2))
             if len(ring) < 4 or ring.shape[1] != 2 or not np.isfinite(ring).all():
-                raise InvalidProblem("a ring is no list of four corners", source, "close the polygon as RFC 7946 says")
+                raise InvalidProblem(
+                    "a ring is not a list of at least four corners", source, "close the ring as RFC 7946 requires"
+                )
             rings.append(ring[:-1] if np.array_equal(ring[0], ring[-1]) else ring)
     if not rings:
-        raise InvalidProblem("there is no polygon", source, "give a GeoJSON Polygon, or a Feature with one")
+        raise InvalidProblem("the file has no polygon", source, "give a GeoJSON Polygon, or a Feature with one")
     return rings
 
 
@@ -44,7 +46,9 @@ def corners_in_frame(ring: Array, frame: Frame, where: str) -> Array:
     if not frame.geodetic:
         return ring
     if frame.kind != "enu":
-        raise InvalidProblem("an area needs a frame with a plan", where, 'write kind = "enu" in [frame]')
+        raise InvalidProblem(
+            "an area needs a local frame with east and north axes", where, 'write kind = "enu" in [frame]'
+        )
     return frame.from_geodetic(np.radians(ring[:, 1]), np.radians(ring[:, 0]), np.zeros(len(ring)))[:, :2]
 
 
@@ -75,12 +79,12 @@ def ground_of(path: Path, where: str) -> PlacementGround:
     x, y, z = (table.numbers(key) for key in "xyz")
     xs, ys = np.unique(x), np.unique(y)
     if len(xs) * len(ys) != len(z) or len(xs) < _NODES or len(ys) < _NODES:
-        what = f"{len(z)} rows are no full grid of at least {_NODES} by {_NODES} points"
-        raise InvalidProblem(what, table.source, "give z at every pair of an x and a y")
+        what = f"{len(z)} rows are not a full grid of at least {_NODES} by {_NODES} points"
+        raise InvalidProblem(what, table.source, "give one z for each pair of x and y")
     height = np.full((len(xs), len(ys)), np.nan)
     height[np.searchsorted(xs, x), np.searchsorted(ys, y)] = z
     if np.isnan(height).any():
-        raise InvalidProblem("a point of the grid occurs twice", table.source, "give z once at every pair")
+        raise InvalidProblem("a grid point occurs twice", table.source, "give one z for each pair of x and y")
     return PlacementGround(xs, ys, height)
 
 
@@ -113,7 +117,7 @@ def convex_parts(ring: Array) -> list[Array]:
     G. H. Meisters, "Polygons have ears", Amer. Math. Monthly 82 (1975).
     """
     if _crosses(ring):
-        raise InvalidProblem("the edges of a polygon cross each other", "polygon", "give a simple one")
+        raise InvalidProblem("the edges of a polygon cross each other", "polygon", "reorder or correct its corners")
     x, y = ring.T
     area = 0.5 * float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
     points = ring if area > 0.0 else ring[::-1]
@@ -135,5 +139,5 @@ def convex_parts(ring: Array) -> list[Array]:
                 del left[k]
                 break
         else:
-            raise InvalidProblem("the edges of a polygon cross each other", "polygon", "give a simple one")
+            raise InvalidProblem("the edges of a polygon cross each other", "polygon", "reorder or correct its corners")
     return [*parts, points[left]]

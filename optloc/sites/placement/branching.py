@@ -10,7 +10,7 @@ from optloc.sites.placement.criteria import gather, invert, measure
 from optloc.sites.placement.relaxation import relax
 
 FREE, OUT, IN = -1, 0, 1
-"""States of a site."""
+"""States of a site: undecided, left out, taken."""
 
 # Relative rounding error of sums of costs: with it, a set that uses the budget exactly is allowed.
 _EXACT = 1e-9

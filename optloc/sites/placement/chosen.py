@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PRIOR = 0.01
-"""Share of the variance at a place that is owed to the prior, above which the place has no fix of its own."""
+"""Share of the prior in the variance at a place; above it, the sites alone do not determine the position."""
 
 AMBIGUOUS = 0.05
-"""Share of ambiguous fixes above which a set is given up for the next."""
+"""Share of ambiguous fixes above which `place` rejects a set and tries the next best."""
 
 # Limit for flat stations: smallest singular value of the centred stations, divided by the bound at a place.
 # Below it, an error of this many standard deviations moves the fix to its mirror image.
@@ -218,8 +218,8 @@ def place(
             tell=tell,
         )
         if not found.best:
-            what = "no set of sites meets the rules" if not banned else "every set that meets the rules is ambiguous"
-            raise InvalidProblem(what, "groups", "allow more sites of a group, ask for fewer, or name more candidates")
+            what = "no set of sites meets the rules" if not banned else "all sets that meet the rules are ambiguous"
+            raise InvalidProblem(what, "groups", "relax the rules of a group, choose fewer sites, or add candidates")
         chosen = found.best[0][1]
         checked = drawn(candidates, chosen, draws, selection.seed) if draws else None
         if checked is None or checked.clean or len(banned) >= selection.alternatives:
@@ -258,12 +258,10 @@ def _answer(
     before, sites = _before(candidates, task)
     per_place, share = _per_place(candidates, chosen)
     told = f"no set of these candidates has a value more than {100 * gap:.2g} % lower"
-    reason = told if found.closed else f"the time was up: {told}; give it more time, or accept a larger gap"
+    reason = told if found.closed else f"the time limit ended the search: {told}; raise the time limit or the gap"
     new = (chosen == 1) & (candidates.state != 1)
     if selection.choose is not None and (count := int(new.sum())) < selection.choose:
-        reason += (
-            f"; {count} of the {selection.choose} sites that were asked for: more exceed the budget, or do not help"
-        )
+        reason += f"; only {count} of the {selection.choose} wanted sites: more exceed the budget or do not help"
     return Placement(
         _named(names, new),
         _named(names, candidates.state == 1),
@@ -421,7 +419,7 @@ def picture(selection: SiteSelection, found: Placement) -> Figure:
 
     problem, names = selection.problem, np.array(selection.problem.stations.names)
     if selection.by == "row":
-        raise InvalidProblem("rows that are chosen have no map", "plot", "choose stations")
+        raise InvalidProblem("a choice of single rows has no map", "plot", "choose stations")
     single = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
     places = np.atleast_2d(np.asarray(selection.places, dtype=float))[:, : problem.dimension]
     truth = np.zeros(problem.layout.size)

@@ -48,33 +48,33 @@ def check_groups(
         _check_one(f"groups, entry {i + 1}", group, members[i], names, state)
     most, least = (_count(groups, members, state, sign) for sign in (-1.0, 1.0))
     if most is None or least is None:
-        what = f"no set of sites meets all of the groups {_told(groups)}"
-        raise InvalidProblem(what, "groups", "allow more sites of a group, or ask for fewer")
+        what = f"no set of sites meets the rules of groups {_told(groups)} together"
+        raise InvalidProblem(what, "groups", "raise most or lower least of a group")
     if choose is None:
         return
     if choose > most:
         cause = _binding(groups, members, state, most)
         rules = " and ".join(f"at most {groups[i].most} of {_listed(members[i], names)}" for i in cause[:_GROUPS])
         rules += f" and {len(cause) - _GROUPS} more groups" if len(cause) > _GROUPS else ""
-        what = f"{choose} sites are wanted, and the groups allow {most} at most ({rules})"
-        raise InvalidProblem(what, "choose", f"ask for {most} or fewer, or allow more sites of a group")
+        what = f"{choose} sites are wanted, but the groups allow at most {most} ({rules})"
+        raise InvalidProblem(what, "choose", f"choose {most} or fewer, or raise most of a group")
     if choose < least:
-        what = f"{choose} sites are wanted, and the groups need {least} at least"
-        raise InvalidProblem(what, "choose", f"ask for {least} or more, or ask for fewer sites of a group")
+        what = f"{choose} sites are wanted, but the groups need at least {least}"
+        raise InvalidProblem(what, "choose", f"choose {least} or more, or lower least of a group")
 
 
 def _check_one(where: str, group: CountGroup, own: Array, names: Sequence[str], state: Array) -> None:
     """Raise if no set of sites can meet this group, independent of the other groups."""
     kept, able, who = int((own & (state == 1)).sum()), int((own & (state != 0)).sum()), _listed(own, names)
     if group.most is not None and kept > group.most:
-        what = f"at most {group.most} of {who} may be taken, and {kept} of them are kept"
-        raise InvalidProblem(what, where, "allow more of them, or keep fewer")
+        what = f"at most {group.most} of {who} may be taken, but {kept} of them are kept"
+        raise InvalidProblem(what, where, "raise most, or keep fewer")
     if group.least is not None and group.least > able:
-        what = f"at least {group.least} of {who} are wanted, and {able} of them can be taken"
-        raise InvalidProblem(what, where, "ask for fewer of them, or name more candidates")
+        what = f"at least {group.least} of {who} are wanted, but only {able} of them can be taken"
+        raise InvalidProblem(what, where, "lower least, or add candidates")
     if group.least is not None and group.most is not None and group.least > group.most:
         what = f"at least {group.least} and at most {group.most} of {who} are wanted"
-        raise InvalidProblem(what, where, "correct one of the two")
+        raise InvalidProblem(what, where, "make least no larger than most")
 
 
 def _count(groups: Sequence[CountGroup], members: Array, state: Array, sign: float) -> int | None:

@@ -125,7 +125,7 @@ def _course(axes: Axes, course: Array) -> None:
     seconds, bound, value = course.T
     seconds = seconds - seconds[0]
     axes.step(seconds, value, where="post", color=BLACK, linewidth=1.4, label="best set")
-    axes.step(seconds, bound, where="post", color="#0072B2", linewidth=1.4, label="no set is better than this")
+    axes.step(seconds, bound, where="post", color="#0072B2", linewidth=1.4, label="bound: no set is better")
     axes.fill_between(seconds, bound, value, step="post", color="#0072B2", alpha=0.12, linewidth=0)
     axes.set_xlabel("time since the first bound (s)")
     axes.set_ylabel("criterion (m)")

@@ -76,7 +76,7 @@ def refined(
             if reached < best[0]:
                 best = reached, places
     if best[1] is None:
-        raise InvalidProblem("no station can stand in the regions", "refine", "give regions that hold sites")
+        raise InvalidProblem("no set of stations fits into the regions", "refine", "give larger regions")
     return replace(found, refined=best[1], refined_value=task.scale(best[0]))
 
 
@@ -110,8 +110,8 @@ def _check(candidates: Candidates) -> None:
     kinds = {rows.kind for rows in candidates.problem.rows}
     odd = [kind for kind in kinds if MODELS[kind].velocity or MODELS[kind].ecef]
     if odd or candidates.selection.by == "row" or any(len(b.row[0]) > 1 for b in candidates.problem.noise.blocks):
-        what = f"{odd[0]} rows" if odd else "single rows, or rows with common noise,"
-        raise InvalidProblem(f"{what} cannot be refined", "refine", "leave the refinement out")
+        what = f"{odd[0]} rows" if odd else "single rows or rows with common noise"
+        raise InvalidProblem(f"{what} cannot be refined", "refine", "remove the refinement")
 
 
 def _stations(candidates: Candidates) -> Array:

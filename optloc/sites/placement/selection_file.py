@@ -88,27 +88,27 @@ class ChoiceTable(_SelectionTable):
     """Number of sites, criterion and limits of the search."""
 
     choose: int | None = Field(default=None, ge=1)
-    """How many candidates to take, beyond the stations that are there."""
+    """Number of candidates to take, in addition to existing stations."""
     budget: float | None = Field(default=None, ge=0.0)
-    """What they may cost together; candidates need a column cost."""
+    """Largest total cost of the new stations; candidates need a column cost."""
     criterion: Literal["rms", "volume", "axis"] = "rms"
     """Mean-square error (A), determinant (D) or largest eigenvalue (E) of the covariance of the position."""
     worst: bool = False
-    """The worst place counts, in place of the weighted mean."""
+    """Use the maximum over the places, instead of the weighted mean."""
     fail_one: bool = False
-    """The worst loss of any one station counts."""
+    """Use the value after the worst loss of one station."""
     gap: float = Field(default=0.01, gt=0.0, lt=1.0)
-    """Share of the value that the bound may be below it."""
+    """Relative gap between value and bound at which the search stops."""
     time: float = Field(default=60.0, gt=0.0)
-    """Seconds after which it stops."""
+    """Time limit of the search, seconds."""
     alternatives: int = Field(default=5, ge=1, le=100)
-    """How many of the best sets are told."""
+    """Number of best sets in the result."""
     kept: list[str] = Field(default_factory=list)
-    """Candidates that are taken in any case, and not counted."""
+    """Candidates that are always taken; `choose` does not count them."""
     forbidden: list[str] = Field(default_factory=list)
-    """Candidates that are not taken."""
+    """Candidates that are never taken."""
     seed: int = Field(default=0, ge=0)
-    """Decides the random sets."""
+    """Seed of the random sets."""
 
 
 class TargetsTable(DataTable):
@@ -117,38 +117,38 @@ class TargetsTable(DataTable):
     unit: str = "m"
     """Unit of x, y, z and height."""
     polygon: str | None = None
-    """GeoJSON file with a polygon: longitude and latitude on Earth, else metres of the frame."""
+    """GeoJSON file with a polygon: longitude and latitude in a geodetic frame, otherwise metres of the frame."""
     spacing: Amount | None = None
-    """Distance of the places in the area."""
+    """Distance between neighbouring places in the area."""
     height: Amount | None = None
-    """Their height, or third coordinate."""
+    """Height, or third coordinate, of the places in the area."""
 
 
 class ExpectedTable(MeasurementsTable):
     """Expected measurements, as in a problem file but without values; the default is one row per station."""
 
     range_max: Amount | None = None
-    """Distance beyond which there is no measurement."""
+    """Largest distance of a measurement."""
 
 
 class SightTable(DataTable):
     """Lines of sight. Columns: candidate, place, sight (0, 1 or a factor on sigma); the default of a pair is 1."""
 
     terrain: str | None = None
-    """CSV file with columns x, y, z on a grid, metres of the frame: what is behind the ground is out of sight."""
+    """CSV file with columns x, y, z on a grid, metres of the frame: terrain that blocks lines of sight."""
 
 
 class GroupTable(_SelectionTable):
     """A rule for the number of candidates from a group, for instance of one mast, region or owner."""
 
     group: str | None = None
-    """Those with this word in their column group."""
+    """Word in the column group of the members."""
     members: list[str] | None = None
-    """Or their names."""
+    """Names of the members, instead of a word."""
     most: int | None = Field(default=None, ge=0)
-    """At most so many."""
+    """Largest number of members to take."""
     least: int | None = Field(default=None, ge=0)
-    """At least so many."""
+    """Smallest number of members to take."""
 
 
 class RefineTable(_SelectionTable):
@@ -157,7 +157,7 @@ class RefineTable(_SelectionTable):
     polygon: str
     """GeoJSON file with a polygon."""
     height: list[Amount] = Field(default=["0 m", "0 m"], min_length=2, max_length=2)
-    """Least and greatest height, or third coordinate; above the terrain where there is one."""
+    """Smallest and largest height, or third coordinate; with a terrain, above the ground."""
     terrain: str | None = None
     """CSV file with columns x, y, z on a grid."""
 
@@ -168,21 +168,21 @@ class SelectionFile(_SelectionTable):
     format: Literal[1]
     """Version of the format."""
     title: str | None = None
-    """What it is."""
+    """Title of the selection."""
     propagation_speed: float | str | SoundTable | SpeedTable | None = None
     """As in a problem file."""
     frame: FrameTable = FrameTable()
     choice: ChoiceTable
     stations: StationsTable | None = None
-    """Stations that are there already, and kept."""
+    """Existing stations, which are kept."""
     candidates: StationsTable
-    """Where stations may stand. Columns as of stations; optional: cost, group, and sigma of their measurements."""
+    """Possible station sites. Columns as for stations; optional: cost, group, and sigma of their measurements."""
     targets: TargetsTable
     measurements: list[ExpectedTable] = Field(min_length=1)
     sight: SightTable | None = None
     groups: list[GroupTable] = Field(default_factory=list)
     priors: list[PriorTable] = Field(default_factory=list)
-    """What is known without any station, such as the position; by default the area of stations and places."""
+    """Priors of the target, such as its position; the default position is the area of stations and places."""
     refine: RefineTable | None = None
 
 
@@ -279,7 +279,7 @@ def _settings(
     """Return the tables of a problem file with all stations and the rows that each station would have."""
     units = {(section.unit, section.speed_unit) for _, section in tables}
     if len(units) > 1:
-        raise InvalidProblem("stations and candidates are in different units", source, "give both the same")
+        raise InvalidProblem("stations and candidates have different units", source, "use the same unit for both")
     keys = [key for key in _PLACE if any(table.has(key) for table, _ in tables)]
     rows: list[dict[str, Any]] = []
     for table, section in tables:
@@ -339,7 +339,9 @@ def _expected_rows(
             if own:
                 sigma = own.get(station["name"])
                 if sigma is None and section.sigma is None:
-                    raise InvalidProblem(f"{station['name']!r} has no sigma", where, "give sigma for all")
+                    raise InvalidProblem(
+                        f"station {station['name']!r} has no sigma", where, "give sigma for all stations"
+                    )
                 row["sigma"] = sigma if sigma is not None else float(str(section.sigma).split()[0])
             made.append(row)
     return made
@@ -353,7 +355,7 @@ def _column(candidates: Table, key: str, problem: Problem) -> Array:
 
 def _group(table: GroupTable, candidates: Table, where: str) -> CountGroup:
     if (table.group is None) == (table.members is None):
-        raise InvalidProblem("a group is given once", where, "give group, a word of the column, or members")
+        raise InvalidProblem("a group needs either the key group or the key members", where, "give one of the two")
     if table.most is None and table.least is None:
         raise InvalidProblem("the group has no rule", where, "give most or least")
     if table.members is not None:
@@ -374,7 +376,9 @@ def _places(
     where = join(source, "[targets]")
     if section.polygon is not None:
         if section.file is not None or section.rows is not None or section.spacing is None:
-            raise InvalidProblem("an area has a polygon and a spacing alone", where, 'write spacing = "5 m"')
+            raise InvalidProblem(
+                "an area needs a polygon and a spacing, without rows or file", where, 'write spacing = "5 m"'
+            )
         points = _area(section, problem.frame, problem.dimension, folder, where)
         return points, tuple(f"P{i + 1}" for i in range(len(points))), None
     table = table_of(section, folder, where)
@@ -384,7 +388,7 @@ def _places(
     found = survey(StationsTable(unit=section.unit), _without_sigma(table), wanted, table.source)[0]
     _, first, _ = distinct(table.labels("name"))
     if len(first) < table.count:
-        raise InvalidProblem("a place has the name of another", table.source, "give each a name of its own")
+        raise InvalidProblem("two places have the same name", table.source, "give each place a different name")
     weights = None
     if table.has("weight"):
         weights = table.numbers("weight")
@@ -408,12 +412,12 @@ def _area(section: TargetsTable, frame: Frame, dimension: int, folder: Path, whe
     ]
     low, high = np.min([r.min(0) for r in rings], axis=0), np.max([r.max(0) for r in rings], axis=0)
     if np.prod((high - low) / step + 1.0) > _MANY:
-        raise InvalidProblem(f"the spacing {step:g} m makes more than {_MANY} places", where, "widen it")
+        raise InvalidProblem(f"the spacing {step:g} m gives more than {_MANY} places", where, "use a larger spacing")
     axes = [np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     points = grid[np.any([inside(grid, ring) for ring in rings], axis=0)]
     if not len(points):
-        raise InvalidProblem("the spacing leaves no place in the area", where, "narrow it")
+        raise InvalidProblem("with this spacing, the area contains no place", where, "use a smaller spacing")
     return points if dimension == 2 else np.column_stack([points, np.full(len(points), height)])
 
 
@@ -453,8 +457,12 @@ def _sight(
                 raise InvalidProblem(f"there is no {key} {label!r}", table.where(key, row), nearest(label, list(known)))
     bad = np.flatnonzero(~((values == 0.0) | (values >= 1.0)))
     if len(bad):
-        what = f"the sight {values[bad[0]]:g} is neither 0 nor 1 nor a larger factor"
-        raise InvalidProblem(what, table.where("sight", int(bad[0])), "give 0 for out of sight, 1 for in sight")
+        what = f"the sight {values[bad[0]]:g} is neither 0 nor at least 1"
+        raise InvalidProblem(
+            what,
+            table.where("sight", int(bad[0])),
+            "give 0 for out of sight, 1 for in sight, or a larger factor on sigma",
+        )
     site, place = {n: i for i, n in enumerate(names)}, {n: i for i, n in enumerate(labels)}
     for one, other, value in zip(table.labels("candidate"), table.labels("place"), values, strict=True):
         out[place[other], site[one]] *= value
@@ -469,7 +477,9 @@ def _regions(
     where = join(source, "[refine]")
     low, high = (Units("length").plain(v, "m", join(where, "key 'height'")) for v in section.height)
     if low > high:
-        raise InvalidProblem("the least height is above the greatest", join(where, "key 'height'"), "swap them")
+        raise InvalidProblem(
+            "the first height is above the second", join(where, "key 'height'"), "swap the two heights"
+        )
     path = within(folder, section.polygon, join(where, "key 'polygon'"))
     parts = [part for ring in polygons_of(path) for part in convex_parts(corners_in_frame(ring, frame, where))]
     ground = None
@@ -481,7 +491,7 @@ def _regions(
 def write_chosen(loaded: LoadedSelection, taken: Sequence[str], out: Path, source: Path) -> None:
     """Write a problem file with the taken stations and their rows, as input of `crlb --map` and studies."""
     if out.suffix.lower() != ".toml":
-        raise InvalidProblem("the chosen stations are written as a problem file", str(out), "let its name end in .toml")
+        raise InvalidProblem("the output is a problem file, so its name must end in .toml", str(out), "change the name")
     claim(out, inputs=[source])
     kept, settings = {*taken}, dict(loaded.settings)
     others = {s.get("b") for s in settings["measurements"]}

@@ -25,7 +25,7 @@ Name = Literal["rms", "volume", "axis"]
 __all__ = ["LETTER", "Candidates", "CountGroup", "Name", "SiteSelection", "candidates_of"]
 
 LETTER: dict[str, Criterion] = {"rms": "A", "volume": "D", "axis": "E"}
-"""The criteria's names in the literature."""
+"""Letter of each criterion in the literature."""
 
 # Least distance of a site and a place, metres: closer, the direction between them has no meaning.
 _SAME = 1e-3
@@ -165,7 +165,7 @@ def candidates_of(selection: SiteSelection) -> Candidates:
     size, d = problem.layout.size, problem.dimension
     places = np.atleast_2d(np.asarray(selection.places, dtype=float))
     if places.ndim != 2 or places.shape[1] not in (d, size) or not np.isfinite(places).all() or not len(places):
-        what = f"the places have shape {np.shape(selection.places)}"
+        what = f"the places have shape {np.shape(selection.places)} or contain a number that is not finite"
         raise InvalidProblem(what, "places", f"give finite numbers (places, {d}), metres")
     vectors = np.zeros((len(places), size))
     vectors[:, : places.shape[1]] = places
@@ -189,7 +189,7 @@ def _checked(selection: SiteSelection) -> SiteSelection:
     if not selection.seconds > 0.0:
         raise InvalidProblem(f"the time {selection.seconds:g} s is not positive", "time", "give seconds, such as 60")
     if selection.choose is None and selection.budget is None:
-        raise InvalidProblem("nothing says how many sites to take", "choose", "give choose, or budget with cost")
+        raise InvalidProblem("the number of sites to take is missing", "choose", "give choose, or budget with cost")
     return selection
 
 
@@ -199,8 +199,10 @@ def _arrivals(problem: Problem) -> Problem:
     The information of a difference depends on the other sites of a set; the information of arrival times adds up.
     """
     if problem.epochs != 1 or len(problem.motions) != 1 or problem.motions[0].known is not None:
-        what = "a placement is for one target at one epoch whose position is unknown"
-        raise InvalidProblem(what, "problem", "give one epoch of one target, and places as an argument")
+        what = "a placement needs one target with an unknown position, at one epoch"
+        raise InvalidProblem(
+            what, "problem", "give a problem with one epoch and one target, and its positions as places"
+        )
     pairs = [rows.kind for rows in problem.rows if MODELS[rows.kind].signs == (1, -1)]
     if not pairs:
         return problem
@@ -208,7 +210,7 @@ def _arrivals(problem: Problem) -> Problem:
     # The rows of independent pairs are equal to arrivals with one noise-free reference. No station is such a
     # reference.
     if made is None or (variance := variances(made.problem.noise, made.problem.count)).min() < _EXACT * variance.mean():
-        what = f"{pairs[0]} rows pair stations, and a set of stations has other pairs than another"
+        what = f"{pairs[0]} rows need pairs of stations, but each set of stations has other pairs"
         raise InvalidProblem(what, "measurements", "give toa rows, or tdoa rows with an arrival_sigma")
     return made.problem.take(np.zeros(1, dtype=int))
 
@@ -218,8 +220,8 @@ def _sites(problem: Problem, selection: SiteSelection) -> tuple[Array, tuple[str
     a, b = (np.concatenate([getattr(rows, end) for rows in problem.rows]) for end in ("a", "b"))
     stations = problem.stations.names
     if (a < 0).any():
-        what = "a row without a station belongs to no site"
-        raise InvalidProblem(what, "measurements", "leave heights out, or give them as a prior of the position")
+        what = "a row without a station cannot belong to a site"
+        raise InvalidProblem(what, "measurements", "remove height rows, or use a prior of the position")
     if selection.by == "row":
         kinds = [rows.kind for rows in problem.rows for _ in range(rows.count)]
         named = [f"{kind} {stations[i]}" for kind, i in zip(kinds, a, strict=True)]
@@ -233,8 +235,8 @@ def _sites(problem: Problem, selection: SiteSelection) -> tuple[Array, tuple[str
     lone = set(names) - set(selection.kept)
     for other in np.unique(b[b >= 0]):
         if stations[other] in lone:
-            what = f"{stations[other]!r} is a candidate and the other end of a row"
-            raise InvalidProblem(what, "measurements", "keep that station, or give it no rows of its own")
+            what = f"station {stations[other]!r} is a candidate and also the second station of a row"
+            raise InvalidProblem(what, "measurements", "keep this station, or remove the rows that it measures")
     return site, names
 
 
@@ -243,19 +245,21 @@ def _check_apart(problem: Problem, site: Array, names: Sequence[str], places: Ar
     apart = np.linalg.norm(places[:, None] - stations[None], axis=-1)
     p, s = np.unravel_index(int(apart.argmin()), apart.shape)
     if apart[p, s] < _SAME:
-        what = f"place {p + 1} is where station {problem.stations.names[s]!r} stands"
-        raise InvalidProblem(what, "places", "move one of them by more than a millimetre")
+        what = f"place {p + 1} is at the position of station {problem.stations.names[s]!r}"
+        raise InvalidProblem(what, "places", "move the place or the station by more than a millimetre")
     own = np.unique(stations, axis=0, return_index=True)[1]
     twice = np.setdiff1d(np.arange(len(stations)), own)
     if len(twice):
         name = problem.stations.names[int(twice[0])]
-        raise InvalidProblem(f"station {name!r} stands where another one does", "candidates", "remove one of them")
+        raise InvalidProblem(
+            f"station {name!r} has the position of another station", "candidates", "remove one of them"
+        )
 
 
 def _weight(selection: SiteSelection, count: int) -> Array:
     weight = np.ones(count) if selection.weights is None else np.asarray(selection.weights, dtype=float)
     if weight.shape != (count,) or not (weight > 0.0).all() or not np.isfinite(weight).all():
-        what = f"the weights of {count} places are not so many positive numbers"
+        what = f"the weights are not {count} positive numbers, one for each place"
         raise InvalidProblem(what, "weights", "give each place a weight above 0, or leave it out")
     return np.asarray(weight / weight.sum())
 
@@ -268,14 +272,14 @@ def _weights(selection: SiteSelection, problem: Problem, places: Array) -> Array
     if selection.sight is not None:
         sight = np.asarray(selection.sight, dtype=float)
         if sight.shape != (count, stations) or not ((sight == 0.0) | (sight >= 1.0)).all():
-            what = f"the sight of {count} places and {stations} stations is not 0, 1 or a larger factor for each"
-            raise InvalidProblem(what, "sight", "give 0 where a station is out of sight, else a factor of sigma")
+            what = f"the sight is not an array of {count} places and {stations} stations with values 0 or at least 1"
+            raise InvalidProblem(what, "sight", "give 0 for a station out of sight, otherwise a factor on sigma")
         factor = sight[:, end]
         weight = np.where(factor > 0.0, weight / np.maximum(factor, 1.0) ** 2, 0.0)
     if selection.reach is not None:
         reach = np.asarray(selection.reach, dtype=float)
         if reach.shape != (problem.count,) or not (reach > 0.0).all():
-            what = f"the reach of {problem.count} rows is not so many positive numbers"
+            what = f"the reach is not {problem.count} positive numbers, one for each row"
             raise InvalidProblem(what, "reach", "give each row a distance in metres")
         position = problem.stations.position.reshape(-1, problem.dimension)[end]
         weight[np.linalg.norm(places[:, None] - position, axis=-1) > reach] = 0.0
@@ -307,8 +311,8 @@ def _rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
     for whitener in linear.noise:
         owner = site[whitener.row]
         if (owner != owner[:, :1]).any():
-            what = "the noise correlates rows of different sites, so that what they say does not add up"
-            raise InvalidProblem(what, "measurements", "give each site noise of its own")
+            what = "the noise correlates rows of different sites, so their information does not add up"
+            raise InvalidProblem(what, "measurements", "give independent noise to each site")
         white = np.broadcast_to(whitener.apply(jacobian), (len(vectors), whitener.row.size, jacobian.shape[-1]))
         white = white.reshape(len(vectors), *whitener.row.shape, -1)
         for group, one in enumerate(owner[:, 0]):
@@ -336,8 +340,8 @@ def _prior(problem: Problem, vectors: Array) -> Array:
     out[:, :n, :n], out[:, n:, n:] = known.shared, known.local[:, 0]
     if (np.diagonal(out, axis1=1, axis2=2) <= 0.0).any():
         unknown = problem.layout.labels()[int(np.argmin(np.diagonal(out[0])))] if n else "emission"
-        what = f"nothing is known of {unknown!r} before anything is measured"
-        raise InvalidProblem(what, "priors", "give it a prior, however wide")
+        what = f"the unknown {unknown!r} has no prior"
+        raise InvalidProblem(what, "priors", "give it a prior, which can be wide")
     return out
 
 
@@ -358,14 +362,14 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
     kept = where(selection.kept, "kept")
     state[where(selection.forbidden, "forbidden")] = 0
     if (state[kept] == 0).any():
-        raise InvalidProblem("a site is kept and forbidden", "forbidden", "say one of the two")
+        raise InvalidProblem("a site is kept and forbidden", "forbidden", "remove it from one of the two lists")
     state[kept] = 1
     free = (state == -1).astype(float)
     rules, limits = [], []
     if selection.choose is not None:
         if not 1 <= selection.choose <= free.sum():
-            what = f"{selection.choose} sites are wanted of {int(free.sum())} candidates"
-            raise InvalidProblem(what, "choose", "ask for fewer, or name more candidates")
+            what = f"{selection.choose} sites are wanted, but there are {int(free.sum())} candidates"
+            raise InvalidProblem(what, "choose", "choose fewer sites, or add candidates")
         rules.append(free + 0.0)
         limits.append(float(selection.choose))
     if selection.budget is not None:
@@ -397,10 +401,10 @@ def _costs(selection: SiteSelection, n: int, site: Array) -> Array:
     stations = np.concatenate([rows.a for rows in selection.problem.rows])
     cost = None if selection.cost is None else np.asarray(selection.cost, dtype=float)
     if cost is None or cost.shape != (selection.problem.stations.count,) or not (cost >= 0.0).all():
-        what = "a budget needs a cost of each station that is not negative"
+        what = "a budget needs a cost for each station, and no cost is negative"
         raise InvalidProblem(what, "cost", "give one number for each station")
     if not np.isfinite(cost).all() or not 0.0 <= float(selection.budget or 0.0) < np.inf:
-        raise InvalidProblem("a cost or the budget is no finite number", "budget", "correct it")
+        raise InvalidProblem("a cost or the budget is not a finite number", "budget", "give finite numbers")
     out = np.zeros(n)
     measuring = np.unique(stations) if selection.by == "station" else None
     if measuring is None:
@@ -423,5 +427,5 @@ def _check_seen(candidates: Candidates) -> None:
         known = int((singular > 1.0).sum())
         if known < m:
             name = candidates.selection.names[p] if candidates.selection.names else str(p + 1)
-            what = f"place {name!r} is in sight of {int(heard[p].sum())} sites, which leave its position open"
-            raise InvalidProblem(what, "places", "add candidates that see it, or leave the place out")
+            what = f"place {name!r} is in sight of {int(heard[p].sum())} sites, which do not determine its position"
+            raise InvalidProblem(what, "places", "add candidates in sight of this place, or remove it")
