@@ -43,7 +43,7 @@ _SAME = 1e-2
 # limit of work of a call has the same unit.
 _BATCH, _DESCENT = 8.0, 0.3
 LONG = 100.0
-"""Of a search without a start, or of a proof that a fix is the only one."""
+"""Work of a search without a start, or of a proof that a fix is unique, in milliseconds."""
 
 
 @dataclass(slots=True)

@@ -76,7 +76,7 @@ def mixture_state(
 
 
 class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
-    """Starts tracks with the fix and covariance of optloc, from as many scans as the fix needs.
+    """Starts tracks with the fix and covariance of optloc, after the number of scans that the fix needs.
 
     Each detection is a scan of one target with a measurement model of this plug-in. Stations can move, but their
     number must stay the same. The initiator separates targets by chi-square: detections of two targets do not fit
@@ -86,31 +86,34 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
     """
 
     velocity_mapping: Sequence[int] | None = Property(
-        default=None, doc="Places of the velocity in the state; by default those after the position's."
+        default=None,
+        doc="State indices of the velocity; by default, each follows the index of its position coordinate.",
     )
-    order: int = Property(default=1, doc="1 for a state with velocity, 0 for one without.")
+    order: int = Property(default=1, doc="1 for a state with a velocity, 0 for a state without.")
     speed: float | None = Property(
         default=None,
-        doc="Prior standard deviation of each coordinate of the velocity about zero, m/s; a single scan may then do.",
+        doc="Prior standard deviation of each velocity coordinate about zero, m/s. With it, one scan can be enough.",
     )
-    limit: int = Property(default=10, doc="Scans after which a chain that is not clear is given up.")
-    confirm: int = Property(default=1, doc="Scans of a chain at least before it becomes a track: more in clutter.")
+    limit: int = Property(default=10, doc="Number of scans after which an undecided chain is dropped.")
+    confirm: int = Property(default=1, doc="Smallest number of scans of a new track; use more in clutter.")
     work: int = Property(
         default=300,
-        doc="Bound of the work of one call beside the fix of each detection, in units of about a millisecond: longer "
-        "chains come first, and what exceeds it is left out.",
+        doc="Limit of the work of one call, in units of about a millisecond, without the fix of each detection. Longer "
+        "chains come first; chains beyond the limit are skipped.",
     )
     prior_state: GaussianState | None = Property(
         default=None,
-        doc="Mean and covariance of what a fix does not say, such as an acceleration; initiators of particles, "
-        "mixtures and ensembles that stand around this one ask for it.",
+        doc="Mean and covariance of state components that a fix does not estimate, such as an acceleration. Particle, "
+        "mixture and ensemble initiators that use this initiator need it.",
     )
-    least_p: float = Property(default=1e-3, doc="Chains whose chi-square is less likely are not of one target.")
+    least_p: float = Property(
+        default=1e-3, doc="Smallest p-value of a chain; below it, the detections are not one target."
+    )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         if self.order not in (0, 1):
-            raise InvalidProblem(f"a motion of order {self.order}", "order", "use 0 or 1")
+            raise InvalidProblem(f"a motion of order {self.order} is not possible", "order", "use 0 or 1")
         self._chains: list[DetectionChain] = []
 
     def initiate(self, detections: Any, timestamp: dt.datetime, **kwargs: Any) -> set[Track]:

@@ -44,7 +44,7 @@ _NOT_ONE_PLACE = (Status.CONTRADICTORY, Status.MISFIT, Status.UNBOUNDED, Status.
 _TYPES = {"azimuth": Bearing, "elevation": Elevation}
 
 Row = tuple[str, int, int]
-"""Kind, first and second station; -1 where the kind takes none."""
+"""Kind, first and second station of a row; -1 if the kind has no such station."""
 
 
 def arrival_covariance(pairs: Any, sigma: Any, stations: int) -> Array:
@@ -80,16 +80,18 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
 
     stations: np.ndarray = Property(doc="Positions (s, d) of the stations, metres.")
     translation_offset: StateVector | None = Property(
-        default=None, doc="Where the origin of these positions is (d, 1), such as a platform's place; by default zero."
+        default=None, doc="Origin (d, 1) of the station positions, such as the position of a platform; by default zero."
     )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.stations = np.asarray(self.stations, dtype=float)
         if np.any(np.asarray(self.rotation_offset, dtype=float)):
-            raise InvalidProblem("there is a rotation offset", "rotation_offset", "give positions in a turned frame")
+            raise InvalidProblem(
+                "a rotation offset is not supported", "rotation_offset", "turn the station positions instead"
+            )
         if self.stations.ndim != 2 or self.stations.shape[1] != len(self.mapping):
-            what = f"stations have shape {self.stations.shape} and {len(self.mapping)} coordinates are mapped"
+            what = f"stations have shape {self.stations.shape}, but {len(self.mapping)} coordinates are mapped"
             raise InvalidProblem(what, "stations", "give an array (stations, 2 or 3)")
         if self.translation_offset is not None and np.size(self.translation_offset) != len(self.mapping):
             what = f"the offset has shape {np.shape(self.translation_offset)} for {len(self.mapping)} coordinates"
@@ -252,7 +254,8 @@ class RateMeasurement(StationMeasurement, ABC):
         default=None, doc="Velocities (s, d) of the stations, m/s; by default they are at rest."
     )
     velocity_mapping: Sequence[int] | None = Property(
-        default=None, doc="Places of the velocity in the state; by default those after the position's."
+        default=None,
+        doc="State indices of the velocity; by default, each follows the index of its position coordinate.",
     )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -260,10 +263,10 @@ class RateMeasurement(StationMeasurement, ABC):
         self.velocities = None if self.velocities is None else np.asarray(self.velocities, dtype=float)
         if self.velocities is not None and self.velocities.shape != self.stations.shape:
             what = f"velocities have shape {self.velocities.shape}, stations {self.stations.shape}"
-            raise InvalidProblem(what, "velocities", "give one for each station")
+            raise InvalidProblem(what, "velocities", "give one velocity for each station")
         if self.moving and (len(self.places) != 2 * len(self.mapping) or max(self.places) >= self.ndim_state):
-            what = f"the velocity is at {self.places[len(self.mapping) :]} of a state of {self.ndim_state}"
-            raise InvalidProblem(what, "velocity_mapping", "name the places of the velocity")
+            what = f"velocity indices {self.places[len(self.mapping) :]} do not fit a state of size {self.ndim_state}"
+            raise InvalidProblem(what, "velocity_mapping", "give the state indices of the velocity")
 
     @property
     def moving(self) -> bool:
@@ -324,11 +327,11 @@ class AnyRows(RateMeasurement):
     """Any mixture of kinds in one measurement, with one inverse from all rows together.
 
     The combined model of Stone Soup adds the inverses of its models, so the sum is no valid state. Use this class
-    with a table of rows instead. The units of the elements are those of `optloc.models.MODELS`: metres, radians,
-    ratios, metres per second.
+    with a table of rows instead. For the units of the elements, see `optloc.models.MODELS`: metres, radians, ratios,
+    metres per second.
     """
 
-    table: Sequence[Row] = Property(doc="Kind, first and second station of each row; -1 where a kind takes none.")
+    table: Sequence[Row] = Property(doc="Kind, first and second station of each row; -1 if a kind has no such station.")
 
     @property
     def rows(self) -> Sequence[Row]:
@@ -420,9 +423,9 @@ class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
     """
 
     arrival_sigma: float = Property(doc="Standard deviation of each station's arrival, metres.")
-    row_sigma: float = Property(default=0.0, doc="Standard deviation of the own noise of each row, metres.")
+    row_sigma: float = Property(default=0.0, doc="Standard deviation of the independent noise of each row, metres.")
     label: str | None = Property(
-        default=None, doc="Key of the metadata that tells targets apart; None: all pairs of an instant are of one."
+        default=None, doc="Metadata key that identifies targets; None: all pairs of one time belong to one target."
     )
 
     @BufferedGenerator.generator_method  # type: ignore[untyped-decorator]
@@ -449,7 +452,9 @@ class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
         models = [detection.measurement_model for detection in group]
         first = models[0]
         if any(not np.array_equal(model.stations, first.stations) for model in models):
-            raise InvalidProblem("stations differ within an instant", "PairFeeder", "give all pairs the same stations")
+            raise InvalidProblem(
+                "stations differ between detections of one time", "PairFeeder", "give all pairs the same stations"
+            )
         pairs = np.concatenate([np.atleast_2d(model.pairs) for model in models])
         z = np.concatenate([values_of(detection) for detection in group])
         # The covariance of arrival noise is singular on closed loops: such rows are sums of others.

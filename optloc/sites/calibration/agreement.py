@@ -65,8 +65,8 @@ def search(
 ) -> NetworkSearchResult | None:
     """Return the cheapest network of the search, or None if no start converges.
 
-    `seed` sets the random starts. The search ends after `limit` starts even if no three of them agree. `tell` is
-    called with a progress message after each round.
+    `seed` sets the random starts. The search ends after `limit` starts even if no three of them agree. The
+    function calls `tell` with a progress message after each round.
     """
     limit = limit or _STARTS
     lik = likelihood(net)

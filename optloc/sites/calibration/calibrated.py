@@ -36,9 +36,9 @@ from optloc.solvers import AMBIGUOUS_GAP, LISTED_GAP, REFUTED, Finding, objectio
 _CORE = 60
 # Method for the other pulses; their proof follows with the proofs of all pulses.
 _QUICK = "gtrs+lsr"
-# Largest share of pulses with two possible positions. If more pulses have two, the search chooses among so many
-# combinations of sides that it can simulate a shape of the stations (flat stations appear 0.1 to 0.3 m thick at
-# 3 cm noise).
+# Largest share of pulses with two possible positions. With more of them, the choice of their sides has many
+# combinations, and the cheapest one can pretend a wrong shape of the stations. At 3 cm noise, flat stations appear
+# 0.1 to 0.3 m thick.
 _TWOFOLD = 0.5
 # Difference of distances, as a share of the size, from which two networks are different.
 _ALIKE = 1e-3
@@ -101,8 +101,9 @@ class Calibration:
     findings : tuple of str
         One sentence for each problem; empty for `ok`.
     proof : "blockwise" or "unknown"
-        "blockwise": if all others are fixed, no other position of a single station or pulse has a lower cost, and
-        no other position of a station costs up to 9 more. The proof does not exclude that several move together.
+        "blockwise" is a proof for each single station or pulse while all others are fixed: no other position has a
+        lower cost. For a station, no other position costs up to 9 more. The proof does not cover joint moves of
+        several stations or pulses.
     cost : float
         Weighted sum of squared residuals.
     dof : int
@@ -556,7 +557,7 @@ def _named(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
 
 
 def _placeable(network: Network) -> Array:
-    """Return a mask (N,) of the pulses with at least as many rows as unknowns."""
+    """Return a mask (N,) of the pulses whose number of rows is at least their number of unknowns."""
     needed = network.dimension + network.emission
     return np.asarray(network.given.sum(axis=1) >= needed)
 

@@ -96,8 +96,8 @@ def departure(lik: Likelihood, at: NetworkEstimate, told: GaugeRank) -> float:
 
     The test points are three standard deviations away, on both sides of each principal axis of stations and
     clocks. The pulses are refitted at each test point. The result is the largest ``|ln((f(x +- 3 t) - f(x)) /
-    9)|``, as for a fix (`optloc.model_checks.shape`). `at` (S = 1) is the estimate, and `told` its determined
-    motions, without open motions.
+    9)|``, as for a fix (`optloc.model_checks.shape`). `at` (S = 1) is the estimate. `told` contains its determined
+    motions; there must be no open motion.
     """
     width, axes = np.linalg.eigh(told.covariance(told.free.T))
     far = (axes * (_FAR * np.sqrt(np.maximum(width, 0.0))))[:, width > _ZERO * width[-1]].T
@@ -235,7 +235,7 @@ def flat(lik: Likelihood, at: NetworkEstimate, covariance: Array) -> list[str]:
     Returns
     -------
     list of str
-        Empty if there is no such plane, or if prior knowledge of the stations decides the side.
+        Empty without a common plane, or if prior knowledge of the stations decides the side.
     """
     net, out = lik.network, list[str]()
     if np.isfinite(net.place_sigma).all():

@@ -46,13 +46,13 @@ def plot_network(
     covariance : array (M d, M d)
         Covariance of the station coordinates, square metres.
     pulses : array (N, d)
-        Pulse positions, metres; NaN if there is none.
+        Pulse positions, metres; NaN for unknown positions.
     known : array (M, d)
-        Prior station positions, metres; NaN if there is none.
+        Prior station positions, metres; NaN for unknown positions.
     others : sequence of arrays (M, d)
         Stations of other networks that fit the data, in the same frame, metres.
     residuals : array (...)
-        Residuals in standard deviations; NaN if there is none.
+        Residuals in standard deviations; NaN for missing measurements.
     dof : int
         Degrees of freedom; the expected spread of the residuals depends on them, since the fit makes residuals
         smaller.

@@ -75,7 +75,7 @@ def arrivals(network: Network) -> tuple[Array, Array, Array]:
     Returns
     -------
     z, weight : array (N, M)
-        Arrivals or ranges, metres, and their inverse standard deviations; 0 if there is none. Differences are
+        Arrivals or ranges, metres, and their inverse standard deviations; 0 without a measurement. Differences are
         converted to arrivals by least squares, up to an unknown constant per pulse.
     emission : bool array (N,)
         Whether a pulse has an unknown offset.

@@ -207,7 +207,7 @@ def search(
     seed : int
         Seed of the random starts.
     tell : callable of (bound, value, nodes)
-        Called about every 0.05 s to report progress.
+        Progress callback, called about every 0.05 s.
     """
     _load()
     begun = monotonic()
@@ -322,7 +322,7 @@ def _open(made: _Open, bound: float, state: Array, w: Array) -> None:
 def _exhausted(
     asked: CompletionRequest, state: Array, w: Array, enough: float, most: int = sys.maxsize
 ) -> tuple[float, Array]:
-    """Return value and set (n,) of the best set of a node below `enough`; all zeros if there is none."""
+    """Return value and set (n,) of the best set of a node below `enough`; all zeros if no set is below."""
     best, free = np.zeros(len(state), dtype=np.int64), np.flatnonzero(state == FREE)
     order = free[np.argsort(w[free], kind="stable")]
     return float(exhaust(asked, state, order, most, enough, best)), best

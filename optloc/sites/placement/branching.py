@@ -145,7 +145,7 @@ def expand(
 ) -> tuple[float, float, int]:
     """Return bound, criterion and number of steps of the relaxation of a node with at least one free site.
 
-    With `fail`, the failed site is unknown in advance. At most c free sites are still taken. By Jensen's
+    With `fail`, the failed site is unknown in advance. The rules still allow at most c free sites. By Jensen's
     inequality, the mean of the criterion over their failures is at least the criterion at the weights (1 - 1 / c)
     v. Sites that are already taken fail one by one.
 

@@ -72,7 +72,7 @@ class Draws:
     ambiguous : array (P,)
         Share of ambiguous fixes at each place: the data fit another position about equally well.
     ratio : array (P,)
-        Root mean square error of the unambiguous fixes, divided by the bound; NaN if there are none.
+        Root mean square error of the unambiguous fixes, divided by the bound; NaN without unambiguous fixes.
     coverage : array (P,)
         Share of the unambiguous fixes whose 95 % ellipse contains the place.
     flat : array (P,)
@@ -104,8 +104,8 @@ class Placement:
         "rms", "volume" or "axis".
     value, bound : float
         The criterion of this set, and a lower bound for all sets that meet the rules, square metres. The
-        criterion is the mean over places of the squared error ("rms"), of the geometric mean of the variances
-        along the axes ("volume"), or of the largest of these variances ("axis").
+        criterion is a mean over the places. It averages the squared error ("rms"), the geometric mean of the
+        variances along the axes ("volume"), or the largest variance ("axis").
     gap : float
         Relative difference of value and bound.
     closed : bool
@@ -190,7 +190,7 @@ def place(
         Simulated fixes at each place that check the set for ambiguity. If a set fails the check, the next best
         set is tried, at most `selection.alternatives` times. 0: no check.
     tell : callable of (bound, value, nodes)
-        Called during the search to report progress, in the units of the criterion.
+        Progress callback during the search, in the units of the criterion.
 
     Returns
     -------

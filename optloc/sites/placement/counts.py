@@ -37,7 +37,7 @@ def check_groups(
     """Raise if no set of sites meets the groups, or if the wanted number of sites does not fit the groups.
 
     `members` (G, n) marks the sites of each group. `state` (n,) is -1 for free, 0 for forbidden and 1 for kept
-    sites. `choose` is the wanted number of free sites; None means as many as the budget allows.
+    sites. `choose` is the wanted number of free sites; None leaves the number to the budget.
 
     Raises
     ------

@@ -65,9 +65,9 @@ def share_out(
 ) -> tuple[float, Array]:
     """Eliminate the level t from the Newton step: write the gradient (n,), add to the Hessian (n, n).
 
-    The maximum of the items is min t with t >= f_q. With the slacks s_q = t - f_q, the multipliers `share` and
-    a_q = share_q / s_q, the step of the level is dt = (sum mu / s_q - 1 + sum a_q g_q'dw) / sum a_q. The function
-    returns the constant part of dt and its derivative (n,) with respect to the step dw.
+    The maximum of the items is min t with t >= f_q. The slacks are s_q = t - f_q, the multipliers are `share`,
+    and a_q = share_q / s_q. The step of the level is dt = (sum mu / s_q - 1 + sum a_q g_q'dw) / sum a_q. The
+    function returns the constant part of dt and its derivative (n,) with respect to the step dw.
     """
     count, n = slopes.shape
     pull, push, total = np.zeros(n), -1.0, 0.0
