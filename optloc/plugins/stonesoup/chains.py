@@ -157,7 +157,7 @@ def _key(run: Sequence[Any]) -> Any:
     return shape, scans, tuple(last - detection.timestamp for detection in run)
 
 
-def _grouped(keys: Sequence[Any]) -> list[list[int]]:
+def _group_indices(keys: Sequence[Any]) -> list[list[int]]:
     """Return lists of the indices of equal keys."""
     found: dict[Any, list[int]] = {}
     for i, key in enumerate(keys):
@@ -168,7 +168,7 @@ def _grouped(keys: Sequence[Any]) -> list[list[int]]:
 def alone(scan: Sequence[Any], terms: ChainTerms) -> list[DetectionChain]:
     """Return a chain for each detection of a scan, with the fix of this detection alone."""
     out: list[Any] = [None] * len(scan)
-    for members in _grouped([_key([detection]) for detection in scan]):
+    for members in _group_indices([_key([detection]) for detection in scan]):
         moving = scan[members[0]].measurement_model.rates is not None
         own = ChainTerms(terms.order if moving else 0, terms.speed, terms.least_p)
         problem, z = posed([[scan[i]] for i in members], own)
@@ -202,14 +202,16 @@ def near(chains: Sequence[DetectionChain], single: DetectionChain, terms: ChainT
     omitted.
     """
     detection = single.detections[-1]
-    known = [i for i, c in enumerate(chains) if c.last < detection.timestamp and _alike(c.detections[-1], detection)]
+    known = [
+        i for i, c in enumerate(chains) if c.last < detection.timestamp and _same_stations(c.detections[-1], detection)
+    ]
     d = len(detection.measurement_model.mapping)
     blind = [i for i in known if chains[i].cov is None or chains[i].x.shape[1] != d * (terms.order + 1)]
     sharp = [i for i in known if i not in set(blind)]
     out = [(1.0, i) for i in blind]
     if not sharp:
         return out
-    mean = np.stack([_ahead(chains[i].x[:1], chains[i], detection, d)[0] for i in sharp])
+    mean = np.stack([_predict(chains[i].x[:1], chains[i], detection, d)[0] for i in sharp])
     step = np.array([(detection.timestamp - chains[i].last).total_seconds() for i in sharp])
     cov = np.stack([np.asarray(chains[i].cov) for i in sharp])
     F = np.tile(np.eye(mean.shape[1]), (len(sharp), 1, 1))
@@ -234,13 +236,13 @@ def _innovations(detection: Any, mean: Array, cov: Array) -> Array:
     return np.asarray((linear.residual * np.linalg.solve(S, linear.residual[..., None])[..., 0]).sum(-1))
 
 
-def _alike(one: Any, two: Any) -> bool:
+def _same_stations(one: Any, two: Any) -> bool:
     """Return whether two detections can be scans of one run: same number of stations, same state mapping."""
     a, b = one.measurement_model, two.measurement_model
     return a.stations.shape == b.stations.shape and list(a.mapping) == list(b.mapping)
 
 
-def _ahead(x: Array, chain: DetectionChain, detection: Any, d: int) -> Array:
+def _predict(x: Array, chain: DetectionChain, detection: Any, d: int) -> Array:
     """Return the states (q, n) of a chain at the time of a detection, for constant velocity."""
     if x.shape[1] == d:
         return x
@@ -254,7 +256,7 @@ def _starts(chain: DetectionChain, single: DetectionChain, terms: ChainTerms) ->
     d = len(detection.measurement_model.mapping)
     if not terms.order:
         return np.concatenate([chain.x, single.x])[:_KEPT]
-    ahead = [_ahead(chain.x, chain, detection, d)] if chain.x.shape[1] == 2 * d else []
+    ahead = [_predict(chain.x, chain, detection, d)] if chain.x.shape[1] == 2 * d else []
     if len(chain) == 1 or not len(chain.x):
         step = (detection.timestamp - chain.last).total_seconds()
         # The velocity follows from two positions. If only one of the two is known, the target starts at rest.
@@ -280,13 +282,13 @@ def grown(
     out = []
     for members in chosen.values():
         runs = [(*chain.detections, *single.detections) for chain, single, _ in members]
-        longer = _fitted(runs, [starts for _, _, starts in members], terms, work)
+        longer = _fit(runs, [starts for _, _, starts in members], terms, work)
         found = zip(longer, members, strict=True)
         out += [(new, chain, single) for new, (chain, single, _) in found if new is not None and new.p >= terms.least_p]
     return out
 
 
-def _fitted(
+def _fit(
     runs: Sequence[tuple[Any, ...]], starts: Sequence[Array], terms: ChainTerms, work: ChainWork
 ) -> list[DetectionChain | None]:
     """Return the chains of runs with the same rows and times; None if a run needs a search and no work is left."""

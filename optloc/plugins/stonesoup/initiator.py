@@ -133,8 +133,8 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         ordered = sorted(detections, key=lambda d: (d.timestamp, tuple(values_of(d))))
         for _, scan in groupby(ordered, key=lambda d: d.timestamp):
             waiting = []
-            for chain in self._continued(list(scan), work):
-                fix = self._proven(chain, work)
+            for chain in self._extend_chains(list(scan), work):
+                fix = self._confirmed_fix(chain, work)
                 if fix is not None:
                     tracks.add(self._track(chain, fix))
                 elif len(chain) < self.limit:
@@ -142,7 +142,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
             self._chains = [*self._chains, *waiting][-_REMEMBERED:]
         return tracks
 
-    def _continued(self, scan: list[Any], work: ChainWork) -> list[DetectionChain]:
+    def _extend_chains(self, scan: list[Any], work: ChainWork) -> list[DetectionChain]:
         """Return new chains from a scan: extended chains (they replace the old chains), and single detections."""
         terms = ChainTerms(self.order, self.speed, self.least_p)
         # If the rows of one detection do not fit together, no chain with this detection fits.
@@ -163,7 +163,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         self._chains = [chain for chain in self._chains if id(chain) not in taken]
         return [*out, *(single for single in singles if id(single) not in taken)]
 
-    def _proven(self, chain: DetectionChain, work: ChainWork) -> Fix | None:
+    def _confirmed_fix(self, chain: DetectionChain, work: ChainWork) -> Fix | None:
         """Return the fix of a chain that is long enough, if the fix is unique and nearly Gaussian; otherwise None."""
         size = len(chain.detections[-1].measurement_model.mapping) * (self.order + 1)
         # Test the cheap conditions first: the search for other minima takes as long as hundreds of descents.

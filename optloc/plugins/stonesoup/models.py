@@ -129,9 +129,9 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
     @clearable_cached_property("stations", "translation_offset", "noise_covar")  # type: ignore[untyped-decorator]
     def problem(self) -> Problem:
         """Return the optloc problem of one measurement, with an unknown position and all values zero."""
-        return self._posed(Motion())
+        return self._build_problem(Motion())
 
-    def _posed(self, motion: Motion) -> Problem:
+    def _build_problem(self, motion: Motion) -> Problem:
         rates = None if self.rates is None else self.rates[None]
         covariance = np.asarray(self.noise_covar, dtype=float)
         return problem_of(self.sites[None], [self.rows], [covariance], velocity=rates, motions=(motion,))
@@ -139,16 +139,16 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
     def function(self, state: Any, noise: Any = False, **kwargs: Any) -> Any:
         """Return the measurement (m, 1) of a state, or (m, N) of N states, with noise if requested."""
         vector = np.asarray(state.state_vector, dtype=float)[self.places].T  # (N, d or 2 d)
-        values = self._ordered(predict(self.problem, vector).T)
+        values = self._in_scan_order(predict(self.problem, vector).T)
         if isinstance(noise, bool) or noise is None:
             noise = self.rvs(num_samples=values.shape[1], **kwargs) if noise else 0
-        return self._typed(values) + noise
+        return self._with_angle_types(values) + noise
 
     def jacobian(self, state: Any, **kwargs: Any) -> Array:
         """Return the derivative (m, n) of the measurement with respect to the state."""
         vector = np.asarray(state.state_vector, dtype=float)[self.places, 0]
         out = np.zeros((self.ndim_meas, self.ndim_state))
-        out[:, self.places] = self._ordered(linearise(self.problem, vector).shared)
+        out[:, self.places] = self._in_scan_order(linearise(self.problem, vector).shared)
         return out
 
     def inverse_function(self, detection: Any, **kwargs: Any) -> Any:
@@ -173,7 +173,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
     def rvs(self, num_samples: int = 1, **kwargs: Any) -> Any:
         """Return samples (m, N) of the noise."""
         drawn = np.asarray(super().rvs(num_samples, **kwargs), dtype=float)
-        return self._typed(drawn.reshape(self.ndim_meas, num_samples))
+        return self._with_angle_types(drawn.reshape(self.ndim_meas, num_samples))
 
     def logpdf(self, state1: Any, state2: Any, **kwargs: Any) -> Any:
         """Return the logarithm of the density of a measurement given a state; angles are wrapped."""
@@ -187,13 +187,13 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         """Return the index in the measurement of each row of `problem`, which sorts the rows by kind."""
         return rows_by_kind([self.rows])[1]
 
-    def _ordered(self, values: Array) -> Array:
+    def _in_scan_order(self, values: Array) -> Array:
         """Return values (m, N) of the rows of `problem` in the row order of the measurement."""
         out = np.empty_like(values)
         out[self.order] = values
         return out
 
-    def _typed(self, values: Array) -> Any:
+    def _with_angle_types(self, values: Array) -> Any:
         """Return values (m, N) with angle rows as Stone Soup angles."""
         kind: Any = StateVector if values.shape[1] == 1 else StateVectors
         if not any(row[0] in _TYPES for row in self.rows):
@@ -287,7 +287,7 @@ class RateMeasurement(StationMeasurement, ABC):
     @clearable_cached_property("stations", "translation_offset", "noise_covar", "velocities")  # type: ignore[untyped-decorator]
     def problem(self) -> Problem:
         """Return the optloc problem of one measurement, with an unknown position and velocity and all values zero."""
-        return self._posed(Motion(1))
+        return self._build_problem(Motion(1))
 
 
 class RangeRate(RateMeasurement):
@@ -356,7 +356,7 @@ class AnyRows(RateMeasurement):
     @clearable_cached_property("stations", "translation_offset", "noise_covar", "velocities", "table")  # type: ignore[untyped-decorator]
     def problem(self) -> Problem:
         """Return the optloc problem of one measurement, with an unknown position, or position and velocity."""
-        return self._posed(Motion(int(self.moving)))
+        return self._build_problem(Motion(int(self.moving)))
 
 
 def values_of(detection: Any) -> Array:
@@ -445,9 +445,9 @@ class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
                     raise InvalidProblem(what, "PairFeeder", "feed detections of the model TDOA")
                 name = detection.metadata.get(self.label) if self.label else None
                 groups.setdefault(name, []).append(detection)
-            yield time, {self._joined(group) for group in groups.values()}
+            yield time, {self._join(group) for group in groups.values()}
 
-    def _joined(self, group: list[Detection]) -> Detection:
+    def _join(self, group: list[Detection]) -> Detection:
         group = sorted(group, key=lambda detection: np.atleast_2d(detection.measurement_model.pairs).tolist())
         models = [detection.measurement_model for detection in group]
         first = models[0]

@@ -74,7 +74,7 @@ def search(
     for made, one in rounds(starts_of(lik, seed)):
         good = np.isfinite(one.cost)
         if good.any():
-            found = _added(found, one.take(good), made)
+            found = _merge(found, one.take(good), made)
             _move_on(lik, found)
             if tell is not None:
                 tell(f"{found.made} starts, {found.agreeing} at the least cost {found.cost:.5g}")
@@ -86,7 +86,7 @@ def search(
     return found
 
 
-def _added(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> NetworkSearchResult:
+def _merge(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> NetworkSearchResult:
     if found is not None:
         ends = joined([found.ends, ends])
     i = int(ends.cost.argmin())
@@ -108,13 +108,13 @@ def _move_on(lik: Likelihood, found: NetworkSearchResult) -> None:
         if _key(ends.cost[i]) in found.onward:
             continue
         tried += 1
-        at, cost = _swept(lik, ends.at.take(np.array([i])), float(ends.cost[i]))
+        at, cost = _sweep_block_moves(lik, ends.at.take(np.array([i])), float(ends.cost[i]))
         found.onward[_key(ends.cost[i])] = cost
         if cost < found.cost - _SAME:
             found.best, found.cost = at, cost
 
 
-def _swept(lik: Likelihood, at: NetworkEstimate, cost: float) -> tuple[NetworkEstimate, float]:
+def _sweep_block_moves(lik: Likelihood, at: NetworkEstimate, cost: float) -> tuple[NetworkEstimate, float]:
     """Return the network and the cost that repeated block moves reach from a minimum."""
     for _ in range(_SWEEPS):
         found = sorted(elsewhere(lik, at), key=lambda block: block.gaps[0])[:_MOVES]
@@ -151,7 +151,7 @@ def proven(
     """
     cost, others = float(lik.cost(at)[0]), list[tuple[str, NetworkEstimate]]()
     for _ in range(_SWEEPS):
-        at, cost, beside = _straightened(lik, at, cost)
+        at, cost, bent_others = _apply_joint_moves(lik, at, cost)
         found = blocks(lik, at)
         places = [
             (block, place)
@@ -160,17 +160,17 @@ def proven(
             if gap <= MOVED
         ]
         if not places:
-            return at, found, beside
+            return at, found, bent_others
         ends, costs = lik.refine(together(*(moved(lik, at, block, place) for block, place in places)))
         others = [(f"{block.name} elsewhere", ends.take(np.array([n]))) for n, (block, _) in enumerate(places)]
         i = int(np.argmin(costs))
         if costs[i] >= cost - _SAME - equal_cost(cost):
             break
         at, cost = ends.take(np.array([i])), float(costs[i])
-    return at, found, others + beside
+    return at, found, others + bent_others
 
 
-def _straightened(
+def _apply_joint_moves(
     lik: Likelihood, at: NetworkEstimate, cost: float
 ) -> tuple[NetworkEstimate, float, list[tuple[str, NetworkEstimate]]]:
     """Return the cheapest network that joint moves reach, its cost, and the other minima of these moves."""

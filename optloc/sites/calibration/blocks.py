@@ -78,7 +78,7 @@ def blocks(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
     """
     net = lik.network
     d, cost, found = net.dimension, float(lik.cost(at)[0]), list[StationBlock]()
-    fixes = _stations(net, at, _sought(net))
+    fixes = _stations(net, at, _inexact_stations(net))
     if fixes:
         costs = lik.cost(together(*(_moved_station(lik, at, i, fix.position[:d]) for i, fix in fixes)))
         for (i, fix), best in zip(fixes, costs, strict=True):
@@ -94,7 +94,7 @@ def blocks(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
     return tuple(found)
 
 
-def _sought(net: Network) -> list[int]:
+def _inexact_stations(net: Network) -> list[int]:
     return [i for i in range(net.stations) if (net.place_sigma[i] > 0.0).any()]
 
 
@@ -136,7 +136,7 @@ def elsewhere(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
         block's partners.
     """
     net = lik.network
-    stations, d = np.array(_sought(net), dtype=int), net.dimension
+    stations, d = np.array(_inexact_stations(net), dtype=int), net.dimension
     groups = [(False, np.arange(net.pulses), at.pulses[0], pulses_alone(net, at))]
     if stations.size:
         groups.append((True, stations, at.stations[0, stations], stations_alone(net, at, stations)))
@@ -167,12 +167,12 @@ def pulses_alone(net: Network, at: NetworkEstimate, which: Array | None = None) 
     for kind in dict.fromkeys(kinds.tolist()):
         slots = np.flatnonzero(kinds == kind)
         ends = {"a": first[slots], "b": second[slots]}
-        rows.append(_given(kind, z[:, slots], sigma[:, slots], given[:, slots], **ends))
+        rows.append(_masked_rows(kind, z[:, slots], sigma[:, slots], given[:, slots], **ends))
     one = at.count == 1
     return assemble(at.stations[0] if one else np.repeat(at.stations, len(which), axis=0)[:, None], *rows).flat()
 
 
-def _given(kind: str, z: Array, sigma: Array, given: Array, **ends: Array) -> Measured:
+def _masked_rows(kind: str, z: Array, sigma: Array, given: Array, **ends: Array) -> Measured:
     """Return rows (B, q) of one kind; rows that are not given have weight 0."""
     deviation, weight = _shared(np.where(given, sigma, 1.0)), _shared(given.astype(float))
     return measured(kind, np.where(given, z, 0.0), sigma=deviation, weight=weight, **ends)
@@ -193,7 +193,7 @@ def stations_alone(net: Network, at: NetworkEstimate, which: Array) -> Problem:
     for kind, ends, sigma, z in kinds:
         given = np.isfinite(sigma[which])
         if given.any():
-            rows.append(_given(kind, z[which], sigma[which], given, a=ends))
+            rows.append(_masked_rows(kind, z[which], sigma[which], given, a=ends))
     soft = np.isfinite(net.place_sigma[which])
     # the prior covers all coordinates of a station, so unknown coordinates get a very wide one
     spread = float(np.ptp(places, axis=0).max()) or 1.0

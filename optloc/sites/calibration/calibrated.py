@@ -224,28 +224,28 @@ def calibrate(
     InvalidProblem
         If `gauge` names an unknown station, or if known positions already define the frame.
     """
-    named = _named(network, gauge)
+    named = _station_indices(network, gauge)
     if robust:
-        return _without_gross(network, gauge, seed, starts, tell)
+        return _calibrate_robust(network, gauge, seed, starts, tell)
     enough = _placeable(network)
     if network.rows - network.unknowns + frame_size(network) < 0 or enough.sum() < 1:
-        return _refused(network, Status.TOO_FEW_ROWS, "There are fewer measurements than unknowns.")
+        return _failure(network, Status.TOO_FEW_ROWS, "There are fewer measurements than unknowns.")
     core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])
     core = core[enough[core]]
     found = search(network.take(core), seed, starts, tell)
     if found is None:
-        return _refused(network, Status.NUMERICAL, "No start converged to a network.")
+        return _failure(network, Status.NUMERICAL, "No start converged to a network.")
     at = found.best
     rest = enough.copy()
     rest[core] = False
     if rest.any():
-        at = _with_rest(network, at, core, np.flatnonzero(rest))
+        at = _add_other_pulses(network, at, core, np.flatnonzero(rest))
     lik = likelihood(network.take(enough))
-    made = _judged(lik, lik.refine(at)[0], found, named)
-    return _whole(made, network, enough)
+    made = _judge(lik, lik.refine(at)[0], found, named)
+    return _with_all_pulses(made, network, enough)
 
 
-def _without_gross(
+def _calibrate_robust(
     network: Network, gauge: tuple[str, ...], seed: int, starts: int | None, tell: Callable[[str], None] | None
 ) -> Calibration:
     """Return the network of the rows that agree, with a list of the rows that were left out."""
@@ -271,7 +271,7 @@ def _without_gross(
     if not len(left):
         return found
     names = [f"{network.names[network.slots[r].a]} of pulse {network.labels[j]}" for j, r in left]
-    words = f"These rows were left out as gross errors, without a proof: {_few(names)}."
+    words = f"These rows were left out as gross errors, without a proof: {_shorten(names)}."
     status = min(found.status, Status.UNPROVEN, key=PRECEDENCE.index) if found.status in PRECEDENCE else found.status
     return replace(found, network=network, status=status, findings=(*found.findings, words), left_out=left)
 
@@ -282,7 +282,7 @@ def _all_residuals(network: Network, found: Calibration) -> Array:
     return np.asarray(np.nan_to_num(likelihood(network).residual(at)[0]))
 
 
-def _with_rest(network: Network, at: NetworkEstimate, core: Array, rest: Array) -> NetworkEstimate:
+def _add_other_pulses(network: Network, at: NetworkEstimate, core: Array, rest: Array) -> NetworkEstimate:
     """Return an estimate of all pulses with enough rows: the pulses of the search, and fixes of the others."""
     n, d = network.pulses, network.dimension
     pulses, emission = np.zeros((1, n, d)), np.zeros((1, n))
@@ -297,19 +297,19 @@ def _with_rest(network: Network, at: NetworkEstimate, core: Array, rest: Array) 
 # Status and findings.
 
 
-def _judged(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, named: tuple[int, ...]) -> Calibration:
+def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, named: tuple[int, ...]) -> Calibration:
     net = lik.network
     soft = bool(np.isfinite(net.place_sigma).any())
     at, checked, others = proven(lik, at)
     at = with_mean_clock(net, at) if soft else in_frame(net, at, named)
-    told = determined(lik, at)
+    rank = determined(lik, at)
     cost = float(lik.cost(at)[0])
-    dof = net.rows - net.unknowns + told.free.shape[1]
+    dof = net.rows - net.unknowns + rank.free.shape[1]
     p = float(tail_probability(np.array(cost), np.array(dof)))
-    covariance, sides, bent = np.full((lik.free.size, lik.free.size), np.nan), list[str](), np.nan
-    if not told.open.shape[1]:
-        covariance = told.covariance(fixed_by(net, named) if named else told.free.T)
-        sides, bent = flat(lik, at, covariance), departure(lik, at, told)
+    covariance, sides, departs = np.full((lik.free.size, lik.free.size), np.nan), list[str](), np.nan
+    if not rank.open.shape[1]:
+        covariance = rank.covariance(fixed_by(net, named) if named else rank.free.T)
+        sides, departs = flat(lik, at, covariance), departure(lik, at, rank)
     alternatives = _alternatives(lik, at, cost, found, others)
     pulses = at.pulses[0].copy()
     pulses[[block.index for block in checked if not block.station and not block.proven]] = np.nan
@@ -318,7 +318,7 @@ def _judged(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, na
     for other in (one for one, alike in zip(rivals, same, strict=True) if alike):
         pulses[_moved_pulses(at, other)] = np.nan
     elsewhere = tuple(one for one, alike in zip(rivals, same, strict=True) if not alike)
-    facts = _Facts(net, found, told, p, tuple(sides), bent, checked, elsewhere, np.isnan(pulses).any(axis=1))
+    facts = _Facts(net, found, rank, p, tuple(sides), departs, checked, elsewhere, np.isnan(pulses).any(axis=1))
     findings = objections(_FINDINGS, facts)
     gauge = "known places" if soft else ", ".join(net.names[i] for i in named)
     return Calibration(
@@ -342,13 +342,13 @@ def _judged(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, na
     )
 
 
-def _open_words(net: Network, told: GaugeRank) -> str:
+def _open_words(net: Network, rank: GaugeRank) -> str:
     m, d = net.stations, net.dimension
-    share = np.sqrt((told.open[: m * d] ** 2).sum(axis=1).reshape(m, d).sum(axis=1))
+    share = np.sqrt((rank.open[: m * d] ** 2).sum(axis=1).reshape(m, d).sum(axis=1))
     if not net.synchronised:
-        share = np.hypot(share, np.sqrt((told.open[m * d :] ** 2).sum(axis=1)))
+        share = np.hypot(share, np.sqrt((rank.open[m * d :] ** 2).sum(axis=1)))
     largest = [net.names[i] for i in np.argsort(-share, kind="stable")[:3]]
-    count = told.open.shape[1]
+    count = rank.open.shape[1]
     return (
         f"The measurements do not determine {count} motion{'s' if count > 1 else ''} of the network, mostly of "
         f"{', '.join(largest)}; add pulses outside their plane, distances between stations, or known positions."
@@ -430,12 +430,12 @@ _FINDINGS = (
     Finding(
         Status.UNPROVEN,
         lambda e: e.refuted,
-        lambda e: [f"With all others fixed, another position costs less: {_few(e.refuted)}."],
+        lambda e: [f"With all others fixed, another position costs less: {_shorten(e.refuted)}."],
     ),
     Finding(
         Status.UNPROVEN,
         lambda e: e.unproven and not e.refuted,
-        lambda e: [f"A proof that no other position fits equally well is missing for {_few(e.unproven)}."],
+        lambda e: [f"A proof that no other position fits equally well is missing for {_shorten(e.unproven)}."],
     ),
     Finding(
         Status.SEARCHED,
@@ -446,7 +446,7 @@ _FINDINGS = (
 """Findings of a network: status, condition and sentences; the first that applies sets the status."""
 
 
-def _few(names: list[str]) -> str:
+def _shorten(names: list[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
@@ -518,8 +518,8 @@ def _same_stations(at: NetworkEstimate, other: Alternative, covariance: Array) -
     apart = spans(other.stations)[1] - spans(at.stations[0])[1]
     size = gradient.shape[1]
     width, axes = np.linalg.eigh(gradient @ covariance[:size, :size] @ gradient.T)
-    told = width > _ZERO * width[-1]
-    shift, dof = float((((axes.T @ apart)[told]) ** 2 / width[told]).sum()), int(told.sum())
+    known = width > _ZERO * width[-1]
+    shift, dof = float((((axes.T @ apart)[known]) ** 2 / width[known]).sum()), int(known.sum())
     share = 1.0 / (1.0 + np.exp(0.5 * other.gap))
     within = float(tail_probability(np.array(shift), np.array(dof))) > _WITHIN
     return within and share * shift <= _COVERS * dof
@@ -541,7 +541,7 @@ def _shape(at: NetworkEstimate, soft: bool) -> Array:
 # Preparation and completion of a search.
 
 
-def _named(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
+def _station_indices(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
     if not gauge:
         return ()
     if np.isfinite(network.place_sigma).any():
@@ -562,7 +562,7 @@ def _placeable(network: Network) -> Array:
     return np.asarray(network.given.sum(axis=1) >= needed)
 
 
-def _refused(network: Network, status: Status, words: str) -> Calibration:
+def _failure(network: Network, status: Status, words: str) -> Calibration:
     m, n, d = network.stations, network.pulses, network.dimension
     p = m * d + (0 if network.synchronised else m)
     nan = np.full
@@ -587,7 +587,7 @@ def _refused(network: Network, status: Status, words: str) -> Calibration:
     )
 
 
-def _whole(made: Calibration, network: Network, enough: Array) -> Calibration:
+def _with_all_pulses(made: Calibration, network: Network, enough: Array) -> Calibration:
     """Return a calibration of all pulses, with NaN for pulses that have too few rows."""
     pulses = np.full((network.pulses, network.dimension), np.nan)
     emission, residuals = np.full(network.pulses, np.nan), np.full(network.z.shape, np.nan)

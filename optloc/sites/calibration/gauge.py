@@ -63,12 +63,12 @@ def determined(lik: Likelihood, at: NetworkEstimate) -> GaugeRank:
     motions = frame_moves(lik.network, at)
     motions[~lik.free] = 0.0
     size = float(np.linalg.norm(jacobian, 2))
-    free = _unseen(jacobian, _span(motions), size)
+    free = _null_space(jacobian, _span(motions), size)
     rest = np.linalg.svd(free.T)[2][free.shape[1] :].T if free.shape[1] else np.eye(p)
     rest = rest[:, np.abs(rest[lik.free]).max(axis=0) > _ZERO]
-    held = np.flatnonzero(~lik.free)
-    rest = _span(rest - np.isin(np.arange(p), held)[:, None] * rest)
-    return GaugeRank(jacobian, free, _unseen(jacobian, rest, size))
+    exact = np.flatnonzero(~lik.free)
+    rest = _span(rest - np.isin(np.arange(p), exact)[:, None] * rest)
+    return GaugeRank(jacobian, free, _null_space(jacobian, rest, size))
 
 
 def without_pulses(lik: Likelihood, at: NetworkEstimate) -> Array:
@@ -91,15 +91,15 @@ _FAR = 3.0
 _NONE = 1e-9
 
 
-def departure(lik: Likelihood, at: NetworkEstimate, told: GaugeRank) -> float:
+def departure(lik: Likelihood, at: NetworkEstimate, rank: GaugeRank) -> float:
     """Return the largest deviation of the cost from the Gaussian cost, as the logarithm of their ratio.
 
     The test points are three standard deviations away, on both sides of each principal axis of stations and
     clocks. The pulses are refitted at each test point. The result is the largest ``|ln((f(x +- 3 t) - f(x)) /
-    9)|``, as for a fix (`optloc.model_checks.shape`). `at` (S = 1) is the estimate. `told` contains its determined
+    9)|``, as for a fix (`optloc.model_checks.shape`). `at` (S = 1) is the estimate. `rank` contains its determined
     motions; there must be no open motion.
     """
-    width, axes = np.linalg.eigh(told.covariance(told.free.T))
+    width, axes = np.linalg.eigh(rank.covariance(rank.free.T))
     far = (axes * (_FAR * np.sqrt(np.maximum(width, 0.0))))[:, width > _ZERO * width[-1]].T
     costs = lik.cost(together(at, settled(lik.network, shifted(at, np.concatenate([far, -far])))))
     rise = (costs[1:] - costs[0]) / _FAR**2
@@ -131,7 +131,7 @@ def _span(columns: Array) -> Array:
     return np.asarray(u[:, s > _ZERO * max(float(np.max(s, initial=0.0)), 1e-300)])
 
 
-def _unseen(jacobian: Array, basis: Array, size: float) -> Array:
+def _null_space(jacobian: Array, basis: Array, size: float) -> Array:
     """Return a basis of the directions in a subspace that a matrix maps to zero."""
     if not basis.shape[1]:
         return basis
@@ -214,10 +214,10 @@ def fixed_by(net: Network, named: tuple[int, ...]) -> Array:
     """Return a selection matrix (g, P) of the coordinates and the clock that the named stations fix at zero."""
     m, d = net.stations, net.dimension
     p = m * d + (0 if net.synchronised else m)
-    held = [named[c] * d + k for c in range(d) for k in range(d) if k >= c]
+    indices = [named[c] * d + k for c in range(d) for k in range(d) if k >= c]
     if not net.synchronised:
-        held.append(m * d + named[0])
-    return np.eye(p)[held]
+        indices.append(m * d + named[0])
+    return np.eye(p)[indices]
 
 
 def flat(lik: Likelihood, at: NetworkEstimate, covariance: Array) -> list[str]:

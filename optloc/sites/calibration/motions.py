@@ -28,10 +28,10 @@ def bent(lik: Likelihood, at: NetworkEstimate) -> tuple[NetworkEstimate, Array] 
     Each copy of the network (`at`, S = 1) is moved along one direction. A first refinement holds its stations
     there with a tether, so that better determined directions adapt. A second refinement has no tether.
     """
-    told = determined(lik, at)
-    if told.open.shape[1]:
+    rank = determined(lik, at)
+    if rank.open.shape[1]:
         return None
-    width, axes = np.linalg.eigh(told.covariance(told.free.T))
+    width, axes = np.linalg.eigh(rank.covariance(rank.free.T))
     weak = np.flatnonzero(width > _EXACT * width[-1])[-_WEAK:]
     deviation = np.repeat(np.sqrt(width[weak]), 2 * len(_STEPS))
     far = np.tile([*_STEPS, *(-step for step in _STEPS)], len(weak)) * deviation

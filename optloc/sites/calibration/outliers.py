@@ -84,13 +84,13 @@ def truncated(lik: Likelihood, at: NetworkEstimate) -> tuple[NetworkEstimate, Ar
 def placed_anew(lik: Likelihood, starts: Starts, at: NetworkEstimate) -> NetworkEstimate:
     """Return a network (S = 1) with pulses, then stations, moved to positions that agree with most of their rows."""
     net, d = lik.network, lik.network.dimension
-    x = _agreed(pulses_alone(net, at), at.pulses[0], starts)
+    x = _random_consensus(pulses_alone(net, at), at.pulses[0], starts)
     emission = x[:, d] if x.shape[1] > d else at.emission[0]
     at = replace(at, pulses=x[None, :, :d], emission=np.where(net.emission, emission, at.emission[0])[None])
     which = np.flatnonzero((net.place_sigma > 0.0).any(axis=1))
     if not which.size:
         return at
-    x = _agreed(stations_alone(net, at, which), at.stations[0, which], starts)
+    x = _random_consensus(stations_alone(net, at, which), at.stations[0, which], starts)
     stations, clocks = at.stations.copy(), at.clocks.copy()
     stations[0, which] = x[:, :d]
     if not net.synchronised:
@@ -98,7 +98,7 @@ def placed_anew(lik: Likelihood, starts: Starts, at: NetworkEstimate) -> Network
     return replace(at, stations=stations, clocks=clocks)
 
 
-def _agreed(problem: Problem, here: Array, starts: Starts) -> Array:
+def _random_consensus(problem: Problem, here: Array, starts: Starts) -> Array:
     """Return the values (B, size) with the least truncated cost of each block.
 
     The candidates are the present position and fits to random subsets of the rows. A fit to all rows fails if

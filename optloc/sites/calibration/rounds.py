@@ -90,8 +90,8 @@ def arrivals(network: Network) -> tuple[Array, Array, Array]:
             rows = np.flatnonzero(given & (kinds == kind))
             if rows.size:
                 values, deviation = network.z[j, rows], network.sigma[j, rows]
-                told = _of_differences if kind == "tdoa" else _of_stations
-                z[j], weight[j] = told(ends[rows], values, 1.0 / deviation**2, m)
+                convert = _of_differences if kind == "tdoa" else _of_stations
+                z[j], weight[j] = convert(ends[rows], values, 1.0 / deviation**2, m)
                 emission[j] = kind != "range"
                 break
     return z, weight, emission
@@ -157,7 +157,7 @@ class Starts:
         new = np.diff(fit.cost[order], prepend=-1.0) > 1e-6 * fit.cost[order] + 1e-24
         stations, pulses, which = upgrade(fit.take(order[new]))
         if not len(which):
-            return _nothing(net), np.zeros(0, dtype=int)
+            return _no_estimates(net), np.zeros(0, dtype=int)
         b = fit.stations.b[order[new]][which] * self.spread
         places = np.zeros((len(which), net.pulses, d))
         places[:, full] = pulses * self.spread
@@ -166,10 +166,10 @@ class Starts:
         offsets[:, full] = fit.pulses.o[order[new]][which] * self.spread
         offsets = np.where(self.emission, offsets + self.shift, 0.0)
         made = NetworkEstimate(stations * self.spread, b, places, offsets * net.emission)
-        self._settle(made, ~full)
+        self._set_emission(made, ~full)
         return made, which
 
-    def _settle(self, made: NetworkEstimate, few: Array) -> None:
+    def _set_emission(self, made: NetworkEstimate, few: Array) -> None:
         """Set the emission of pulses that the fit did not use (mask `few`) to the mean that fits their position."""
         if few.any():
             apart = np.linalg.norm(made.stations[:, None] - made.pulses[:, few, None], axis=-1)
@@ -201,7 +201,7 @@ class Starts:
         return RoundEnds(found, cost, start)
 
 
-def _nothing(net: Network) -> NetworkEstimate:
+def _no_estimates(net: Network) -> NetworkEstimate:
     m, n, d = net.stations, net.pulses, net.dimension
     return NetworkEstimate(np.zeros((0, m, d)), np.zeros((0, m)), np.zeros((0, n, d)), np.zeros((0, n)))
 
@@ -260,7 +260,7 @@ def laid(at: NetworkEstimate, net: Network, rng: np.random.Generator) -> Network
     points, pulses = both.stations - middle, both.pulses - middle
     extent = np.sqrt(np.mean(points**2)) or 1.0
     weight = 1.0 / np.maximum(net.place_sigma, _LOOSE * extent)
-    turn, move = _onto(points, net.place, weight, rng)
+    turn, move = _align(points, net.place, weight, rng)
     stations = points @ np.swapaxes(turn, 1, 2) + move[:, None]
     exact = net.place_sigma <= 0.0
     return replace(
@@ -270,7 +270,7 @@ def laid(at: NetworkEstimate, net: Network, rng: np.random.Generator) -> Network
     )
 
 
-def _onto(points: Array, place: Array, weight: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+def _align(points: Array, place: Array, weight: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Return rotations (S, d, d) and shifts (S, d) that minimise the weighted distance from known coordinates."""
     s, m, d = points.shape
     generators = np.array([_generator(i, k, d) for i in range(d) for k in range(i)])

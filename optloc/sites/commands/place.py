@@ -67,11 +67,11 @@ def run_place(
     selection = _with(loaded.selection, wanted)
     with line(quiet or as_json) as tell:
 
-        def told(bound: float, value: float, nodes: int) -> None:
+        def report(bound: float, value: float, nodes: int) -> None:
             tell(f"best {value:.5g}, no set below {bound:.5g}, {nodes} nodes")
 
         tell("searching")
-        found = place(selection, draws=wanted.draws, tell=told)
+        found = place(selection, draws=wanted.draws, tell=report)
         if loaded.regions:
             tell("refining")
             found = refined(selection, found, loaded.regions, loaded.ground)

@@ -128,16 +128,16 @@ def convex_parts(ring: Array) -> list[Array]:
     count = len(points)
     if all(turn(points[i - 1], points[i], points[(i + 1) % count]) >= 0.0 for i in range(count)):
         return [points]
-    left, parts = list(range(count)), []
-    while len(left) > 3:
-        for k in range(len(left)):
-            a, b, c = (points[left[(k + s) % len(left)]] for s in (-1, 0, 1))
-            others = [points[i] for i in left if not any(points[i] is p for p in (a, b, c))]
-            held = [turn(a, b, p) > 0 and turn(b, c, p) > 0 and turn(c, a, p) > 0 for p in others]
-            if turn(a, b, c) > 0.0 and not any(held):
+    remaining, parts = list(range(count)), []
+    while len(remaining) > 3:
+        for k in range(len(remaining)):
+            a, b, c = (points[remaining[(k + s) % len(remaining)]] for s in (-1, 0, 1))
+            others = [points[i] for i in remaining if not any(points[i] is p for p in (a, b, c))]
+            covered = [turn(a, b, p) > 0 and turn(b, c, p) > 0 and turn(c, a, p) > 0 for p in others]
+            if turn(a, b, c) > 0.0 and not any(covered):
                 parts.append(np.array([a, b, c]))
-                del left[k]
+                del remaining[k]
                 break
         else:
             raise InvalidProblem("the edges of a polygon cross each other", "polygon", "reorder or correct its corners")
-    return [*parts, points[left]]
+    return [*parts, points[remaining]]

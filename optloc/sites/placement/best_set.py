@@ -148,7 +148,7 @@ class BestSetResult:
 
 
 @dataclass(slots=True)
-class _Open:
+class _SearchState:
     """The state of a search: the best sets so far, the open nodes and the counts."""
 
     task: SearchTask
@@ -213,7 +213,7 @@ def search(
     begun = monotonic()
     rows = np.ascontiguousarray(task.design.rows)  # one type of array: machine code is made for each
     task = replace(task, design=replace(task.design, rows=rows))
-    made, state = _Open(task, task.asked(), gap, max(1, keep), {}, []), np.array(task.state, dtype=np.int64)
+    made, state = _SearchState(task, task.asked(), gap, max(1, keep), {}, []), np.array(task.state, dtype=np.int64)
     if not propagate(task.rules, task.limits, state):
         return BestSetResult((), np.inf, True, np.inf, 0, np.zeros((0, 3)))
     root, w = -np.inf, np.where(state == IN, 1.0, 0.0)
@@ -221,7 +221,7 @@ def search(
         w[state == FREE] = 0.5
         root, w, _ = _relax(made, state, w, np.nan, _ROOT_STEPS)
         made.push(root, state, w)
-    for value, chosen in _starts(task, state, w, seed):
+    for value, chosen in _start_sets(task, state, w, seed):
         made.add(value, chosen)
     if not made.seen:
         return BestSetResult((), np.inf, True, np.inf, made.nodes, np.zeros((0, 3)))
@@ -234,8 +234,8 @@ def search(
     closed = not made.heap or made.heap[0][0] >= made.enough
     course.append((monotonic() - begun, made.bound, made.value))
     first = min(made.seen.values(), key=itemgetter(0))[1]
-    for gone in np.flatnonzero((first == 1) & (task.state == FREE)).tolist():  # sets that are nearly as good
-        value, chosen = _exchange(task, made.asked, first, gone, np.inf)
+    for removed in np.flatnonzero((first == 1) & (task.state == FREE)).tolist():  # sets that are nearly as good
+        value, chosen = _exchange(task, made.asked, first, removed, np.inf)
         if chosen.any():
             made.add(value, chosen)
     best = sorted(made.seen.values(), key=itemgetter(0))[: made.keep]
@@ -250,13 +250,13 @@ def _load() -> None:
     )
     state = np.full(2, FREE, dtype=np.int64)
     propagate(one.rules, one.limits, state)
-    _relax(_Open(one, one.asked(), 0.5, 1, {}, []), state, np.full(2, 0.5), np.nan, 1)
+    _relax(_SearchState(one, one.asked(), 0.5, 1, {}, []), state, np.full(2, 0.5), np.nan, 1)
     settle(0.0, np.zeros(2), 1.0, state)
     one.score(np.eye(2))
-    _exhausted(one.asked(), state, np.zeros(2), 1.0)
+    _enumerate(one.asked(), state, np.zeros(2), 1.0)
 
 
-def _relax(made: _Open, state: Array, w: Array, enough: float, steps: int) -> tuple[float, Array, Array]:
+def _relax(made: _SearchState, state: Array, w: Array, enough: float, steps: int) -> tuple[float, Array, Array]:
     """Return bound, weights (n,) and reduced costs (n,) of the relaxation of a node."""
     task, x, cost = made.task, w.copy(), np.empty(len(w))
     design = task.design
@@ -280,17 +280,17 @@ def _relax(made: _Open, state: Array, w: Array, enough: float, steps: int) -> tu
     return float(bound), x, cost
 
 
-def _branch(made: _Open, bound: float, state: Array, w: Array) -> None:
+def _branch(made: _SearchState, bound: float, state: Array, w: Array) -> None:
     """Branch a node: open both children of the free site with the largest weight up to `_TAKEN`."""
     free = np.flatnonzero(state == FREE)
     j = free[np.where(w[free] > _TAKEN, -1.0, w[free]).argmax()]
     for one in (1, 0):
         child, x = state.copy(), w.copy()
         child[j] = x[j] = one
-        _open(made, bound, child, x)
+        _bound_node(made, bound, child, x)
 
 
-def _open(made: _Open, bound: float, state: Array, w: Array) -> None:
+def _bound_node(made: _SearchState, bound: float, state: Array, w: Array) -> None:
     """Bound a node, and add it to the open nodes if it can contain a better set.
 
     A node without free sites is one set; a small node is enumerated.
@@ -302,7 +302,7 @@ def _open(made: _Open, bound: float, state: Array, w: Array) -> None:
                 made.add(float(task.score(state[None])[0]), state)
             return
         if _is_small(task, state):
-            value, best = _exhausted(made.asked, state, w, made.enough)
+            value, best = _enumerate(made.asked, state, w, made.enough)
             if best.any():
                 made.add(value, best)
             return
@@ -319,7 +319,7 @@ def _open(made: _Open, bound: float, state: Array, w: Array) -> None:
                 return
 
 
-def _exhausted(
+def _enumerate(
     asked: CompletionRequest, state: Array, w: Array, enough: float, most: int = sys.maxsize
 ) -> tuple[float, Array]:
     """Return value and set (n,) of the best set of a node below `enough`; all zeros if no set is below."""
@@ -340,17 +340,17 @@ def _is_small(task: SearchTask, state: Array) -> bool:
     return number <= (_FEW_FAIL if task.fail else _FEW) * (1.0 if at_once else _SLOW)
 
 
-def _starts(task: SearchTask, state: Array, w: Array, seed: int) -> Iterator[tuple[float, Array]]:
+def _start_sets(task: SearchTask, state: Array, w: Array, seed: int) -> Iterator[tuple[float, Array]]:
     """Yield values and sets (n,) that no exchange of two sites improves, from the relaxation and random sets."""
     rng = np.random.default_rng(seed)
     for priority in (w, *rng.random((_STARTS, len(w)))):
-        chosen = _rounded(task, state, priority)
+        chosen = _round_to_set(task, state, priority)
         if chosen is None:
             return
         yield exchanged(task, chosen)
 
 
-def _rounded(task: SearchTask, state: Array, priority: Array) -> Array | None:
+def _round_to_set(task: SearchTask, state: Array, priority: Array) -> Array | None:
     """Return a full set (n,) of sites with high priority that meets the rules; None if the rules allow no set."""
     chosen = (state == IN).astype(np.int64)
     for j in np.argsort(-priority, kind="stable"):
@@ -376,7 +376,7 @@ def random_sets(task: SearchTask, count: int, seed: int) -> Iterator[Array]:
     """Yield random sets (n,) that meet the rules and have no space for another site."""
     rng = np.random.default_rng(seed)
     for priority in rng.random((count, len(task.state))):
-        chosen = _rounded(task, task.state, priority)
+        chosen = _round_to_set(task, task.state, priority)
         if chosen is not None:
             yield chosen
 
@@ -386,8 +386,8 @@ def exchanged(task: SearchTask, chosen: Array) -> tuple[float, Array]:
     asked, value = task.asked(), float(task.score(chosen[None])[0])
     while True:
         better, other = value - _SAME * max(1.0, abs(value)), None
-        for gone in (None, *np.flatnonzero((chosen == 1) & (task.state == FREE)).tolist()):
-            found, tried = _exchange(task, asked, chosen, gone, better)
+        for removed in (None, *np.flatnonzero((chosen == 1) & (task.state == FREE)).tolist()):
+            found, tried = _exchange(task, asked, chosen, removed, better)
             if tried.any():
                 better, other = found, tried
         if other is None:
@@ -396,10 +396,10 @@ def exchanged(task: SearchTask, chosen: Array) -> tuple[float, Array]:
 
 
 def _exchange(
-    task: SearchTask, asked: CompletionRequest, chosen: Array, gone: int | None, enough: float
+    task: SearchTask, asked: CompletionRequest, chosen: Array, removed: int | None, enough: float
 ) -> tuple[float, Array]:
-    """Return value and set (n,) with the best new site, instead of site `gone` or in addition; see `_exhausted`."""
+    """Return value and set (n,) with the best new site, instead of site `removed` or in addition; see `_enumerate`."""
     state = np.where(chosen == 1, IN, np.where(task.state == FREE, FREE, OUT))
-    if gone is not None:
-        state[gone] = OUT
-    return _exhausted(asked, state, np.zeros(len(chosen)), enough, 1)
+    if removed is not None:
+        state[removed] = OUT
+    return _enumerate(asked, state, np.zeros(len(chosen)), enough, 1)

@@ -210,7 +210,7 @@ def place(
     task, banned = task_of(candidates), list[Array]()
     while True:
         found = search(
-            _without(task, banned),
+            _ban_sets(task, banned),
             gap=selection.gap,
             seconds=selection.seconds,
             keep=selection.alternatives,
@@ -223,7 +223,7 @@ def place(
         chosen = found.best[0][1]
         checked = drawn(candidates, chosen, draws, selection.seed) if draws else None
         if checked is None or checked.clean or len(banned) >= selection.alternatives:
-            return _answer(candidates, task, found, checked, banned)
+            return _placement(candidates, task, found, checked, banned)
         banned.append(chosen)
 
 
@@ -241,14 +241,14 @@ def task_of(candidates: Candidates) -> SearchTask:
     )
 
 
-def _without(task: SearchTask, banned: Sequence[Array]) -> SearchTask:
+def _ban_sets(task: SearchTask, banned: Sequence[Array]) -> SearchTask:
     """Return the task with one more rule for each banned set: at least one of its sites is not taken."""
     rules = np.array([chosen / chosen.sum() for chosen in banned]).reshape(len(banned), len(task.state))
     limits = np.array([1.0 - 1.0 / chosen.sum() for chosen in banned])
     return replace(task, rules=np.vstack([task.rules, rules]), limits=np.concatenate([task.limits, limits]))
 
 
-def _answer(
+def _placement(
     candidates: Candidates, task: SearchTask, found: BestSetResult, checked: Draws | None, banned: Sequence[Array]
 ) -> Placement:
     selection, names = candidates.selection, candidates.names
@@ -257,14 +257,14 @@ def _answer(
     gap = max(0.0, 1.0 - bound / reached)
     before, sites = _before(candidates, task)
     per_place, share = _per_place(candidates, chosen)
-    told = f"no set of these candidates has a value more than {100 * gap:.2g} % lower"
-    reason = told if found.closed else f"the time limit ended the search: {told}; raise the time limit or the gap"
+    claim = f"no set of these candidates has a value more than {100 * gap:.2g} % lower"
+    reason = claim if found.closed else f"the time limit ended the search: {claim}; raise the time limit or the gap"
     new = (chosen == 1) & (candidates.state != 1)
     if selection.choose is not None and (count := int(new.sum())) < selection.choose:
         reason += f"; only {count} of the {selection.choose} wanted sites: more exceed the budget or do not help"
     return Placement(
-        _named(names, new),
-        _named(names, candidates.state == 1),
+        _select_names(names, new),
+        _select_names(names, candidates.state == 1),
         selection.criterion,
         reached,
         bound,
@@ -278,12 +278,12 @@ def _answer(
         share,
         _redundancy(candidates, chosen),
         tuple(_swaps(task, names, chosen)),
-        tuple((_named(names, (one == 1) & (candidates.state != 1)), task.scale(v)) for v, one in found.best),
+        tuple((_select_names(names, (one == 1) & (candidates.state != 1)), task.scale(v)) for v, one in found.best),
         tuple(_following(task, names, chosen)),
         _course(task, found.course),
         found.nodes,
         checked,
-        tuple(_named(names, one == 1) for one in banned),
+        tuple(_select_names(names, one == 1) for one in banned),
     )
 
 
@@ -293,7 +293,7 @@ def _course(task: SearchTask, course: Array) -> Array:
     return out
 
 
-def _named(names: Sequence[str], mask: Array) -> tuple[str, ...]:
+def _select_names(names: Sequence[str], mask: Array) -> tuple[str, ...]:
     return tuple(names[i] for i in np.flatnonzero(mask).tolist())
 
 
@@ -323,10 +323,10 @@ def _before(candidates: Candidates, task: SearchTask) -> tuple[Array, tuple[str,
     if kept.any():
         per_place, share = _per_place(candidates, kept)
         if (share <= PRIOR).all():
-            return per_place, _named(candidates.names, kept)
+            return per_place, _select_names(candidates.names, kept)
     sets = np.array(list(random_sets(task, _RANDOM, candidates.selection.seed)))
     middle = sets[np.argsort(task.score(sets))[len(sets) // 2]]
-    return _per_place(candidates, middle)[0], _named(candidates.names, middle)
+    return _per_place(candidates, middle)[0], _select_names(candidates.names, middle)
 
 
 def _redundancy(candidates: Candidates, chosen: Array) -> Array:
@@ -394,8 +394,8 @@ def _flat(candidates: Candidates, chosen: Array, bounds: Array) -> Array:
     out = np.empty(len(bounds))
     owner = np.concatenate([rows.a for rows in candidates.problem.rows])
     for p in range(len(bounds)):
-        heard = stations[np.unique(owner[weight[p] > 0.0])]
-        off = np.linalg.svd(heard - heard.mean(0), compute_uv=False)[-1] if len(heard) > 1 else 0.0
+        in_sight = stations[np.unique(owner[weight[p] > 0.0])]
+        off = np.linalg.svd(in_sight - in_sight.mean(0), compute_uv=False)[-1] if len(in_sight) > 1 else 0.0
         out[p] = off / bounds[p]
     return out
 

@@ -45,16 +45,16 @@ def check_groups(
         The message names the groups and the possible number of sites.
     """
     for i, group in enumerate(groups):
-        _check_one(f"groups, entry {i + 1}", group, members[i], names, state)
+        _check_group(f"groups, entry {i + 1}", group, members[i], names, state)
     most, least = (_count(groups, members, state, sign) for sign in (-1.0, 1.0))
     if most is None or least is None:
-        what = f"no set of sites meets the rules of groups {_told(groups)} together"
+        what = f"no set of sites meets the rules of groups {_group_numbers(groups)} together"
         raise InvalidProblem(what, "groups", "raise most or lower least of a group")
     if choose is None:
         return
     if choose > most:
-        cause = _binding(groups, members, state, most)
-        rules = " and ".join(f"at most {groups[i].most} of {_listed(members[i], names)}" for i in cause[:_GROUPS])
+        cause = _limiting_groups(groups, members, state, most)
+        rules = " and ".join(f"at most {groups[i].most} of {_list_names(members[i], names)}" for i in cause[:_GROUPS])
         rules += f" and {len(cause) - _GROUPS} more groups" if len(cause) > _GROUPS else ""
         what = f"{choose} sites are wanted, but the groups allow at most {most} ({rules})"
         raise InvalidProblem(what, "choose", f"choose {most} or fewer, or raise most of a group")
@@ -63,9 +63,9 @@ def check_groups(
         raise InvalidProblem(what, "choose", f"choose {least} or more, or lower least of a group")
 
 
-def _check_one(where: str, group: CountGroup, own: Array, names: Sequence[str], state: Array) -> None:
+def _check_group(where: str, group: CountGroup, own: Array, names: Sequence[str], state: Array) -> None:
     """Raise if no set of sites can meet this group, independent of the other groups."""
-    kept, able, who = int((own & (state == 1)).sum()), int((own & (state != 0)).sum()), _listed(own, names)
+    kept, able, who = int((own & (state == 1)).sum()), int((own & (state != 0)).sum()), _list_names(own, names)
     if group.most is not None and kept > group.most:
         what = f"at most {group.most} of {who} may be taken, but {kept} of them are kept"
         raise InvalidProblem(what, where, "raise most, or keep fewer")
@@ -88,7 +88,7 @@ def _count(groups: Sequence[CountGroup], members: Array, state: Array, sign: flo
     return None if solved.x is None else round(float(free @ solved.x))
 
 
-def _binding(groups: Sequence[CountGroup], members: Array, state: Array, most: int) -> list[int]:
+def _limiting_groups(groups: Sequence[CountGroup], members: Array, state: Array, most: int) -> list[int]:
     """Return the indices of the groups that limit the number of sites to `most`.
 
     If the removal of one group allows more sites, the list has only this group. Otherwise it has all groups with
@@ -102,10 +102,10 @@ def _binding(groups: Sequence[CountGroup], members: Array, state: Array, most: i
     return limiting
 
 
-def _listed(own: Array, names: Sequence[str]) -> str:
-    told = [names[i] for i in np.flatnonzero(own).tolist()]
-    return ", ".join(told[:_NAMED]) + (f" and {len(told) - _NAMED} more" if len(told) > _NAMED else "")
+def _list_names(mask: Array, names: Sequence[str]) -> str:
+    members = [names[i] for i in np.flatnonzero(mask).tolist()]
+    return ", ".join(members[:_NAMED]) + (f" and {len(members) - _NAMED} more" if len(members) > _NAMED else "")
 
 
-def _told(groups: Sequence[CountGroup]) -> str:
+def _group_numbers(groups: Sequence[CountGroup]) -> str:
     return ", ".join(str(i + 1) for i in range(len(groups)))

@@ -68,10 +68,10 @@ def refined(
     for chosen in sets:
         sites = np.flatnonzero((chosen == 1) & free)
         start = position[owner[sites]]
-        homes = [_home(place, regions, ground) for place in start]
+        homes = [_nearest_region(place, regions, ground) for place in start]
         begin = np.array([home[1] for home in homes])
         parts = [home[0] for home in homes]
-        for places in _optima(candidates, sites, begin, parts, ground):
+        for places in _local_optima(candidates, sites, begin, parts, ground):
             reached = _value(candidates, sites, places)
             if reached < best[0]:
                 best = reached, places
@@ -80,7 +80,7 @@ def refined(
     return replace(found, refined=best[1], refined_value=task.scale(best[0]))
 
 
-def _optima(
+def _local_optima(
     candidates: Candidates, sites: Array, begin: Array, parts: Sequence[PlacementRegion], ground: PlacementGround | None
 ) -> list[Array]:
     """Return the start and, if the refinement ends inside the regions, the local optimum; each (k, d), metres."""
@@ -119,7 +119,7 @@ def _stations(candidates: Candidates) -> Array:
     return np.unique(np.concatenate([rows.a for rows in candidates.problem.rows]))
 
 
-def _home(
+def _nearest_region(
     place: Array, regions: Sequence[PlacementRegion], ground: PlacementGround | None
 ) -> tuple[PlacementRegion, Array]:
     """Return the nearest region of a position (d,), and the nearest position inside this region, metres."""
@@ -157,7 +157,7 @@ def _information(candidates: Candidates, sites: Array, symbols: Sequence[Any]) -
     totals = [ca.SX(ca.DM(matrix)) for matrix in base]
     t, a = ca.SX.sym("t", d), ca.SX.sym("a", d)
     slopes: dict[tuple[str, bytes, bytes], Any] = {}
-    for row in _numbers(candidates):
+    for row in _site_rows(candidates):
         at = np.flatnonzero(sites == row.site)
         if not len(at) or symbols[at[0]] is None:
             continue
@@ -190,7 +190,7 @@ class _Row:
         return MODELS[self.kind].h(Point(tuple(ca.vertsplit(t))), own, other)
 
 
-def _numbers(candidates: Candidates) -> list[_Row]:
+def _site_rows(candidates: Candidates) -> list[_Row]:
     """Return the rows of all sites, with whitening factors and derivatives by the unknowns other than the position."""
     from optloc.engine import linearise
 

@@ -228,10 +228,10 @@ def read_selection(path: Path) -> LoadedSelection:
     """
     source, folder = name_of(path), path.parent
     file = conform(SelectionFile, parse_toml(read_text(path), source), source)
-    candidates = table_of(_bare(file.candidates), folder, join(source, "[candidates]"))
+    candidates = table_of(_data_only(file.candidates), folder, join(source, "[candidates]"))
     tables = [(candidates, file.candidates)]
     if file.stations is not None:
-        tables.append((table_of(_bare(file.stations), folder, join(source, "[stations]")), file.stations))
+        tables.append((table_of(_data_only(file.stations), folder, join(source, "[stations]")), file.stations))
     names = [table.labels("name").tolist() for table, _ in tables]
     check_once([name for own in names for name in own], "station name {!r} is used twice", source)
     settings = _settings(file, tables, folder, source)
@@ -269,7 +269,7 @@ def read_selection(path: Path) -> LoadedSelection:
     return LoadedSelection(selection, source, file.title or source, settings, regions, ground)
 
 
-def _bare(section: StationsTable) -> DataTable:
+def _data_only(section: StationsTable) -> DataTable:
     return DataTable(file=section.file, rows=section.rows, columns=section.columns, separator=section.separator)
 
 

@@ -159,8 +159,8 @@ def candidates_of(selection: SiteSelection) -> Candidates:
     InvalidProblem
         If an argument, site or place is invalid; the message names it.
     """
-    selection = _checked(selection)
-    problem = _arrivals(selection.problem)
+    selection = _check_options(selection)
+    problem = _as_arrival_times(selection.problem)
     site, names = _sites(problem, selection)
     size, d = problem.layout.size, problem.dimension
     places = np.atleast_2d(np.asarray(selection.places, dtype=float))
@@ -176,11 +176,11 @@ def candidates_of(selection: SiteSelection) -> Candidates:
     design = Design(_rows(batch, vectors, site, len(names)), _prior(batch, vectors), weight, d)
     rules, limits, state = _rules(selection, names, site)
     candidates = Candidates(selection, batch, vectors, site, names, design, rules, limits, state)
-    _check_seen(candidates)
+    _check_determined(candidates)
     return candidates
 
 
-def _checked(selection: SiteSelection) -> SiteSelection:
+def _check_options(selection: SiteSelection) -> SiteSelection:
     if selection.criterion not in LETTER:
         what = f"there is no criterion {selection.criterion!r}"
         raise InvalidProblem(what, "criterion", nearest(str(selection.criterion), list(LETTER)))
@@ -193,7 +193,7 @@ def _checked(selection: SiteSelection) -> SiteSelection:
     return selection
 
 
-def _arrivals(problem: Problem) -> Problem:
+def _as_arrival_times(problem: Problem) -> Problem:
     """Return the problem with arrival times instead of range differences.
 
     The information of a difference depends on the other sites of a set; the information of arrival times adds up.
@@ -413,9 +413,9 @@ def _costs(selection: SiteSelection, n: int, site: Array) -> Array:
     return out
 
 
-def _check_seen(candidates: Candidates) -> None:
+def _check_determined(candidates: Candidates) -> None:
     """Raise if all sites together do not determine the position at a place: then no set of sites has a fix there."""
-    heard = (candidates.design.rows != 0.0).any(axis=(1, 2)) & (candidates.state != 0)
+    in_sight = (candidates.design.rows != 0.0).any(axis=(1, 2)) & (candidates.state != 0)
     rows = candidates.design.rows[..., candidates.state != 0]
     places, r, m, n = rows.shape
     flat = np.moveaxis(rows, -1, 1).reshape(places, n * r, m)
@@ -427,5 +427,5 @@ def _check_seen(candidates: Candidates) -> None:
         known = int((singular > 1.0).sum())
         if known < m:
             name = candidates.selection.names[p] if candidates.selection.names else str(p + 1)
-            what = f"place {name!r} is in sight of {int(heard[p].sum())} sites, which do not determine its position"
+            what = f"place {name!r} is in sight of {int(in_sight[p].sum())} sites, which do not determine its position"
             raise InvalidProblem(what, "places", "add candidates in sight of this place, or remove it")
