@@ -75,11 +75,13 @@ def place(
 
 
 def _commands(app: typer.Typer) -> None:
+    """Add the commands of this package to the command line."""
     app.command(rich_help_panel=ANSWERS, epilog=_PLACE)(place)
     app.command(rich_help_panel=ANSWERS, epilog=example(*NETWORKS))(calibrate)
 
 
 def _kernels() -> Mapping[str, KernelPart]:
+    """Return the compiled functions of this package, with an example that calls them."""
     entries = (
         *(f"optloc.sites.placement.branching.{name}" for name in ("propagate", "expand", "score", "settle")),
         "optloc.sites.placement.completions.exhaust",
@@ -88,6 +90,7 @@ def _kernels() -> Mapping[str, KernelPart]:
 
 
 def _place() -> None:
+    """Run a small placement, which calls all compiled functions."""
     from optloc.cli import TARGET, problem_of
     from optloc.sites.placement import SiteSelection, place as chosen
 

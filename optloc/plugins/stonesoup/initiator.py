@@ -178,6 +178,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         return fix if is_flat(fix.covariance(), fix.position, chain.detections[-1]) else None
 
     def _track(self, chain: DetectionChain, fix: Fix) -> Track:
+        """Return a new track with the fix of a chain as its first state."""
         detection = chain.detections[-1]
         model = detection.measurement_model
         place = [*model.mapping, *self._rates(model)]
@@ -198,6 +199,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         return Track([update])
 
     def _rates(self, model: StationMeasurement) -> Sequence[int]:
+        """Return the state indices of the velocity; empty for targets at rest."""
         if not self.order:
             return []
         own = getattr(model, "velocity_mapping", None) if self.velocity_mapping is None else self.velocity_mapping

@@ -132,6 +132,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         return self._build_problem(Motion())
 
     def _build_problem(self, motion: Motion) -> Problem:
+        """Return the optloc problem of one measurement for a motion, with all values zero."""
         rates = None if self.rates is None else self.rates[None]
         covariance = np.asarray(self.noise_covar, dtype=float)
         return problem_of(self.sites[None], [self.rows], [covariance], velocity=rates, motions=(motion,))
@@ -448,6 +449,7 @@ class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
             yield time, {self._join(group) for group in groups.values()}
 
     def _join(self, group: list[Detection]) -> Detection:
+        """Return one vector detection from the pair detections of one target."""
         group = sorted(group, key=lambda detection: np.atleast_2d(detection.measurement_model.pairs).tolist())
         models = [detection.measurement_model for detection in group]
         first = models[0]

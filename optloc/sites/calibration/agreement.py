@@ -57,6 +57,7 @@ class NetworkSearchResult:
 
 
 def _key(cost: float) -> float:
+    """Return a rounded cost as key of `onward`: minima with equal keys are the same."""
     return round(float(cost), 4)
 
 
@@ -87,6 +88,7 @@ def search(
 
 
 def _merge(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> NetworkSearchResult:
+    """Add the minima of a round to the search result, and return the result; `made` is the number of starts."""
     if found is not None:
         ends = joined([found.ends, ends])
     i = int(ends.cost.argmin())
@@ -188,6 +190,7 @@ def _apply_joint_moves(
 
 
 def _fits(net: Network, cost: float) -> bool:
+    """Return whether the cost of a network passes the chi-square test."""
     dof = np.array(net.rows - net.unknowns + frame_size(net))
     return not float(tail_probability(np.array(cost), dof)) < REFUTED
 

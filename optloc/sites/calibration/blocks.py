@@ -95,6 +95,7 @@ def blocks(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
 
 
 def _inexact_stations(net: Network) -> list[int]:
+    """Return the numbers of the stations that are not known exactly."""
     return [i for i in range(net.stations) if (net.place_sigma[i] > 0.0).any()]
 
 
@@ -312,6 +313,7 @@ def moved_pulses(lik: Likelihood, at: NetworkEstimate, which: Array, places: Arr
 
 
 def _moved_station(lik: Likelihood, at: NetworkEstimate, i: int, place: Array) -> NetworkEstimate:
+    """Return an estimate with station i at another position (d,), and with the clock that fits there."""
     stations, clocks, net = at.stations.copy(), at.clocks.copy(), lik.network
     stations[0, i] = np.where(np.isfinite(place), place, stations[0, i])
     there = replace(at, stations=stations)

@@ -37,7 +37,7 @@ _CORE = 60
 # Method for the other pulses; their proof follows with the proofs of all pulses.
 _QUICK = "gtrs+lsr"
 # Largest share of pulses with two possible positions. With more of them, the choice of their sides has many
-# combinations, and the cheapest one can pretend a wrong shape of the stations. At 3 cm noise, flat stations appear
+# combinations, and the cheapest one can give a wrong shape of the stations. At 3 cm noise, flat stations appear
 # 0.1 to 0.3 m thick.
 _TWOFOLD = 0.5
 # Difference of distances, as a share of the size, from which two networks are different.
@@ -298,6 +298,7 @@ def _add_other_pulses(network: Network, at: NetworkEstimate, core: Array, rest: 
 
 
 def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, named: tuple[int, ...]) -> Calibration:
+    """Return the calibration: block proofs, frame, covariance, alternatives, findings and status."""
     net = lik.network
     soft = bool(np.isfinite(net.place_sigma).any())
     at, checked, others = proven(lik, at)
@@ -343,6 +344,7 @@ def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, nam
 
 
 def _open_words(net: Network, rank: GaugeRank) -> str:
+    """Return a sentence about open motions, with the stations that move most."""
     m, d = net.stations, net.dimension
     share = np.sqrt((rank.open[: m * d] ** 2).sum(axis=1).reshape(m, d).sum(axis=1))
     if not net.synchronised:
@@ -542,6 +544,7 @@ def _shape(at: NetworkEstimate, soft: bool) -> Array:
 
 
 def _station_indices(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the numbers of the `gauge` stations, or raise if these cannot define the frame."""
     if not gauge:
         return ()
     if np.isfinite(network.place_sigma).any():
@@ -563,6 +566,7 @@ def _placeable(network: Network) -> Array:
 
 
 def _failure(network: Network, status: Status, words: str) -> Calibration:
+    """Return a calibration without estimates, with a status and its sentence."""
     m, n, d = network.stations, network.pulses, network.dimension
     p = m * d + (0 if network.synchronised else m)
     nan = np.full

@@ -127,6 +127,7 @@ def over(one: NetworkEstimate, at: NetworkEstimate) -> NetworkEstimate:
 
 
 def _span(columns: Array) -> Array:
+    """Return an orthonormal basis of the space of the columns."""
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(u[:, s > _ZERO * max(float(np.max(s, initial=0.0)), 1e-300)])
 

@@ -130,6 +130,7 @@ class Likelihood:
         return made, x
 
     def _estimate(self, problem: Problem, x: Array, at: NetworkEstimate) -> NetworkEstimate:
+        """Return the estimates at parameter vectors x (S, size), linearised about `at`."""
         net, local = self.network, problem.layout.split(x)[1]
         moved = problem.stations.position[:, 0] + x[:, _columns(problem, "stations")].reshape(at.stations.shape)
         stations = np.where(net.place_sigma > 0.0, moved, net.place)
@@ -214,6 +215,7 @@ def likelihood(net: Network) -> Likelihood:
 
 
 def _loose(net: Network) -> float:
+    """Return the wide prior standard deviation of free coordinates and clocks, metres."""
     return _LOOSE * float(min(net.sigma.min(), *net.distance_sigma, np.inf))
 
 
@@ -250,5 +252,6 @@ def _clocks(net: Network, r: Array) -> Bias:
 
 
 def _columns(problem: Problem, name: str) -> Array:
+    """Return the indices of an unknown in the shared parameter vector."""
     slot, _ = problem.layout.find(name)
     return np.arange(slot.start, slot.start + slot.size)

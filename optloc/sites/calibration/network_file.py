@@ -166,6 +166,7 @@ def _places(section: NetworkStations, table: Table, where: str) -> tuple[Array, 
 
 
 def _optional(table: Table, key: str) -> Array:
+    """Return a column as numbers, NaN where a cell or the column is missing."""
     return table.numbers(key, optional=True) if table.has(key) else np.full(table.count, np.nan)
 
 

@@ -100,6 +100,7 @@ def _view(
     known: Array,
     others: Sequence[Array],
 ) -> None:
+    """Draw the network in the plane of two coordinates."""
     i, k = view
     d = stations.shape[1]
     axes.plot(pulses[:, i], pulses[:, k], ".", color=GREY, markersize=4, label="pulses")

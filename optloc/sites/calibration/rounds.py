@@ -98,6 +98,7 @@ def arrivals(network: Network) -> tuple[Array, Array, Array]:
 
 
 def _of_stations(ends: Array, values: Array, weight: Array, m: int) -> tuple[Array, Array]:
+    """Return the mean value (m,) of each station's rows, and its inverse standard deviation (m,)."""
     total, sums = np.zeros(m), np.zeros(m)
     np.add.at(total, ends[:, 0], weight)
     np.add.at(sums, ends[:, 0], weight * values)
@@ -202,6 +203,7 @@ class Starts:
 
 
 def _no_estimates(net: Network) -> NetworkEstimate:
+    """Return an empty set of estimates (S = 0)."""
     m, n, d = net.stations, net.pulses, net.dimension
     return NetworkEstimate(np.zeros((0, m, d)), np.zeros((0, m)), np.zeros((0, n, d)), np.zeros((0, n)))
 
@@ -303,6 +305,7 @@ def _align(points: Array, place: Array, weight: Array, rng: np.random.Generator)
 
 
 def _generator(i: int, k: int, d: int) -> Array:
+    """Return the skew-symmetric matrix (d, d) of a rotation in the plane of axes i and k."""
     out = np.zeros((d, d))
     out[i, k], out[k, i] = 1.0, -1.0
     return out

@@ -59,6 +59,7 @@ def _run(
     as_json: bool,
     quiet: bool,
 ) -> int:
+    """Calibrate, write the outputs and return the exit code: 0 for status ok, otherwise 1."""
     from optloc.cli import Screen, claim_outputs, dumps, line, say, write_picture, write_text
     from optloc.problem import Status
     from optloc.sites.calibration import calibrate as find
@@ -86,6 +87,7 @@ def _run(
 
 
 def _show(found: Calibration) -> None:
+    """Print status, findings, the table of stations and the alternatives."""
     from rich.table import Table
 
     from optloc.cli import Screen, say
@@ -116,6 +118,7 @@ def _show(found: Calibration) -> None:
 
 
 def _record(found: Calibration, file: Path) -> dict[str, Any]:
+    """Return the result as a dictionary for JSON output."""
     net = found.network
     return {
         "file": str(file),
@@ -143,6 +146,7 @@ def _record(found: Calibration, file: Path) -> dict[str, Any]:
 
 
 def _picture(found: Calibration, title: str) -> Any:
+    """Return the figure of the network."""
     from optloc.sites.calibration.network_map import plot_network
 
     net = found.network

@@ -133,11 +133,13 @@ def _with(selection: SiteSelection, wanted: PlaceOptions) -> SiteSelection:
 
 
 def _names_of(selection: SiteSelection) -> tuple[str, ...]:
+    """Return the names of the places; P1, P2 and so on if they have none."""
     count = len(np.atleast_2d(selection.places))
     return selection.names or tuple(f"P{i + 1}" for i in range(count))
 
 
 def _record(loaded: LoadedSelection, selection: SiteSelection, found: Placement) -> dict[str, Any]:
+    """Return the result as a dictionary for JSON output."""
     drawn = found.draws
     return {
         "file": loaded.source,
@@ -191,6 +193,7 @@ def _record(loaded: LoadedSelection, selection: SiteSelection, found: Placement)
 
 
 def _show(loaded: LoadedSelection, selection: SiteSelection, found: Placement) -> None:
+    """Print the chosen sites, both tables and the remarks."""
     console = Screen()
     sure = "" if found.closed else " (not closed)"
     say(console, f"{loaded.title}: take {', '.join(found.chosen) or 'nothing'}.")
@@ -204,6 +207,7 @@ def _show(loaded: LoadedSelection, selection: SiteSelection, found: Placement) -
 
 
 def _places_table(selection: SiteSelection, found: Placement) -> Table:
+    """Return the table of the bounds at the places, largest bound first."""
     before = "kept stations" if set(found.before_sites) == set(found.kept) else "random set"
     table = Table(title="Bound of the position error, m", title_justify="left")
     for heading in ("place", f"before ({before})", "after", "one failed", "spare rows"):
@@ -219,6 +223,7 @@ def _places_table(selection: SiteSelection, found: Placement) -> Table:
 
 
 def _losses_table(found: Placement) -> Table:
+    """Return the table of the bounds after the loss of each station."""
     table = Table(title="Bound after the loss of a station, m", title_justify="left")
     for heading in ("station", "without it", "best replacement", "with replacement"):
         table.add_column(heading, justify="left" if heading in ("station", "best replacement") else "right")
@@ -229,6 +234,7 @@ def _losses_table(found: Placement) -> Table:
 
 
 def _remarks(selection: SiteSelection, found: Placement) -> list[str]:
+    """Return sentences about weak places, the next station, simulated fixes and the refinement."""
     names, out = _names_of(selection), []
     weak = [names[i] for i in np.flatnonzero(found.share_of_prior > PRIOR)]
     if weak:

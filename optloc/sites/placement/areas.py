@@ -123,6 +123,7 @@ def convex_parts(ring: Array) -> list[Array]:
     points = ring if area > 0.0 else ring[::-1]
 
     def turn(a: Array, b: Array, c: Array) -> float:
+        """Return twice the signed area of a triangle, m^2: positive for a left turn at b."""
         return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
 
     count = len(points)

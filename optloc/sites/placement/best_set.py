@@ -162,24 +162,29 @@ class _SearchState:
 
     @property
     def value(self) -> float:
+        """Return the best value so far, infinite before the first set."""
         return min((value for value, _ in self.seen.values()), default=np.inf)
 
     def add(self, value: float, chosen: Array) -> None:
+        """Store a set (n,) and its value; drop the worst sets if there are many."""
         self.seen[chosen.astype(np.int8).tobytes()] = (value, chosen)
         if len(self.seen) > 4 * self.keep:  # the worst of many go
             best = sorted(self.seen.items(), key=lambda item: item[1][0])[: self.keep]
             self.seen = dict(best)
 
     def push(self, bound: float, state: Array, w: Array) -> None:
+        """Add an open node with its bound, states (n,) and weights (n,)."""
         self.count += 1  # a counter breaks ties: arrays have no order
         heappush(self.heap, (bound, self.count, state, w))
 
     @property
     def enough(self) -> float:
+        """Return the bound at which the search can stop."""
         return self.task.enough(self.value, self.gap) if self.seen else np.inf
 
     @property
     def bound(self) -> float:
+        """Return the proven lower bound of all sets."""
         return min(self.heap[0][0] if self.heap else np.inf, self.enough)
 
 

@@ -251,6 +251,7 @@ def _ban_sets(task: SearchTask, banned: Sequence[Array]) -> SearchTask:
 def _placement(
     candidates: Candidates, task: SearchTask, found: BestSetResult, checked: Draws | None, banned: Sequence[Array]
 ) -> Placement:
+    """Return the result of a search with its accuracy at each place, losses and next sites."""
     selection, names = candidates.selection, candidates.names
     value, chosen = found.best[0]
     bound, reached = task.scale(found.bound), task.scale(value)
@@ -288,12 +289,14 @@ def _placement(
 
 
 def _course(task: SearchTask, course: Array) -> Array:
+    """Return the recorded points (q, 3) with bound and value as variances, m^2."""
     out = course.copy()
     out[:, 1:] = [[task.scale(v) for v in row] for row in course[:, 1:]]
     return out
 
 
 def _select_names(names: Sequence[str], mask: Array) -> tuple[str, ...]:
+    """Return the names at the true entries of a mask (n,)."""
     return tuple(names[i] for i in np.flatnonzero(mask).tolist())
 
 
@@ -319,6 +322,7 @@ def _failed(candidates: Candidates, chosen: Array) -> Array:
 
 
 def _before(candidates: Candidates, task: SearchTask) -> tuple[Array, tuple[str, ...]]:
+    """Return the bounds (P,) before the choice, metres, and the sites that give them: kept sites or a random set."""
     kept = (candidates.state == 1).astype(np.int64)
     if kept.any():
         per_place, share = _per_place(candidates, kept)
@@ -336,6 +340,7 @@ def _redundancy(candidates: Candidates, chosen: Array) -> Array:
 
 
 def _swaps(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[Swap]:
+    """Yield the effect of the loss of each taken site, with the best replacement; largest loss first."""
     found = []
     for i in np.flatnonzero(chosen).tolist():
         without = chosen.copy()
@@ -354,6 +359,7 @@ def _swaps(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[Sw
 
 
 def _following(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[tuple[str, float]]:
+    """Yield each site that can be added, with the criterion after the addition, m^2; best first."""
     others = np.flatnonzero((chosen == 0) & (task.state != 0)).tolist()
     if not others:
         return
@@ -389,6 +395,7 @@ def drawn(candidates: Candidates, chosen: Array, count: int, seed: int = 0) -> D
 
 
 def _flat(candidates: Candidates, chosen: Array, bounds: Array) -> Array:
+    """Return the smallest singular value of the centred stations in sight, divided by the bound at each place (P,)."""
     stations = candidates.problem.stations.position.reshape(-1, candidates.design.dimension)
     weight = candidates.assembled(chosen).weight
     out = np.empty(len(bounds))

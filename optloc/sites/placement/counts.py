@@ -103,9 +103,11 @@ def _limiting_groups(groups: Sequence[CountGroup], members: Array, state: Array,
 
 
 def _list_names(mask: Array, names: Sequence[str]) -> str:
+    """Return the names at the true entries of a mask (n,) as text; at most `_NAMED` names."""
     members = [names[i] for i in np.flatnonzero(mask).tolist()]
     return ", ".join(members[:_NAMED]) + (f" and {len(members) - _NAMED} more" if len(members) > _NAMED else "")
 
 
 def _group_numbers(groups: Sequence[CountGroup]) -> str:
+    """Return the numbers of all groups as text."""
     return ", ".join(str(i + 1) for i in range(len(groups)))

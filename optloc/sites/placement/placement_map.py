@@ -80,6 +80,7 @@ def plot_placement(
 
 
 def _mark(axes: Axes, found: BoundMap, chosen: Array, places: Array, weights: Array, scale: float) -> None:
+    """Draw places, candidates and taken stations into a map."""
     stations = found.stations * scale
     size = 30.0 + 50.0 * weights / weights.max()
     axes.scatter(
@@ -122,6 +123,7 @@ def _mark(axes: Axes, found: BoundMap, chosen: Array, places: Array, weights: Ar
 
 
 def _course(axes: Axes, course: Array) -> None:
+    """Draw bound and value over time."""
     seconds, bound, value = course.T
     seconds = seconds - seconds[0]
     axes.step(seconds, value, where="post", color=BLACK, linewidth=1.4, label="best set")

@@ -107,6 +107,7 @@ def _local_optima(
 
 
 def _check(candidates: Candidates) -> None:
+    """Raise if the rows of the candidates do not allow a refinement."""
     kinds = {rows.kind for rows in candidates.problem.rows}
     odd = [kind for kind in kinds if MODELS[kind].velocity or MODELS[kind].ecef]
     if odd or candidates.selection.by == "row" or any(len(b.row[0]) > 1 for b in candidates.problem.noise.blocks):
@@ -128,6 +129,7 @@ def _nearest_region(
 
 
 def _inside(place: Array, region: PlacementRegion, ground: PlacementGround | None) -> bool:
+    """Return whether a position (d,) is inside a region, up to rounding."""
     return bool((region.excess(place, ground) <= _EDGE).all())
 
 

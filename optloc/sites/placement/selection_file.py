@@ -270,6 +270,7 @@ def read_selection(path: Path) -> LoadedSelection:
 
 
 def _data_only(section: StationsTable) -> DataTable:
+    """Return a station section with only the keys for the source of its rows."""
     return DataTable(file=section.file, rows=section.rows, columns=section.columns, separator=section.separator)
 
 
@@ -310,11 +311,13 @@ def _settings(
 
 
 def _without_sigma(table: Table) -> Table:
+    """Return the table without its column sigma, which describes measurements here, not positions."""
     columns = {name: column for name, column in table.columns.items() if name != table.name("sigma")}
     return replace(table, columns=columns)
 
 
 def _own_sigma(table: Table) -> tuple[Sequence[str], Sequence[float]]:
+    """Return names and sigmas of the candidates; empty without a column sigma."""
     if not table.has("sigma"):
         return (), ()
     return table.labels("name").tolist(), table.numbers("sigma").tolist()
@@ -354,6 +357,7 @@ def _column(candidates: Table, key: str, problem: Problem) -> Array:
 
 
 def _group(table: GroupTable, candidates: Table, where: str) -> CountGroup:
+    """Return the rule of a group table, with the names of its members."""
     if (table.group is None) == (table.members is None):
         raise InvalidProblem("a group needs either the key group or the key members", where, "give one of the two")
     if table.most is None and table.least is None:
@@ -472,6 +476,7 @@ def _sight(
 def _regions(
     section: RefineTable | None, frame: Frame, dimension: int, folder: Path, source: str
 ) -> tuple[tuple[PlacementRegion, ...], PlacementGround | None]:
+    """Return the convex regions of the refinement, and its terrain."""
     if section is None:
         return (), None
     where = join(source, "[refine]")

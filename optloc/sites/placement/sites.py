@@ -181,6 +181,7 @@ def candidates_of(selection: SiteSelection) -> Candidates:
 
 
 def _check_options(selection: SiteSelection) -> SiteSelection:
+    """Return the selection unchanged, or raise if an option is invalid."""
     if selection.criterion not in LETTER:
         what = f"there is no criterion {selection.criterion!r}"
         raise InvalidProblem(what, "criterion", nearest(str(selection.criterion), list(LETTER)))
@@ -241,6 +242,7 @@ def _sites(problem: Problem, selection: SiteSelection) -> tuple[Array, tuple[str
 
 
 def _check_apart(problem: Problem, site: Array, names: Sequence[str], places: Array) -> None:
+    """Raise if a place is at a station, or if two stations have the same position."""
     stations = problem.stations.position.reshape(-1, problem.dimension)
     apart = np.linalg.norm(places[:, None] - stations[None], axis=-1)
     p, s = np.unravel_index(int(apart.argmin()), apart.shape)
@@ -257,6 +259,7 @@ def _check_apart(problem: Problem, site: Array, names: Sequence[str], places: Ar
 
 
 def _weight(selection: SiteSelection, count: int) -> Array:
+    """Return the weights (P,) of the places, sum 1."""
     weight = np.ones(count) if selection.weights is None else np.asarray(selection.weights, dtype=float)
     if weight.shape != (count,) or not (weight > 0.0).all() or not np.isfinite(weight).all():
         what = f"the weights are not {count} positive numbers, one for each place"
@@ -353,6 +356,7 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
     n, place = len(names), {name: i for i, name in enumerate(names)}
 
     def where(wanted: Sequence[str], argument: str) -> Array:
+        """Return the indices of sites by name, or raise for an unknown name."""
         for name in wanted:
             if name not in place:
                 raise InvalidProblem(f"there is no site {name!r}", argument, nearest(name, list(names)))
@@ -398,6 +402,7 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
 
 
 def _costs(selection: SiteSelection, n: int, site: Array) -> Array:
+    """Return the cost (n,) of each site."""
     stations = np.concatenate([rows.a for rows in selection.problem.rows])
     cost = None if selection.cost is None else np.asarray(selection.cost, dtype=float)
     if cost is None or cost.shape != (selection.problem.stations.count,) or not (cost >= 0.0).all():
