@@ -58,7 +58,7 @@ def register_yaml(yaml: Any) -> None:
     # class moves to another module.
     def construct(constructor: Any, suffix: str, node: Any) -> Any:
         constructor.deep_construct = True
-        (properties,) = constructor.construct_yaml_omap(node)  # a generator that must be exhausted
+        (properties,) = constructor.construct_yaml_omap(node)  # the generator must run to its end
         return classes[suffix.rpartition(".")[2]](**properties)
 
     yaml.constructor.add_multi_constructor("!optloc.plugins.stonesoup.", construct)

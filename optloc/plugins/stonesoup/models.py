@@ -229,7 +229,7 @@ class GROA(StationMeasurement):
 
 
 class AOATDOA(StationMeasurement):
-    """Azimuths, in space then elevations, of some stations; then range differences r_a - r_b of pairs, metres."""
+    """Azimuths of some stations (with three coordinates, then elevations); then range differences of pairs, metres."""
 
     angles: np.ndarray = Property(doc="Stations (q,) that measure angles.")
     pairs: np.ndarray = Property(doc="Stations a and b (m, 2) of each range difference.")
@@ -292,7 +292,7 @@ class RateMeasurement(StationMeasurement, ABC):
 
 
 class RangeRate(RateMeasurement):
-    """Range rates of single stations, m/s: a Doppler shift f is the rate -c f / carrier."""
+    """Range rates of single stations, m/s. A Doppler shift f corresponds to the range rate -c f / carrier."""
 
     receivers: np.ndarray = Property(doc="Station (m,) of each row.")
 

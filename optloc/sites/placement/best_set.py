@@ -168,13 +168,13 @@ class _SearchState:
     def add(self, value: float, chosen: Array) -> None:
         """Store a set (n,) and its value; drop the worst sets if there are many."""
         self.seen[chosen.astype(np.int8).tobytes()] = (value, chosen)
-        if len(self.seen) > 4 * self.keep:  # the worst of many go
+        if len(self.seen) > 4 * self.keep:  # limit the memory: keep the best sets
             best = sorted(self.seen.items(), key=lambda item: item[1][0])[: self.keep]
             self.seen = dict(best)
 
     def push(self, bound: float, state: Array, w: Array) -> None:
         """Add an open node with its bound, states (n,) and weights (n,)."""
-        self.count += 1  # a counter breaks ties: arrays have no order
+        self.count += 1  # equal bounds: arrays cannot be compared, counters can
         heappush(self.heap, (bound, self.count, state, w))
 
     @property
@@ -216,7 +216,7 @@ def search(
     """
     _load()
     begun = monotonic()
-    rows = np.ascontiguousarray(task.design.rows)  # one type of array: machine code is made for each
+    rows = np.ascontiguousarray(task.design.rows)  # each array layout would be compiled separately
     task = replace(task, design=replace(task.design, rows=rows))
     made, state = _SearchState(task, task.asked(), gap, max(1, keep), {}, []), np.array(task.state, dtype=np.int64)
     if not propagate(task.rules, task.limits, state):
@@ -239,7 +239,7 @@ def search(
     closed = not made.heap or made.heap[0][0] >= made.enough
     course.append((monotonic() - begun, made.bound, made.value))
     first = min(made.seen.values(), key=itemgetter(0))[1]
-    for removed in np.flatnonzero((first == 1) & (task.state == FREE)).tolist():  # sets that are nearly as good
+    for removed in np.flatnonzero((first == 1) & (task.state == FREE)).tolist():  # good alternatives
         value, chosen = _exchange(task, made.asked, first, removed, np.inf)
         if chosen.any():
             made.add(value, chosen)
