@@ -44,7 +44,7 @@ _NOT_ONE_PLACE = (Status.CONTRADICTORY, Status.MISFIT, Status.UNBOUNDED, Status.
 _TYPES = {"azimuth": Bearing, "elevation": Elevation}
 
 Row = tuple[str, int, int]
-"""Kind, first and second station of a row; -1 if the kind has no such station."""
+"""Kind, first and second station of a row; -1 for a kind with one station."""
 
 
 def arrival_covariance(pairs: Any, sigma: Any, stations: int) -> Array:
@@ -332,7 +332,7 @@ class AnyRows(RateMeasurement):
     metres per second.
     """
 
-    table: Sequence[Row] = Property(doc="Kind, first and second station of each row; -1 if a kind has no such station.")
+    table: Sequence[Row] = Property(doc="Kind, first and second station of each row; -1 for a kind with one station.")
 
     @property
     def rows(self) -> Sequence[Row]:

@@ -1,6 +1,6 @@
 """Fixes of a single station or pulse of a network while all others are fixed, with the proof of an ordinary fix.
 
-A block is one station or one pulse.
+A block is one station or one pulse. Its partners are the stations and pulses that share rows with it.
 """
 
 from __future__ import annotations
@@ -235,7 +235,7 @@ def _shared(values: Array) -> Array:
 
 
 def _station_rows(net: Network, at: NetworkEstimate) -> tuple[Array, list[tuple[str, Array, Array, Array]]]:
-    """Return positions of pulses and stations, and the stations' rows: kind, far end, sigmas and values (M, q)."""
+    """Return positions of pulses and stations, and the stations' rows: kind, partners, sigmas, values (M, q)."""
     timed, ranged = _ranges(net, at)
     near = np.full((net.stations, net.stations), np.inf), np.zeros((net.stations, net.stations))
     for (i, k), distance, sigma in zip(net.between, net.distance, net.distance_sigma, strict=True):

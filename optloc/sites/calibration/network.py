@@ -1,4 +1,8 @@
-"""A network of stations, clocks and emitters that are unknown together: measurements and prior knowledge."""
+"""A network of stations, clocks and emitters that are unknown together: measurements and prior knowledge.
+
+A pulse is one emission at an unknown position and, except for two-way ranges, at an unknown time. A slot is the
+kind and the stations of one measurement; each pulse has at most one value for each slot.
+"""
 
 from __future__ import annotations
 

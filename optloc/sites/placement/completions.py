@@ -212,7 +212,9 @@ def with_loss(asked: CompletionRequest, members: Array, size: int, enough: float
 
 @compiled
 def trace_with(products: Array, inverse: Array, d: int, begin: int, along: Array, trace: Array) -> None:
-    """Write tr C (M + g g')^-1 C' = tr C M^-1 C' - |C M^-1 g|^2 / (1 + g'M^-1 g) for each row g from index `begin`.
+    """Write the trace of the position covariance (q,) after the addition of each row g from index `begin`.
+
+    tr C (M + g g')^-1 C' = tr C M^-1 C' - |C M^-1 g|^2 / (1 + g'M^-1 g)
 
     Both quadratic forms are linear in the `products` of the rows, (m (m + 1) / 2, q).
     """

@@ -188,7 +188,10 @@ def slope(rows: Array, inverse: Array, weight: Array, u: Array, v: Array, gradie
 def bend(
     rows: Array, u: Array, v: Array, factor: float, extra: float, hessian: Array, near: Array, along: Array
 ) -> None:
-    """Add factor * (2 (g_i'M^-1 g_j)(c_i'W c_j) + extra (c_i'W c_j)^2) to the lower triangle of a Hessian (n, n)."""
+    """Add the second derivatives of tr(W Cov) by the weights to the lower triangle of a Hessian (n, n).
+
+    The entry is factor * (2 (g_i'M^-1 g_j)(c_i'W c_j) + extra (c_i'W c_j)^2); for log det Cov, `extra` is -1.
+    """
     r, m, n = rows.shape
     d = v.shape[1]
     for q in range(r):
