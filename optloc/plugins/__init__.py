@@ -1,1 +1,1 @@
-"""Plug-ins for other programs; each is imported by the program that it is for."""
+"""Plug-ins for other programs. The other program imports its plug-in."""

@@ -1,4 +1,4 @@
-"""Where stations stand: networks of unknown places, and the choice of sites."""
+"""Positions of stations: choice of sites (placement) and self-calibration of networks (calibration)."""
 
 from typing import TYPE_CHECKING
 

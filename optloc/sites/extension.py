@@ -1,4 +1,4 @@
-"""Commands and kernels of sites: `optloc place` and `optloc calibrate`."""
+"""Command line and kernel list of this package: `optloc place` and `optloc calibrate`."""
 
 from __future__ import annotations
 
@@ -41,14 +41,20 @@ def place(
     choose: Choose = None,
     budget_: Costs = None,
     criterion: Criterion = None,
-    worst: Annotated[bool | None, typer.Option("--worst/--mean", help="The worst place counts, or the mean.")] = None,
+    worst: Annotated[
+        bool | None, typer.Option("--worst/--mean", help="Use the worst place, or the mean of all places.")
+    ] = None,
     fail_one: FailOne = None,
-    gap: Annotated[float | None, typer.Option(metavar="SHARE", help="Stop when the bound is as close.")] = None,
-    time: Annotated[float | None, typer.Option(metavar="SECONDS", help="Stop after so long.")] = None,
+    gap: Annotated[
+        float | None, typer.Option(metavar="SHARE", help="Stop at this relative gap between value and bound.")
+    ] = None,
+    time: Annotated[float | None, typer.Option(metavar="SECONDS", help="Time limit of the search.")] = None,
     at: PlaceOfInterest = None,
-    rows: Annotated[bool, typer.Option("--rows", help="Choose single measurements, not stations.")] = False,
+    rows: Annotated[bool, typer.Option("--rows", help="Choose single measurements instead of stations.")] = False,
     draws: AmbiguityDraws = 20,
-    out: Annotated[Path | None, typer.Option(metavar="OUT.toml", help="Write the chosen stations.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="OUT.toml", help="Write a problem file with the chosen stations.")
+    ] = None,
     plot: PlacementMap = None,
     as_json: Json = False,
     outside: Outside = False,
@@ -57,9 +63,10 @@ def place(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Choose where stations go: which of many sites give the best fixes, with a bound of what any choice can reach.
+    """Choose the best station sites from a list of candidates, with a proven bound for any other choice.
 
-    FILE is a selection file (choice, candidates, targets), or a problem file, whose stations are the candidates.
+    FILE is a selection file (choice, candidates, targets), or a problem file. The stations of a problem file are
+    the candidates.
     """
     from optloc.sites.commands.place import PlaceOptions, run_place
 
@@ -68,11 +75,13 @@ def place(
 
 
 def _commands(app: typer.Typer) -> None:
+    """Add the commands of this package to the command line."""
     app.command(rich_help_panel=ANSWERS, epilog=_PLACE)(place)
     app.command(rich_help_panel=ANSWERS, epilog=example(*NETWORKS))(calibrate)
 
 
 def _kernels() -> Mapping[str, KernelPart]:
+    """Return the compiled functions of this package, with an example that calls them."""
     entries = (
         *(f"optloc.sites.placement.branching.{name}" for name in ("propagate", "expand", "score", "settle")),
         "optloc.sites.placement.completions.exhaust",
@@ -81,10 +90,11 @@ def _kernels() -> Mapping[str, KernelPart]:
 
 
 def _place() -> None:
+    """Run a small placement, which calls all compiled functions."""
     from optloc.cli import TARGET, problem_of
     from optloc.sites.placement import SiteSelection, place as chosen
 
-    # the criteria differ by numbers, not by types
+    # one criterion is enough: the criteria differ in argument values, not in types
     chosen(SiteSelection(problem_of("toa"), TARGET[None], choose=4, gap=0.5))
 
 

@@ -1,7 +1,7 @@
-"""Plug-in for Stone Soup: measurement models, an initiator that needs no guess, and a feeder of pairwise differences.
+"""Plug-in for Stone Soup: measurement models, an initiator without a first guess, and a feeder for pairs.
 
-Once optloc is installed, Stone Soup also offers it as ``stonesoup.plugins.optloc``, and its YAML reads and writes all
-classes.
+After the installation of optloc, the plug-in is also available as ``stonesoup.plugins.optloc``. Stone Soup
+can read and write all its classes as YAML.
 """
 
 from __future__ import annotations
@@ -42,21 +42,23 @@ __all__ = [
 
 
 def register_yaml(yaml: Any) -> None:
-    """Teach a ``ruamel.yaml.YAML`` of Stone Soup the classes of this plug-in.
+    """Register the classes of this plug-in with a ``ruamel.yaml.YAML`` of Stone Soup.
 
     Parameters
     ----------
     yaml : ruamel.yaml.YAML
-        Given by Stone Soup, which finds this function by the entry point ``stonesoup.serialise.yaml``.
+        The argument comes from Stone Soup, which finds this function by the entry point
+        ``stonesoup.serialise.yaml``.
     """
     classes = {
         cls.__name__: cls for cls in (TDOA, GROA, AOATDOA, RangeRate, FDOA, TDOAFDOA, AnyRows, FixInitiator, PairFeeder)
     }
 
-    # Stone Soup writes the module of a class into its tag; the class alone is read, so files outlive moves.
+    # The tag of a class in a file contains its module. Read only the class name, so that old files work after a
+    # class moves to another module.
     def construct(constructor: Any, suffix: str, node: Any) -> Any:
         constructor.deep_construct = True
-        (properties,) = constructor.construct_yaml_omap(node)  # a generator that must be exhausted
+        (properties,) = constructor.construct_yaml_omap(node)  # the generator must run to its end
         return classes[suffix.rpartition(".")[2]](**properties)
 
     yaml.constructor.add_multi_constructor("!optloc.plugins.stonesoup.", construct)

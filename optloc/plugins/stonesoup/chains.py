@@ -1,7 +1,7 @@
-"""Chains: detections of several scans that may be of one target, fitted many at a time, within a bound of work.
+"""Chains of detections of several scans that may come from one target, fitted in batches within a limit of work.
 
-A scan's own fix says where its target is, and two of them how fast it goes: with such starts a chain takes one descent,
-where a search without them takes as long as hundreds.
+The fix of one scan gives a position, and the fixes of two scans give a velocity. A chain with these start
+values needs one descent. A search without start values takes as long as hundreds of descents.
 """
 
 from __future__ import annotations
@@ -20,36 +20,40 @@ from optloc.plugins.stonesoup.models import problem_of, rows_by_kind, values_of
 from optloc.problem import Array, Fix, Motion, Prior, Problem, Status, tail_probability
 from optloc.solvers import prepare, solve
 
-# A fix is trusted as a Gaussian where no other minimum costs less than this more: five standard deviations.
+# Smallest cost gap to another minimum at which a fix counts as Gaussian: five standard deviations.
 GAP = 25.0
-# ... and where its largest standard deviation is below this share of the nearest range: a circle bends away from its
-# tangent by half the square of that, which is then 2.5 % of the deviation.
+# Largest standard deviation of a Gaussian fix, as a share of the nearest range: a circle deviates from its
+# tangent by half the square of this angle, which is 2.5 % of the standard deviation.
 _FLAT = 0.05
-# The gate before a fit is twice as wide in standard deviations as the test after it: rows are curved, the gate is not.
+# Factor of the gate (squared distance) before a fit: the gate is linear but the rows are curved, so it is twice
+# as wide in standard deviations as the test after the fit.
 _WIDE = 4.0
-# Of single scans: without a search for other minima than the mirror image, and without a proof.
+# Method for single scans: the search finds only mirror images, and there is no proof.
 _QUICK = "gtrs+lsr"
-# Places of a scan, or states of a chain, that are kept: the best and its rivals. Flat networks have two.
+# Largest number of states that a chain keeps: the best and its alternatives. Flat networks have two.
 _KEPT = 3
-# Steps of a descent: chains of one target take four to eight, and what wanders longer is hardly one.
+# Steps of a descent: chains of one target need four to eight, and a descent that needs more is rarely one
+# target.
 _STEPS = 30
-# Two descents ended in one minimum where their squared distance, in its covariance, is below this: a tenth of a sigma.
+# Two descents have the same minimum if their squared distance, in units of the covariance, is smaller: 0.1
+# sigma.
 _SAME = 1e-2
 
-# What things cost, in milliseconds of one core (of 2020 or later; five rows a scan): the bound of a call is in them.
+# Work of a batch and of a descent, in milliseconds of one core (of 2020 or later, with five rows per scan); the
+# limit of work of a call has the same unit.
 _BATCH, _DESCENT = 8.0, 0.3
 LONG = 100.0
-"""Of a search without a start, or of a proof that a fix is the only one."""
+"""Work of a search without a start, or of a proof that a fix is unique, in milliseconds."""
 
 
 @dataclass(slots=True)
 class ChainWork:
-    """What is left of the work that one call may do, in about a millisecond each."""
+    """The work that a call can still do, in units of about a millisecond."""
 
     left: float
 
     def take(self, cost: float) -> bool:
-        """Return whether there is work left, which is then less by a cost."""
+        """Subtract a cost and return True if any work is left; otherwise return False."""
         if self.left <= 0.0:
             return False
         self.left -= cost
@@ -58,16 +62,16 @@ class ChainWork:
 
 @dataclass(frozen=True, slots=True)
 class ChainTerms:
-    """What is assumed of all targets.
+    """Assumptions about all targets.
 
     Parameters
     ----------
     order : int
-        1 where they have a velocity, 0 where they are at rest.
+        1 for targets with a velocity, 0 for targets at rest.
     speed : float, optional
-        Prior standard deviation of each coordinate of a velocity about zero, m/s.
+        Prior standard deviation of each velocity coordinate about zero, m/s.
     least_p : float
-        Chains whose chi-square is less likely are not of one target.
+        Smallest p-value of a chain; a chain with a smaller p-value is not one target.
     """
 
     order: int
@@ -77,19 +81,19 @@ class ChainTerms:
 
 @dataclass(frozen=True, slots=True)
 class DetectionChain:
-    """Detections that may be of one target, in their order of time.
+    """Detections that may come from one target, in order of time.
 
     Parameters
     ----------
     detections : tuple of Detection
-        With models of this plug-in.
+        Detections with models of this plug-in.
     x : array (q, n)
-        States at the last detection that fit, the best first: a position alone where nothing shows a velocity yet;
-        none (q = 0) where nothing shows a position.
+        States at the last detection that fit, best first. A state is only a position if no row or prior
+        determines the velocity. q = 0 if no position is determined.
     cov : array (n, n), optional
-        Covariance of the first; None where it is too wide to be trusted as that of a Gaussian.
+        Covariance of the first state; None if it is too wide for a Gaussian.
     p : float
-        Tail probability of the chi-square; 1 without redundancy.
+        p-value of the chi-square; 1 without redundancy.
     """
 
     detections: tuple[Any, ...]
@@ -108,15 +112,16 @@ class DetectionChain:
 
 
 def is_flat(cov: Array, position: Array, detection: Any) -> bool:
-    """Return whether a covariance (d, d) is small against the range of the nearest station."""
+    """Return whether the largest sigma of a covariance (d, d), m^2, is below 5 % of the nearest range."""
     nearest = np.linalg.norm(detection.measurement_model.sites - position, axis=-1).min()
     return bool(np.isfinite(cov).all() and np.sqrt(np.linalg.eigvalsh(cov)[-1]) < _FLAT * nearest)
 
 
 def posed(runs: Sequence[Sequence[Any]], terms: ChainTerms) -> tuple[Problem, Array]:
-    """Return the problem of runs of detections (B), without their values, and the values (B, m) of its rows.
+    """Return the problem of B runs of detections, without values, and the values (B, m) of its rows.
 
-    The runs have the same rows in each scan, and the same times before the last; the state is that at the last.
+    The runs have the same rows in each scan, and the same time differences. The state is the state at the last
+    scan.
     """
     models = [[detection.measurement_model for detection in run] for run in runs]
     last = runs[0][-1].timestamp
@@ -139,21 +144,21 @@ def posed(runs: Sequence[Sequence[Any]], terms: ChainTerms) -> tuple[Problem, Ar
 
 
 def _shared(values: Any) -> Array:
-    """Return an array (B, ...), or only its first entry where all are the same."""
+    """Return an array (B, ...), or only its first entry if all entries are equal."""
     array = np.asarray(values, dtype=float)
     return array[0] if (array == array[:1]).all() else array
 
 
 def _key(run: Sequence[Any]) -> Any:
-    """Return what runs that are posed together have in common."""
+    """Return a key that is equal for runs that fit into one batch: same shapes, rows and time differences."""
     last = run[-1].timestamp
     shape = run[0].measurement_model.stations.shape, tuple(run[0].measurement_model.mapping)
     scans = tuple((tuple(d.measurement_model.rows), d.measurement_model.rates is None) for d in run)
     return shape, scans, tuple(last - detection.timestamp for detection in run)
 
 
-def _grouped(keys: Sequence[Any]) -> list[list[int]]:
-    """Return the places of equal keys."""
+def _group_indices(keys: Sequence[Any]) -> list[list[int]]:
+    """Return lists of the indices of equal keys."""
     found: dict[Any, list[int]] = {}
     for i, key in enumerate(keys):
         found.setdefault(key, []).append(i)
@@ -161,9 +166,9 @@ def _grouped(keys: Sequence[Any]) -> list[list[int]]:
 
 
 def alone(scan: Sequence[Any], terms: ChainTerms) -> list[DetectionChain]:
-    """Return a chain of each detection of a scan: where its own rows place it."""
+    """Return a chain for each detection of a scan, with the fix of this detection alone."""
     out: list[Any] = [None] * len(scan)
-    for members in _grouped([_key([detection]) for detection in scan]):
+    for members in _group_indices([_key([detection]) for detection in scan]):
         moving = scan[members[0]].measurement_model.rates is not None
         own = ChainTerms(terms.order if moving else 0, terms.speed, terms.least_p)
         problem, z = posed([[scan[i]] for i in members], own)
@@ -174,7 +179,7 @@ def alone(scan: Sequence[Any], terms: ChainTerms) -> list[DetectionChain]:
 
 
 def _of_fix(detections: tuple[Any, ...], fix: Fix, terms: ChainTerms) -> DetectionChain:
-    """Return a chain with the states of its single fix: where rows do not show the velocity, its prior does."""
+    """Return a chain with the states of its single fix; without a velocity in the fix, the velocity prior is added."""
     p = float(fix.p_value)
     p = 1.0 if np.isnan(p) else p
     if not bool(fix.answered) or bool(fix.has(Status.UNBOUNDED)):
@@ -190,20 +195,23 @@ def _of_fix(detections: tuple[Any, ...], fix: Fix, terms: ChainTerms) -> Detecti
 
 
 def near(chains: Sequence[DetectionChain], single: DetectionChain, terms: ChainTerms) -> list[tuple[float, int]]:
-    """Return how far a detection is from each chain that it may continue, and the chain's place.
+    """Return the distance of a detection from each chain that it may continue, and the index of the chain.
 
-    The squared distance in the covariance of the innovation, in shares of the gate: 1 at its edge; 1 as well for
-    chains that are no Gaussian to look ahead from. What is beyond the gate is left out.
+    The distance is the squared innovation in units of its covariance, divided by the gate: 1 at the edge of the
+    gate. Chains without a Gaussian state have no prediction and get the distance 1. Chains beyond the gate are
+    omitted.
     """
     detection = single.detections[-1]
-    known = [i for i, c in enumerate(chains) if c.last < detection.timestamp and _alike(c.detections[-1], detection)]
+    known = [
+        i for i, c in enumerate(chains) if c.last < detection.timestamp and _same_stations(c.detections[-1], detection)
+    ]
     d = len(detection.measurement_model.mapping)
     blind = [i for i in known if chains[i].cov is None or chains[i].x.shape[1] != d * (terms.order + 1)]
     sharp = [i for i in known if i not in set(blind)]
     out = [(1.0, i) for i in blind]
     if not sharp:
         return out
-    mean = np.stack([_ahead(chains[i].x[:1], chains[i], detection, d)[0] for i in sharp])
+    mean = np.stack([_predict(chains[i].x[:1], chains[i], detection, d)[0] for i in sharp])
     step = np.array([(detection.timestamp - chains[i].last).total_seconds() for i in sharp])
     cov = np.stack([np.asarray(chains[i].cov) for i in sharp])
     F = np.tile(np.eye(mean.shape[1]), (len(sharp), 1, 1))
@@ -216,10 +224,10 @@ def near(chains: Sequence[DetectionChain], single: DetectionChain, terms: ChainT
 
 
 def _innovations(detection: Any, mean: Array, cov: Array) -> Array:
-    """Return the squared distances (C,) of a detection from what states (C, n) with covariances predict."""
+    """Return the squared distances (C,) of a detection from the predictions of C states (C, n) with covariances."""
     model = detection.measurement_model
     size, order = len(model.places), model.order
-    # Of a target at rest a model of rates asks the velocity as well, which is then zero and known.
+    # A rate model also needs the velocity. For a target at rest, the velocity is exactly zero.
     x, P = np.zeros((len(mean), size)), np.zeros((len(mean), size, size))
     n = min(size, mean.shape[1])
     x[:, :n], P[:, :n, :n] = mean[:, :n], cov[:, :n, :n]
@@ -228,14 +236,14 @@ def _innovations(detection: Any, mean: Array, cov: Array) -> Array:
     return np.asarray((linear.residual * np.linalg.solve(S, linear.residual[..., None])[..., 0]).sum(-1))
 
 
-def _alike(one: Any, two: Any) -> bool:
-    """Return whether two detections can be scans of one run."""
+def _same_stations(one: Any, two: Any) -> bool:
+    """Return whether two detections can be scans of one run: same number of stations, same state mapping."""
     a, b = one.measurement_model, two.measurement_model
     return a.stations.shape == b.stations.shape and list(a.mapping) == list(b.mapping)
 
 
-def _ahead(x: Array, chain: DetectionChain, detection: Any, d: int) -> Array:
-    """Return states (q, n) of a chain at the time of a detection, in uniform motion."""
+def _predict(x: Array, chain: DetectionChain, detection: Any, d: int) -> Array:
+    """Return the states (q, n) of a chain at the time of a detection, for constant velocity."""
     if x.shape[1] == d:
         return x
     step = (detection.timestamp - chain.last).total_seconds()
@@ -243,15 +251,15 @@ def _ahead(x: Array, chain: DetectionChain, detection: Any, d: int) -> Array:
 
 
 def _starts(chain: DetectionChain, single: DetectionChain, terms: ChainTerms) -> Array:
-    """Return the states (q, n) from which a chain with one more detection is fitted."""
+    """Return start states (q, n) for the fit of a chain with one more detection."""
     detection = single.detections[-1]
     d = len(detection.measurement_model.mapping)
     if not terms.order:
         return np.concatenate([chain.x, single.x])[:_KEPT]
-    ahead = [_ahead(chain.x, chain, detection, d)] if chain.x.shape[1] == 2 * d else []
+    ahead = [_predict(chain.x, chain, detection, d)] if chain.x.shape[1] == 2 * d else []
     if len(chain) == 1 or not len(chain.x):
         step = (detection.timestamp - chain.last).total_seconds()
-        # From place to place; where only one of both has a place, from a target at rest.
+        # The velocity follows from two positions. If only one of the two is known, the target starts at rest.
         pairs = [(b, (b - a) / step) for a, b in product(chain.x[:, :d], single.x[:, :d])]
         pairs = pairs or [(a, np.zeros(d)) for a in (*chain.x[:, :d], *single.x[:, :d])]
         ahead.append(np.array([np.concatenate(pair) for pair in pairs]).reshape(-1, 2 * d))
@@ -261,9 +269,9 @@ def _starts(chain: DetectionChain, single: DetectionChain, terms: ChainTerms) ->
 def grown(
     pairs: Sequence[tuple[DetectionChain, DetectionChain]], terms: ChainTerms, work: ChainWork
 ) -> list[tuple[DetectionChain, DetectionChain, DetectionChain]]:
-    """Return (longer chain, chain, chain of the detection) of the pairs that fit, the first within the work left.
+    """Return (longer chain, chain, chain of the detection) of the pairs that fit.
 
-    Pairs of the same rows and times are fitted together, from all their starts at once.
+    The first pairs come first, until no work is left. Pairs with the same rows and times are fitted as one batch.
     """
     chosen: dict[Any, list[tuple[DetectionChain, DetectionChain, Array]]] = {}
     for chain, single in pairs:
@@ -274,16 +282,16 @@ def grown(
     out = []
     for members in chosen.values():
         runs = [(*chain.detections, *single.detections) for chain, single, _ in members]
-        longer = _fitted(runs, [starts for _, _, starts in members], terms, work)
+        longer = _fit(runs, [starts for _, _, starts in members], terms, work)
         found = zip(longer, members, strict=True)
         out += [(new, chain, single) for new, (chain, single, _) in found if new is not None and new.p >= terms.least_p]
     return out
 
 
-def _fitted(
+def _fit(
     runs: Sequence[tuple[Any, ...]], starts: Sequence[Array], terms: ChainTerms, work: ChainWork
 ) -> list[DetectionChain | None]:
-    """Return the chains of runs of the same rows and times; None where it takes a search and no work is left."""
+    """Return the chains of runs with the same rows and times; None if a run needs a search and no work is left."""
     problem, z = posed(runs, terms)
     problem = problem.with_rows(z=z)
     dof = degrees_of_freedom(problem)
@@ -299,7 +307,7 @@ def _fitted(
     for i in range(len(runs)):
         if len(starts[i]):
             continue
-        if dof[i] < 0:  # too few rows for any state: more scans may do
+        if dof[i] < 0:  # too few rows for any state: wait for more scans
             out[i] = DetectionChain(runs[i], np.zeros((0, problem.layout.size)), None, 1.0)
         elif work.take(LONG):
             fix = solve(problem.take(np.array([i])), "roots+lsr").flat()[0]
@@ -308,7 +316,7 @@ def _fitted(
 
 
 def _best(run: tuple[Any, ...], done: Refined, p: Array, cov: Array, own: Array) -> DetectionChain:
-    """Return the chain of a run by the descents that are its own: their distinct ends, the best first."""
+    """Return the chain of a run from its descents (indices `own`): their different minima, best first."""
     own = own[np.argsort(np.where(np.isfinite(done.cost[own]), done.cost[own], np.inf), kind="stable")]
     first, d = own[0], len(run[-1].measurement_model.mapping)
     kept: list[int] = []

@@ -1,4 +1,4 @@
-"""An initiator of Stone Soup that needs no guess: it gathers scans until they determine the state."""
+"""An initiator of Stone Soup without a first guess: it collects scans until they determine a state."""
 
 from __future__ import annotations
 
@@ -36,25 +36,26 @@ from optloc.solvers import solve
 from optloc.tracking import is_one_gaussian
 from optloc.uncertainty import mixture
 
-# Chains that wait for more scans: of those that no detection has continued for long the oldest are forgotten.
+# Largest number of chains that wait for more scans; the chains that were not continued for the longest time are
+# dropped.
 _REMEMBERED = 40
 
 
 def mixture_state(
     problem: Problem, fix: Fix, mapping: Sequence[int], prior_state: GaussianState, timestamp: dt.datetime | None = None
 ) -> GaussianMixture:
-    """Return what the data say of a position, other minima included, as a Gaussian mixture of Stone Soup.
+    """Return the position and its alternatives as a Gaussian mixture of Stone Soup.
 
     Parameters
     ----------
     problem, fix : Problem, Fix
-        One static position and its single fix, as `optloc.uncertainty.mixture` takes them.
+        One static position and its single fix, as for `optloc.uncertainty.mixture`.
     mapping : sequence of int
-        Places of the position in the state.
+        Indices of the position in the state.
     prior_state : GaussianState
         Mean and covariance of the rest of the state.
     timestamp : datetime, optional
-        Of the state.
+        Time of the state.
     """
     found, place = mixture(problem, fix), list(mapping)
     components = []
@@ -75,61 +76,65 @@ def mixture_state(
 
 
 class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
-    """Begins tracks with optloc's fix of as many scans as it takes, with its covariance.
+    """Starts tracks with the fix and covariance of optloc, after the number of scans that the fix needs.
 
-    Every detection is a scan of one target, its measurement model one of this plug-in, and its stations, which may
-    move, the same throughout. Detections of several targets are told apart by the chi-square of the fix that they would
-    have together. A chain of them becomes a track once position and velocity are determined, unique and nearly
-    Gaussian: no other minimum within a cost gap of 25, standard deviation below 5 % of the nearest range.
+    Each detection is a scan of one target with a measurement model of this plug-in. Stations can move, but their
+    number must stay the same. The initiator separates targets by chi-square: detections of two targets do not fit
+    one position and velocity. A chain of detections becomes a track if position and velocity are determined,
+    unique and nearly Gaussian. Unique means no other minimum within a cost gap of 25; nearly Gaussian means a
+    standard deviation below 5 % of the nearest range.
     """
 
     velocity_mapping: Sequence[int] | None = Property(
-        default=None, doc="Places of the velocity in the state; by default those after the position's."
+        default=None,
+        doc="State indices of the velocity; by default, each follows the index of its position coordinate.",
     )
-    order: int = Property(default=1, doc="1 for a state with velocity, 0 for one without.")
+    order: int = Property(default=1, doc="1 for a state with a velocity, 0 for a state without.")
     speed: float | None = Property(
         default=None,
-        doc="Prior standard deviation of each coordinate of the velocity about zero, m/s; a single scan may then do.",
+        doc="Prior standard deviation of each velocity coordinate about zero, m/s. With it, one scan can be enough.",
     )
-    limit: int = Property(default=10, doc="Scans after which a chain that is not clear is given up.")
-    confirm: int = Property(default=1, doc="Scans of a chain at least before it becomes a track: more in clutter.")
+    limit: int = Property(default=10, doc="Number of scans after which an undecided chain is dropped.")
+    confirm: int = Property(default=1, doc="Smallest number of scans of a new track; use more in clutter.")
     work: int = Property(
         default=300,
-        doc="Bound of the work of one call beside the fix of each detection, in units of about a millisecond: longer "
-        "chains come first, and what exceeds it is left out.",
+        doc="Limit of the work of one call, in units of about a millisecond, without the fix of each detection. Longer "
+        "chains come first; chains beyond the limit are skipped.",
     )
     prior_state: GaussianState | None = Property(
         default=None,
-        doc="Mean and covariance of what a fix does not say, such as an acceleration; initiators of particles, "
-        "mixtures and ensembles that stand around this one ask for it.",
+        doc="Mean and covariance of state components that a fix does not estimate, such as an acceleration. Particle, "
+        "mixture and ensemble initiators that use this initiator need it.",
     )
-    least_p: float = Property(default=1e-3, doc="Chains whose chi-square is less likely are not of one target.")
+    least_p: float = Property(
+        default=1e-3, doc="Smallest p-value of a chain; below it, the detections are not one target."
+    )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         if self.order not in (0, 1):
-            raise InvalidProblem(f"a motion of order {self.order}", "order", "use 0 or 1")
+            raise InvalidProblem(f"a motion of order {self.order} is not possible", "order", "use 0 or 1")
         self._chains: list[DetectionChain] = []
 
     def initiate(self, detections: Any, timestamp: dt.datetime, **kwargs: Any) -> set[Track]:
-        """Return the tracks that begin with some of the detections that belong to no track yet.
+        """Return the new tracks from detections that do not belong to a track yet.
 
         Raises
         ------
         InvalidProblem
-            For a detection whose measurement model is not one of this plug-in.
+            If the measurement model of a detection is not from this plug-in.
         """
         for detection in detections:
             if not isinstance(detection.measurement_model, StationMeasurement):
                 what = f"a detection has the measurement model {type(detection.measurement_model).__name__}"
                 raise InvalidProblem(what, "initiator", "use a model of this plug-in, such as TDOA")
         work, tracks = ChainWork(float(self.work)), set()
-        # In an order of their own, so that a set that is iterated in another one begins the same tracks.
+        # Sort the detections: the order of a set is random, and the tracks must not depend on it.
         ordered = sorted(detections, key=lambda d: (d.timestamp, tuple(values_of(d))))
         for _, scan in groupby(ordered, key=lambda d: d.timestamp):
             waiting = []
-            for chain in self._continued(list(scan), work):
-                fix = self._proven(chain, work)
+            for chain in self._extend_chains(list(scan), work):
+                fix = self._confirmed_fix(chain, work)
                 if fix is not None:
                     tracks.add(self._track(chain, fix))
                 elif len(chain) < self.limit:
@@ -137,15 +142,15 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
             self._chains = [*self._chains, *waiting][-_REMEMBERED:]
         return tracks
 
-    def _continued(self, scan: list[Any], work: ChainWork) -> list[DetectionChain]:
-        """Return the chains that the detections of a scan continue, which are taken, and those that they begin."""
+    def _extend_chains(self, scan: list[Any], work: ChainWork) -> list[DetectionChain]:
+        """Return new chains from a scan: extended chains (they replace the old chains), and single detections."""
         terms = ChainTerms(self.order, self.speed, self.least_p)
-        # Where the rows of a detection do not fit together no chain with it would fit.
+        # If the rows of one detection do not fit together, no chain with this detection fits.
         singles = [single for single in alone(scan, terms) if single.p >= self.least_p]
         pairs = [
             (share, self._chains[i], single) for single in singles for share, i in near(self._chains, single, terms)
         ]
-        # What has fitted many scans is continued before what has fitted one, which in clutter is mostly false.
+        # Extend long chains first: in clutter, most chains of one detection are false.
         pairs.sort(key=lambda pair: (-len(pair[1]), pair[0]))
         fitting = grown([(chain, single) for _, chain, single in pairs], terms, work)
         fitting.sort(key=lambda found: (-len(found[0]), -found[0].p))
@@ -158,21 +163,22 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         self._chains = [chain for chain in self._chains if id(chain) not in taken]
         return [*out, *(single for single in singles if id(single) not in taken)]
 
-    def _proven(self, chain: DetectionChain, work: ChainWork) -> Fix | None:
-        """Return the fix of a chain that is long enough where it is the only one, and nearly Gaussian; else None."""
+    def _confirmed_fix(self, chain: DetectionChain, work: ChainWork) -> Fix | None:
+        """Return the fix of a chain that is long enough, if the fix is unique and nearly Gaussian; otherwise None."""
         size = len(chain.detections[-1].measurement_model.mapping) * (self.order + 1)
-        # Another place is looked for where all else speaks for a track: that takes as long as hundreds of descents.
+        # Test the cheap conditions first: the search for other minima takes as long as hundreds of descents.
         if len(chain) < self.confirm or chain.cov is None or len(chain.cov) != size or not work.take(LONG):
             return None
         problem, z = posed([chain.detections], ChainTerms(self.order, self.speed, self.least_p))
         fix = solve(problem.with_rows(z=z[0]))
         known = is_one_gaussian(fix) and not (fix.alternatives.gap < GAP).any()
-        # Without redundancy nothing speaks against the chain.
+        # Without redundancy, the p-value is NaN and the chain passes this test.
         if not known or fix.p_value < self.least_p:
             return None
         return fix if is_flat(fix.covariance(), fix.position, chain.detections[-1]) else None
 
     def _track(self, chain: DetectionChain, fix: Fix) -> Track:
+        """Return a new track with the fix of a chain as its first state."""
         detection = chain.detections[-1]
         model = detection.measurement_model
         place = [*model.mapping, *self._rates(model)]
@@ -193,6 +199,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         return Track([update])
 
     def _rates(self, model: StationMeasurement) -> Sequence[int]:
+        """Return the state indices of the velocity; empty for targets at rest."""
         if not self.order:
             return []
         own = getattr(model, "velocity_mapping", None) if self.velocity_mapping is None else self.velocity_mapping

@@ -1,7 +1,7 @@
-"""Measurement models of Stone Soup whose functions, derivatives and inverses are those of optloc, and their feeder.
+"""Measurement models of Stone Soup with functions, derivatives and inverses of optloc, and a feeder for pairs.
 
-A model is one scan of several rows. The feeder makes such scans of detections of single pairs, with the covariance that
-rows share where they share a station.
+One measurement of a model is one scan with several rows. The feeder joins detections of single pairs to such
+scans. Rows that share a station have correlated errors; the feeder computes their covariance.
 """
 
 from __future__ import annotations
@@ -39,25 +39,25 @@ from optloc.problem import (
 )
 from optloc.solvers import solve
 
-# A detection with one of these has no position of its own.
+# A detection with one of these statuses has no usable position.
 _NOT_ONE_PLACE = (Status.CONTRADICTORY, Status.MISFIT, Status.UNBOUNDED, Status.AMBIGUOUS)
 _TYPES = {"azimuth": Bearing, "elevation": Elevation}
 
 Row = tuple[str, int, int]
-"""Kind, first and second station; -1 where the kind takes none."""
+"""Kind, first and second station of a row; -1 for a kind with one station."""
 
 
 def arrival_covariance(pairs: Any, sigma: Any, stations: int) -> Array:
-    """Return the covariance (m, m) of differences of what stations measure: rows that share a station correlate.
+    """Return the covariance (m, m) of differences between stations: rows that share a station are correlated.
 
     Parameters
     ----------
     pairs : int array (m, 2)
         Stations a and b of each row.
     sigma : float or array (s,)
-        Standard deviation of each station's arrival, metres; of its range rate, m/s.
+        Standard deviation of the arrival of each station, metres, or of its range rate, m/s.
     stations : int
-        Number of stations s.
+        Number s of stations.
     """
     index = np.atleast_2d(np.asarray(pairs, dtype=int))
     variance = np.broadcast_to(np.asarray(sigma, dtype=float) ** 2, (stations,))
@@ -65,29 +65,33 @@ def arrival_covariance(pairs: Any, sigma: Any, stations: int) -> Array:
 
 
 class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  # type: ignore[misc]  # untyped bases
-    """What stations at given positions measure of a target; base of the models below.
+    """Base class of the models below: measurements of a target by stations at given positions.
 
-    Moving stations: give each detection a model of its own. Azimuths go from +x towards +y, elevations up from the
-    plane, ranges and their differences are in metres, range rates and theirs in metres per second.
+    If stations move, give each detection a separate model. Azimuths are measured from +x towards +y, elevations
+    upwards from the plane. Ranges and range differences are in metres, range rates and their differences in
+    metres per second.
 
     Raises
     ------
     InvalidProblem
-        Where stations, mapping or rows do not fit together, or for a rotation offset: turn the frame instead.
+        If stations, mapping or rows do not fit together. A rotation offset is an error too: turn the frame
+        instead.
     """
 
     stations: np.ndarray = Property(doc="Positions (s, d) of the stations, metres.")
     translation_offset: StateVector | None = Property(
-        default=None, doc="Where the origin of these positions is (d, 1), such as a platform's place; by default zero."
+        default=None, doc="Origin (d, 1) of the station positions, such as the position of a platform; by default zero."
     )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.stations = np.asarray(self.stations, dtype=float)
         if np.any(np.asarray(self.rotation_offset, dtype=float)):
-            raise InvalidProblem("there is a rotation offset", "rotation_offset", "give positions in a turned frame")
+            raise InvalidProblem(
+                "a rotation offset is not supported", "rotation_offset", "turn the station positions instead"
+            )
         if self.stations.ndim != 2 or self.stations.shape[1] != len(self.mapping):
-            what = f"stations have shape {self.stations.shape} and {len(self.mapping)} coordinates are mapped"
+            what = f"stations have shape {self.stations.shape}, but {len(self.mapping)} coordinates are mapped"
             raise InvalidProblem(what, "stations", "give an array (stations, 2 or 3)")
         if self.translation_offset is not None and np.size(self.translation_offset) != len(self.mapping):
             what = f"the offset has shape {np.shape(self.translation_offset)} for {len(self.mapping)} coordinates"
@@ -108,54 +112,55 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
 
     @property
     def sites(self) -> Array:
-        """Return where the stations are (s, d): their positions from the translation offset on."""
+        """Return the station positions (s, d), metres: `stations` plus the translation offset."""
         offset = self.translation_offset
         return self.stations if offset is None else self.stations + np.asarray(offset, dtype=float).ravel()
 
     @property
     def places(self) -> list[int]:
-        """Return the places in the state of what the measurement depends on: the position."""
+        """Return the state indices that the measurement depends on: the position."""
         return list(self.mapping)
 
     @property
     def rates(self) -> Array | None:
-        """Return the velocities (s, d) of the stations, metres per second, where they matter."""
+        """Return the station velocities (s, d), m/s, or None if the measurement does not depend on velocities."""
         return None
 
     @clearable_cached_property("stations", "translation_offset", "noise_covar")  # type: ignore[untyped-decorator]
     def problem(self) -> Problem:
-        """Return the optloc problem of one measurement: an unknown position, values of zero."""
-        return self._posed(Motion())
+        """Return the optloc problem of one measurement, with an unknown position and all values zero."""
+        return self._build_problem(Motion())
 
-    def _posed(self, motion: Motion) -> Problem:
+    def _build_problem(self, motion: Motion) -> Problem:
+        """Return the optloc problem of one measurement for a motion, with all values zero."""
         rates = None if self.rates is None else self.rates[None]
         covariance = np.asarray(self.noise_covar, dtype=float)
         return problem_of(self.sites[None], [self.rows], [covariance], velocity=rates, motions=(motion,))
 
     def function(self, state: Any, noise: Any = False, **kwargs: Any) -> Any:
-        """Return the measurement (m, 1) of a state, or (m, N) of N of them, with noise if wanted."""
+        """Return the measurement (m, 1) of a state, or (m, N) of N states, with noise if requested."""
         vector = np.asarray(state.state_vector, dtype=float)[self.places].T  # (N, d or 2 d)
-        values = self._ordered(predict(self.problem, vector).T)
+        values = self._in_scan_order(predict(self.problem, vector).T)
         if isinstance(noise, bool) or noise is None:
             noise = self.rvs(num_samples=values.shape[1], **kwargs) if noise else 0
-        return self._typed(values) + noise
+        return self._with_angle_types(values) + noise
 
     def jacobian(self, state: Any, **kwargs: Any) -> Array:
         """Return the derivative (m, n) of the measurement with respect to the state."""
         vector = np.asarray(state.state_vector, dtype=float)[self.places, 0]
         out = np.zeros((self.ndim_meas, self.ndim_state))
-        out[:, self.places] = self._ordered(linearise(self.problem, vector).shared)
+        out[:, self.places] = self._in_scan_order(linearise(self.problem, vector).shared)
         return out
 
     def inverse_function(self, detection: Any, **kwargs: Any) -> Any:
-        """Return the state (n, 1) whose `places` fit a detection best, found without a guess; zeros elsewhere.
+        """Return the state (n, 1) that fits a detection best, without a first guess; zero outside `places`.
 
-        Of a detection with several measurements (m, N) it returns their states (n, N), each found by itself.
+        For a detection with N measurements (m, N), the result is N independent states (n, N).
 
         Raises
         ------
         NotImplementedError
-            Where one has no clean fix of its own; initiators of Stone Soup can skip such ones.
+            If a measurement has no clean and unique fix; initiators of Stone Soup can skip such measurements.
         """
         z = np.asarray(detection.state_vector, dtype=float)[self.order].T
         fix = solve(self.problem.with_rows(z=z if len(z) > 1 else z[0])).flat()
@@ -169,10 +174,10 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
     def rvs(self, num_samples: int = 1, **kwargs: Any) -> Any:
         """Return samples (m, N) of the noise."""
         drawn = np.asarray(super().rvs(num_samples, **kwargs), dtype=float)
-        return self._typed(drawn.reshape(self.ndim_meas, num_samples))
+        return self._with_angle_types(drawn.reshape(self.ndim_meas, num_samples))
 
     def logpdf(self, state1: Any, state2: Any, **kwargs: Any) -> Any:
-        """Return the logarithm of the density of a measurement given a state, angles wrapped."""
+        """Return the logarithm of the density of a measurement given a state; angles are wrapped."""
         from scipy.stats import multivariate_normal
 
         off = np.asarray(state1.state_vector - self.function(state2), dtype=float)
@@ -180,21 +185,21 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
 
     @property
     def order(self) -> Array:
-        """Return the place in the measurement of each row of `problem`, which keeps kinds together."""
+        """Return the index in the measurement of each row of `problem`, which sorts the rows by kind."""
         return rows_by_kind([self.rows])[1]
 
-    def _ordered(self, values: Array) -> Array:
-        """Return values (m, N) of the rows of `problem` in the order of the measurement."""
+    def _in_scan_order(self, values: Array) -> Array:
+        """Return values (m, N) of the rows of `problem` in the row order of the measurement."""
         out = np.empty_like(values)
         out[self.order] = values
         return out
 
-    def _typed(self, values: Array) -> Any:
-        """Return values (m, N) with the angles among them as angles."""
+    def _with_angle_types(self, values: Array) -> Any:
+        """Return values (m, N) with angle rows as Stone Soup angles."""
         kind: Any = StateVector if values.shape[1] == 1 else StateVectors
         if not any(row[0] in _TYPES for row in self.rows):
             return kind(values)
-        typed = values.astype(object)  # Stone Soup wraps differences of its own angle types only
+        typed = values.astype(object)  # Stone Soup wraps only its angle types
         for i, (name, _, _) in enumerate(self.rows):
             if name in _TYPES:
                 typed[i] = [_TYPES[name](value) for value in values[i]]
@@ -224,7 +229,7 @@ class GROA(StationMeasurement):
 
 
 class AOATDOA(StationMeasurement):
-    """Azimuths, in space then elevations, of some stations; then range differences r_a - r_b of pairs, metres."""
+    """Azimuths of some stations (with three coordinates, then elevations); then range differences of pairs, metres."""
 
     angles: np.ndarray = Property(doc="Stations (q,) that measure angles.")
     pairs: np.ndarray = Property(doc="Stations a and b (m, 2) of each range difference.")
@@ -238,19 +243,20 @@ class AOATDOA(StationMeasurement):
 
 
 class RateMeasurement(StationMeasurement, ABC):
-    """What depends on the velocity of the target as well; base of the models below.
+    """Base class of the models below, whose measurements also depend on the velocity of the target.
 
     Raises
     ------
     InvalidProblem
-        Where velocities do not fit the stations, or the state has no place for the target's.
+        If the velocities do not fit the stations, or if the state has no velocity of the target.
     """
 
     velocities: np.ndarray | None = Property(
         default=None, doc="Velocities (s, d) of the stations, m/s; by default they are at rest."
     )
     velocity_mapping: Sequence[int] | None = Property(
-        default=None, doc="Places of the velocity in the state; by default those after the position's."
+        default=None,
+        doc="State indices of the velocity; by default, each follows the index of its position coordinate.",
     )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -258,10 +264,10 @@ class RateMeasurement(StationMeasurement, ABC):
         self.velocities = None if self.velocities is None else np.asarray(self.velocities, dtype=float)
         if self.velocities is not None and self.velocities.shape != self.stations.shape:
             what = f"velocities have shape {self.velocities.shape}, stations {self.stations.shape}"
-            raise InvalidProblem(what, "velocities", "give one for each station")
+            raise InvalidProblem(what, "velocities", "give one velocity for each station")
         if self.moving and (len(self.places) != 2 * len(self.mapping) or max(self.places) >= self.ndim_state):
-            what = f"the velocity is at {self.places[len(self.mapping) :]} of a state of {self.ndim_state}"
-            raise InvalidProblem(what, "velocity_mapping", "name the places of the velocity")
+            what = f"velocity indices {self.places[len(self.mapping) :]} do not fit a state of size {self.ndim_state}"
+            raise InvalidProblem(what, "velocity_mapping", "give the state indices of the velocity")
 
     @property
     def moving(self) -> bool:
@@ -270,23 +276,23 @@ class RateMeasurement(StationMeasurement, ABC):
 
     @property
     def places(self) -> list[int]:
-        """Return the places in the state of the position, then of the velocity."""
+        """Return the state indices of the position, then of the velocity."""
         own = self.velocity_mapping
         return [*self.mapping, *([i + 1 for i in self.mapping] if own is None else own)]
 
     @property
     def rates(self) -> Array | None:
-        """Return the velocities (s, d) of the stations."""
+        """Return the station velocities (s, d), metres per second."""
         return np.zeros_like(self.stations) if self.velocities is None else self.velocities
 
     @clearable_cached_property("stations", "translation_offset", "noise_covar", "velocities")  # type: ignore[untyped-decorator]
     def problem(self) -> Problem:
-        """Return the optloc problem of one measurement: an unknown position and velocity, values of zero."""
-        return self._posed(Motion(1))
+        """Return the optloc problem of one measurement, with an unknown position and velocity and all values zero."""
+        return self._build_problem(Motion(1))
 
 
 class RangeRate(RateMeasurement):
-    """Range rates of single stations, m/s: a Doppler shift f is the rate -c f / carrier."""
+    """Range rates of single stations, m/s. A Doppler shift f corresponds to the range rate -c f / carrier."""
 
     receivers: np.ndarray = Property(doc="Station (m,) of each row.")
 
@@ -319,13 +325,14 @@ class TDOAFDOA(RateMeasurement):
 
 
 class AnyRows(RateMeasurement):
-    """Any mixture of kinds in one measurement, with one inverse of all of them together.
+    """Any mixture of kinds in one measurement, with one inverse from all rows together.
 
-    Stone Soup's combined model of several sums their inverses, which is a state of none: name the rows here instead.
-    Elements follow `optloc.models.MODELS`: metres, radians, ratios, metres per second.
+    The combined model of Stone Soup adds the inverses of its models, so the sum is no valid state. Use this class
+    with a table of rows instead. For the units of the elements, see `optloc.models.MODELS`: metres, radians, ratios,
+    metres per second.
     """
 
-    table: Sequence[Row] = Property(doc="Kind, first and second station of each row; -1 where a kind takes none.")
+    table: Sequence[Row] = Property(doc="Kind, first and second station of each row; -1 for a kind with one station.")
 
     @property
     def rows(self) -> Sequence[Row]:
@@ -339,18 +346,18 @@ class AnyRows(RateMeasurement):
 
     @property
     def places(self) -> list[int]:
-        """Return the places in the state of the position and, where a row depends on it, of the velocity."""
+        """Return the state indices of the position and, if a row depends on the velocity, of the velocity."""
         return super().places if self.moving else list(self.mapping)
 
     @property
     def rates(self) -> Array | None:
-        """Return the velocities (s, d) of the stations, where they matter."""
+        """Return the station velocities (s, d), metres per second, or None if no row depends on velocities."""
         return super().rates if self.moving else None
 
     @clearable_cached_property("stations", "translation_offset", "noise_covar", "velocities", "table")  # type: ignore[untyped-decorator]
     def problem(self) -> Problem:
-        """Return the optloc problem of one measurement: an unknown position, or position and velocity."""
-        return self._posed(Motion(int(self.moving)))
+        """Return the optloc problem of one measurement, with an unknown position, or position and velocity."""
+        return self._build_problem(Motion(int(self.moving)))
 
 
 def values_of(detection: Any) -> Array:
@@ -359,7 +366,7 @@ def values_of(detection: Any) -> Array:
 
 
 def rows_by_kind(scans: Sequence[Sequence[Row]]) -> tuple[dict[str, list[tuple[int, int, int]]], Array]:
-    """Return (a, b, scan) of the rows of each kind, and the place of each in the scans one after the other."""
+    """Return (a, b, scan) of the rows of each kind, and the index of each row in the concatenated scans."""
     found: dict[str, list[tuple[int, int, int]]] = {}
     places: dict[str, list[int]] = {}
     every = [(k, row) for k, rows in enumerate(scans) for row in rows]
@@ -377,18 +384,18 @@ def problem_of(
     velocity: Array | None = None,
     **more: Any,
 ) -> Problem:
-    """Return the problem of some scans, with values of zero.
+    """Return the problem of several scans, with all values zero.
 
     Parameters
     ----------
     stations : array (..., k, s, d)
-        Positions at each scan.
+        Station positions at each scan, metres.
     scans : sequence of k sequences of (kind, a, b)
-        Rows.
+        Rows of each scan.
     covariances : sequence of k arrays (..., m, m)
-        Of the rows of each scan.
+        Covariance of the rows of each scan.
     velocity : array (..., k, s, d), optional
-        Of the stations at each scan.
+        Station velocities at each scan, m/s.
     **more
         Further arguments of `optloc.assemble`.
     """
@@ -397,7 +404,7 @@ def problem_of(
     for kind, rows in kinds.items():
         a, b, k = np.array(rows).T
         parts.append(measured(kind, np.zeros(len(rows)), a=a, b=b, epoch=k, sigma=1.0))
-    place = np.argsort(order)  # where each row of the scans stands among those sorted by kind
+    place = np.argsort(order)  # index of each scan row in the order by kind
     ends = np.cumsum([0, *(len(rows) for rows in scans)])
     blocks = [
         Block(place[None, first:last], np.asarray(covariance, dtype=float)[..., None, :, :])
@@ -409,26 +416,27 @@ def problem_of(
 
 
 class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
-    """Groups the TDOA detections of an instant to one vector detection of each target.
+    """Joins the TDOA detections of one time to one vector detection for each target.
 
-    Rows that share a station share the error of its arrival: their covariance is D diag(arrival_sigma^2) D' plus that
-    of each row's own noise. Without such own noise, pairs that close a loop say nothing new and are left out.
+    Rows that share a station share the error of its arrival. Their covariance is D diag(arrival_sigma^2) D' plus
+    the independent noise of each row. Without independent noise, a pair that closes a loop adds no information
+    and is left out.
     """
 
     arrival_sigma: float = Property(doc="Standard deviation of each station's arrival, metres.")
-    row_sigma: float = Property(default=0.0, doc="Standard deviation of the own noise of each row, metres.")
+    row_sigma: float = Property(default=0.0, doc="Standard deviation of the independent noise of each row, metres.")
     label: str | None = Property(
-        default=None, doc="Key of the metadata that tells targets apart; None: all pairs of an instant are of one."
+        default=None, doc="Metadata key that identifies targets; None: all pairs of one time belong to one target."
     )
 
     @BufferedGenerator.generator_method  # type: ignore[untyped-decorator]
     def data_gen(self) -> Iterator[tuple[dt.datetime, set[Detection]]]:
-        """Yield the times and the vector detections.
+        """Yield each time with its vector detections.
 
         Raises
         ------
         InvalidProblem
-            For a detection that is no TDOA, or stations that differ within an instant.
+            If a detection is not a TDOA, or if stations differ between detections of one time.
         """
         for time, detections in self.reader:
             groups: dict[Any, list[Detection]] = {}
@@ -438,17 +446,20 @@ class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
                     raise InvalidProblem(what, "PairFeeder", "feed detections of the model TDOA")
                 name = detection.metadata.get(self.label) if self.label else None
                 groups.setdefault(name, []).append(detection)
-            yield time, {self._joined(group) for group in groups.values()}
+            yield time, {self._join(group) for group in groups.values()}
 
-    def _joined(self, group: list[Detection]) -> Detection:
+    def _join(self, group: list[Detection]) -> Detection:
+        """Return one vector detection from the pair detections of one target."""
         group = sorted(group, key=lambda detection: np.atleast_2d(detection.measurement_model.pairs).tolist())
         models = [detection.measurement_model for detection in group]
         first = models[0]
         if any(not np.array_equal(model.stations, first.stations) for model in models):
-            raise InvalidProblem("stations differ within an instant", "PairFeeder", "give all pairs the same stations")
+            raise InvalidProblem(
+                "stations differ between detections of one time", "PairFeeder", "give all pairs the same stations"
+            )
         pairs = np.concatenate([np.atleast_2d(model.pairs) for model in models])
         z = np.concatenate([values_of(detection) for detection in group])
-        # Noise of arrivals alone is singular on closed loops: their rows are sums of the others.
+        # The covariance of arrival noise is singular on closed loops: such rows are sums of others.
         kept = np.ones(len(z), dtype=bool) if self.row_sigma > 0.0 else _forest(pairs, len(first.stations))
         covariance = arrival_covariance(pairs[kept], self.arrival_sigma, len(first.stations))
         model = TDOA(
@@ -463,8 +474,8 @@ class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
 
 
 def _forest(pairs: Array, stations: int) -> Array:
-    """Return which pairs (m,) link stations that those before leave apart."""
-    # Groups of linked stations, each named by one of its members.
+    """Return a mask (m,) of the pairs that connect two groups of stations which earlier pairs do not connect."""
+    # Label of the connected group of each station.
     group, kept = np.arange(stations), np.zeros(len(pairs), dtype=bool)
     for i, (a, b) in enumerate(pairs):
         if group[a] != group[b]:

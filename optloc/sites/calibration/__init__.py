@@ -1,4 +1,4 @@
-"""Self-calibration: stations, clocks and emitters unknown together."""
+"""Self-calibration of networks: unknown stations, clocks and emitters are estimated together."""
 
 from optloc.sites.calibration.calibrated import Alternative, Calibration, calibrate
 from optloc.sites.calibration.network import Network, NetworkSlot, network_of

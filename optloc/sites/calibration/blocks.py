@@ -1,4 +1,7 @@
-"""One station or pulse at a time, the others held: an ordinary fix, with the proof that ordinary fixes have."""
+"""Fixes of a single station or pulse of a network while all others are fixed, with the proof of an ordinary fix.
+
+A block is one station or one pulse. Its partners are the stations and pulses that share rows with it.
+"""
 
 from __future__ import annotations
 
@@ -14,46 +17,47 @@ from optloc.sites.calibration.network import Network
 from optloc.solvers import AMBIGUOUS_GAP, equal_cost, solve
 
 MOVED = 16.0
-"""Cost that a block's other place may have beyond its present one for all to be refined from there: what is dearer by
-four sigma with the others held hardly ends below when they move as well."""
+"""Largest extra cost of a block at another position for a refinement of the whole network from there. If the cost rises
+by more than four sigma while the others are fixed, a joint refinement hardly ever ends below the present cost."""
 
-# Steps of a block alone, and the length in deviations below which one is the last: most are near their minimum then,
-# and the rest is refined with all others anyway.
+# Steps of a single block, and step length in standard deviations at which it ends: most blocks are then close
+# to their minimum, and the joint refinement does the rest.
 _ALONE, _LAST = 30, 1e-3
-# Rows above which a station's proof begins where it is.
+# Number of rows above which the proof of a station starts at its present position.
 _MANY = 100
-# Share of the spread below which two places are one.
+# Distance, as a share of the spread, below which two positions are the same.
 _APART = 1e-3
 
-# Cost that tells no two places apart: a tenth of a sigma of one number.
+# Difference of cost below which two positions are the same: a tenth of a standard deviation of one measurement.
 _ALIKE = 0.01
 
-# Deviation, as a share of the spread, of a coordinate that is known exactly beside others that are not.
+# Standard deviation, as a share of the spread, of an exact coordinate if other coordinates are unknown.
 _EXACT = 1e-7
 
 
 @dataclass(frozen=True, slots=True)
 class StationBlock:
-    """What became of one station or pulse with the others held.
+    """The proof and the other positions of one station or pulse while all others are fixed.
 
     Parameters
     ----------
     name : str
-        In words, for instance "station A3".
+        Description, for instance "station A3".
     station : bool
-        A station, or else a pulse.
+        True for a station, False for a pulse.
     index : int
-        Which.
+        Number of the station or pulse.
     proven : bool
-        That no other place costs less, and none within `AMBIGUOUS_GAP` but those listed.
+        Whether it is proven that no other position costs less, and that all positions within `AMBIGUOUS_GAP` are
+        listed.
     cheapest : bool
-        That no other place costs less.
+        Whether it is proven that no other position costs less.
     refuted : bool
-        That another place costs less.
+        Whether another position costs less.
     gaps : tuple of float
-        Cost of other places beyond the present one's.
+        Costs of the other positions minus the cost of the present position.
     places : array (q, d)
-        These places.
+        The other positions, metres.
     """
 
     name: str
@@ -67,31 +71,21 @@ class StationBlock:
 
 
 def blocks(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
-    """Return what is proven of each station that is not known exactly, and of each pulse, with all others held.
+    """Return the proof of each pulse and of each station that is not exact, while all others are fixed.
 
-    Parameters
-    ----------
-    lik : Likelihood
-        The network.
-    at : NetworkEstimate
-        One estimate, S = 1.
-
-    Returns
-    -------
-    tuple of StationBlock
-        Stations first. The proof is that of a fix from known stations; it does not exclude that several blocks move
-        together.
+    Stations come first. `at` is one estimate, S = 1. Each proof is the proof of a fix from known stations; it
+    does not exclude that several blocks move together.
     """
     net = lik.network
     d, cost, found = net.dimension, float(lik.cost(at)[0]), list[StationBlock]()
-    fixes = _stations(net, at, _sought(net))
+    fixes = _stations(net, at, _inexact_stations(net))
     if fixes:
         costs = lik.cost(together(*(_moved_station(lik, at, i, fix.position[:d]) for i, fix in fixes)))
         for (i, fix), best in zip(fixes, costs, strict=True):
             name = f"station {net.names[i]}"
             found.append(_block(fix, i, name, True, at.stations[0, i], cost - float(best)))
     fix = place_pulses(net, at, np.arange(net.pulses))
-    # pulses do not know of each other: all are moved at once
+    # pulses do not affect each other, so all of them move at once
     before = (lik.residual(at)[0] ** 2).sum(axis=1)
     after = (lik.residual(moved_pulses(lik, at, np.arange(net.pulses), fix.position))[0] ** 2).sum(axis=1)
     for j in range(net.pulses):
@@ -100,12 +94,13 @@ def blocks(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
     return tuple(found)
 
 
-def _sought(net: Network) -> list[int]:
+def _inexact_stations(net: Network) -> list[int]:
+    """Return the numbers of the stations that are not known exactly."""
     return [i for i in range(net.stations) if (net.place_sigma[i] > 0.0).any()]
 
 
 def mirrored(problem: Problem, here: Array) -> Array:
-    """Return places (B, K, d) of blocks mirrored in the principal planes of their partners, and in their centre."""
+    """Return mirror positions (B, K, d) of blocks: in the principal planes of their partners, and in their centre."""
     partners = problem.stations.position[..., 0, np.concatenate([rows.a for rows in problem.rows]), :]
     weight = np.broadcast_to(problem.weight > 0.0, (len(here), problem.count))
     weight = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1)
@@ -118,7 +113,7 @@ def mirrored(problem: Problem, here: Array) -> Array:
 
 
 def minima(problem: Problem, places: Array) -> tuple[Array, Array]:
-    """Return the minima (B, K, size) of blocks that places (B, K, d) lead to, and their costs (B, K)."""
+    """Return the minima (B, K, size) of blocks from start positions (B, K, d), and their costs (B, K)."""
     count, each = places.shape[:2]
     start = vectors(problem, places).reshape(count * each, -1)
     done = refine(problem, start, item=np.repeat(np.arange(count), each), tolerance=_LAST, limit=_ALONE)
@@ -126,7 +121,7 @@ def minima(problem: Problem, places: Array) -> tuple[Array, Array]:
 
 
 def elsewhere(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
-    """Return the likeliest other places of each station and pulse, the others held: nothing is proven.
+    """Return the likeliest other positions of each station and pulse, without a proof.
 
     Parameters
     ----------
@@ -138,10 +133,11 @@ def elsewhere(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
     Returns
     -------
     tuple of StationBlock
-        Those that have other places, found from mirror images in the principal planes of their partners.
+        One block for each other position. The refinement starts from mirror images in the principal planes of the
+        block's partners.
     """
     net = lik.network
-    stations, d = np.array(_sought(net), dtype=int), net.dimension
+    stations, d = np.array(_inexact_stations(net), dtype=int), net.dimension
     groups = [(False, np.arange(net.pulses), at.pulses[0], pulses_alone(net, at))]
     if stations.size:
         groups.append((True, stations, at.stations[0, stations], stations_alone(net, at, stations)))
@@ -162,7 +158,7 @@ def elsewhere(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
 
 
 def pulses_alone(net: Network, at: NetworkEstimate, which: Array | None = None) -> Problem:
-    """Return n pulses (all) of S estimates as a batch of S n fixes from stations that are held."""
+    """Return n pulses of S estimates (all pulses by default) as a batch of S n fixes from fixed stations."""
     which = np.arange(net.pulses) if which is None else which
     first, second, sign = clock_signs(net)
     tick = (sign[0] * at.clocks[:, first] + sign[1] * at.clocks[:, second])[:, None]
@@ -172,19 +168,19 @@ def pulses_alone(net: Network, at: NetworkEstimate, which: Array | None = None) 
     for kind in dict.fromkeys(kinds.tolist()):
         slots = np.flatnonzero(kinds == kind)
         ends = {"a": first[slots], "b": second[slots]}
-        rows.append(_given(kind, z[:, slots], sigma[:, slots], given[:, slots], **ends))
+        rows.append(_masked_rows(kind, z[:, slots], sigma[:, slots], given[:, slots], **ends))
     one = at.count == 1
     return assemble(at.stations[0] if one else np.repeat(at.stations, len(which), axis=0)[:, None], *rows).flat()
 
 
-def _given(kind: str, z: Array, sigma: Array, given: Array, **ends: Array) -> Measured:
-    """Return rows (B, q) of which some are absent."""
+def _masked_rows(kind: str, z: Array, sigma: Array, given: Array, **ends: Array) -> Measured:
+    """Return rows (B, q) of one kind; rows that are not given have weight 0."""
     deviation, weight = _shared(np.where(given, sigma, 1.0)), _shared(given.astype(float))
     return measured(kind, np.where(given, z, 0.0), sigma=deviation, weight=weight, **ends)
 
 
 def settled(net: Network, at: NetworkEstimate) -> NetworkEstimate:
-    """Return estimates with their pulses where they fit best, the stations held."""
+    """Return the estimates with their pulses at the best fit to the fixed stations."""
     problem = pulses_alone(net, at)
     done = minima(problem, at.pulses.reshape(-1, 1, net.dimension))[0].reshape(at.count, net.pulses, -1)
     d = net.dimension
@@ -192,15 +188,15 @@ def settled(net: Network, at: NetworkEstimate) -> NetworkEstimate:
 
 
 def stations_alone(net: Network, at: NetworkEstimate, which: Array) -> Problem:
-    """Return some stations as a batch of fixes from pulses and the other stations, which are held."""
+    """Return some stations as a batch of fixes from the pulses and the other stations, which are fixed."""
     places, kinds = _station_rows(net, at)
     rows = []
     for kind, ends, sigma, z in kinds:
         given = np.isfinite(sigma[which])
         if given.any():
-            rows.append(_given(kind, z[which], sigma[which], given, a=ends))
+            rows.append(_masked_rows(kind, z[which], sigma[which], given, a=ends))
     soft = np.isfinite(net.place_sigma[which])
-    # a coordinate of which nothing is known has a prior that says nothing, too
+    # the prior covers all coordinates of a station, so unknown coordinates get a very wide one
     spread = float(np.ptp(places, axis=0).max()) or 1.0
     sigma = np.clip(net.place_sigma[which], _EXACT * spread, 1e6 * spread)
     prior = Prior("position", net.place[which], sigma[..., None] ** 2 * np.eye(net.dimension))
@@ -208,13 +204,13 @@ def stations_alone(net: Network, at: NetworkEstimate, which: Array) -> Problem:
 
 
 def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: float) -> StationBlock:
-    """Return a block from the fix that has its place: `above` is what the present place costs beyond the best."""
+    """Return a block from a fix; `above` is the cost of the present position minus the cost of the fix."""
     claims, d = fix.claims, len(here)
     x = np.concatenate([fix.position[None, :d], fix.alternatives.x.reshape(-1, fix.x.shape[-1])[:, :d]])
     gaps = np.concatenate([[0.0], fix.alternatives.gap.ravel()])
     kept = np.isfinite(gaps) & np.isfinite(x).all(axis=1)
     x, gaps = x[kept], gaps[kept]
-    # the present place is among those found, unless it is no minimum or too dear to be listed
+    # The present position is in this list, unless it is no minimum or its cost is above the limit of the list.
     alike = np.abs(gaps - above) <= _ALIKE + equal_cost(float(fix.cost))
     apart = np.where(alike, np.linalg.norm(x - here, axis=1), np.inf)
     others = np.arange(len(x)) != (apart.argmin() if alike.any() else -1)
@@ -225,40 +221,27 @@ def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: f
 
 
 def place_pulses(net: Network, at: NetworkEstimate, which: Array, method: str = "auto") -> Fix:
-    """Return fixes of some pulses from stations that are held.
+    """Return a batch of n fixes of pulses from fixed stations.
 
-    Parameters
-    ----------
-    net : Network
-        What was measured.
-    at : NetworkEstimate
-        One estimate, S = 1; that of the pulses is not used.
-    which : int array (n,)
-        The pulses.
-    method : str
-        Of `optloc.solve`.
-
-    Returns
-    -------
-    Fix
-        A batch of n.
+    `at` is one estimate (S = 1); only its stations and clocks are used. `which` (n,) selects the pulses. `method`
+    is a method of `optloc.solve`.
     """
     return solve(pulses_alone(net, at, which), method)
 
 
 def _shared(values: Array) -> Array:
-    """Return values (n, q) as one row (q,) where all rows are equal: problems that share them are solved at once."""
+    """Return values (n, q) as one row (q,) if all rows are equal; shared values allow one batch."""
     return np.asarray(values[0]) if (values == values[0]).all() else values
 
 
 def _station_rows(net: Network, at: NetworkEstimate) -> tuple[Array, list[tuple[str, Array, Array, Array]]]:
-    """Return places of all, and rows of stations: kind, which place, deviations and values (M, q)."""
+    """Return positions of pulses and stations, and the stations' rows: kind, partners, sigmas, values (M, q)."""
     timed, ranged = _ranges(net, at)
     near = np.full((net.stations, net.stations), np.inf), np.zeros((net.stations, net.stations))
     for (i, k), distance, sigma in zip(net.between, net.distance, net.distance_sigma, strict=True):
         for one, other in ((i, k), (k, i)):
             near[0][one, other], near[1][one, other] = sigma, distance
-    # clocks that are sought are to a station what the time of emission is to a pulse
+    # An unknown clock has the same effect on a station's rows as an emission time on a pulse's rows: kind toa.
     kinds = [("range" if net.synchronised else "toa", np.arange(net.pulses), *timed)]
     kinds.append(("range", np.arange(net.pulses), *ranged))
     kinds.append(("range", net.pulses + np.arange(net.stations), *near))
@@ -266,7 +249,7 @@ def _station_rows(net: Network, at: NetworkEstimate) -> tuple[Array, list[tuple[
 
 
 def _stations(net: Network, at: NetworkEstimate, which: list[int]) -> list[tuple[int, Fix]]:
-    """Return fixes of some stations from pulses and stations that are held."""
+    """Return fixes of stations from fixed pulses and stations."""
     soft = np.isfinite(net.place_sigma[which]).any(axis=1) if which else np.zeros(0, dtype=bool)
     plain = np.array(which, dtype=int)[~soft]
     free = _fixes(stations_alone(net, at, plain), at.stations[0, plain]) if plain.size else None
@@ -276,7 +259,10 @@ def _stations(net: Network, at: NetworkEstimate, which: list[int]) -> list[tuple
 
 
 def _fixes(problem: Problem, here: Array) -> Fix:
-    """Return fixes with their proof; of many rows from where they are, as other starts take matrices of all rows."""
+    """Return fixes with their proof; with many rows, from the present position.
+
+    Other starts need matrices of all rows.
+    """
     if problem.count <= _MANY:
         return solve(problem)
     start = np.zeros((len(here), problem.layout.size))
@@ -285,9 +271,9 @@ def _fixes(problem: Problem, here: Array) -> Fix:
 
 
 def _ranges(net: Network, at: NetworkEstimate) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return deviations and values (M, N) of what each station's rows say of its ranges: with and without its clock.
+    """Return sigmas and values (M, N) of the ranges to pulses: with the station's clock, then without.
 
-    Several rows of one pulse are one range: their mean by inverse variance.
+    Several rows of one pulse are combined to their mean, weighted by inverse variance.
     """
     m, n = net.stations, net.pulses
     information, sums = np.zeros((2, m, n)), np.zeros((2, m, n))
@@ -310,14 +296,14 @@ def _ranges(net: Network, at: NetworkEstimate) -> tuple[tuple[Array, Array], tup
 
 
 def moved(lik: Likelihood, at: NetworkEstimate, block: StationBlock, place: Array) -> NetworkEstimate:
-    """Return an estimate with one block at another place, and its clock or emission as that place wants it."""
+    """Return an estimate with one block at another position, and with the clock or emission time that fits there."""
     if block.station:
         return _moved_station(lik, at, block.index, place)
     return moved_pulses(lik, at, np.array([block.index]), place[None])
 
 
 def moved_pulses(lik: Likelihood, at: NetworkEstimate, which: Array, places: Array) -> NetworkEstimate:
-    """Return an estimate with some pulses (n,) at other places (n, d), and their emission as these want it."""
+    """Return an estimate with some pulses (n,) at other positions (n, d), with the emission times that fit there."""
     net, pulses, emission = lik.network, at.pulses.copy(), at.emission.copy()
     pulses[0, which] = np.where(np.isfinite(places), places, pulses[0, which])
     there = replace(at, pulses=pulses)
@@ -327,6 +313,7 @@ def moved_pulses(lik: Likelihood, at: NetworkEstimate, which: Array, places: Arr
 
 
 def _moved_station(lik: Likelihood, at: NetworkEstimate, i: int, place: Array) -> NetworkEstimate:
+    """Return an estimate with station i at another position (d,), and with the clock that fits there."""
     stations, clocks, net = at.stations.copy(), at.clocks.copy(), lik.network
     stations[0, i] = np.where(np.isfinite(place), place, stations[0, i])
     there = replace(at, stations=stations)
@@ -339,5 +326,5 @@ def _moved_station(lik: Likelihood, at: NetworkEstimate, i: int, place: Array) -
 
 
 def _mean(residual: Array, slope: Array) -> Array:
-    """Return the change (...) of an unknown that fits whitened residuals (..., q), by their slopes."""
+    """Return the change (...) of an unknown that best fits whitened residuals (..., q) with given slopes (..., q)."""
     return np.asarray((residual * slope).sum(axis=-1) / np.maximum((slope**2).sum(axis=-1), 1e-300))

@@ -1,4 +1,9 @@
-"""Networks from nothing: starts until three agree, moves of single blocks, and a verdict with its reasons."""
+"""Self-calibration of a network: search, block moves with proofs, and a result with status and findings.
+
+`calibrate` searches with up to 60 pulses, adds the other pulses as fixes, and refines everything together.
+Then it tests the result: open motions, mirror images, misfit, alternatives and proofs of single stations and
+pulses.
+"""
 
 from __future__ import annotations
 
@@ -27,22 +32,25 @@ from optloc.sites.calibration.outliers import PRICE, outliers
 from optloc.sites.calibration.restarts import laid
 from optloc.solvers import AMBIGUOUS_GAP, LISTED_GAP, P_MISFIT, Finding, objections
 
-# Pulses that starts are made from: those with most rows. More find nothing that so many do not.
+# Pulses in the search, those with the most rows: more pulses did not find other networks.
 _CORE = 60
-# Method that places the other pulses; their proof comes with that of all.
+# Method for the other pulses; their proof follows with the proofs of all pulses.
 _QUICK = "gtrs+lsr"
-# Share of pulses with two places that the others outvote: of more, the cheapest combination of their sides is chosen
-# among so many that it feigns a shape of the stations (flat ones come out 0.1 to 0.3 m thick at 3 cm).
+# Largest share of pulses with two possible positions. With more of them, the choice of their sides has many
+# combinations, and the cheapest one can give a wrong shape of the stations. At 3 cm noise, flat stations appear
+# 0.1 to 0.3 m thick.
 _TWOFOLD = 0.5
-# Share of the size by which distances differ in networks that are not the same.
+# Difference of distances, as a share of the size, from which two networks are different.
 _ALIKE = 1e-3
-# Probability beyond the ellipsoid in which two networks are one answer.
+# Two networks are one result if their difference has at least this probability under the covariance.
 _WITHIN = 0.05
-# Share of the largest variance below which a change of distances is none that stations can make.
+# Variances below this share of the largest belong to changes of distances that no motion of stations can make.
 _ZERO = 1e-9
-# Share of the largest move of a pulse above which others are elsewhere, too, and do not just follow the stations.
+# Share of the largest pulse displacement from which another pulse has a different position too, and does not
+# only follow the stations.
 _GIVES_WAY = 0.1
-# Share of squared errors that another network with nearly the same stations may add: 10 % of a deviation.
+# Largest share that another network with nearly the same stations may add to the squared errors: 10 % of a
+# standard deviation.
 _COVERS = 0.2
 
 
@@ -53,13 +61,13 @@ class Alternative:
     Parameters
     ----------
     what : str
-        How it differs, for instance "pulse 7 elsewhere".
+        The difference, for instance "pulse 7 elsewhere".
     gap : float
-        Its cost beyond that of the network found.
+        Its cost minus the cost of the network found.
     stations : array (M, d)
-        Where it has the stations, metres, in the same frame.
+        Station positions in the same frame, metres.
     pulses : array (N, d)
-        Where it has the pulses that can be placed.
+        Positions of the pulses that have enough rows, metres.
     """
 
     what: str
@@ -70,45 +78,46 @@ class Alternative:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A network with its covariance and verdict.
+    """A network with its covariance and status.
 
     Parameters
     ----------
     network : Network
-        What was measured.
+        Measurements and prior knowledge.
     stations : array (M, d)
-        Places, metres, in the frame `gauge`.
+        Station positions in the frame `gauge`, metres.
     clocks : array (M,)
-        Offsets times the speed of propagation, metres; zeros where stations share a clock.
+        Clock offsets times the propagation speed, metres; zeros if the stations share a clock.
     pulses : array (N, d)
-        Places, metres; NaN where a pulse has too few rows, or is not proven to fit at one place alone.
+        Pulse positions, metres; NaN if a pulse has too few rows, or if its position is not proven to be unique.
     emission : array (N,)
-        Times of emission times the speed of propagation, metres.
+        Emission times multiplied by the propagation speed, metres.
     covariance : array (P, P)
-        Of the M d station coordinates, then the clocks where these are sought, square metres, in that frame.
+        Covariance of the M d station coordinates, then of unknown clocks, in that frame, square metres.
     gauge : str
-        What defines the frame: "known places", "centre and main axes of the stations" or the names of stations.
+        Definition of the frame: "known places", "centre and main axes of the stations" or names of stations.
     status : Status
-        The verdict.
+        `ok`, or the most serious problem.
     findings : tuple of str
-        All that speaks against the network, a sentence each; empty for `ok`.
+        One sentence for each problem; empty for `ok`.
     proof : "blockwise" or "unknown"
-        "blockwise": with the others held, no other place of any one station or pulse costs less, and none of a station
-        costs up to 9 more, proven. It does not exclude that several move together.
+        "blockwise" is a proof for each single station or pulse while all others are fixed: no other position has a
+        lower cost. For a station, no other position costs up to 9 more. The proof does not cover joint moves of
+        several stations or pulses.
     cost : float
         Weighted sum of squared residuals.
     dof : int
         Degrees of freedom.
     p_value : float
-        Chi-square probability of a cost at least this large.
+        Probability of a cost at least as large, from the chi-square distribution.
     agreeing, starts : int
-        How many starts arrived here, and how many were made.
+        Number of starts that reached this network, and of all starts.
     alternatives : tuple of Alternative
-        Other networks within 25 of the cost, cheapest first.
+        Other networks with a cost at most 25 higher, cheapest first.
     residuals : array (N, R)
-        Whitened residuals; NaN where nothing was measured.
+        Whitened residuals; NaN if there is no measurement.
     left_out : int array (k, 2)
-        Pulse and column of `network.z` of each row that was left out as gross, with `robust`.
+        Pulse and column of `network.z` of each row that `robust` left out as gross.
     """
 
     network: Network
@@ -132,33 +141,33 @@ class Calibration:
 
     @property
     def sigma(self) -> Array:
-        """Return the standard deviations (M, d) of the stations' coordinates in the frame, metres."""
+        """Return the standard deviations (M, d) of the station coordinates in the frame, metres."""
         m, d = self.stations.shape
         return np.asarray(np.sqrt(np.diag(self.covariance)[: m * d]).reshape(m, d))
 
     def distances(self) -> tuple[Array, Array, Array]:
-        """Return distances between stations, which no frame changes, and their covariance.
+        """Return the distances between stations, which do not depend on the frame, and their covariance.
 
         Returns
         -------
         pairs : int array (q, 2)
             All pairs of stations.
         distance : array (q,)
-            Metres.
+            Distances, metres.
         covariance : array (q, q)
-            Square metres.
+            Covariance of the distances, square metres.
         """
         pairs, length, flat = spans(self.stations)
         size = flat.shape[1]
         return pairs, length, flat @ self.covariance[:size, :size] @ flat.T
 
     def require(self, allow: tuple[str, ...] = ()) -> Calibration:
-        """Return this where its status is `ok` or one that is allowed.
+        """Return this calibration if its status is `ok` or in `allow`.
 
         Raises
         ------
         NoSolution
-            With the findings.
+            For any other status; the exception has the findings.
         """
         if self.status is not Status.OK and self.status.label not in allow:
             raise NoSolution(self.network, self)
@@ -166,7 +175,7 @@ class Calibration:
 
 
 def spans(stations: Array) -> tuple[Array, Array, Array]:
-    """Return all pairs of stations (q, 2), their distances (q,) and the derivatives of these (q, M d)."""
+    """Return all pairs of stations (q, 2), their distances (q,), metres, and the derivatives (q, M d)."""
     m, d = stations.shape
     pairs = np.array([(i, k) for i in range(m) for k in range(i)], dtype=int).reshape(-1, 2)
     line = stations[pairs[:, 0]] - stations[pairs[:, 1]]
@@ -187,66 +196,66 @@ def calibrate(
     robust: bool = False,
     tell: Callable[[str], None] | None = None,
 ) -> Calibration:
-    """Find stations, clocks and pulses together, without a guess.
+    """Estimate stations, clocks and pulses together, without a first guess.
 
     Parameters
     ----------
     network : Network
-        What was measured and what is known.
+        Measurements and prior knowledge.
     gauge : tuple of str
-        Names of d stations that define the frame of a free network; by default all do.
+        Names of d stations that define the frame of a free network; by default all stations define it.
     seed : int
-        Decides the starts.
+        Seed of the random starts.
     starts : int, optional
-        Starts after which the search ends, agreed or not.
+        Largest number of starts, even if they do not agree.
     robust : bool
-        Whether rows that most others contradict are left out first: they are named, and the network is `unproven` at
-        best, as no proof says that these are the wrong ones.
+        Whether to leave out and list rows that most other rows contradict. The best possible status is then
+        `unproven`: no proof shows that these rows are wrong.
     tell : callable, optional
-        Called with a sentence on each round.
+        Called with a progress message after each round.
 
     Returns
     -------
     Calibration
-        Network, covariance, verdict.
+        Network, covariance, status and findings.
 
     Raises
     ------
     InvalidProblem
-        For stations of `gauge` that are not there, or where known places define the frame.
+        If `gauge` names an unknown station, or if known positions already define the frame.
     """
-    named = _named(network, gauge)
+    named = _station_indices(network, gauge)
     if robust:
-        return _without_gross(network, gauge, seed, starts, tell)
+        return _calibrate_robust(network, gauge, seed, starts, tell)
     enough = _placeable(network)
     if network.rows - network.unknowns + frame_size(network) < 0 or enough.sum() < 1:
-        return _refused(network, Status.TOO_FEW_ROWS, "There are fewer measurements than unknowns.")
+        return _failure(network, Status.TOO_FEW_ROWS, "There are fewer measurements than unknowns.")
     core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])
     core = core[enough[core]]
     found = search(network.take(core), seed, starts, tell)
     if found is None:
-        return _refused(network, Status.NUMERICAL, "No start led to a network.")
+        return _failure(network, Status.NUMERICAL, "No start converged to a network.")
     at = found.best
     rest = enough.copy()
     rest[core] = False
     if rest.any():
-        at = _with_rest(network, at, core, np.flatnonzero(rest))
+        at = _add_other_pulses(network, at, core, np.flatnonzero(rest))
     lik = likelihood(network.take(enough))
-    made = _judged(lik, lik.refine(at)[0], found, named)
-    return _whole(made, network, enough)
+    made = _judge(lik, lik.refine(at)[0], found, named)
+    return _with_all_pulses(made, network, enough)
 
 
-def _without_gross(
+def _calibrate_robust(
     network: Network, gauge: tuple[str, ...], seed: int, starts: int | None, tell: Callable[[str], None] | None
 ) -> Calibration:
-    """Return the network of the rows that agree, and name those that do not."""
+    """Return the network of the rows that agree, with a list of the rows that were left out."""
     core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])
     gross = np.zeros(network.z.shape, dtype=bool)
     gross[core] = outliers(network.take(core), seed)
     found = calibrate(
         replace(network, sigma=np.where(gross, np.inf, network.sigma)), gauge=gauge, seed=seed, starts=starts, tell=tell
     )
-    # all rows are asked again, those of pulses that the search did not have too
+    # test all rows again, also of pulses that were not in the search
     residual = _all_residuals(network, found)
     again = network.given & (residual**2 > PRICE)
     if (again != gross).any() and np.isfinite(found.stations).all():
@@ -262,19 +271,19 @@ def _without_gross(
     if not len(left):
         return found
     names = [f"{network.names[network.slots[r].a]} of pulse {network.labels[j]}" for j, r in left]
-    words = f"Left out as gross, which no proof confirms: {_few(names)}."
+    words = f"These rows were left out as gross errors, without a proof: {_shorten(names)}."
     status = min(found.status, Status.UNPROVEN, key=PRECEDENCE.index) if found.status in PRECEDENCE else found.status
     return replace(found, network=network, status=status, findings=(*found.findings, words), left_out=left)
 
 
 def _all_residuals(network: Network, found: Calibration) -> Array:
-    """Return whitened residuals (N, R) of all rows; zeros of pulses without a place."""
+    """Return whitened residuals (N, R) of all rows; zeros for pulses without a position."""
     at = NetworkEstimate(found.stations[None], found.clocks[None], found.pulses[None], found.emission[None])
     return np.asarray(np.nan_to_num(likelihood(network).residual(at)[0]))
 
 
-def _with_rest(network: Network, at: NetworkEstimate, core: Array, rest: Array) -> NetworkEstimate:
-    """Return an estimate of all pulses that can be placed: the core's, and fixes of the others."""
+def _add_other_pulses(network: Network, at: NetworkEstimate, core: Array, rest: Array) -> NetworkEstimate:
+    """Return an estimate of all pulses with enough rows: the pulses of the search, and fixes of the others."""
     n, d = network.pulses, network.dimension
     pulses, emission = np.zeros((1, n, d)), np.zeros((1, n))
     pulses[0, core], emission[0, core] = at.pulses[0], at.emission[0]
@@ -285,22 +294,23 @@ def _with_rest(network: Network, at: NetworkEstimate, core: Array, rest: Array) 
     return NetworkEstimate(at.stations, at.clocks, whole.pulses[:, every], whole.emission[:, every])
 
 
-# The verdict.
+# Status and findings.
 
 
-def _judged(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, named: tuple[int, ...]) -> Calibration:
+def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, named: tuple[int, ...]) -> Calibration:
+    """Return the calibration: block proofs, frame, covariance, alternatives, findings and status."""
     net = lik.network
     soft = bool(np.isfinite(net.place_sigma).any())
     at, checked, others = proven(lik, at)
     at = with_mean_clock(net, at) if soft else in_frame(net, at, named)
-    told = determined(lik, at)
+    rank = determined(lik, at)
     cost = float(lik.cost(at)[0])
-    dof = net.rows - net.unknowns + told.free.shape[1]
+    dof = net.rows - net.unknowns + rank.free.shape[1]
     p = float(tail_probability(np.array(cost), np.array(dof)))
-    covariance, sides, bent = np.full((lik.free.size, lik.free.size), np.nan), list[str](), np.nan
-    if not told.open.shape[1]:
-        covariance = told.covariance(fixed_by(net, named) if named else told.free.T)
-        sides, bent = flat(lik, at, covariance), departure(lik, at, told)
+    covariance, sides, departs = np.full((lik.free.size, lik.free.size), np.nan), list[str](), np.nan
+    if not rank.open.shape[1]:
+        covariance = rank.covariance(fixed_by(net, named) if named else rank.free.T)
+        sides, departs = flat(lik, at, covariance), departure(lik, at, rank)
     alternatives = _alternatives(lik, at, cost, found, others)
     pulses = at.pulses[0].copy()
     pulses[[block.index for block in checked if not block.station and not block.proven]] = np.nan
@@ -309,7 +319,7 @@ def _judged(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, na
     for other in (one for one, alike in zip(rivals, same, strict=True) if alike):
         pulses[_moved_pulses(at, other)] = np.nan
     elsewhere = tuple(one for one, alike in zip(rivals, same, strict=True) if not alike)
-    facts = _Facts(net, found, told, p, tuple(sides), bent, checked, elsewhere, np.isnan(pulses).any(axis=1))
+    facts = _Facts(net, found, rank, p, tuple(sides), departs, checked, elsewhere, np.isnan(pulses).any(axis=1))
     findings = objections(_FINDINGS, facts)
     gauge = "known places" if soft else ", ".join(net.names[i] for i in named)
     return Calibration(
@@ -333,44 +343,45 @@ def _judged(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, na
     )
 
 
-def _open_words(net: Network, told: GaugeRank) -> str:
+def _open_words(net: Network, rank: GaugeRank) -> str:
+    """Return a sentence about open motions, with the stations that move most."""
     m, d = net.stations, net.dimension
-    share = np.sqrt((told.open[: m * d] ** 2).sum(axis=1).reshape(m, d).sum(axis=1))
+    share = np.sqrt((rank.open[: m * d] ** 2).sum(axis=1).reshape(m, d).sum(axis=1))
     if not net.synchronised:
-        share = np.hypot(share, np.sqrt((told.open[m * d :] ** 2).sum(axis=1)))
+        share = np.hypot(share, np.sqrt((rank.open[m * d :] ** 2).sum(axis=1)))
     largest = [net.names[i] for i in np.argsort(-share, kind="stable")[:3]]
-    count = told.open.shape[1]
+    count = rank.open.shape[1]
     return (
-        f"{count} motion{'s' if count > 1 else ''} of the network beyond the frame change no measurement, mostly of "
-        f"{', '.join(largest)}; add pulses off their plane, distances between stations, or known places."
+        f"The measurements do not determine {count} motion{'s' if count > 1 else ''} of the network, mostly of "
+        f"{', '.join(largest)}; add pulses outside their plane, distances between stations, or known positions."
     )
 
 
 def _curved_words(far: float) -> str:
-    words = f"three deviations away the cost is up to {np.exp(far):.2g} times more or less than it says"
-    return f"The covariance does not cover: {words}."
+    words = f"three standard deviations away, the rise of the cost differs by a factor of up to {np.exp(far):.2g}"
+    return f"The covariance does not cover the error: {words}."
 
 
 @dataclass(frozen=True, slots=True)
 class _Facts:
-    """The facts that decide about a network.
+    """The quantities that decide the status of a network.
 
     Parameters
     ----------
     net, found, motions : Network, NetworkSearchResult, GaugeRank
-        The network, its starts, and the motions that the data determine.
+        The network, its search, and its determined and open motions.
     p : float
-        Probability of residuals as large.
+        Probability of residuals at least as large.
     sides : tuple of str
-        Sentences on stations, or pulses, in one plane.
+        Sentences about stations, or pulses, in one plane.
     departure : float
-        See `optloc.sites.calibration.gauge.departure`; NaN where a motion is open.
+        See `optloc.sites.calibration.gauge.departure`; NaN if a motion is open.
     blocks : tuple of StationBlock
         Stations and pulses with their proofs.
     elsewhere : tuple of Alternative
-        Networks with other stations that fit about as well.
+        Networks with other stations that fit about equally well.
     twofold : bool array (N,)
-        Pulses without a single place.
+        Pulses without a unique position.
     """
 
     net: Network
@@ -385,12 +396,12 @@ class _Facts:
 
     @property
     def refuted(self) -> list[str]:
-        """Return the names of blocks that cost less elsewhere."""
+        """Return the names of blocks that have a lower cost at another position."""
         return [block.name for block in self.blocks if block.refuted]
 
     @property
     def unproven(self) -> list[str]:
-        """Return the names of blocks without a proof; a pulse may be elsewhere at the same cost."""
+        """Return the names of blocks without a proof; for a pulse, another position may have the same cost."""
         return [block.name for block in self.blocks if not (block.proven if block.station else block.cheapest)]
 
 
@@ -406,52 +417,55 @@ _FINDINGS = (
     Finding(
         Status.AMBIGUOUS,
         lambda e: e.elsewhere,
-        lambda e: [f"{other.what} costs {other.gap:.2g} more: both fit the data." for other in e.elsewhere],
+        lambda e: [
+            f"Another network fits the data: {other.what[0].lower()}{other.what[1:]}, cost + {other.gap:.2g}."
+            for other in e.elsewhere
+        ],
     ),
     Finding(
         Status.AMBIGUOUS,
         lambda e: e.twofold.mean() > _TWOFOLD,
         lambda e: [
-            f"{e.twofold.sum()} of {len(e.twofold)} pulses have no single place, as near a plane of all stations."
+            f"{e.twofold.sum()} of {len(e.twofold)} pulses have no unique position: the stations may be near one plane."
         ],
     ),
     Finding(
         Status.UNPROVEN,
         lambda e: e.refuted,
-        lambda e: [f"Another place costs less for {_few(e.refuted)}, the others held."],
+        lambda e: [f"With all others fixed, another position costs less: {_shorten(e.refuted)}."],
     ),
     Finding(
         Status.UNPROVEN,
         lambda e: e.unproven and not e.refuted,
-        lambda e: [f"That no other place fits as well is not proven of {_few(e.unproven)}."],
+        lambda e: [f"A proof that no other position fits equally well is missing for {_shorten(e.unproven)}."],
     ),
     Finding(
         Status.SEARCHED,
         lambda e: e.found.agreeing < AGREEING,
-        lambda e: [f"{e.found.agreeing} of {e.found.made} starts arrived at this network; {AGREEING} must agree."],
+        lambda e: [f"Only {e.found.agreeing} of {e.found.made} starts reached this network; {AGREEING} must agree."],
     ),
 )
-"""All findings against networks."""
+"""Findings of a network: status, condition and sentences; the first that applies sets the status."""
 
 
-def _few(names: list[str]) -> str:
+def _shorten(names: list[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def refuted_blocks(network: Network, at: NetworkEstimate) -> tuple[StationBlock, ...]:
-    """Return the stations and pulses that cost less elsewhere with the others held, proven.
+    """Return the stations and pulses with a lower cost at another position while all others are fixed.
 
     Parameters
     ----------
     network : Network
-        What was measured.
+        Measurements and prior knowledge.
     at : NetworkEstimate
-        One network, S = 1, for instance one with a station on the wrong side.
+        One network, S = 1, for instance with a station on the wrong side.
 
     Returns
     -------
     tuple of StationBlock
-        Empty where none is.
+        Empty if no block has a lower cost elsewhere.
     """
     return tuple(block for block in blocks(likelihood(network), at) if block.refuted)
 
@@ -463,10 +477,10 @@ def _alternatives(
     found: NetworkSearchResult,
     others: list[tuple[str, NetworkEstimate]],
 ) -> tuple[Alternative, ...]:
-    """Return other minima within `LISTED_GAP`: blocks elsewhere, ends of other starts, and the mirror image."""
+    """Return other minima within `LISTED_GAP`: moved blocks, minima of other starts, and the mirror image."""
     net = lik.network
     soft = bool(np.isfinite(net.place_sigma).any())
-    if at.pulses.shape[1] == found.best.pulses.shape[1]:  # else starts are of the core alone
+    if at.pulses.shape[1] == found.best.pulses.shape[1]:  # otherwise the starts contain only a part of the pulses
         near = found.ends.cost < found.cost + LISTED_GAP
         _, first = np.unique(np.round(found.ends.cost[near], 3), return_index=True)
         others = others + [("another network", found.ends.at.take(np.flatnonzero(near)[[i]])) for i in first]
@@ -479,11 +493,12 @@ def _alternatives(
     out: list[Alternative] = []
     shapes = [_shape(at, soft)]
     scale = max(float(np.abs(shapes[0]).max()), 1e-300)
-    # of the same network, refined twice, the first name says more
+    # The same network can occur twice. A stable sort keeps the first name, which is the most specific.
     for i in np.argsort(np.round(costs, 3), kind="stable"):
         one, gap = ends.take(np.array([i])), float(costs[i] - cost)
         shape = _shape(one, soft)
-        # a thousandth of the size, or where costs agree to what is left of the digits, is the same network
+        # Networks that differ by less than `_ALIKE` of the size are the same: equal costs allow a difference from
+        # rounding.
         if gap < LISTED_GAP and all(np.abs(shape - other).max() > _ALIKE * scale for other in shapes):
             shapes.append(shape)
             words = others[i][0]
@@ -494,9 +509,10 @@ def _alternatives(
 
 
 def _same_stations(at: NetworkEstimate, other: Alternative, covariance: Array) -> bool:
-    """Return whether another network has the stations where this one has them, as far as its covariance tells.
+    """Return whether another network has the same stations, within the covariance.
 
-    They are within its 95 % ellipsoid, and what the other's share of the likelihood adds to squared errors is covered.
+    The stations are within the 95 % ellipsoid, and the covariance covers the squared error that the other network
+    adds in proportion to its likelihood.
     """
     if not np.isfinite(covariance).all():
         return False
@@ -504,36 +520,39 @@ def _same_stations(at: NetworkEstimate, other: Alternative, covariance: Array) -
     apart = spans(other.stations)[1] - spans(at.stations[0])[1]
     size = gradient.shape[1]
     width, axes = np.linalg.eigh(gradient @ covariance[:size, :size] @ gradient.T)
-    told = width > _ZERO * width[-1]
-    shift, dof = float((((axes.T @ apart)[told]) ** 2 / width[told]).sum()), int(told.sum())
+    known = width > _ZERO * width[-1]
+    shift, dof = float((((axes.T @ apart)[known]) ** 2 / width[known]).sum()), int(known.sum())
     share = 1.0 / (1.0 + np.exp(0.5 * other.gap))
     within = float(tail_probability(np.array(shift), np.array(dof))) > _WITHIN
     return within and share * shift <= _COVERS * dof
 
 
 def _moved_pulses(at: NetworkEstimate, other: Alternative) -> Array:
-    """Return which pulses another network has elsewhere (N,): the rest gives way a little."""
+    """Return a mask (N,) of the pulses that another network has at different positions; others move a little."""
     apart = np.linalg.norm(other.pulses - at.pulses[0], axis=1)
     return np.asarray(apart > _GIVES_WAY * apart.max())
 
 
 def _shape(at: NetworkEstimate, soft: bool) -> Array:
-    """Return distances between stations and to the pulses, which no frame changes; places too where these are known."""
+    """Return distances of stations to stations and pulses, which need no frame; with priors, also positions."""
     points = np.concatenate([at.stations[0], at.pulses[0]])
     apart = np.linalg.norm(points[:, None] - at.stations[0][None], axis=-1).ravel()
     return np.concatenate([apart, at.stations.ravel()]) if soft else apart
 
 
-# What surrounds a search.
+# Preparation and completion of a search.
 
 
-def _named(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
+def _station_indices(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the numbers of the `gauge` stations, or raise if these cannot define the frame."""
     if not gauge:
         return ()
     if np.isfinite(network.place_sigma).any():
-        raise InvalidProblem("known places define the frame already", "gauge", "leave it out")
+        raise InvalidProblem("known places define the frame already", "gauge", "remove this argument")
     if len(gauge) != network.dimension or len(set(gauge)) != len(gauge):
-        raise InvalidProblem(f"a frame needs {network.dimension} stations", "gauge", "name so many, each once")
+        raise InvalidProblem(
+            f"a frame needs {network.dimension} stations", "gauge", f"name {network.dimension} different stations"
+        )
     for name in gauge:
         if name not in network.names:
             raise no_station(name, "gauge", network.names)
@@ -541,12 +560,13 @@ def _named(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
 
 
 def _placeable(network: Network) -> Array:
-    """Return which pulses have as many rows as unknowns (N,)."""
+    """Return a mask (N,) of the pulses whose number of rows is at least their number of unknowns."""
     needed = network.dimension + network.emission
     return np.asarray(network.given.sum(axis=1) >= needed)
 
 
-def _refused(network: Network, status: Status, words: str) -> Calibration:
+def _failure(network: Network, status: Status, words: str) -> Calibration:
+    """Return a calibration without estimates, with a status and its sentence."""
     m, n, d = network.stations, network.pulses, network.dimension
     p = m * d + (0 if network.synchronised else m)
     nan = np.full
@@ -571,8 +591,8 @@ def _refused(network: Network, status: Status, words: str) -> Calibration:
     )
 
 
-def _whole(made: Calibration, network: Network, enough: Array) -> Calibration:
-    """Return a calibration of all pulses, NaN for those that have too few rows."""
+def _with_all_pulses(made: Calibration, network: Network, enough: Array) -> Calibration:
+    """Return a calibration of all pulses, with NaN for pulses that have too few rows."""
     pulses = np.full((network.pulses, network.dimension), np.nan)
     emission, residuals = np.full(network.pulses, np.nan), np.full(network.z.shape, np.nan)
     pulses[enough], emission[enough], residuals[enough] = made.pulses, made.emission, made.residuals

@@ -1,4 +1,8 @@
-"""What no measurement of a network tells: its frame, and the side of a plane in which stations or pulses are."""
+"""The gauge freedom of a network: its frame, and mirror images if stations or pulses are in one plane.
+
+Rows between stations and pulses do not change if the whole network moves, turns or is mirrored. This module
+finds these motions, and other open motions, at an estimate. It also sets the frame of the result.
+"""
 
 from __future__ import annotations
 
@@ -14,26 +18,26 @@ from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, tog
 from optloc.sites.calibration.network import Network
 from optloc.solvers import AMBIGUOUS_GAP
 
-# Singular values of scaled derivatives below this share of the largest are zeros: exact ones come out at 1e-15.
+# Singular values below this share of the largest count as zero; exact zeros have a rounding error of 1e-15.
 _ZERO = 1e-9
-# Level at which points refute that they are in one plane: that of three sigma of a single number.
+# Probability level of the test for points in one plane: three standard deviations of a single number.
 _LEVEL = 0.9973
-# Share of the size by which what is known exactly may be missed: rounding of a refinement.
+# Tolerance of exact knowledge, as a share of the network size: the rounding error of a refinement.
 _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class GaugeRank:
-    """What rows determine of stations and clocks at an estimate, pulses eliminated.
+    """Motions of stations and clocks that the rows determine at an estimate, after elimination of the pulses.
 
     Parameters
     ----------
     jacobian : array (q, P)
-        Whitened derivatives by station coordinates and clocks, what pulses explain taken away.
+        Whitened derivatives by station coordinates and clocks, without the part that pulses explain.
     free : array (P, g)
-        Orthonormal: moves of the whole network and of its clocks that no row sees, the frame.
+        Orthonormal basis of the frame: motions of the whole network and of all clocks that change no row.
     open : array (P, f)
-        Orthonormal: other changes that no row sees.
+        Orthonormal basis of the other motions that change no row.
     """
 
     jacobian: Array
@@ -41,7 +45,7 @@ class GaugeRank:
     open: Array
 
     def covariance(self, fixed: Array) -> Array:
-        """Return the covariance (P, P) in the frame in which `fixed` (g, P) times any change is zero."""
+        """Return the covariance (P, P), m^2, in the frame in which `fixed` (g, P) times each change is zero."""
         p = self.jacobian.shape[1]
         moving = np.flatnonzero(np.abs(self.jacobian).max(axis=0) > 0.0)
         basis = np.eye(p)[:, moving]
@@ -54,24 +58,24 @@ class GaugeRank:
 
 
 def determined(lik: Likelihood, at: NetworkEstimate) -> GaugeRank:
-    """Return what the rows determine at an estimate (S = 1)."""
+    """Return the determined, free and open motions at an estimate (S = 1)."""
     p, jacobian = lik.free.size, without_pulses(lik, at)
     motions = frame_moves(lik.network, at)
     motions[~lik.free] = 0.0
     size = float(np.linalg.norm(jacobian, 2))
-    free = _unseen(jacobian, _span(motions), size)
+    free = _null_space(jacobian, _span(motions), size)
     rest = np.linalg.svd(free.T)[2][free.shape[1] :].T if free.shape[1] else np.eye(p)
     rest = rest[:, np.abs(rest[lik.free]).max(axis=0) > _ZERO]
-    held = np.flatnonzero(~lik.free)
-    rest = _span(rest - np.isin(np.arange(p), held)[:, None] * rest)
-    return GaugeRank(jacobian, free, _unseen(jacobian, rest, size))
+    exact = np.flatnonzero(~lik.free)
+    rest = _span(rest - np.isin(np.arange(p), exact)[:, None] * rest)
+    return GaugeRank(jacobian, free, _null_space(jacobian, rest, size))
 
 
 def without_pulses(lik: Likelihood, at: NetworkEstimate) -> Array:
-    """Return a triangle (q, P) with the derivatives of an estimate (S = 1), what pulses explain taken away."""
+    """Return a triangle (q, P): the derivatives at an estimate (S = 1) after elimination of the pulses."""
     by_station, by_pulse, known = lik.jacobian(at)
     n, r, p = by_station.shape
-    # a pulse far away has columns of very different lengths
+    # the columns of a distant pulse have very different lengths, so scale them first
     length = np.sqrt((by_pulse**2).sum(axis=1, keepdims=True))
     q, triangle = np.linalg.qr(by_pulse / np.where(length > 0.0, length, 1.0))
     pivot = np.abs(np.einsum("nii->ni", triangle))
@@ -80,28 +84,22 @@ def without_pulses(lik: Likelihood, at: NetworkEstimate) -> Array:
     return np.asarray(np.linalg.qr(np.concatenate([reduced, known]), mode="r"))
 
 
-# Deviations at which the cost is compared with that of a Gaussian: as of a fix.
+# Distance in standard deviations at which the cost is compared with the Gaussian cost, as for a fix.
 _FAR = 3.0
-# Share of that cost below which a rise counts as none.
+# Smallest rise of the cost, as a share of the Gaussian rise: smaller rises count as this one, so that the
+# logarithm exists.
 _NONE = 1e-9
 
 
-def departure(lik: Likelihood, at: NetworkEstimate, told: GaugeRank) -> float:
-    """Return how far the cost departs from that of a Gaussian with the covariance found.
+def departure(lik: Likelihood, at: NetworkEstimate, rank: GaugeRank) -> float:
+    """Return the largest deviation of the cost from the Gaussian cost, as the logarithm of their ratio.
 
-    Three deviations to either side along each principal axis of stations and clocks, the pulses wherever they then fit
-    best: the largest ``|ln((f(x +- 3 t) - f(x)) / 9)|``, as of a fix (`optloc.model_checks.shape`).
-
-    Parameters
-    ----------
-    lik : Likelihood
-        The network.
-    at : NetworkEstimate
-        The one found, S = 1.
-    told : GaugeRank
-        What is determined there, nothing left open.
+    The test points are three standard deviations away, on both sides of each principal axis of stations and
+    clocks. The pulses are refitted at each test point. The result is the largest ``|ln((f(x +- 3 t) - f(x)) /
+    9)|``, as for a fix (`optloc.model_checks.shape`). `at` (S = 1) is the estimate. `rank` contains its determined
+    motions; there must be no open motion.
     """
-    width, axes = np.linalg.eigh(told.covariance(told.free.T))
+    width, axes = np.linalg.eigh(rank.covariance(rank.free.T))
     far = (axes * (_FAR * np.sqrt(np.maximum(width, 0.0))))[:, width > _ZERO * width[-1]].T
     costs = lik.cost(together(at, settled(lik.network, shifted(at, np.concatenate([far, -far])))))
     rise = (costs[1:] - costs[0]) / _FAR**2
@@ -109,7 +107,7 @@ def departure(lik: Likelihood, at: NetworkEstimate, told: GaugeRank) -> float:
 
 
 def shifted(at: NetworkEstimate, moves: Array) -> NetworkEstimate:
-    """Return an estimate (S = 1) with its stations, and clocks where these are sought, moved in several ways (n, P)."""
+    """Return n copies of an estimate (S = 1), with stations and unknown clocks moved by `moves` (n, P), metres."""
     there, size = at.take(np.zeros(len(moves), dtype=int)), at.stations[0].size
     stations = there.stations + moves[:, :size].reshape(there.stations.shape)
     clocks = there.clocks + moves[:, size:] if moves.shape[1] > size else there.clocks
@@ -117,7 +115,7 @@ def shifted(at: NetworkEstimate, moves: Array) -> NetworkEstimate:
 
 
 def over(one: NetworkEstimate, at: NetworkEstimate) -> NetworkEstimate:
-    """Return a network turned, and mirrored if need be, onto another's stations (Procrustes)."""
+    """Return a network rotated, and mirrored if needed, onto the stations of another network (Procrustes)."""
     a, b = one.stations[0], at.stations[0]
     u, _, v = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
     turn = u @ v
@@ -129,12 +127,13 @@ def over(one: NetworkEstimate, at: NetworkEstimate) -> NetworkEstimate:
 
 
 def _span(columns: Array) -> Array:
+    """Return an orthonormal basis of the space of the columns."""
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(u[:, s > _ZERO * max(float(np.max(s, initial=0.0)), 1e-300)])
 
 
-def _unseen(jacobian: Array, basis: Array, size: float) -> Array:
-    """Return those directions of a subspace that a matrix takes to nothing."""
+def _null_space(jacobian: Array, basis: Array, size: float) -> Array:
+    """Return a basis of the directions in a subspace that a matrix maps to zero."""
     if not basis.shape[1]:
         return basis
     _, s, turn = np.linalg.svd(jacobian @ basis, full_matrices=True)
@@ -144,7 +143,7 @@ def _unseen(jacobian: Array, basis: Array, size: float) -> Array:
 
 
 def frame_moves(net: Network, at: NetworkEstimate) -> Array:
-    """Return columns (P, g): translations, rotations and, with clocks, the common offset of all."""
+    """Return the motions of the frame as columns (P, g): translations, rotations and a common clock offset."""
     m, d = net.stations, net.dimension
     p = m * d + (0 if net.synchronised else m)
     columns = []
@@ -163,23 +162,24 @@ def frame_moves(net: Network, at: NetworkEstimate) -> Array:
 
 
 def in_frame(net: Network, at: NetworkEstimate, named: tuple[int, ...]) -> NetworkEstimate:
-    """Return a free network in the frame of some stations, or of all.
+    """Return a free network in the frame of the named stations, or of all stations.
 
     Parameters
     ----------
     net : Network
-        What was measured.
+        Measurements and prior knowledge.
     at : NetworkEstimate
-        S = 1.
+        The estimate, S = 1.
     named : tuple of int
-        The first is the origin, the second lies on the first axis, the third in the plane of the first two (in space).
-        Empty: the centroid is the origin, and the axes are the principal ones of the stations.
+        Stations of the frame: the first is the origin, the second is on the first axis, the third (in space) is
+        in the plane of the first two axes. Empty: the origin is the centroid of all stations, and the axes are
+        their principal axes.
 
     Returns
     -------
     NetworkEstimate
-        Of the two mirror images in space the one in which the station farthest from the plane of the first two axes is
-        above it; in the plane likewise.
+        One of the two mirror images: the station that is farthest from the plane of the first two axes is above
+        this plane. In two dimensions, the same holds for the first axis.
     """
     d = net.dimension
     stations = at.stations[0]
@@ -201,16 +201,9 @@ def in_frame(net: Network, at: NetworkEstimate, named: tuple[int, ...]) -> Netwo
 
 
 def with_mean_clock(net: Network, at: NetworkEstimate, named: tuple[int, ...] = ()) -> NetworkEstimate:
-    """Return a network whose clocks are told against that of a named station, or against their mean.
+    """Return a network with clocks relative to the clock of the named station, or relative to their mean.
 
-    Parameters
-    ----------
-    net : Network
-        What was measured.
-    at : NetworkEstimate
-        S = 1.
-    named : tuple of int
-        The station, or empty.
+    `at` is an estimate (S = 1); `named` is one station or empty.
     """
     if net.synchronised:
         return at
@@ -219,17 +212,17 @@ def with_mean_clock(net: Network, at: NetworkEstimate, named: tuple[int, ...] = 
 
 
 def fixed_by(net: Network, named: tuple[int, ...]) -> Array:
-    """Return rows (g, P) that name the coordinates, and the clock, which named stations hold at zero."""
+    """Return a selection matrix (g, P) of the coordinates and the clock that the named stations fix at zero."""
     m, d = net.stations, net.dimension
     p = m * d + (0 if net.synchronised else m)
-    held = [named[c] * d + k for c in range(d) for k in range(d) if k >= c]
+    indices = [named[c] * d + k for c in range(d) for k in range(d) if k >= c]
     if not net.synchronised:
-        held.append(m * d + named[0])
-    return np.eye(p)[held]
+        indices.append(m * d + named[0])
+    return np.eye(p)[indices]
 
 
 def flat(lik: Likelihood, at: NetworkEstimate, covariance: Array) -> list[str]:
-    """Return what follows from stations, or pulses, in one plane, in sentences.
+    """Return a sentence for each mirror ambiguity that follows from stations, or pulses, in one plane.
 
     Parameters
     ----------
@@ -238,12 +231,12 @@ def flat(lik: Likelihood, at: NetworkEstimate, covariance: Array) -> list[str]:
     at : NetworkEstimate
         Its minimum, S = 1.
     covariance : array (P, P)
-        Of station coordinates and clocks, in any frame.
+        Covariance of station coordinates and clocks, metres squared, in any frame.
 
     Returns
     -------
     list of str
-        Empty where nothing is in a plane, or what is known of the stations says on which side all are.
+        Empty without a common plane, or if prior knowledge of the stations decides the side.
     """
     net, out = lik.network, list[str]()
     if np.isfinite(net.place_sigma).all():
@@ -251,24 +244,29 @@ def flat(lik: Likelihood, at: NetworkEstimate, covariance: Array) -> list[str]:
     m, d = net.stations, net.dimension
     places = covariance[: m * d, : m * d].reshape(m, d, m, d)
     if _in_one_plane(at.stations[0], lambda normal: np.einsum("c,icje,e->ij", normal, places, normal)):
-        out.append("The stations are in one plane as far as the data tell: which side of it pulses are on is open.")
+        out.append(
+            "The stations are in one plane within their errors: the data do not show on which side the pulses are."
+        )
     placed = np.flatnonzero(net.given.sum(axis=1) > d)
     pulses = at.pulses[0, placed]
     if _in_one_plane(pulses, lambda normal: _of_pulses(lik, at, covariance, placed, normal)) and _may_be_mirrored(
         net, at.stations[0], pulses
     ):
-        out.append("The pulses are in one plane as far as the data tell: which side of it stations are on is open.")
+        out.append(
+            "The pulses are in one plane within their errors: the data do not show on which side the stations are."
+        )
     return out
 
 
 def _in_one_plane(points: Array, covariance: Callable[[Array], Array]) -> bool:
-    """Return whether points (m, d) are in one plane, by the covariance (m, m) of their heights along a normal."""
+    """Return whether points (m, d) are in one plane; `covariance` gives the (m, m) of their heights along a normal."""
     m, d = points.shape
     if m <= d:
         return True
     centred = points - points.mean(axis=0)
     turn = np.linalg.svd(centred)[2]
-    # of heights above the best plane what no other plane explains: its covariance is the same in every frame
+    # Remove the part of the heights that another plane explains: the covariance of the rest is the same in every
+    # frame.
     left = np.linalg.svd(np.column_stack([np.ones(m), centred @ turn[:-1].T]).T)[2][d:]
     height = left @ (centred @ turn[-1])
     spread = left @ covariance(turn[-1]) @ left.T
@@ -276,18 +274,20 @@ def _in_one_plane(points: Array, covariance: Callable[[Array], Array]) -> bool:
 
 
 def _of_pulses(lik: Likelihood, at: NetworkEstimate, covariance: Array, which: Array, normal: Array) -> Array:
-    """Return the covariance (n, n) of the heights of some pulses: from their own rows, and from the stations."""
+    """Return the covariance (n, n) of the heights of pulses, from the noise of their rows and from the stations."""
     by_station, by_pulse = (one[which] for one in lik.jacobian(at)[:2])
     own = np.einsum("c,jcr->jr", normal, np.linalg.pinv(by_pulse)[:, : len(normal)])
     along = np.einsum("jr,jrp->jp", own, by_station)
-    # a pulse's own errors and those of the stations have nothing in common: these come from what pulses leave over
+    # The two parts are independent: the station covariance comes from the part of the rows that pulses do not
+    # explain.
     return np.asarray(np.diag((own**2).sum(axis=1)) + along @ covariance @ along.T)
 
 
 def _may_be_mirrored(net: Network, stations: Array, pulses: Array) -> bool:
-    """Return whether what is known of places and distances lets stations (m, d) change sides of the pulses' plane.
+    """Return whether prior places and distances allow stations (m, d) to be mirrored in the plane of the pulses.
 
-    Stations whose distances were measured change together; all at once is the mirror image of the whole network.
+    Stations with measured distances between them are mirrored together. If all stations are mirrored, the result
+    is the mirror image of the whole network, which is the same network.
     """
     middle = pulses.mean(axis=0)
     normal = np.linalg.svd(pulses - middle)[2][-1]

@@ -1,4 +1,8 @@
-"""The likelihood of networks: an ordinary problem with unknown stations, refined from many places at once."""
+"""The likelihood of a network: a problem with unknown stations, refined from many estimates at once.
+
+The network becomes a run of `optloc.problem`: each pulse is an epoch, and the station errors are constant
+over the run.
+"""
 
 from __future__ import annotations
 
@@ -11,29 +15,30 @@ from optloc.models import BETWEEN
 from optloc.problem import Array, Bias, Measured, Motion, Problem, Stations, assemble, measured, variances
 from optloc.sites.calibration.network import CLOCKED, Network
 
-# Steps of a refinement, and the length in deviations below which a step is the last: costs are then off by 1e-6.
+# Largest number of refinement steps, and step length in standard deviations at which the refinement ends: the
+# error of the cost is then 1e-6.
 _STEPS, _LAST = 100, 1e-3
-# Deviation of free coordinates and clocks about their start, in deviations of the best row: it holds the frame, which
-# no row determines, and costs the rest nothing.
+# Prior standard deviation of free coordinates and clocks about their start, in standard deviations of the best
+# row. It fixes the frame, which no row determines, and hardly affects the rest.
 _LOOSE = 1e7
-# Deviation of coordinates that are known exactly, as a share of the size of the network.
+# Standard deviation of coordinates that are known exactly, as a share of the network size.
 _EXACT = 1e-7
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkEstimate:
-    """Values of all unknowns, of S estimates at once.
+    """Values of all unknowns, for S estimates at once.
 
     Parameters
     ----------
     stations : array (S, M, d)
-        Metres.
+        Station positions, metres.
     clocks : array (S, M)
-        Offsets times the speed of propagation, metres; zeros where the stations share a clock.
+        Clock offsets times the propagation speed, metres; zeros if the stations share a clock.
     pulses : array (S, N, d)
-        Metres.
+        Pulse positions, metres.
     emission : array (S, N)
-        Times of emission times the speed of propagation, metres.
+        Emission times multiplied by the propagation speed, metres.
     """
 
     stations: Array
@@ -43,15 +48,15 @@ class NetworkEstimate:
 
     @property
     def count(self) -> int:
-        """Return how many estimates there are."""
+        """Return the number S of estimates."""
         return int(self.stations.shape[0])
 
     def take(self, which: Array | slice) -> NetworkEstimate:
-        """Return some of the estimates (mask, indices or slice)."""
+        """Return a selection of the estimates (mask, indices or slice)."""
         return NetworkEstimate(self.stations[which], self.clocks[which], self.pulses[which], self.emission[which])
 
     def where(self, mask: Array, other: NetworkEstimate) -> NetworkEstimate:
-        """Return the other's values where the mask (S,) is false."""
+        """Return the estimates with values of `other` where the mask (S,) is false."""
         two, three = mask[:, None], mask[:, None, None]
         return NetworkEstimate(
             np.where(three, self.stations, other.stations),
@@ -62,25 +67,26 @@ class NetworkEstimate:
 
 
 def together(*estimates: NetworkEstimate) -> NetworkEstimate:
-    """Return all estimates of several."""
+    """Return several sets of estimates as one."""
     names = NetworkEstimate.__dataclass_fields__
     return NetworkEstimate(*(np.concatenate([getattr(one, name) for one in estimates]) for name in names))
 
 
 @dataclass(frozen=True, slots=True)
 class Likelihood:
-    """A network as a run: its stations err for the whole run, and each pulse is an epoch.
+    """A network as a run: the station errors are constant over the run, and each pulse is an epoch.
 
     Parameters
     ----------
     network : Network
-        What was measured.
+        Measurements and prior knowledge.
     problem : Problem
-        The run, with any stations.
+        The run, with placeholder station positions.
     weight : array (S, N, R), optional
-        Weights of the rows, of each estimate its own; None: all count.
+        Weights of the rows for each estimate; None: all rows have weight 1.
     tether : array (S,), optional
-        Deviation of free coordinates about their start, metres; None: so large that it holds the frame alone.
+        Prior standard deviation of free coordinates about their start, metres; None: so large that it only fixes
+        the frame.
     """
 
     network: Network
@@ -90,12 +96,12 @@ class Likelihood:
 
     @property
     def free(self) -> Array:
-        """Return which station unknowns (P,) move: the coordinates, and the clocks where these are sought."""
+        """Return a mask (P,) of the station unknowns that can change: inexact coordinates, and unknown clocks."""
         clocks = np.ones(0 if self.network.synchronised else self.network.stations, dtype=bool)
         return np.concatenate([(self.network.place_sigma > 0.0).ravel(), clocks])
 
     def posed(self, at: NetworkEstimate) -> tuple[Problem, Array]:
-        """Return estimates as S problems, each about its own stations and clocks, and as vectors (S, size)."""
+        """Return S estimates as a batch of problems, about their stations and clocks, and as vectors (S, size)."""
         net, problem, (j, r) = self.network, self.problem, rows_of(self.network)
         known = np.isfinite(net.place_sigma)
         place = np.where(known, net.place, at.stations)
@@ -115,7 +121,7 @@ class Likelihood:
             rows.append(block)
         stations = replace(problem.stations, position=place[:, None], covariance=covariance)
         made = replace(problem, stations=stations, rows=tuple(rows))
-        # numbers alone are other ones
+        # only numbers differ from `problem`, so its structure and caches are valid
         vars(made).update({name: getattr(problem, name) for name in ("starts", "layout", "structure")})
         layout, x = made.layout, np.zeros((at.count, made.layout.size))
         x[:, _columns(made, "stations")] = (at.stations - place).reshape(at.count, -1)
@@ -124,6 +130,7 @@ class Likelihood:
         return made, x
 
     def _estimate(self, problem: Problem, x: Array, at: NetworkEstimate) -> NetworkEstimate:
+        """Return the estimates at parameter vectors x (S, size), linearised about `at`."""
         net, local = self.network, problem.layout.split(x)[1]
         moved = problem.stations.position[:, 0] + x[:, _columns(problem, "stations")].reshape(at.stations.shape)
         stations = np.where(net.place_sigma > 0.0, moved, net.place)
@@ -132,7 +139,7 @@ class Likelihood:
         return NetworkEstimate(stations, clocks, local[..., :d], local[..., d] if local.shape[-1] > d else at.emission)
 
     def refine(self, at: NetworkEstimate, steps: int = _STEPS) -> tuple[NetworkEstimate, Array]:
-        """Return the minima that estimates lead to, and their costs (S,)."""
+        """Return the minima that the refinement of the estimates reaches, and their costs (S,)."""
         if not at.count:
             return at, np.zeros(0)
         problem, x = self.posed(at)
@@ -145,34 +152,34 @@ class Likelihood:
         return np.asarray((problem.observed - predict(problem, x)) / np.sqrt(variances(problem.noise, problem.count)))
 
     def cost(self, at: NetworkEstimate) -> Array:
-        """Return the weighted sum of squared residuals, (S,); weights of rows do not enter it."""
+        """Return the weighted sum of squared residuals (S,), priors included; `weight` does not affect it."""
         place = np.where(self.network.place_sigma > 0.0, self.network.place_sigma, np.inf)
         known = (at.stations - self.network.place) / place
         return np.asarray((self._whitened(at) ** 2).sum(axis=1) + (known**2).sum(axis=(1, 2)))
 
     def residual(self, at: NetworkEstimate) -> Array:
-        """Return whitened residuals (S, N, R) of the measurements of pulses, without weights; zero where absent."""
+        """Return whitened residuals (S, N, R) of the pulse measurements, without weights; 0 without measurement."""
         j, r = rows_of(self.network)
         out = np.zeros((at.count, *self.network.z.shape))
         out[:, j, r] = self._whitened(at)[:, : len(j)]
         return out
 
     def jacobian(self, at: NetworkEstimate) -> tuple[Array, Array, Array]:
-        """Return whitened derivatives of the rows of one estimate.
+        """Return the whitened derivatives of the rows at one estimate.
 
         Parameters
         ----------
         at : NetworkEstimate
-            S = 1.
+            The estimate, S = 1.
 
         Returns
         -------
         by_station : array (N, R, P)
-            Of rows of pulses, by station coordinates and clocks.
+            Derivatives of pulse rows by station coordinates and clocks.
         by_pulse : array (N, R, d or d + 1)
-            Of the same, by place and time of emission.
+            Derivatives of pulse rows by position and emission time of the pulse.
         known : array (q, P)
-            Of distances between stations, and of what is known of places.
+            Derivatives of the rows for distances between stations and for prior coordinates.
         """
         net, (j, r) = self.network, rows_of(self.network)
         problem, x = self.posed(at)
@@ -208,11 +215,12 @@ def likelihood(net: Network) -> Likelihood:
 
 
 def _loose(net: Network) -> float:
+    """Return the wide prior standard deviation of free coordinates and clocks, metres."""
     return _LOOSE * float(min(net.sigma.min(), *net.distance_sigma, np.inf))
 
 
 def clock_signs(net: Network) -> tuple[Array, Array, Array]:
-    """Return the stations (R,) of each slot, and with what sign (2, R) their clocks enter."""
+    """Return the stations a (R,) and b (R,) of each slot, and the signs (2, R) of their clocks in the measurement."""
     first = np.array([slot.a for slot in net.slots])
     second = np.array([max(slot.b, 0) for slot in net.slots])
     sign = [[float(slot.kind in CLOCKED), -1.0 * (slot.kind == "tdoa")] for slot in net.slots]
@@ -220,20 +228,20 @@ def clock_signs(net: Network) -> tuple[Array, Array, Array]:
 
 
 def _kinds(net: Network, r: Array) -> list[tuple[str, Array]]:
-    """Return each kind, and which of the rows, given by their slots, are of it."""
+    """Return each kind with the indices of its rows; `r` (m,) is the slot of each row."""
     kinds = np.array([slot.kind for slot in net.slots])[r]
     return [(kind, np.flatnonzero(kinds == kind)) for kind in dict.fromkeys(kinds.tolist())]
 
 
 def rows_of(net: Network) -> tuple[Array, Array]:
-    """Return pulse and slot of each row, kind by kind: the order of rows in the problem."""
+    """Return pulse and slot of each row, in the row order of the problem: kind by kind."""
     j, r = np.nonzero(net.given)
     order = np.concatenate([part for _, part in _kinds(net, r)])
     return j[order], r[order]
 
 
 def _clocks(net: Network, r: Array) -> Bias:
-    """Return the offsets of the stations' clocks from their start."""
+    """Return the clock offsets of the stations as a bias, relative to their start values."""
     first, second, sign = clock_signs(net)
     row, member = np.tile(np.arange(len(r)), 2), np.concatenate([first[r], second[r]])
     sign = np.concatenate([sign[0, r], sign[1, r]])
@@ -244,5 +252,6 @@ def _clocks(net: Network, r: Array) -> Bias:
 
 
 def _columns(problem: Problem, name: str) -> Array:
+    """Return the indices of an unknown in the shared parameter vector."""
     slot, _ = problem.layout.find(name)
     return np.arange(slot.start, slot.start + slot.size)

@@ -1,4 +1,4 @@
-"""Joint moves of a network: all stations bend along the directions of largest variance, and pulses follow."""
+"""Joint motions of a network: all stations move along the directions with the largest variance."""
 
 from __future__ import annotations
 
@@ -10,40 +10,28 @@ from optloc.problem import Array
 from optloc.sites.calibration.gauge import determined, shifted
 from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate
 
-# Directions of largest variance, and standard deviations to either side: other minima were 5 to 20 deviations away, in
-# a valley that is curved.
+# Number of directions, and distances in standard deviations on both sides: other minima were 5 to 20 standard
+# deviations away, in a curved valley.
 _WEAK, _STEPS = 3, (6.0, 14.0)
-# Deviation of the tether, as a share of that of the direction: it holds the direction to a tenth, and gives way to
-# those that are better determined.
+# Standard deviation of the tether, as a share of the standard deviation of the direction. It fixes the
+# direction to a tenth, but better determined directions can still move.
 _TETHER = 0.3
-# Steps with a tether: the rest follows roughly.
+# Refinement steps with the tether: the other unknowns follow approximately.
 _SETTLING = 30
-# Share of the largest variance below which a direction is exact.
+# Directions with a variance below this share of the largest count as exact.
 _EXACT = 1e-9
 
 
 def bent(lik: Likelihood, at: NetworkEstimate) -> tuple[NetworkEstimate, Array] | None:
-    """Return the minima that bent networks lead to, and their costs.
+    """Return the minima that moved networks reach, and their costs (S,); None if an open motion changes no row.
 
-    Each network is moved along one direction and refined while its stations are tethered there, so that the directions
-    that rows determine better follow. Then it is released and refined.
-
-    Parameters
-    ----------
-    lik : Likelihood
-        The network.
-    at : NetworkEstimate
-        A minimum, S = 1.
-
-    Returns
-    -------
-    tuple of Estimate and array (S,), or None
-        None where some motion of the network changes no row.
+    Each copy of the network (`at`, S = 1) is moved along one direction. A first refinement holds its stations
+    there with a tether, so that better determined directions adapt. A second refinement has no tether.
     """
-    told = determined(lik, at)
-    if told.open.shape[1]:
+    rank = determined(lik, at)
+    if rank.open.shape[1]:
         return None
-    width, axes = np.linalg.eigh(told.covariance(told.free.T))
+    width, axes = np.linalg.eigh(rank.covariance(rank.free.T))
     weak = np.flatnonzero(width > _EXACT * width[-1])[-_WEAK:]
     deviation = np.repeat(np.sqrt(width[weak]), 2 * len(_STEPS))
     far = np.tile([*_STEPS, *(-step for step in _STEPS)], len(weak)) * deviation

@@ -1,4 +1,8 @@
-"""The search of a network: rounds of starts and moves of blocks, until three starts agree on the cheapest."""
+"""Multi-start search for a network, until three starts agree on the least cost.
+
+Each round makes starts (`rounds`) and then moves single stations or pulses (`blocks`) of the cheapest
+networks.
+"""
 
 from __future__ import annotations
 
@@ -16,25 +20,27 @@ from optloc.sites.calibration.restarts import RoundEnds, joined, rounds, starts_
 from optloc.solvers import P_MISFIT, equal_cost
 
 AGREEING = 3
-"""Starts that must arrive at the least cost: with fewer, one network in ten was found in another minimum."""
+"""Number of starts that must reach the least cost: with fewer, 10 % of networks ended in another minimum."""
 
-# Starts after which the best is taken for what it is: nine networks in ten of six stations need fewer.
+# Largest number of starts, after which the best network is accepted: 90 % of networks of six stations need
+# fewer.
 _STARTS = 144
-# Networks whose blocks are moved after each round, the cheapest first.
+# Networks whose blocks are moved after each round, least cost first.
 _TRIED = 2
-# Moves that are tried of one network while the search goes on, the cheapest first.
+# Block moves that are tried in one network during the search, least cost first.
 _MOVES = 8
-# Sweeps of block moves: each lowers the cost or is the last.
+# Largest number of sweeps of block moves; a sweep that does not lower the cost is the last.
 _SWEEPS = 6
-# Difference of cost that nobody can tell: a tenth of a sigma of one number.
+# Costs with a smaller difference count as equal: a tenth of a standard deviation of one measurement.
 _SAME = 0.01
 
 
 @dataclass(slots=True)
 class NetworkSearchResult:
-    """What a search has arrived at so far.
+    """State of a search.
 
-    `ends` are the minima of starts; `onward` tells where moves of blocks lead from the cost of one.
+    `ends` holds the minima of all starts and `best`, `cost` the best network. `made` is the number of starts.
+    `onward` maps the cost of a minimum to the lower cost that block moves reach from it.
     """
 
     ends: RoundEnds
@@ -45,30 +51,23 @@ class NetworkSearchResult:
 
     @property
     def agreeing(self) -> int:
-        """Return how many starts led to the best: by themselves, or by moves of blocks."""
+        """Return the number of starts that reach the best network, directly or by block moves."""
         led = np.array([self.onward.get(_key(cost), cost) for cost in self.ends.cost])
         return self.ends.counted(led <= self.cost + _SAME + equal_cost(self.cost))
 
 
 def _key(cost: float) -> float:
+    """Return a rounded cost as key of `onward`: minima with equal keys are the same."""
     return round(float(cost), 4)
 
 
 def search(
     net: Network, seed: int, limit: int | None, tell: Callable[[str], None] | None
 ) -> NetworkSearchResult | None:
-    """Return the cheapest network that a search finds, None where no start leads to one.
+    """Return the cheapest network of the search, or None if no start converges.
 
-    Parameters
-    ----------
-    net : Network
-        What was measured.
-    seed : int
-        Decides the starts.
-    limit : int, optional
-        Starts after which it ends, agreed or not.
-    tell : callable, optional
-        Called with a sentence on each round.
+    `seed` sets the random starts. The search ends after `limit` starts even if no three of them agree. The
+    function calls `tell` with a progress message after each round.
     """
     limit = limit or _STARTS
     lik = likelihood(net)
@@ -76,7 +75,7 @@ def search(
     for made, one in rounds(starts_of(lik, seed)):
         good = np.isfinite(one.cost)
         if good.any():
-            found = _added(found, one.take(good), made)
+            found = _merge(found, one.take(good), made)
             _move_on(lik, found)
             if tell is not None:
                 tell(f"{found.made} starts, {found.agreeing} at the least cost {found.cost:.5g}")
@@ -88,7 +87,8 @@ def search(
     return found
 
 
-def _added(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> NetworkSearchResult:
+def _merge(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> NetworkSearchResult:
+    """Add the minima of a round to the search result, and return the result; `made` is the number of starts."""
     if found is not None:
         ends = joined([found.ends, ends])
     i = int(ends.cost.argmin())
@@ -101,7 +101,7 @@ def _added(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> Net
 
 
 def _move_on(lik: Likelihood, found: NetworkSearchResult) -> None:
-    """Move single blocks of the cheapest networks to their other places, as long as that lowers the cost."""
+    """Move single blocks of the cheapest networks to other positions, as long as that lowers the cost."""
     ends = found.ends
     tried = 0
     for i in np.argsort(ends.cost, kind="stable"):
@@ -110,14 +110,14 @@ def _move_on(lik: Likelihood, found: NetworkSearchResult) -> None:
         if _key(ends.cost[i]) in found.onward:
             continue
         tried += 1
-        at, cost = _swept(lik, ends.at.take(np.array([i])), float(ends.cost[i]))
+        at, cost = _sweep_block_moves(lik, ends.at.take(np.array([i])), float(ends.cost[i]))
         found.onward[_key(ends.cost[i])] = cost
         if cost < found.cost - _SAME:
             found.best, found.cost = at, cost
 
 
-def _swept(lik: Likelihood, at: NetworkEstimate, cost: float) -> tuple[NetworkEstimate, float]:
-    """Return where moves of blocks lead from a minimum."""
+def _sweep_block_moves(lik: Likelihood, at: NetworkEstimate, cost: float) -> tuple[NetworkEstimate, float]:
+    """Return the network and the cost that repeated block moves reach from a minimum."""
     for _ in range(_SWEEPS):
         found = sorted(elsewhere(lik, at), key=lambda block: block.gaps[0])[:_MOVES]
         if not found:
@@ -133,7 +133,7 @@ def _swept(lik: Likelihood, at: NetworkEstimate, cost: float) -> tuple[NetworkEs
 def proven(
     lik: Likelihood, at: NetworkEstimate
 ) -> tuple[NetworkEstimate, tuple[StationBlock, ...], list[tuple[str, NetworkEstimate]]]:
-    """Move blocks to all places that a proof leaves, until none lowers the cost.
+    """Move blocks to all other positions that their proofs did not exclude, until no move lowers the cost.
 
     Parameters
     ----------
@@ -147,13 +147,13 @@ def proven(
     at : NetworkEstimate
         The cheapest network.
     blocks : tuple of StationBlock
-        What is proven of it.
+        Stations and pulses with their proofs.
     others : list of (str, NetworkEstimate)
-        Networks with one block elsewhere, refined.
+        Refined networks with one block at another position, and a description of each.
     """
     cost, others = float(lik.cost(at)[0]), list[tuple[str, NetworkEstimate]]()
     for _ in range(_SWEEPS):
-        at, cost, beside = _straightened(lik, at, cost)
+        at, cost, bent_others = _apply_joint_moves(lik, at, cost)
         found = blocks(lik, at)
         places = [
             (block, place)
@@ -162,20 +162,20 @@ def proven(
             if gap <= MOVED
         ]
         if not places:
-            return at, found, beside
+            return at, found, bent_others
         ends, costs = lik.refine(together(*(moved(lik, at, block, place) for block, place in places)))
         others = [(f"{block.name} elsewhere", ends.take(np.array([n]))) for n, (block, _) in enumerate(places)]
         i = int(np.argmin(costs))
         if costs[i] >= cost - _SAME - equal_cost(cost):
             break
         at, cost = ends.take(np.array([i])), float(costs[i])
-    return at, found, others + beside
+    return at, found, others + bent_others
 
 
-def _straightened(
+def _apply_joint_moves(
     lik: Likelihood, at: NetworkEstimate, cost: float
 ) -> tuple[NetworkEstimate, float, list[tuple[str, NetworkEstimate]]]:
-    """Return the cheapest network that joint moves lead to, its cost, and the other ends of these moves."""
+    """Return the cheapest network that joint moves reach, its cost, and the other minima of these moves."""
     for _ in range(_SWEEPS):
         made = bent(lik, at)
         if made is None:
@@ -190,12 +190,13 @@ def _straightened(
 
 
 def _fits(net: Network, cost: float) -> bool:
+    """Return whether the cost of a network passes the chi-square test."""
     dof = np.array(net.rows - net.unknowns + frame_size(net))
     return not float(tail_probability(np.array(cost), dof)) < P_MISFIT
 
 
 def frame_size(network: Network) -> int:
-    """Return how many unknowns the frame is, as far as known coordinates can fix it."""
+    """Return the number of unknowns that the frame adds; known coordinates reduce it."""
     d = network.dimension
     known = int(np.isfinite(network.place_sigma).sum())
     clocks = int(not network.synchronised and any(slot.kind in CLOCKED for slot in network.slots))

@@ -1,4 +1,8 @@
-"""A network whose stations, clocks and emitters are unknown together: what was measured, and what is known."""
+"""A network of stations, clocks and emitters that are unknown together: measurements and prior knowledge.
+
+A pulse is one emission at an unknown position and, except for two-way ranges, at an unknown time. A slot is the
+kind and the stations of one measurement; each pulse has at most one value for each slot.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ from optloc.models import MODELS, kind_named
 from optloc.problem import Array, InvalidProblem, check_once, nearest
 
 CLOCKED = ("toa", "tdoa")
-"""Kinds that a station's clock enters; a two-way range has none."""
+"""Kinds that depend on the station clock; a two-way range does not."""
 
 KINDS = (*CLOCKED, "range")
 """Kinds of rows between stations and pulses."""
@@ -21,14 +25,14 @@ KINDS = (*CLOCKED, "range")
 
 @dataclass(frozen=True, slots=True)
 class NetworkSlot:
-    """Which stations measure what: one column of the table of measurements.
+    """The stations of one measurement: a column of the table of measurements.
 
     Parameters
     ----------
     kind : str
         "toa", "tdoa" or "range".
     a, b : int
-        Stations; `b` is -1 where the kind takes one.
+        Stations; `b` is -1 for kinds with one station.
     """
 
     kind: str
@@ -38,28 +42,29 @@ class NetworkSlot:
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """Measurements between stations and pulses, none of whose places need be known.
+    """Measurements between stations and pulses at unknown positions.
 
     Parameters
     ----------
     names : tuple of M str
-        Stations.
+        Names of the stations.
     slots : tuple of R NetworkSlot
         Columns of `z`.
     z : array (N, R)
-        Measured values of N pulses, metres (times multiplied by the speed of propagation).
+        Measured values of N pulses, metres (times are multiplied by the propagation speed).
     sigma : array (N, R)
-        Standard deviations, metres; infinite where nothing was measured.
+        Standard deviations, metres; infinite if there is no measurement.
     place : array (M, d)
-        What is known of the stations' places, metres.
+        Prior coordinates of the stations, metres.
     place_sigma : array (M, d)
-        Its standard deviations: infinite where a coordinate is free, zero where it is known.
+        Standard deviations of the prior coordinates, metres: infinite for a free coordinate, zero for an exact
+        one.
     synchronised : bool
-        Whether the stations share a clock; else each has an unknown offset.
+        Whether the stations share a clock; otherwise each station has an unknown offset.
     between : int array (q, 2)
-        Pairs of stations whose distance was measured.
+        Pairs of stations with a measured distance.
     distance, distance_sigma : array (q,)
-        That distance and its standard deviation, metres.
+        The measured distances and their standard deviations, metres.
     labels : tuple of N str
         Names of the pulses.
     """
@@ -78,45 +83,45 @@ class Network:
 
     @property
     def dimension(self) -> int:
-        """Return 2 or 3."""
+        """Return the number of dimensions, 2 or 3."""
         return int(self.place.shape[1])
 
     @property
     def stations(self) -> int:
-        """Return the number of stations, M."""
+        """Return the number M of stations."""
         return len(self.names)
 
     @property
     def pulses(self) -> int:
-        """Return the number of pulses, N."""
+        """Return the number N of pulses."""
         return int(self.z.shape[0])
 
     @property
     def given(self) -> Array:
-        """Return which entries of `z` were measured, (N, R)."""
+        """Return a mask (N, R) of the measured entries of `z`."""
         return np.isfinite(self.sigma)
 
     @property
     def emission(self) -> Array:
-        """Return which pulses have an unknown time of emission, (N,)."""
+        """Return a mask (N,) of the pulses with an unknown emission time."""
         emitting = np.array([MODELS[slot.kind].emission for slot in self.slots])
         return np.asarray((self.given & emitting).any(axis=1))
 
     @property
     def rows(self) -> int:
-        """Return how many numbers were measured or known before, exact ones not counted."""
+        """Return the number of measurements and of prior coordinates that are not exact."""
         soft = np.isfinite(self.place_sigma) & (self.place_sigma > 0.0)
         return int(self.given.sum() + len(self.distance) + soft.sum())
 
     @property
     def unknowns(self) -> int:
-        """Return how many numbers are sought, the frame included."""
+        """Return the number of unknowns, frame included."""
         free = int((self.place_sigma > 0.0).sum())
         clocks = 0 if self.synchronised else self.stations
         return free + clocks + self.pulses * self.dimension + int(self.emission.sum())
 
     def take(self, pulses: Array) -> Network:
-        """Return the network of some pulses (mask or indices)."""
+        """Return the network with a selection of the pulses (mask or indices)."""
         labels = tuple(np.array(self.labels, dtype=object)[pulses])
         return Network(
             self.names,
@@ -147,26 +152,26 @@ def network_of(
     distances: Sequence[tuple[int, int, float, float]] = (),
     labels: Sequence[str] | None = None,
 ) -> Network:
-    """Return a network of one kind of measurements.
+    """Return a network with one kind of measurements.
 
     Parameters
     ----------
     z : array (N, M), or (N, R) with `pairs`
-        Arrival times times the speed of propagation (or ranges) of N pulses at M stations, metres; NaN where there is
-        none.
+        Arrival times multiplied by the propagation speed, or ranges, of N pulses at M stations, metres; NaN if
+        there is no measurement.
     sigma : float or array like `z`
         Standard deviations, metres.
     kind : str
-        "toa" (unknown time of emission), "range" (two-way) or, with `pairs`, "tdoa".
+        "toa" (unknown emission time), "range" (two-way) or, with `pairs`, "tdoa".
     pairs : sequence of (a, b), optional
         Stations of each column of differences ``r_a - r_b``.
     names : sequence of M str, optional
-        Stations; "A1", "A2" and so on by default.
+        Names of the stations; "A1", "A2" and so on by default.
     dimension : 2 or 3, optional
-        Of space; by default the columns of `place`, or 3.
+        Number of dimensions; by default the number of columns of `place`, or 3.
     place, place_sigma : array (M, d), optional
-        What is known of the stations' places, metres: sigma zero is exact, infinite (or a place that is NaN) is free.
-        By default everything is.
+        Prior coordinates of the stations and their standard deviations, metres. Zero sigma is exact; an infinite
+        sigma (or a NaN coordinate) is free. By default all coordinates are free.
     synchronised : bool
         Whether the stations share a clock.
     distances : sequence of (a, b, distance, sigma)
@@ -177,21 +182,23 @@ def network_of(
     Returns
     -------
     Network
-        To be given to `calibrate`.
+        The input of `calibrate`.
 
     Raises
     ------
     InvalidProblem
-        Naming the argument that cannot be right.
+        If an argument is invalid; the message names it.
     """
     kind = kind_named(kind)
     if kind not in KINDS:
         raise InvalidProblem(f"networks have no rows of kind {kind!r}", "kind", nearest(kind, list(KINDS)))
     if (kind == "tdoa") != (pairs is not None):
-        raise InvalidProblem("pairs of stations belong to time differences", "pairs", 'give them with kind="tdoa"')
+        raise InvalidProblem(
+            "the argument pairs and the kind tdoa need each other", "pairs", 'give pairs with kind="tdoa" only'
+        )
     values = np.asarray(numbers(np.where(np.isnan(z := np.asarray(z, dtype=float)), 0.0, z), "z"))
     if values.ndim != 2 or not values.size:
-        raise InvalidProblem(f"the measurements have shape {values.shape}", "z", "give one line a pulse")
+        raise InvalidProblem(f"the measurements have shape {values.shape}", "z", "give one row for each pulse")
     count = values.shape[1] if pairs is None else 1 + max(max(pair) for pair in pairs)
     names = tuple(names) if names is not None else tuple(f"A{i + 1}" for i in range(count))
     if pairs is None:
@@ -223,34 +230,42 @@ def network_of(
 
 
 def checked(made: Network) -> Network:
-    """Return a network whose parts fit together.
+    """Return the network unchanged after checks that its parts fit together.
 
     Raises
     ------
     InvalidProblem
-        Naming the part that does not.
+        If a part does not fit; the message names it.
     """
     m, (n, r) = made.stations, made.z.shape
     if made.dimension not in (2, 3):
         raise InvalidProblem(f"a network has {made.dimension} dimensions", "dimension", "give 2 or 3")
     check_once(made.names, "station name {!r} is used twice", "names")
     if len(made.slots) != r or len(made.labels) != n or made.sigma.shape != (n, r):
-        raise InvalidProblem("measurements, deviations and labels differ in number", "z", "give one for each")
+        raise InvalidProblem(
+            "slots, labels and standard deviations do not fit the measurements", "z", "give one for each measurement"
+        )
     ends = np.array([[slot.a, slot.b] for slot in made.slots]).reshape(-1, 2)
     two = np.array([MODELS[slot.kind].stations == 2 for slot in made.slots])
     if (ends[:, 0] < 0).any() or (ends >= m).any() or (ends[two, 1] < 0).any() or (ends[:, 0] == ends[:, 1]).any():
-        raise InvalidProblem("a row names a station that is not there", "pairs", f"give two of 0 to {m - 1}")
+        raise InvalidProblem(
+            "a row has an unknown station, or the same station twice", "pairs", f"give two numbers from 0 to {m - 1}"
+        )
     if np.isnan(made.sigma).any() or (made.sigma <= 0.0).any():
         raise InvalidProblem("a standard deviation is not positive", "sigma", "give metres above zero")
     if made.place.shape != (m, made.dimension) or made.place_sigma.shape != made.place.shape:
         raise InvalidProblem(f"places have shape {made.place.shape}", "place", f"give ({m}, {made.dimension})")
     if np.isnan(made.place_sigma).any() or (made.place_sigma < 0.0).any() or not np.isfinite(made.place).all():
-        raise InvalidProblem("a place or its deviation is no number", "place_sigma", "give zero, metres or infinity")
+        raise InvalidProblem(
+            "a place or its standard deviation is not a number", "place_sigma", "give zero, metres or infinity"
+        )
     b = made.between
     if len(b) and ((b < 0).any() or (b >= m).any() or (b[:, 0] == b[:, 1]).any()):
-        raise InvalidProblem("a distance names a station that is not there", "distances", f"give two of 0 to {m - 1}")
+        raise InvalidProblem(
+            "a distance has an unknown station or one twice", "distances", f"give two numbers from 0 to {m - 1}"
+        )
     if (made.distance < 0.0).any() or not np.isfinite(made.distance).all():
-        raise InvalidProblem("a distance between stations is not positive", "distances", "give metres")
+        raise InvalidProblem("a distance between stations is negative or infinite", "distances", "give metres")
     if not np.isfinite(made.distance_sigma).all() or (made.distance_sigma <= 0.0).any():
-        raise InvalidProblem("a distance has no deviation", "distances", "give metres above zero")
+        raise InvalidProblem("a distance has no positive standard deviation", "distances", "give metres above zero")
     return made

@@ -1,4 +1,4 @@
-"""Networks as files: stations with coordinates left out, pulses, distances; and the problem file of what is found."""
+"""Network files: stations with unknown coordinates, pulses and distances; output of a result as a problem file."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ from optloc.problem import SPEED_OF_LIGHT, Amount, Array, InvalidProblem, neares
 from optloc.sites.calibration.calibrated import Calibration
 from optloc.sites.calibration.network import KINDS, Network, NetworkSlot, checked
 
-# Deviation that stations of the frame get in a file, metres: as good as exact.
+# Smallest standard deviation of stations in the output file, metres: as good as exact.
 _EXACT = 1e-6
 
 BETWEEN = "station_range"
-"""Kind of rows that are distances between two stations."""
+"""Kind of the rows with a distance between two stations."""
 
 
 class _NetworkTable(BaseModel):
-    """A table of the file; keys that it does not know are refused."""
+    """A table of the file; unknown keys are an error."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -52,38 +52,38 @@ class _NetworkTable(BaseModel):
 
 
 class NetworkStations(DataTable):
-    """The stations. Columns: name; x, y, z where something is known of them, sigma where not exactly."""
+    """The stations. Columns: name; x, y, z (empty if unknown); sigma of known coordinates."""
 
     unit: str = "m"
     """Unit of x, y, z and sigma."""
     sigma: Amount | None = None
     """Standard deviation of known coordinates; None: exact."""
     synchronised: bool = True
-    """Whether the stations share a clock; else each has an unknown offset."""
+    """Whether the stations share a clock; otherwise each station has an unknown offset."""
     dimension: Literal[2, 3] = 3
-    """Of space."""
+    """Number of dimensions."""
 
 
 class NetworkRows(DataTable):
-    """Measurements of one kind. Columns: epoch (the pulse), a, z; b of two stations; sigma."""
+    """Measurements of one kind. Columns: epoch (the pulse), a, b (for pairs of stations), z, sigma."""
 
     kind: str
-    """toa, tdoa, range; station_range is the distance of stations a and b, without epoch."""
+    """toa, tdoa or range; station_range is the distance between stations a and b and has no epoch."""
     unit: str = "m"
-    """Unit of z, or of time."""
+    """Unit of z: a length or a time."""
     sigma: Amount | None = None
-    """Standard deviation of each row, where there is no column sigma."""
+    """Standard deviation of each row, if there is no column sigma."""
 
 
 class NetworkFile(_NetworkTable):
-    """A network whose stations are to be found."""
+    """A network with unknown stations."""
 
     format: Literal[1, 2]
-    """Version of the format; nothing that a network holds differs between them."""
+    """Version of the format; network files are the same in both versions."""
     title: str | None = None
-    """What it is."""
+    """Title of the network."""
     propagation_speed: Amount | None = None
-    """Metres per second, or an amount such as "1480 m/s"; light by default."""
+    """Metres per second, or an amount such as "1480 m/s"; the speed of light by default."""
     stations: NetworkStations
     measurements: list[NetworkRows] = Field(min_length=1)
 
@@ -94,13 +94,13 @@ def read_network(path: Path) -> Network:
     Raises
     ------
     InvalidProblem
-        Naming the file, the row and the column or key.
+        If the file is invalid; the message names file, row and column or key.
     """
     source, folder = name_of(path), path.parent
     data = parse_toml(read_text(path), source, formats=(1, 2))
     foreign = [key for key in ProblemFile.model_fields if key in data and key not in NetworkFile.model_fields]
     if foreign:
-        what = f"the key {foreign[0]!r} is that of a problem whose stations are known, not of a network"
+        what = f"the key {foreign[0]!r} belongs to a problem with known stations, not to a network"
         raise InvalidProblem(what, source, "use optloc fix, or see optloc new calibration")
     file = validated(NetworkFile, data, source)
     stated, where = file.propagation_speed, join(source, "key 'propagation_speed'")
@@ -116,8 +116,8 @@ def read_network(path: Path) -> Network:
         place_of = join(source, f"[[measurements]] {i + 1}")
         own = table_of(section, folder, place_of)
         if section.kind != BETWEEN and not own.has("epoch"):
-            advice = "add a column epoch; of stations that are known, optloc fix takes the file"
-            raise InvalidProblem("the rows do not say of which pulse they are", own.source, advice)
+            advice = "add a column epoch; for known stations, use optloc fix"
+            raise InvalidProblem("the rows have no column epoch for the pulse", own.source, advice)
         between = section.kind == BETWEEN
         kind = BETWEEN if between else kind_named(section.kind, place_of)
         if not between and kind not in KINDS:
@@ -130,7 +130,7 @@ def read_network(path: Path) -> Network:
         else:
             rows.append((kind, own.labels("epoch"), a, b, z, sigma))
     if not rows:
-        raise InvalidProblem("there are no pulses", source, 'add [[measurements]] of kind "toa", "tdoa" or "range"')
+        raise InvalidProblem("the file has no pulses", source, 'add [[measurements]] of kind "toa", "tdoa" or "range"')
     labels, slots, table_z, table_sigma = _by_pulse(rows)
     ends = np.array([[a, b] for one in apart for a, b in zip(one[0], one[1], strict=True)], dtype=np.int64)
     return checked(
@@ -151,26 +151,29 @@ def read_network(path: Path) -> Network:
 
 
 def _places(section: NetworkStations, table: Table, where: str) -> tuple[Array, Array]:
-    """Return what is known of places (M, d), and how well: infinite where a cell is empty."""
+    """Return prior station coordinates (M, d) and their standard deviations, metres; infinite if a cell is empty."""
     unit = Units("length").conversion(section.unit, where)
     keys = ("x", "y", "z")[: section.dimension]
     if section.dimension == 2 and table.has("z"):
-        raise InvalidProblem("a network in the plane has no column z", where, "leave it out, or write dimension = 3")
+        raise InvalidProblem(
+            "a network of dimension 2 has no column z", where, "remove the column, or write dimension = 3"
+        )
     place = np.array([_optional(table, key) for key in keys]).T * unit.factor
     own = _optional(table, "sigma") * unit.factor
     common = 0.0 if section.sigma is None else Units("length").plain(section.sigma, section.unit, where)
     sigma = np.where(np.isnan(own), common, own)[:, None]
     if (sigma < 0.0).any():
-        raise InvalidProblem("a standard deviation is negative", where, "give zero where a place is exact")
+        raise InvalidProblem("a standard deviation is negative", where, "give zero for an exact position")
     return np.where(np.isnan(place), 0.0, place), np.where(np.isnan(place), np.inf, sigma)
 
 
 def _optional(table: Table, key: str) -> Array:
+    """Return a column as numbers, NaN where a cell or the column is missing."""
     return table.numbers(key, optional=True) if table.has(key) else np.full(table.count, np.nan)
 
 
 def _values(read: Context, name: str) -> tuple[Array, Array]:
-    """Return the values (m,) of rows and their standard deviations, metres; `name` is their unit."""
+    """Return values (m,) and standard deviations (m,) of rows, metres; `name` is the unit in the file."""
     units = Units("length", read.speed)
     unit = units.conversion(name, join(read.where, "key 'unit'"))
     z = values_of(read, unit, np.ones(read.table.count))
@@ -184,9 +187,9 @@ def _values(read: Context, name: str) -> tuple[Array, Array]:
 def _by_pulse(
     rows: list[tuple[str, Array, Array, Array, Array, Array]],
 ) -> tuple[tuple[str, ...], tuple[NetworkSlot, ...], Array, Array]:
-    """Return labels of pulses, slots, and tables (N, R) of values and deviations.
+    """Return labels of pulses, slots, and tables (N, R) of values and standard deviations.
 
-    What the same stations measure of one pulse more than once has a slot for each time.
+    If the same stations measure a pulse several times, each repetition has its own slot.
     """
     labels, _, pulse = distinct(np.concatenate([one[1] for one in rows]))
     slots: dict[tuple[str, int, int, int], int] = {}
@@ -209,22 +212,24 @@ def _by_pulse(
 
 
 def check_name(out: Path) -> None:
-    """Refuse a name for what is found that is not that of a problem file, before anything is searched."""
+    """Raise if the output file does not have the ending of a problem file, before the search starts."""
     if out.suffix.lower() != ".toml":
-        raise InvalidProblem("what was found is written as a problem file", str(out), "let its name end in .toml")
+        raise InvalidProblem("the output is a problem file, so its name must end in .toml", str(out), "change the name")
 
 
 def write_calibrated(found: Calibration, title: str, out: Path, source: Path) -> None:
-    """Write a problem file with the stations that were found, their deviations, and the rows of the pulses.
+    """Write a problem file with the estimated stations, their standard deviations, and the rows of the pulses.
 
     Raises
     ------
     InvalidProblem
-        Where there is no network to write, or the file's name does not end in .toml.
+        If there is no finite network to write, or if the file name does not end in .toml.
     """
     check_name(out)
     if not np.isfinite(found.covariance).all():
-        raise InvalidProblem(f"the network is {found.status.label}", str(out), "see its findings")
+        raise InvalidProblem(
+            f"the network has the status {found.status.label} and cannot be written", str(out), "see its findings"
+        )
     claim(out, inputs=[source])
     net, sigma = found.network, np.sqrt(np.mean(found.sigma**2, axis=1))
     stations = []

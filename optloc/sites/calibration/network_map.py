@@ -1,4 +1,4 @@
-"""A network in plan and elevation: stations with ellipses, pulses, what was known, and other networks that fit."""
+"""A network in plan and elevation: stations with ellipses, pulses, prior positions and alternatives."""
 
 from __future__ import annotations
 
@@ -16,9 +16,11 @@ if TYPE_CHECKING:
 
 # Root of the 95 % quantile of chi-square with two degrees of freedom.
 _RADIUS = 2.447746830680816
-# Points of an ellipse, and width of the bars of the histogram: narrow enough to show the shape of a normal law.
+# Points of an ellipse, and width of the histogram bars: narrow enough to show the shape of a normal
+# distribution.
 _POINTS, _BAR = 60, 0.25
-# Residuals beyond so many deviations are in the last bars: a gross one must not make the others one bar.
+# Larger residuals (in standard deviations) go into the last bars: a gross residual must not compress the others
+# into one bar.
 _FAR = 5.0
 
 
@@ -33,28 +35,29 @@ def plot_network(
     dof: int,
     title: str,
 ) -> Figure:
-    """Return plan, elevation (in space) and histogram of the residuals of a network.
+    """Return a figure with plan, elevation (in space) and histogram of the residuals of a network.
 
     Parameters
     ----------
     names : sequence of M str
-        Stations.
+        Names of the stations.
     stations : array (M, d)
-        Metres.
+        Station positions, metres.
     covariance : array (M d, M d)
-        Of their coordinates, square metres.
+        Covariance of the station coordinates, square metres.
     pulses : array (N, d)
-        Metres; NaN where there is none.
+        Pulse positions, metres; NaN for unknown positions.
     known : array (M, d)
-        What was known of the stations; NaN where nothing.
+        Prior station positions, metres; NaN for unknown positions.
     others : sequence of arrays (M, d)
-        Stations of other networks that fit the data, in the same frame.
+        Stations of other networks that fit the data, in the same frame, metres.
     residuals : array (...)
-        Residuals in standard deviations; NaN where there is none.
+        Residuals in standard deviations; NaN for missing measurements.
     dof : int
-        Degrees of freedom: unknowns that are fitted make residuals smaller than their noise.
+        Degrees of freedom; the expected spread of the residuals depends on them, since the fit makes residuals
+        smaller.
     title : str
-        Of the picture.
+        Title of the figure.
     """
     d = stations.shape[1]
     figure = figure_class()(figsize=(9.6, 4.8 if d == 2 else 6.4), layout="constrained")
@@ -71,7 +74,7 @@ def plot_network(
 
 
 def _histogram(axes: Axes, residuals: Array, dof: int) -> None:
-    """Draw residuals (n,), and the normal law that is left of the noise when so many degrees of freedom remain."""
+    """Draw the residuals (n,) and their expected normal distribution; its variance is dof / n, because of the fit."""
     edges = np.arange(-_FAR, _FAR + _BAR, _BAR)
     weights = np.full(residuals.size, 1.0 / (max(residuals.size, 1) * _BAR))
     axes.hist(np.clip(residuals, -_FAR, _FAR), bins=edges.tolist(), weights=weights, color=GREY)
@@ -97,6 +100,7 @@ def _view(
     known: Array,
     others: Sequence[Array],
 ) -> None:
+    """Draw the network in the plane of two coordinates."""
     i, k = view
     d = stations.shape[1]
     axes.plot(pulses[:, i], pulses[:, k], ".", color=GREY, markersize=4, label="pulses")

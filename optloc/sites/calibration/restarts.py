@@ -1,4 +1,4 @@
-"""Where networks may be, without a guess: fits of low rank and random places, refined until three starts agree."""
+"""Starts of a network without a first guess: low-rank fits and random positions, refined in rounds."""
 
 from __future__ import annotations
 
@@ -14,35 +14,35 @@ from optloc.problem import Array
 from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, likelihood, together
 from optloc.sites.calibration.network import Network
 
-# Starts at a time: a batch of eight costs little more than one.
+# Starts per round: a batch of eight takes little longer than one start.
 _LOW_RANK, _RANDOM = 8, 8
-# Stations from which random places alone are tried first: most of them lead to the optimum there, and take a tenth of
-# the time.
+# From this number of stations, the first round has only random positions: most of them reach the optimum, in a
+# tenth of the time.
 _MANY = 10
-# Fits whose relaxed cost is within this factor of the best are refined: the relaxation weighs errors otherwise than the
-# likelihood does, so that its best need not lead to the best.
+# Fits with a relaxed cost below this factor times the best are refined: the relaxation weights errors
+# differently from the likelihood, so its best fit need not lead to the best network.
 _NEARLY = 2.0
-# Steps of a refinement in the free network, before it is laid over what is known.
+# Steps of the refinement as a free network, before the network is aligned with known coordinates.
 _ROUGH = 15
-# Orientations from which a network is laid over known places, and the steps of that.
+# Initial orientations for the alignment with known coordinates, and steps of the alignment.
 _TURNS, _LAID = 24, 12
-# Share of the spread by which what is known exactly may be missed while a network is laid over it.
+# Smallest standard deviation of known coordinates during the alignment, as a share of the network size.
 _LOOSE = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
 class RoundEnds:
-    """Minima that starts arrived at.
+    """The minima of several starts.
 
     Parameters
     ----------
     at : NetworkEstimate
         S minima.
     cost : array (S,)
-        Their costs.
+        Costs of the minima.
     start : int array (S,)
-        Number of the start that each comes from; starts that found the same fit of low rank are one, for they agree in
-        where that leads, right or wrong.
+        Number of the start of each minimum. Starts with the same low-rank fit share a number: their agreement is
+        no evidence, since they lead to the same network, right or wrong.
     """
 
     at: NetworkEstimate
@@ -50,33 +50,33 @@ class RoundEnds:
     start: Array
 
     def take(self, which: Array) -> RoundEnds:
-        """Return some of the ends."""
+        """Return a selection of the minima (mask or indices)."""
         return RoundEnds(self.at.take(which), self.cost[which], self.start[which])
 
     def counted(self, which: Array) -> int:
-        """Return how many starts some of the ends (mask) come from."""
+        """Return the number of different starts among a selection (mask) of the minima."""
         return len(np.unique(self.start[which]))
 
 
 def joined(some: list[RoundEnds]) -> RoundEnds:
-    """Return all ends of several rounds."""
+    """Return the minima of several rounds as one object."""
     arrays = (np.concatenate([getattr(one, name) for one in some]) for name in ("cost", "start"))
     return RoundEnds(together(*(one.at for one in some)), *arrays)
 
 
 def arrivals(network: Network) -> tuple[Array, Array, Array]:
-    """Return what each pulse measured as one number a station.
+    """Return one arrival or range per pulse and station, and its weight.
 
     Parameters
     ----------
     network : Network
-        What was measured.
+        Measurements and prior knowledge.
 
     Returns
     -------
     z, weight : array (N, M)
-        Arrivals or ranges, and their inverse standard deviations, zero where there is none. Differences become arrivals
-        by least squares, up to a number that no difference tells.
+        Arrivals or ranges, metres, and their inverse standard deviations; 0 without a measurement. Differences are
+        converted to arrivals by least squares, up to an unknown constant per pulse.
     emission : bool array (N,)
         Whether a pulse has an unknown offset.
     """
@@ -90,14 +90,15 @@ def arrivals(network: Network) -> tuple[Array, Array, Array]:
             rows = np.flatnonzero(given & (kinds == kind))
             if rows.size:
                 values, deviation = network.z[j, rows], network.sigma[j, rows]
-                told = _of_differences if kind == "tdoa" else _of_stations
-                z[j], weight[j] = told(ends[rows], values, 1.0 / deviation**2, m)
+                convert = _of_differences if kind == "tdoa" else _of_stations
+                z[j], weight[j] = convert(ends[rows], values, 1.0 / deviation**2, m)
                 emission[j] = kind != "range"
                 break
     return z, weight, emission
 
 
 def _of_stations(ends: Array, values: Array, weight: Array, m: int) -> tuple[Array, Array]:
+    """Return the mean value (m,) of each station's rows, and its inverse standard deviation (m,)."""
     total, sums = np.zeros(m), np.zeros(m)
     np.add.at(total, ends[:, 0], weight)
     np.add.at(sums, ends[:, 0], weight * values)
@@ -105,7 +106,10 @@ def _of_stations(ends: Array, values: Array, weight: Array, m: int) -> tuple[Arr
 
 
 def _of_differences(ends: Array, values: Array, weight: Array, m: int) -> tuple[Array, Array]:
-    """Return the arrivals of the largest group of stations that differences link, up to a number."""
+    """Return the arrivals (M,) and weights (M,) of the largest group of stations that differences link.
+
+    The arrivals have an unknown common constant.
+    """
     linked = np.zeros((m, m))
     np.add.at(linked, (ends[:, 0], ends[:, 1]), weight)
     _, group = connected_components(linked, directed=False)
@@ -121,7 +125,11 @@ def _of_differences(ends: Array, values: Array, weight: Array, m: int) -> tuple[
 
 @dataclass(frozen=True, slots=True)
 class Starts:
-    """Starts of one network: see `rounds`."""
+    """Generator of starts for one network, used by `rounds`.
+
+    `z`, `weight` and `emission` come from `arrivals`. `shift` (N,) is the median arrival of each pulse and
+    `spread` the size of the network, metres.
+    """
 
     lik: Likelihood
     z: Array
@@ -133,11 +141,11 @@ class Starts:
 
     @property
     def dimension(self) -> int:
-        """Return 2 or 3."""
+        """Return the number of dimensions, 2 or 3."""
         return self.lik.network.dimension
 
     def low_rank(self, count: int) -> tuple[NetworkEstimate, Array]:
-        """Return networks from the fits of low rank that `count` starts find, and the number of each fit."""
+        """Return networks from the low-rank fits of `count` random starts, and the fit number of each network."""
         net, d = self.lik.network, self.dimension
         full = (self.weight > 0.0).sum(axis=1) >= d + 3
         relative = self.weight / self.weight.max()
@@ -145,12 +153,12 @@ class Starts:
         z = (self.z - self.shift[:, None]) / self.spread
         fit = fit_low_rank(z[full], relative[full], self.emission[full], begun, clocks=not net.synchronised)
         keep = np.flatnonzero(fit.cost <= _NEARLY * np.nanmin(fit.cost))
-        # starts that found the same fit lead to the same network
+        # starts with the same fit lead to the same network: keep the first
         order = keep[np.argsort(fit.cost[keep], kind="stable")]
         new = np.diff(fit.cost[order], prepend=-1.0) > 1e-6 * fit.cost[order] + 1e-24
         stations, pulses, which = upgrade(fit.take(order[new]))
         if not len(which):
-            return _nothing(net), np.zeros(0, dtype=int)
+            return _no_estimates(net), np.zeros(0, dtype=int)
         b = fit.stations.b[order[new]][which] * self.spread
         places = np.zeros((len(which), net.pulses, d))
         places[:, full] = pulses * self.spread
@@ -159,11 +167,11 @@ class Starts:
         offsets[:, full] = fit.pulses.o[order[new]][which] * self.spread
         offsets = np.where(self.emission, offsets + self.shift, 0.0)
         made = NetworkEstimate(stations * self.spread, b, places, offsets * net.emission)
-        self._settle(made, ~full)
+        self._set_emission(made, ~full)
         return made, which
 
-    def _settle(self, made: NetworkEstimate, few: Array) -> None:
-        """Give pulses that took no part in a fit the emission that their places at the centre call for."""
+    def _set_emission(self, made: NetworkEstimate, few: Array) -> None:
+        """Set the emission of pulses that the fit did not use (mask `few`) to the mean that fits their position."""
         if few.any():
             apart = np.linalg.norm(made.stations[:, None] - made.pulses[:, few, None], axis=-1)
             weight = self.weight[few] / np.maximum(self.weight[few].sum(axis=1, keepdims=True), 1e-300)
@@ -171,7 +179,7 @@ class Starts:
             made.emission[:, few] = offset * self.lik.network.emission[few]
 
     def random(self, count: int) -> NetworkEstimate:
-        """Return networks with all places drawn, in the spread that the arrivals tell."""
+        """Return `count` networks with random positions; the arrivals determine the size of the area."""
         net, d = self.lik.network, self.dimension
         size = np.full(d, self.spread)
         box = np.ones((count, 1, d)) * size
@@ -184,7 +192,7 @@ class Starts:
         return NetworkEstimate(stations, np.zeros((count, net.stations)), pulses, offset * net.emission)
 
     def ends(self, at: NetworkEstimate, start: Array) -> RoundEnds:
-        """Refine networks, laid over what is known of the stations in both ways."""
+        """Return the minima of refined networks; both mirror images are aligned with prior coordinates, if any."""
         net = self.lik.network
         if np.isfinite(net.place_sigma).any():
             free = replace(net, place_sigma=np.full(net.place.shape, np.inf), place=np.zeros(net.place.shape))
@@ -194,13 +202,14 @@ class Starts:
         return RoundEnds(found, cost, start)
 
 
-def _nothing(net: Network) -> NetworkEstimate:
+def _no_estimates(net: Network) -> NetworkEstimate:
+    """Return an empty set of estimates (S = 0)."""
     m, n, d = net.stations, net.pulses, net.dimension
     return NetworkEstimate(np.zeros((0, m, d)), np.zeros((0, m)), np.zeros((0, n, d)), np.zeros((0, n)))
 
 
 def starts_of(lik: Likelihood, seed: int) -> Starts:
-    """Return the starts of a network."""
+    """Return the generator of starts for a network."""
     z, weight, emission = arrivals(lik.network)
     measured = weight > 0.0
     shift = np.where(emission, [np.median(z[j, measured[j]]) if measured[j].any() else 0.0 for j in range(len(z))], 0.0)
@@ -211,7 +220,7 @@ def starts_of(lik: Likelihood, seed: int) -> Starts:
 
 
 def rounds(starts: Starts) -> Iterator[tuple[int, RoundEnds]]:
-    """Yield how many starts were made, and the ends of each round: low rank where it applies, and random places."""
+    """Yield the number of starts so far and the minima of each round (low-rank fits and random positions)."""
     net, d = starts.lik.network, starts.dimension
     full = int(((starts.weight > 0.0).sum(axis=1) >= d + 3).sum())
     able = net.stations >= d + 3 and full > 0 and max(net.stations, full) >= unknowns(d)
@@ -220,7 +229,7 @@ def rounds(starts: Starts) -> Iterator[tuple[int, RoundEnds]]:
         at, start = starts.random(_RANDOM), np.arange(_RANDOM) + begun
         begun += _RANDOM
         if able and not patient:
-            # all are refined side by side
+            # one batch refines all starts together
             fits, which = starts.low_rank(_LOW_RANK)
             at, start = together(fits, at), np.concatenate([which + begun, start])
             begun += _LOW_RANK
@@ -229,21 +238,21 @@ def rounds(starts: Starts) -> Iterator[tuple[int, RoundEnds]]:
 
 
 def laid(at: NetworkEstimate, net: Network, rng: np.random.Generator) -> NetworkEstimate:
-    """Return networks moved and turned onto what is known of the stations: S as they are, then S mirrored.
+    """Return networks aligned with the prior coordinates of the stations: S networks, then their S mirror images.
 
     Parameters
     ----------
     at : NetworkEstimate
         S networks.
     net : Network
-        With places that are known, each coordinate by itself.
+        A network with prior coordinates; each coordinate can be known alone.
     rng : numpy.random.Generator
-        Draws the orientations from which each is turned.
+        Draws the initial orientations.
 
     Returns
     -------
     NetworkEstimate
-        2 S networks; exact coordinates are as they are known.
+        2 S networks; coordinates that are known exactly have their known values.
     """
     d = net.dimension
     mirror = np.ones(d)
@@ -253,7 +262,7 @@ def laid(at: NetworkEstimate, net: Network, rng: np.random.Generator) -> Network
     points, pulses = both.stations - middle, both.pulses - middle
     extent = np.sqrt(np.mean(points**2)) or 1.0
     weight = 1.0 / np.maximum(net.place_sigma, _LOOSE * extent)
-    turn, move = _onto(points, net.place, weight, rng)
+    turn, move = _align(points, net.place, weight, rng)
     stations = points @ np.swapaxes(turn, 1, 2) + move[:, None]
     exact = net.place_sigma <= 0.0
     return replace(
@@ -263,8 +272,8 @@ def laid(at: NetworkEstimate, net: Network, rng: np.random.Generator) -> Network
     )
 
 
-def _onto(points: Array, place: Array, weight: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return rotations (S, d, d) and shifts (S, d) with the least weighted distance from known coordinates."""
+def _align(points: Array, place: Array, weight: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return rotations (S, d, d) and shifts (S, d) that minimise the weighted distance from known coordinates."""
     s, m, d = points.shape
     generators = np.array([_generator(i, k, d) for i in range(d) for k in range(i)])
     turn = np.linalg.qr(rng.standard_normal((_TURNS, d, d)))[0]
@@ -285,7 +294,7 @@ def _onto(points: Array, place: Array, weight: Array, rng: np.random.Generator) 
         gradient = np.einsum("stqp,stq->stp", columns, residual)
         step = np.linalg.solve(normal, gradient[..., None])[..., 0]
         half = 0.5 * np.einsum("stg,gab->stab", step[..., : len(generators)], generators)
-        # Cayley's map is a rotation for any step
+        # the Cayley map gives a rotation for any step
         turn = np.linalg.solve(np.eye(d) - half, (np.eye(d) + half) @ turn)
         move = move + step[..., len(generators) :]
     turned = points[:, None] @ np.swapaxes(turn, -1, -2)
@@ -296,6 +305,7 @@ def _onto(points: Array, place: Array, weight: Array, rng: np.random.Generator) 
 
 
 def _generator(i: int, k: int, d: int) -> Array:
+    """Return the skew-symmetric matrix (d, d) of a rotation in the plane of axes i and k."""
     out = np.zeros((d, d))
     out[i, k], out[k, i] = 1.0, -1.0
     return out

@@ -1,1 +1,1 @@
-"""Commands of sites: placement and calibration."""
+"""The commands ``optloc place`` and ``optloc calibrate``."""

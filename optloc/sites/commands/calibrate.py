@@ -1,4 +1,4 @@
-"""What ``optloc calibrate`` does: stations, clocks and pulses from measurements alone."""
+"""The command ``optloc calibrate``: stations, clocks and pulses from measurements alone."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ NETWORKS = (
     "optloc calibrate hall.toml",
     "optloc calibrate hall.toml --gauge A1,A2,A3 --out surveyed.toml --plot network.png",
 )
-# Stations that a table shows: what a screen holds.
+# Largest number of stations in the table, so that it fits on a screen.
 _LINES = 40
 
 Gauge = Annotated[str | None, typer.Option(metavar="A1,A2,A3", help="Stations that define the frame.")]
-Seed = Annotated[int, typer.Option(min=0, help="Decides the starts.")]
-Robust = Annotated[bool, typer.Option("--robust", help="Leave out rows that most others contradict, and name them.")]
-Out = Annotated[Path | None, typer.Option(metavar="OUT.toml", help="Write a problem file with the stations found.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the random starts.")]
+Robust = Annotated[bool, typer.Option("--robust", help="Leave out and list rows that contradict most others.")]
+Out = Annotated[Path | None, typer.Option(metavar="OUT.toml", help="Write a problem file with the estimated stations.")]
 Picture = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw plan, elevation and residuals.")]
 
 
@@ -41,9 +41,9 @@ def calibrate(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Find where stations are, and their clocks, from pulses at unknown places: no first guess, and a verdict.
+    """Find positions and clocks of stations from pulses at unknown positions, without a first guess, and check them.
 
-    FILE lists stations, with the coordinates that are known and no others, and what they measured of each pulse.
+    FILE lists the stations, with coordinates only where these are known, and the measurements of each pulse.
     """
     raise typer.Exit(_run(file, gauge, seed, out, plot, robust=robust, as_json=as_json, quiet=quiet))
 
@@ -59,6 +59,7 @@ def _run(
     as_json: bool,
     quiet: bool,
 ) -> int:
+    """Calibrate, write the outputs and return the exit code: 0 for status ok, otherwise 1."""
     from optloc.cli import Screen, claim_outputs, dumps, line, say, write_picture, write_text
     from optloc.problem import Status
     from optloc.sites.calibration import calibrate as find
@@ -81,11 +82,12 @@ def _run(
     elif not quiet:
         _show(found)
         if out is not None:
-            say(Screen(), f"The stations are in {out}: try optloc fix {out}.")
+            say(Screen(), f"The stations are in {out}. Next step: optloc fix {out}.")
     return 0 if found.status is Status.OK else 1
 
 
 def _show(found: Calibration) -> None:
+    """Print status, findings, the table of stations and the alternatives."""
     from rich.table import Table
 
     from optloc.cli import Screen, say
@@ -100,7 +102,7 @@ def _show(found: Calibration) -> None:
     table = Table(title="Stations, m", title_justify="left")
     axes = "xyz"[: net.dimension]
     clocks = [] if net.synchronised else ["clock"]
-    for heading in ("station", *(f"{c} ±" for c in axes), *clocks, "residual, sigma"):
+    for heading in ("station", *(f"{c} ±" for c in axes), *clocks, "rms residual, sigma"):
         table.add_column(heading, justify="left" if heading == "station" else "right")
     with np.errstate(invalid="ignore"):
         sigma = found.sigma
@@ -116,6 +118,7 @@ def _show(found: Calibration) -> None:
 
 
 def _record(found: Calibration, file: Path) -> dict[str, Any]:
+    """Return the result as a dictionary for JSON output."""
     net = found.network
     return {
         "file": str(file),
@@ -143,6 +146,7 @@ def _record(found: Calibration, file: Path) -> dict[str, Any]:
 
 
 def _picture(found: Calibration, title: str) -> Any:
+    """Return the figure of the network."""
     from optloc.sites.calibration.network_map import plot_network
 
     net = found.network

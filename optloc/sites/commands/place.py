@@ -1,4 +1,4 @@
-"""What ``optloc place`` does: which sites to take, how far from the best that is, what each loss costs, and maps."""
+"""The command ``optloc place``: choice of sites, gap to the best possible set, effect of each loss, and maps."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from optloc.sites.placement.selection_file import (
     write_chosen,
 )
 
-# Lines of a table of places or stations: what a screen holds.
+# Largest number of lines in a table of places or stations, so that the table fits on a screen.
 _LINES = 20
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceOptions:
-    """What the command line says in the place of the file, None where it says nothing.
+    """Options of the command line that replace settings of the file; None keeps the setting of the file.
 
     Parameters
     ----------
     choose, budget, criterion, worst, fail_one, gap, seconds
-        As of `SiteSelection`.
+        See `SiteSelection`.
     at : str, optional
-        The one place of interest.
+        The only place of interest.
     rows : bool
-        Single rows are chosen.
+        Whether single rows are chosen instead of stations.
     draws : int
         Simulated fixes at each place.
     """
@@ -58,23 +58,28 @@ class PlaceOptions:
 def run_place(
     file: Path, wanted: PlaceOptions, *, plot: Path | None, out: Path | None, as_json: bool = False, quiet: bool = False
 ) -> int:
-    """Choose sites, print and write what was chosen, and return the exit code: 1 where the gap did not close."""
+    """Choose sites, print and write the result, and return the exit code.
+
+    The code is 1 if the gap did not close or too many simulated fixes are ambiguous, otherwise 0.
+    """
     claim_outputs(out, picture=plot, inputs=[file])
     loaded = read_selection(file) if is_selection(file) else _of_problem(file, wanted)
     selection = _with(loaded.selection, wanted)
     with line(quiet or as_json) as tell:
 
-        def told(bound: float, value: float, nodes: int) -> None:
+        def report(bound: float, value: float, nodes: int) -> None:
             tell(f"best {value:.5g}, no set below {bound:.5g}, {nodes} nodes")
 
         tell("searching")
-        found = place(selection, draws=wanted.draws, tell=told)
+        found = place(selection, draws=wanted.draws, tell=report)
         if loaded.regions:
             tell("refining")
             found = refined(selection, found, loaded.regions, loaded.ground)
     if out is not None:
         if not loaded.settings or selection.by == "row":
-            raise InvalidProblem("only the choice of a selection file is written", str(out), "leave --out out")
+            raise InvalidProblem(
+                "only a selection file with a choice of stations can be written as a problem", str(out), "remove --out"
+            )
         write_chosen(loaded, (*found.chosen, *found.kept), out, file)
     if plot is not None:
         write_picture(picture(selection, found), plot)
@@ -88,12 +93,12 @@ def run_place(
 
 
 def _of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
-    """Return the selection of stations of an ordinary problem file, for a target at a place or the fix."""
+    """Return the stations of a problem file as candidates, for a target at `--at` or at the fix of the file."""
     loaded = read(file, values=False)
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
     problem = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
     if wanted.choose is None:
-        what = "the file has no table [choice], and nothing says how many stations to take"
+        what = "the file has no table [choice], so the number of stations to take is missing"
         raise InvalidProblem(what, loaded.source, "give -k, such as -k 4")
     if wanted.at is not None:
         places = vector(problem, wanted.at, None, False)[None, : problem.dimension]
@@ -102,12 +107,14 @@ def _of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
 
         places = solve(read(file).problem).position.reshape(-1, problem.dimension)[:1]
         if not np.isfinite(places).all():
-            raise InvalidProblem("the file has no fix to choose stations for", loaded.source, "give a place with --at")
+            raise InvalidProblem(
+                "the file has no fix, so the position of the target is unknown", loaded.source, "give a place with --at"
+            )
     return LoadedSelection(SiteSelection(problem, places, choose=wanted.choose), loaded.source, loaded.title, {})
 
 
 def _with(selection: SiteSelection, wanted: PlaceOptions) -> SiteSelection:
-    """Return a selection with the options of the command line."""
+    """Return the selection with the options of the command line."""
     given: dict[str, Any] = {
         key: value
         for key in ("choose", "budget", "worst", "fail_one", "gap", "seconds")
@@ -126,11 +133,13 @@ def _with(selection: SiteSelection, wanted: PlaceOptions) -> SiteSelection:
 
 
 def _names_of(selection: SiteSelection) -> tuple[str, ...]:
+    """Return the names of the places; P1, P2 and so on if they have none."""
     count = len(np.atleast_2d(selection.places))
     return selection.names or tuple(f"P{i + 1}" for i in range(count))
 
 
 def _record(loaded: LoadedSelection, selection: SiteSelection, found: Placement) -> dict[str, Any]:
+    """Return the result as a dictionary for JSON output."""
     drawn = found.draws
     return {
         "file": loaded.source,
@@ -184,8 +193,9 @@ def _record(loaded: LoadedSelection, selection: SiteSelection, found: Placement)
 
 
 def _show(loaded: LoadedSelection, selection: SiteSelection, found: Placement) -> None:
+    """Print the chosen sites, both tables and the remarks."""
     console = Screen()
-    sure = "" if found.closed else " (open)"
+    sure = "" if found.closed else " (not closed)"
     say(console, f"{loaded.title}: take {', '.join(found.chosen) or 'nothing'}.")
     words = {"rms": "mean bound", "volume": "mean axis of the ellipsoid", "axis": "longest axis of the ellipsoid"}
     least = f"{words[found.criterion]} {found.sigma:.4g} m, no choice below {np.sqrt(max(found.bound, 0.0)):.4g} m"
@@ -197,6 +207,7 @@ def _show(loaded: LoadedSelection, selection: SiteSelection, found: Placement) -
 
 
 def _places_table(selection: SiteSelection, found: Placement) -> Table:
+    """Return the table of the bounds at the places, largest bound first."""
     before = "kept stations" if set(found.before_sites) == set(found.kept) else "random set"
     table = Table(title="Bound of the position error, m", title_justify="left")
     for heading in ("place", f"before ({before})", "after", "one failed", "spare rows"):
@@ -212,9 +223,10 @@ def _places_table(selection: SiteSelection, found: Placement) -> Table:
 
 
 def _losses_table(found: Placement) -> Table:
-    table = Table(title="What the loss of a station costs, m", title_justify="left")
-    for heading in ("station", "without it", "best in its place", "then"):
-        table.add_column(heading, justify="left" if heading in ("station", "best in its place") else "right")
+    """Return the table of the bounds after the loss of each station."""
+    table = Table(title="Bound after the loss of a station, m", title_justify="left")
+    for heading in ("station", "without it", "best replacement", "with replacement"):
+        table.add_column(heading, justify="left" if heading in ("station", "best replacement") else "right")
     for swap in found.swaps[:_LINES]:
         then = f"{np.sqrt(swap.replaced):.4g}" if swap.replacement else ""
         table.add_row(swap.name, f"{np.sqrt(swap.value):.4g}", swap.replacement or "-", then)
@@ -222,13 +234,14 @@ def _losses_table(found: Placement) -> Table:
 
 
 def _remarks(selection: SiteSelection, found: Placement) -> list[str]:
+    """Return sentences about weak places, the next station, simulated fixes and the refinement."""
     names, out = _names_of(selection), []
     weak = [names[i] for i in np.flatnonzero(found.share_of_prior > PRIOR)]
     if weak:
-        out.append(f"No fix of its own, the prior holds it: {', '.join(weak)}.")
+        out.append(f"The stations do not determine the position, only the prior does: {', '.join(weak)}.")
     bare = [names[i] for i in np.flatnonzero(found.redundancy <= 0)]
     if bare:
-        out.append(f"No spare row, a wrong one would not be noticed: {', '.join(bare)}.")
+        out.append(f"Without a spare row, a wrong measurement is not detected: {', '.join(bare)}.")
     if found.following:
         name, value = found.following[0]
         out.append(f"The best station to add next is {name}: {np.sqrt(value):.4g} m.")
@@ -238,10 +251,12 @@ def _remarks(selection: SiteSelection, found: Placement) -> list[str]:
         text = f"{share:.2g} % of simulated fixes are ambiguous, most at {worst}"
         out.append(text + ("." if found.draws.clean else "; add a height, a constraint or a station off the plane."))
         coverage = np.nanmean(found.draws.coverage) if np.isfinite(found.draws.coverage).any() else np.nan
-        out.append(f"Of the others {100 * coverage:.3g} % are in their 95 % ellipse.")
+        out.append(f"For {100 * coverage:.3g} % of the other fixes, the 95 % ellipse contains the place.")
     if found.banned:
-        out.append(f"Better sets were given up, their fixes are ambiguous: {'; '.join(map(', '.join, found.banned))}.")
+        out.append(
+            f"Better sets were rejected because their fixes are ambiguous: {'; '.join(map(', '.join, found.banned))}."
+        )
     if found.refined is not None:
         spots = "; ".join(", ".join(f"{v:.1f}" for v in row) for row in found.refined)
-        out.append(f"Refined to {np.sqrt(found.refined_value):.4g} m, a local optimum, at {spots}.")
+        out.append(f"The refinement reaches {np.sqrt(found.refined_value):.4g} m, a local optimum, at {spots}.")
     return out

@@ -1,4 +1,4 @@
-"""Where to put stations: which of many sites to take, with a bound of what any choice can reach."""
+"""Sensor placement: the best set of sites from a list of candidates, with a proven bound for all other sets."""
 
 from optloc.sites.placement.chosen import Draws, Placement, Swap, picture, place
 from optloc.sites.placement.sites import CountGroup, SiteSelection

@@ -1,7 +1,8 @@
-"""The search for a set of sites: starts that are exchanged, and a branch and bound that says how good any set can be.
+"""Search for the best set of sites: local exchange, then branch and bound with a proven bound.
 
-Best first; a node is bounded by its relaxation (`optloc.sites.placement.relaxation`), started with the weights of its
-parent. What the reduced costs forbid is fixed at once.
+The search takes the open node with the lowest bound first. The bound is a relaxation
+(`optloc.sites.placement.relaxation`) that starts with the weights of the parent node. Sites whose reduced
+cost excludes one of their two values are fixed at once.
 """
 
 from __future__ import annotations
@@ -22,28 +23,31 @@ from optloc.problem import Array
 from optloc.sites.placement.branching import FREE, IN, OUT, expand, propagate, score, settle
 from optloc.sites.placement.completions import CompletionRequest, exhaust
 
-# Random sets that are exchanged beside the rounded relaxation, and steps of a relaxation: at the root, and of a node.
+# Random sets that are improved by exchange in addition to the rounded relaxation; steps of the relaxation at
+# the root and in a node.
 _STARTS, _ROOT_STEPS, _STEPS = 15, 60, 40
-# A value that is better than another by less is the same, relatively: rounding of sums over places.
+# Two values with a smaller relative difference are equal: sums over places have rounding errors.
 _SAME = 1e-12
-# Weight above which a site is as good as taken: to cut there decides little. With weights nearest one half the
-# hardest of 100 searches had half as many nodes more.
+# A site with a larger weight is almost certainly taken, so a branch on it decides little. When the branch was
+# at the weight nearest 1/2, the hardest of 100 searches had 50 % more nodes.
 _TAKEN = 0.9
-# Rounding of a rule whose largest entry is one.
+# Rounding error of a rule whose largest entry is 1.
 _ROOM = 1e-9
-# Seconds between two points of the course of bound and value.
+# Seconds between two recorded points of bound and value.
 _EVERY = 0.05
-# Sets, all but their last site, and all but that where one may fail, below which a node is looked at set by set: that
-# takes as long as a relaxation, and spares a tree of them. Of 200, 400, 800 and 2000 the third took the least time.
+# A node with at most this number of sets is enumerated: that takes as long as one relaxation and avoids a
+# subtree. If one site may fail, the number counts the sets without their last site. Of the limits 200, 400, 800
+# and 2000, the third was the fastest.
 _FEW, _FEW_FAIL = 800, 8_000
-# Share of these where sites are not compared all at once: with several rows each, or by a volume or an axis.
+# Factor on these limits if the sites are not compared all at once: sites with several rows, or the criteria D
+# and E.
 _SLOW = 0.1
 _KINDS: dict[Criterion, int] = {"A": 0, "D": 1, "E": 2}
 
 
 @dataclass(frozen=True, slots=True)
 class SearchTask:
-    """What is searched.
+    """A search for the best set of sites.
 
     Parameters
     ----------
@@ -52,11 +56,12 @@ class SearchTask:
     criterion : "A", "D" or "E"
         As in `formulations.placement`.
     worst, fail : bool
-        Whether the worst place, and the worst failure of a site, count.
+        Whether the criterion is the maximum over places, and whether it is the value after the worst failure of a
+        site.
     rules, limits : array (R, n), (R,)
-        rules @ w <= limits; the first has no negative entry.
+        rules @ w <= limits; the first rule has no negative entry.
     state : int array (n,)
-        -1 for free sites, 0 and 1 for those that are left out and taken.
+        -1 for free sites, 0 for sites that are left out, 1 for sites that are taken.
     """
 
     design: Design
@@ -69,7 +74,7 @@ class SearchTask:
 
     @property
     def kind(self) -> int:
-        """Return the criterion's number in machine code."""
+        """Return the number of the criterion in machine code."""
         return _KINDS[self.criterion]
 
     def score(self, sets: Array) -> Array:
@@ -89,7 +94,7 @@ class SearchTask:
         )
 
     def asked(self) -> CompletionRequest:
-        """Return what sets are judged by, for machine code."""
+        """Return the rows, rules and criterion as arguments of the compiled enumeration."""
         design = self.design
         sites = np.ascontiguousarray(np.moveaxis(design.rows, -1, 1))
         whole = np.trace(design.prior, axis1=1, axis2=2) + (sites**2).sum(axis=(1, 2, 3))
@@ -99,16 +104,16 @@ class SearchTask:
         )
 
     def fits(self, sets: Array) -> Array:
-        """Return whether sets (B, n) meet the rules."""
+        """Return whether sets (B, n) meet the rules, up to rounding."""
         room = self.limits + _ROOM * np.maximum(1.0, np.abs(self.limits))
         return np.asarray((sets @ self.rules.T <= room).all(-1))
 
     def scale(self, value: float) -> float:
-        """Return a criterion as a variance, square metres: that of a determinant is its geometric mean."""
+        """Return a criterion as a variance, square metres; for a determinant, the geometric mean of the variances."""
         return float(np.exp(value / self.design.dimension)) if self.criterion == "D" else value
 
     def enough(self, value: float, gap: float) -> float:
-        """Return the bound at which a value is known to be the best but for a share of it."""
+        """Return the bound at which the relative gap to `value` is at most `gap`."""
         if self.criterion == "D":
             return value + self.design.dimension * float(np.log1p(-gap))
         return value * (1.0 - gap)
@@ -116,22 +121,22 @@ class SearchTask:
 
 @dataclass(frozen=True, slots=True)
 class BestSetResult:
-    """What a search found.
+    """The result of a search.
 
     Parameters
     ----------
     best : tuple of (float, array (n,))
-        Values and sets, the best first; none where the rules allow no set.
+        Values and sets, best first; empty if the rules allow no set.
     bound : float
-        No set that meets the rules has a lower value.
+        Lower bound of the value of each set that meets the rules.
     closed : bool
-        Whether bound and value are as close as was asked.
+        Whether the gap of bound and value is at most the requested gap.
     root : float
-        Bound before anything was branched.
+        Bound of the root node, before any branch.
     nodes : int
-        Relaxations that were solved.
+        Number of solved relaxations.
     course : array (q, 3)
-        Seconds, bound and value.
+        Seconds, bound and value during the search.
     """
 
     best: tuple[tuple[float, Array], ...]
@@ -143,8 +148,8 @@ class BestSetResult:
 
 
 @dataclass(slots=True)
-class _Open:
-    """The state of a search: sets that were seen, open nodes, how far it is."""
+class _SearchState:
+    """The state of a search: the best sets so far, the open nodes and the counts."""
 
     task: SearchTask
     asked: CompletionRequest
@@ -157,24 +162,29 @@ class _Open:
 
     @property
     def value(self) -> float:
+        """Return the best value so far, infinite before the first set."""
         return min((value for value, _ in self.seen.values()), default=np.inf)
 
     def add(self, value: float, chosen: Array) -> None:
+        """Store a set (n,) and its value; drop the worst sets if there are many."""
         self.seen[chosen.astype(np.int8).tobytes()] = (value, chosen)
-        if len(self.seen) > 4 * self.keep:  # the worst of many go
+        if len(self.seen) > 4 * self.keep:  # limit the memory: keep the best sets
             best = sorted(self.seen.items(), key=lambda item: item[1][0])[: self.keep]
             self.seen = dict(best)
 
     def push(self, bound: float, state: Array, w: Array) -> None:
-        self.count += 1  # a counter breaks ties: arrays have no order
+        """Add an open node with its bound, states (n,) and weights (n,)."""
+        self.count += 1  # equal bounds: arrays cannot be compared, counters can
         heappush(self.heap, (bound, self.count, state, w))
 
     @property
     def enough(self) -> float:
+        """Return the bound at which the search can stop."""
         return self.task.enough(self.value, self.gap) if self.seen else np.inf
 
     @property
     def bound(self) -> float:
+        """Return the proven lower bound of all sets."""
         return min(self.heap[0][0] if self.heap else np.inf, self.enough)
 
 
@@ -187,28 +197,28 @@ def search(
     seed: int = 0,
     tell: Callable[[float, float, int], None] = lambda bound, value, nodes: None,
 ) -> BestSetResult:
-    """Return the best set that was found and the bound of all.
+    """Return the best sets of the search, and a proven bound for all sets.
 
     Parameters
     ----------
     task : SearchTask
-        What is searched.
+        Design, criterion and rules.
     gap : float
-        Share of the value at which it stops.
+        Relative gap at which the search stops.
     seconds : float
-        After which it stops.
+        Time limit, seconds.
     keep : int
-        Sets that are told.
+        Number of sets to return.
     seed : int
-        Of the random starts.
+        Seed of the random starts.
     tell : callable of (bound, value, nodes)
-        Told now and then how far it is.
+        Progress callback, called about every 0.05 s.
     """
     _load()
     begun = monotonic()
-    rows = np.ascontiguousarray(task.design.rows)  # one type of array: machine code is made for each
+    rows = np.ascontiguousarray(task.design.rows)  # each array layout would be compiled separately
     task = replace(task, design=replace(task.design, rows=rows))
-    made, state = _Open(task, task.asked(), gap, max(1, keep), {}, []), np.array(task.state, dtype=np.int64)
+    made, state = _SearchState(task, task.asked(), gap, max(1, keep), {}, []), np.array(task.state, dtype=np.int64)
     if not propagate(task.rules, task.limits, state):
         return BestSetResult((), np.inf, True, np.inf, 0, np.zeros((0, 3)))
     root, w = -np.inf, np.where(state == IN, 1.0, 0.0)
@@ -216,7 +226,7 @@ def search(
         w[state == FREE] = 0.5
         root, w, _ = _relax(made, state, w, np.nan, _ROOT_STEPS)
         made.push(root, state, w)
-    for value, chosen in _starts(task, state, w, seed):
+    for value, chosen in _start_sets(task, state, w, seed):
         made.add(value, chosen)
     if not made.seen:
         return BestSetResult((), np.inf, True, np.inf, made.nodes, np.zeros((0, 3)))
@@ -229,8 +239,8 @@ def search(
     closed = not made.heap or made.heap[0][0] >= made.enough
     course.append((monotonic() - begun, made.bound, made.value))
     first = min(made.seen.values(), key=itemgetter(0))[1]
-    for gone in np.flatnonzero((first == 1) & (task.state == FREE)).tolist():  # sets that are nearly as good
-        value, chosen = _exchange(task, made.asked, first, gone, np.inf)
+    for removed in np.flatnonzero((first == 1) & (task.state == FREE)).tolist():  # good alternatives
+        value, chosen = _exchange(task, made.asked, first, removed, np.inf)
         if chosen.any():
             made.add(value, chosen)
     best = sorted(made.seen.values(), key=itemgetter(0))[: made.keep]
@@ -238,21 +248,21 @@ def search(
 
 
 def _load() -> None:
-    """Have machine code at hand before the time counts: where it is made first, that takes a minute."""
+    """Load or compile the machine code before the time limit starts: the first compilation takes a minute."""
     prior, none = np.ones((1, 1, 1)), np.zeros(0)
     one = SearchTask(
         Design(np.ones((1, 1, 1, 2)), prior, np.ones(1), 1), "A", False, False, np.ones((1, 2)), np.ones(1), none
     )
     state = np.full(2, FREE, dtype=np.int64)
     propagate(one.rules, one.limits, state)
-    _relax(_Open(one, one.asked(), 0.5, 1, {}, []), state, np.full(2, 0.5), np.nan, 1)
+    _relax(_SearchState(one, one.asked(), 0.5, 1, {}, []), state, np.full(2, 0.5), np.nan, 1)
     settle(0.0, np.zeros(2), 1.0, state)
     one.score(np.eye(2))
-    _exhausted(one.asked(), state, np.zeros(2), 1.0)
+    _enumerate(one.asked(), state, np.zeros(2), 1.0)
 
 
-def _relax(made: _Open, state: Array, w: Array, enough: float, steps: int) -> tuple[float, Array, Array]:
-    """Return bound, weights (n,) and costs (n,) of the relaxation of a node."""
+def _relax(made: _SearchState, state: Array, w: Array, enough: float, steps: int) -> tuple[float, Array, Array]:
+    """Return bound, weights (n,) and reduced costs (n,) of the relaxation of a node."""
     task, x, cost = made.task, w.copy(), np.empty(len(w))
     design = task.design
     bound, _, _ = expand(
@@ -275,18 +285,21 @@ def _relax(made: _Open, state: Array, w: Array, enough: float, steps: int) -> tu
     return float(bound), x, cost
 
 
-def _branch(made: _Open, bound: float, state: Array, w: Array) -> None:
-    """Open both children of a node, cut at the free site of the largest weight that is not all but taken."""
+def _branch(made: _SearchState, bound: float, state: Array, w: Array) -> None:
+    """Branch a node: open both children of the free site with the largest weight up to `_TAKEN`."""
     free = np.flatnonzero(state == FREE)
     j = free[np.where(w[free] > _TAKEN, -1.0, w[free]).argmax()]
     for one in (1, 0):
         child, x = state.copy(), w.copy()
         child[j] = x[j] = one
-        _open(made, bound, child, x)
+        _bound_node(made, bound, child, x)
 
 
-def _open(made: _Open, bound: float, state: Array, w: Array) -> None:
-    """Bound a node, and put it among the open ones if it may hold a better set; a node without a choice is one set."""
+def _bound_node(made: _SearchState, bound: float, state: Array, w: Array) -> None:
+    """Bound a node, and add it to the open nodes if it can contain a better set.
+
+    A node without free sites is one set; a small node is enumerated.
+    """
     task = made.task
     while propagate(task.rules, task.limits, state):
         if not (state == FREE).any():
@@ -294,7 +307,7 @@ def _open(made: _Open, bound: float, state: Array, w: Array) -> None:
                 made.add(float(task.score(state[None])[0]), state)
             return
         if _is_small(task, state):
-            value, best = _exhausted(made.asked, state, w, made.enough)
+            value, best = _enumerate(made.asked, state, w, made.enough)
             if best.any():
                 made.add(value, best)
             return
@@ -311,17 +324,17 @@ def _open(made: _Open, bound: float, state: Array, w: Array) -> None:
                 return
 
 
-def _exhausted(
+def _enumerate(
     asked: CompletionRequest, state: Array, w: Array, enough: float, most: int = sys.maxsize
 ) -> tuple[float, Array]:
-    """Return the best set (n,) of a node and its value, below `enough`; of zeros where there is none."""
+    """Return value and set (n,) of the best set of a node below `enough`; all zeros if no set is below."""
     best, free = np.zeros(len(state), dtype=np.int64), np.flatnonzero(state == FREE)
     order = free[np.argsort(w[free], kind="stable")]
     return float(exhaust(asked, state, order, most, enough, best)), best
 
 
 def _is_small(task: SearchTask, state: Array) -> bool:
-    """Return whether a node has so few sets that it is cheaper to look at each."""
+    """Return whether a node has so few sets that enumeration is faster than a relaxation."""
     free = task.rules[0][state == FREE]
     left = task.limits[0] - task.rules[0][state == IN].sum()
     room = int((np.cumsum(np.sort(free)) <= left + _ROOM * max(1.0, abs(task.limits[0]))).sum())
@@ -332,18 +345,18 @@ def _is_small(task: SearchTask, state: Array) -> bool:
     return number <= (_FEW_FAIL if task.fail else _FEW) * (1.0 if at_once else _SLOW)
 
 
-def _starts(task: SearchTask, state: Array, w: Array, seed: int) -> Iterator[tuple[float, Array]]:
-    """Yield sets that no exchange of two sites improves, from the rounded relaxation and random ones, with values."""
+def _start_sets(task: SearchTask, state: Array, w: Array, seed: int) -> Iterator[tuple[float, Array]]:
+    """Yield values and sets (n,) that no exchange of two sites improves, from the relaxation and random sets."""
     rng = np.random.default_rng(seed)
     for priority in (w, *rng.random((_STARTS, len(w)))):
-        chosen = _rounded(task, state, priority)
+        chosen = _round_to_set(task, state, priority)
         if chosen is None:
             return
         yield exchanged(task, chosen)
 
 
-def _rounded(task: SearchTask, state: Array, priority: Array) -> Array | None:
-    """Return a set (n,) of sites of large priority that meets the rules and has no room for another; None for none."""
+def _round_to_set(task: SearchTask, state: Array, priority: Array) -> Array | None:
+    """Return a full set (n,) of sites with high priority that meets the rules; None if the rules allow no set."""
     chosen = (state == IN).astype(np.int64)
     for j in np.argsort(-priority, kind="stable"):
         if state[j] == FREE:
@@ -351,7 +364,8 @@ def _rounded(task: SearchTask, state: Array, priority: Array) -> Array | None:
             chosen[j] = int((task.rules @ chosen <= task.limits + _ROOM)[(task.rules >= 0.0).all(1)].all())
     if task.fits(chosen[None])[0]:
         return np.asarray(chosen)
-    # rules that ask for sites may be met by others only: a programme of integers finds out
+    # The greedy set may violate a rule with a least number of sites. Then an integer programme finds a set that
+    # meets all rules.
     lower, upper = (state == IN).astype(float), (state != 0).astype(float)
     rules = LinearConstraint(task.rules, -np.inf, task.limits)
     found = milp(
@@ -364,21 +378,21 @@ def _rounded(task: SearchTask, state: Array, priority: Array) -> Array | None:
 
 
 def random_sets(task: SearchTask, count: int, seed: int) -> Iterator[Array]:
-    """Yield random sets (n,) that meet the rules and leave no room for another site."""
+    """Yield random sets (n,) that meet the rules and have no space for another site."""
     rng = np.random.default_rng(seed)
     for priority in rng.random((count, len(task.state))):
-        chosen = _rounded(task, task.state, priority)
+        chosen = _round_to_set(task, task.state, priority)
         if chosen is not None:
             yield chosen
 
 
 def exchanged(task: SearchTask, chosen: Array) -> tuple[float, Array]:
-    """Return value and set (n,) after the best exchanges of two sites, or additions, until none improves it."""
+    """Return value and set (n,) after repeated exchange or addition of one site, until no change improves the value."""
     asked, value = task.asked(), float(task.score(chosen[None])[0])
     while True:
         better, other = value - _SAME * max(1.0, abs(value)), None
-        for gone in (None, *np.flatnonzero((chosen == 1) & (task.state == FREE)).tolist()):
-            found, tried = _exchange(task, asked, chosen, gone, better)
+        for removed in (None, *np.flatnonzero((chosen == 1) & (task.state == FREE)).tolist()):
+            found, tried = _exchange(task, asked, chosen, removed, better)
             if tried.any():
                 better, other = found, tried
         if other is None:
@@ -387,10 +401,10 @@ def exchanged(task: SearchTask, chosen: Array) -> tuple[float, Array]:
 
 
 def _exchange(
-    task: SearchTask, asked: CompletionRequest, chosen: Array, gone: int | None, enough: float
+    task: SearchTask, asked: CompletionRequest, chosen: Array, removed: int | None, enough: float
 ) -> tuple[float, Array]:
-    """Return the best set (n,) with another site in the place of one, or beside all, and its value, as `_exhausted`."""
+    """Return value and set (n,) with the best new site, instead of site `removed` or in addition; see `_enumerate`."""
     state = np.where(chosen == 1, IN, np.where(task.state == FREE, FREE, OUT))
-    if gone is not None:
-        state[gone] = OUT
-    return _exhausted(asked, state, np.zeros(len(chosen)), enough, 1)
+    if removed is not None:
+        state[removed] = OUT
+    return _enumerate(asked, state, np.zeros(len(chosen)), enough, 1)

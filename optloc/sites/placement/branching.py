@@ -1,4 +1,4 @@
-"""Nodes of the search for a set of sites, as machine code: what rules leave open, scenarios, scores of whole sets."""
+"""Steps of the branch and bound in machine code: propagation of rules, score of whole sets, bound of a node."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from optloc.sites.placement.criteria import gather, invert, measure
 from optloc.sites.placement.relaxation import relax
 
 FREE, OUT, IN = -1, 0, 1
-"""States of a site."""
+"""States of a site: undecided, left out, taken."""
 
-# Rounding of sums of costs, as a share of a limit: a budget that is met exactly is met.
+# Relative rounding error of sums of costs: with it, a set that uses the budget exactly is allowed.
 _EXACT = 1e-9
-# How far inside 0 <= w <= 1 a node begins.
+# Distance of the first weights of a node from the limits of 0 <= w <= 1.
 _INSIDE = 0.02
 
 
 @compiled
 def propagate(rules: Array, limits: Array, state: Array) -> bool:
-    """Fix in `state` what rules leave no choice of; return whether a set is left at all.
+    """Fix in `state` all sites that the rules decide; return whether the rules still allow a set.
 
-    Where all that is free may be taken it is: no criterion gets worse by another site.
+    If all free sites fit together, the function takes them all: another site never makes a criterion worse.
     """
     count, n = rules.shape
     changed = True
@@ -63,11 +63,11 @@ def score(rows: Array, prior: Array, weight: Array, d: int, kind: int, worst: in
     prior : array (P, m, m)
         Information without any site.
     weight : array (P,)
-        Of the places.
+        Weights of the places.
     d, kind, worst
-        As in `optloc.sites.placement.relaxation.evaluate`.
+        See `optloc.sites.placement.relaxation.evaluate`.
     fail : int
-        Whether the worst loss of one site counts.
+        1 for the value after the worst loss of one site, otherwise 0.
     chosen : int array (B, n)
         1 for sites that are taken.
     """
@@ -109,7 +109,7 @@ def score(rows: Array, prior: Array, weight: Array, d: int, kind: int, worst: in
 
 @compiled
 def number_left(rule: Array, limit: float, state: Array) -> int:
-    """Return how many free sites a rule leaves room for at the most."""
+    """Return the largest number of free sites that a rule still allows."""
     left, sizes, count = limit, np.empty(rule.shape[0]), 0
     for j in range(rule.shape[0]):
         if state[j] == IN:
@@ -143,24 +143,24 @@ def expand(
     most: int,
     cost: Array,
 ) -> tuple[float, float, int]:
-    """Return bound, criterion and steps of the relaxed choice of a node with at least one free site.
+    """Return bound, criterion and number of steps of the relaxation of a node with at least one free site.
 
-    That one of the sites fails is bounded without knowing which are taken: the mean over those that are still to be
-    taken, c at the most, is by Jensen's inequality no less than the criterion of all at the weight (1 - 1 / c) v.
-    Those that are taken for sure fail one by one.
+    With `fail`, the failed site is unknown in advance. The rules still allow at most c free sites. By Jensen's
+    inequality, the mean of the criterion over their failures is at least the criterion at the weights (1 - 1 / c)
+    v. Sites that are already taken fail one by one.
 
     Parameters
     ----------
     rows, prior, weight, d, kind, worst, fail
-        As in `score`.
+        See `score`.
     rules, limits : array (R, n), (R,)
-        rules @ w <= limits; the first has no negative entry.
+        rules @ w <= limits; the first rule has no negative entry.
     state : int array (n,)
         FREE, OUT or IN.
     w, cost : array (n,)
-        As in `relax`, of all sites.
+        Start and output as in `relax`, but for all sites.
     enough, most
-        As in `relax`.
+        See `relax`.
     """
     places, r, m, n = rows.shape
     free, taken = np.flatnonzero(state == FREE), np.flatnonzero(state == IN)
@@ -210,7 +210,7 @@ def expand(
 
 @compiled
 def settle(bound: float, cost: Array, enough: float, state: Array) -> int:
-    """Fix in `state` free sites whose other value would lift the bound to enough; return how many."""
+    """Fix in `state` the free sites whose other value raises the bound to `enough`; return their number."""
     fixed = 0
     for j in range(state.shape[0]):
         if state[j] == FREE and bound + abs(cost[j]) >= enough:

@@ -1,4 +1,8 @@
-"""Where to put stations: the set of sites, how far from the best it can be, and what becomes of it."""
+"""Sensor placement: search, result, accuracy at each place and check by simulated fixes.
+
+`place` builds the candidates, searches the best set with a proven bound, and simulates fixes with it. If too
+many of these fixes are ambiguous, `place` takes the next best set.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +23,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PRIOR = 0.01
-"""Share of the variance at a place that is owed to the prior, above which the place has no fix of its own."""
+"""Share of the prior in the variance at a place; above it, the sites alone do not determine the position."""
 
 AMBIGUOUS = 0.05
-"""Share of ambiguous fixes above which a set is given up for the next."""
+"""Share of ambiguous fixes above which `place` rejects a set and tries the next best."""
 
-# Singular values of stations about their centre, over the bound of a place, below which they are flat: a mirror image
-# is told from the place by an error of so many standard deviations.
+# Limit for flat stations: smallest singular value of the centred stations, divided by the bound at a place.
+# Below it, an error of this many standard deviations moves the fix to its mirror image.
 _FLAT = 3.0
-# Random sets whose median stands for what there was before, where nothing is kept.
+# Number of random sets; if no site is kept, the median of these sets is the comparison "before".
 _RANDOM = 25
 # Points along each side of a map.
 _MAP_POINTS = 80
@@ -37,18 +41,18 @@ _QUANTILE = {2: 5.991464547107979, 3: 7.814727903251179}
 
 @dataclass(frozen=True, slots=True)
 class Swap:
-    """What the loss of a station costs.
+    """The effect of the loss of one station.
 
     Parameters
     ----------
     name : str
         The station.
     value : float
-        The criterion without it, square metres.
+        The criterion without this station, square metres.
     replacement : str
-        What would best take its place; empty where there is nothing.
+        The site that replaces it best; empty if no site can.
     replaced : float
-        The criterion then.
+        The criterion with the replacement, square metres.
     """
 
     name: str
@@ -59,21 +63,21 @@ class Swap:
 
 @dataclass(frozen=True, slots=True)
 class Draws:
-    """What became of simulated fixes with the chosen stations.
+    """Statistics of simulated fixes with the chosen stations.
 
     Parameters
     ----------
     count : int
-        Draws at each place.
+        Simulated fixes at each place.
     ambiguous : array (P,)
-        Share of fixes at each place whose data fit another position about as well.
+        Share of ambiguous fixes at each place: the data fit another position about equally well.
     ratio : array (P,)
-        Root mean square error over the bound, of the fixes that are not ambiguous; NaN where there are none.
+        Root mean square error of the unambiguous fixes, divided by the bound; NaN without unambiguous fixes.
     coverage : array (P,)
-        Share of these whose 95 % ellipse holds the place.
+        Share of the unambiguous fixes whose 95 % ellipse contains the place.
     flat : array (P,)
-        How far stations in sight are off their best plane (root of the sum of squares), in bounds of the place; a small
-        number says mirror image.
+        Distance of the stations in sight from their best plane (root of the sum of squares), divided by the bound
+        at the place. A small number means that a mirror image fits equally well.
     """
 
     count: int
@@ -84,58 +88,60 @@ class Draws:
 
     @property
     def clean(self) -> bool:
-        """Return whether few enough fixes are ambiguous."""
+        """Return whether the mean share of ambiguous fixes is at most `AMBIGUOUS`."""
         return float(self.ambiguous.mean()) <= AMBIGUOUS
 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """A set of sites, and a proof of how good any set of the candidates can be.
+    """A set of sites, with a proven bound for all sets of the candidates.
 
     Parameters
     ----------
     chosen, kept : tuple of str
-        Sites that were taken beyond those that were there; and those.
+        New sites, and sites that exist already.
     criterion : str
         "rms", "volume" or "axis".
     value, bound : float
-        The criterion of the set, and what no set that meets the rules is below, square metres: the mean over places of
-        the squared error, of the geometric mean of the variances along the axes, or of the largest of them.
+        The criterion of this set, and a lower bound for all sets that meet the rules, square metres. The
+        criterion is a mean over the places. It averages the squared error ("rms"), the geometric mean of the
+        variances along the axes ("volume"), or the largest variance ("axis").
     gap : float
-        Share of the value by which the bound is below it.
+        Relative difference of value and bound.
     closed : bool
-        Whether the gap is no larger than was asked.
+        Whether the gap is at most the requested gap.
     reason : str
-        What that means, in a sentence.
+        The meaning of gap and bound, as a sentence.
     per_place, failed : array (P,)
-        Bound of the position error at each place (root of the trace), metres: of the set, and with the worst loss of
-        one site at this place.
+        Bound of the position error at each place (root of the trace), metres: with this set, and after the worst
+        loss of one site at this place.
     before : array (P,)
-        The same of the kept sites, or of the median of random sets where those have no fix.
+        The same bound for the kept sites. If the kept sites give no fix, it is the bound of the median of random
+        sets.
     before_sites : tuple of str
-        Whose they are.
+        Sites of `before`.
     share_of_prior : array (P,)
-        Share of the variance that is owed to the prior.
+        Share of the variance that the prior causes.
     redundancy : int array (P,)
-        Rows in sight less unknowns: with none a wrong one is not noticed.
+        Rows in sight minus unknowns; at 0, a wrong row cannot be detected.
     swaps : tuple of Swap
-        What the loss of each taken site costs, the dearest first.
+        Effect of the loss of each taken site, largest first.
     alternatives : tuple of (tuple of str, float)
-        The best sets that were seen, and their values, square metres.
+        The best sets of the search, with their values, square metres.
     following : tuple of (str, float)
-        What another site would bring: names and values, square metres, the best first.
+        Sites that can be added, with the value after each addition, square metres, best first.
     course : array (q, 3)
-        Seconds, bound and value while it searched.
+        Seconds, bound and value during the search.
     nodes : int
-        Relaxations that were solved.
+        Number of solved relaxations.
     draws : Draws, optional
-        What simulated fixes say.
+        Statistics of simulated fixes.
     banned : tuple of tuple of str
-        Better sets that were given up because their fixes are ambiguous.
+        Better sets that were rejected because their fixes are ambiguous.
     refined : array (k, d), optional
-        Positions of the taken sites after continuous refinement, metres.
+        Positions of the new sites after continuous refinement, metres.
     refined_value : float
-        The criterion there; the bound says nothing about it.
+        The criterion at these positions, square metres; the bound does not apply to it.
     """
 
     chosen: tuple[str, ...]
@@ -164,7 +170,7 @@ class Placement:
 
     @property
     def sigma(self) -> float:
-        """Return the root of the value, metres."""
+        """Return the square root of the value, metres."""
         return float(np.sqrt(self.value))
 
 
@@ -174,27 +180,27 @@ def place(
     draws: int = 0,
     tell: Callable[[float, float, int], None] = lambda bound, value, nodes: None,
 ) -> Placement:
-    """Return which sites to take, with a bound of what any choice of the candidates can reach.
+    """Return the best set of sites, with a proven bound for all sets of the candidates.
 
     Parameters
     ----------
     selection : SiteSelection
         Candidates, places and rules.
     draws : int
-        Simulated fixes at each place that check the set for ambiguity; a set that fails is given up for the next best,
-        as often as `selection.alternatives` says. 0: none.
+        Simulated fixes at each place that check the set for ambiguity. If a set fails the check, the next best
+        set is tried, at most `selection.alternatives` times. 0: no check.
     tell : callable of (bound, value, nodes)
-        Told now and then how far the search is; in the units of the criterion.
+        Progress callback during the search, in the units of the criterion.
 
     Returns
     -------
     Placement
-        Where `closed` is False, the time was up: the gap says what is known.
+        If `closed` is False, the time limit ended the search; `gap` is the proven gap at that time.
 
     Raises
     ------
     InvalidProblem
-        Naming the argument, site or place that cannot be right, or the rules that allow no set.
+        If an argument, site or place is invalid, or if no set meets the rules; the message names the cause.
 
     References
     ----------
@@ -204,7 +210,7 @@ def place(
     task, banned = task_of(candidates), list[Array]()
     while True:
         found = search(
-            _without(task, banned),
+            _ban_sets(task, banned),
             gap=selection.gap,
             seconds=selection.seconds,
             keep=selection.alternatives,
@@ -212,17 +218,17 @@ def place(
             tell=tell,
         )
         if not found.best:
-            what = "no set of sites meets the rules" if not banned else "every set that meets the rules is ambiguous"
-            raise InvalidProblem(what, "groups", "allow more sites of a group, ask for fewer, or name more candidates")
+            what = "no set of sites meets the rules" if not banned else "all sets that meet the rules are ambiguous"
+            raise InvalidProblem(what, "groups", "relax the rules of a group, choose fewer sites, or add candidates")
         chosen = found.best[0][1]
         checked = drawn(candidates, chosen, draws, selection.seed) if draws else None
         if checked is None or checked.clean or len(banned) >= selection.alternatives:
-            return _answer(candidates, task, found, checked, banned)
+            return _placement(candidates, task, found, checked, banned)
         banned.append(chosen)
 
 
 def task_of(candidates: Candidates) -> SearchTask:
-    """Return the search for the best set of some candidates."""
+    """Return the search task for the best set of the candidates."""
     selection = candidates.selection
     return SearchTask(
         candidates.design,
@@ -235,32 +241,31 @@ def task_of(candidates: Candidates) -> SearchTask:
     )
 
 
-def _without(task: SearchTask, banned: Sequence[Array]) -> SearchTask:
-    """Return a task that does not allow some sets."""
+def _ban_sets(task: SearchTask, banned: Sequence[Array]) -> SearchTask:
+    """Return the task with one more rule for each banned set: at least one of its sites is not taken."""
     rules = np.array([chosen / chosen.sum() for chosen in banned]).reshape(len(banned), len(task.state))
     limits = np.array([1.0 - 1.0 / chosen.sum() for chosen in banned])
     return replace(task, rules=np.vstack([task.rules, rules]), limits=np.concatenate([task.limits, limits]))
 
 
-def _answer(
+def _placement(
     candidates: Candidates, task: SearchTask, found: BestSetResult, checked: Draws | None, banned: Sequence[Array]
 ) -> Placement:
+    """Return the result of a search with its accuracy at each place, losses and next sites."""
     selection, names = candidates.selection, candidates.names
     value, chosen = found.best[0]
     bound, reached = task.scale(found.bound), task.scale(value)
     gap = max(0.0, 1.0 - bound / reached)
     before, sites = _before(candidates, task)
     per_place, share = _per_place(candidates, chosen)
-    told = f"no set of these candidates has a value more than {100 * gap:.2g} % lower"
-    reason = told if found.closed else f"the time was up: {told}; give it more time, or accept a larger gap"
+    claim = f"no set of these candidates has a value more than {100 * gap:.2g} % lower"
+    reason = claim if found.closed else f"the time limit ended the search: {claim}; raise the time limit or the gap"
     new = (chosen == 1) & (candidates.state != 1)
     if selection.choose is not None and (count := int(new.sum())) < selection.choose:
-        reason += (
-            f"; {count} of the {selection.choose} sites that were asked for: more exceed the budget, or do not help"
-        )
+        reason += f"; only {count} of the {selection.choose} wanted sites: more exceed the budget or do not help"
     return Placement(
-        _named(names, new),
-        _named(names, candidates.state == 1),
+        _select_names(names, new),
+        _select_names(names, candidates.state == 1),
         selection.criterion,
         reached,
         bound,
@@ -274,27 +279,29 @@ def _answer(
         share,
         _redundancy(candidates, chosen),
         tuple(_swaps(task, names, chosen)),
-        tuple((_named(names, (one == 1) & (candidates.state != 1)), task.scale(v)) for v, one in found.best),
+        tuple((_select_names(names, (one == 1) & (candidates.state != 1)), task.scale(v)) for v, one in found.best),
         tuple(_following(task, names, chosen)),
         _course(task, found.course),
         found.nodes,
         checked,
-        tuple(_named(names, one == 1) for one in banned),
+        tuple(_select_names(names, one == 1) for one in banned),
     )
 
 
 def _course(task: SearchTask, course: Array) -> Array:
+    """Return the recorded points (q, 3) with bound and value as variances, m^2."""
     out = course.copy()
     out[:, 1:] = [[task.scale(v) for v in row] for row in course[:, 1:]]
     return out
 
 
-def _named(names: Sequence[str], mask: Array) -> tuple[str, ...]:
+def _select_names(names: Sequence[str], mask: Array) -> tuple[str, ...]:
+    """Return the names at the true entries of a mask (n,)."""
     return tuple(names[i] for i in np.flatnonzero(mask).tolist())
 
 
 def _per_place(candidates: Candidates, chosen: Array) -> tuple[Array, Array]:
-    """Return the bound (P,) of the position error of a set, metres, and the prior's share of its variance."""
+    """Return the bound (P,) of the position error, metres, and the share (P,) of its variance from the prior."""
     covariance = np.asarray(crlb(candidates.assembled(chosen), candidates.vectors))
     d = candidates.design.dimension
     variance = np.trace(covariance[..., :d, :d], axis1=-2, axis2=-1)
@@ -307,7 +314,7 @@ def _per_place(candidates: Candidates, chosen: Array) -> tuple[Array, Array]:
 
 
 def _failed(candidates: Candidates, chosen: Array) -> Array:
-    """Return the bound (P,) at each place after the loss of the site that is worst there, metres."""
+    """Return the bound (P,) at each place after the worst loss of one site there, metres."""
     lost = np.repeat(chosen[None], int(chosen.sum()), axis=0)
     lost[np.arange(len(lost)), np.flatnonzero(chosen)] = 0
     variance = np.trace(covariances(candidates.design, lost), axis1=-2, axis2=-1)
@@ -315,23 +322,25 @@ def _failed(candidates: Candidates, chosen: Array) -> Array:
 
 
 def _before(candidates: Candidates, task: SearchTask) -> tuple[Array, tuple[str, ...]]:
+    """Return the bounds (P,) before the choice, metres, and the sites that give them: kept sites or a random set."""
     kept = (candidates.state == 1).astype(np.int64)
     if kept.any():
         per_place, share = _per_place(candidates, kept)
         if (share <= PRIOR).all():
-            return per_place, _named(candidates.names, kept)
+            return per_place, _select_names(candidates.names, kept)
     sets = np.array(list(random_sets(task, _RANDOM, candidates.selection.seed)))
     middle = sets[np.argsort(task.score(sets))[len(sets) // 2]]
-    return _per_place(candidates, middle)[0], _named(candidates.names, middle)
+    return _per_place(candidates, middle)[0], _select_names(candidates.names, middle)
 
 
 def _redundancy(candidates: Candidates, chosen: Array) -> Array:
-    """Return the degrees of freedom (P,) of a fix from chosen sites, with the priors of the selection alone."""
+    """Return the degrees of freedom (P,) of a fix from the chosen sites, with only the given priors."""
     problem = replace(candidates.assembled(chosen), priors=candidates.selection.problem.priors)
     return np.asarray(degrees_of_freedom(problem))
 
 
 def _swaps(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[Swap]:
+    """Yield the effect of the loss of each taken site, with the best replacement; largest loss first."""
     found = []
     for i in np.flatnonzero(chosen).tolist():
         without = chosen.copy()
@@ -350,6 +359,7 @@ def _swaps(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[Sw
 
 
 def _following(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[tuple[str, float]]:
+    """Yield each site that can be added, with the criterion after the addition, m^2; best first."""
     others = np.flatnonzero((chosen == 0) & (task.state != 0)).tolist()
     if not others:
         return
@@ -360,7 +370,7 @@ def _following(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterato
 
 
 def drawn(candidates: Candidates, chosen: Array, count: int, seed: int = 0) -> Draws:
-    """Return what becomes of simulated fixes with a set (n,) of sites: `count` at each place, by the method "auto"."""
+    """Return the statistics of simulated fixes with a set (n,) of sites: `count` at each place, method "auto"."""
     from optloc.solvers import solve
 
     places, d = len(candidates.vectors), candidates.design.dimension
@@ -385,37 +395,38 @@ def drawn(candidates: Candidates, chosen: Array, count: int, seed: int = 0) -> D
 
 
 def _flat(candidates: Candidates, chosen: Array, bounds: Array) -> Array:
+    """Return the smallest singular value of the centred stations in sight, divided by the bound at each place (P,)."""
     stations = candidates.problem.stations.position.reshape(-1, candidates.design.dimension)
     weight = candidates.assembled(chosen).weight
     out = np.empty(len(bounds))
     owner = np.concatenate([rows.a for rows in candidates.problem.rows])
     for p in range(len(bounds)):
-        heard = stations[np.unique(owner[weight[p] > 0.0])]
-        off = np.linalg.svd(heard - heard.mean(0), compute_uv=False)[-1] if len(heard) > 1 else 0.0
+        in_sight = stations[np.unique(owner[weight[p] > 0.0])]
+        off = np.linalg.svd(in_sight - in_sight.mean(0), compute_uv=False)[-1] if len(in_sight) > 1 else 0.0
         out[p] = off / bounds[p]
     return out
 
 
 def picture(selection: SiteSelection, found: Placement) -> Figure:
-    """Return maps of the bound before and after on one scale, and how the gap closed while it was searched.
+    """Return a figure: maps of the bound before and after on one scale, and the gap during the search.
 
     Parameters
     ----------
     selection : SiteSelection
-        As it was given to `place`.
+        The selection that was passed to `place`.
     found : Placement
-        Its answer.
+        The result of `place`.
 
     Raises
     ------
     InvalidProblem
-        Where rows were chosen, which have no map.
+        If the selection takes single rows: these have no map.
     """
     from optloc.sites.placement.placement_map import plot_placement
 
     problem, names = selection.problem, np.array(selection.problem.stations.names)
     if selection.by == "row":
-        raise InvalidProblem("rows that are chosen have no map", "plot", "choose stations")
+        raise InvalidProblem("a choice of single rows has no map", "plot", "choose stations")
     single = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
     places = np.atleast_2d(np.asarray(selection.places, dtype=float))[:, : problem.dimension]
     truth = np.zeros(problem.layout.size)

@@ -1,8 +1,9 @@
-"""All sets of a node that leaves little open, as machine code: to look at each is cheaper than to bound them.
+"""Enumeration of all sets of a small node, in machine code: faster than a bound for each child.
 
-Sites are added depth first, each by an update of the inverse information, and all that may come last are compared at
-once. Where any one site may fail, the last two are: each of them must be good enough without the other, which few are.
-Both leave a millionth for rounding; what is within it is computed from its sums.
+Sites are added depth first; each addition updates the inverse information. All candidates for the last site
+are compared at once. If one site may fail, the last two sites are compared: the set must be good enough
+without either of them, and few sites pass this test. A comparison by updates has a tolerance of a millionth
+for rounding errors. Values within the tolerance are recomputed from the sums.
 """
 
 from __future__ import annotations
@@ -16,17 +17,17 @@ from optloc.problem import Array
 from optloc.sites.placement.branching import IN, OUT, number_left
 from optloc.sites.placement.criteria import TRACE, VOLUME, invert, measure
 
-# Rounding of sums of costs, as a share of a limit: a budget that is met exactly is met.
+# Relative rounding error of sums of costs: with it, a set that uses the budget exactly is allowed.
 _EXACT = 1e-9
-# Share of a criterion by which an update may be wrong. Rounding, 1e-16, grows by the condition, and by how much
-# another site lowers the variance, which is the condition again at the most.
+# Largest relative error of a criterion by update. The rounding error 1e-16 grows by the condition number, and
+# by the factor by which another site lowers the variance. This factor is at most the condition number.
 _WRONG = 1e-6
-# Condition times that drop up to which an update is good enough to compare, and to be updated again.
+# Largest product of condition number and variance drop at which an update may be compared, and updated again.
 _COMPARE, _AGAIN = 1e9, 1e8
 
 
 class CompletionRequest(NamedTuple):
-    """What sets are judged by.
+    """Arguments of the enumeration: rows, criterion and rules.
 
     Parameters
     ----------
@@ -37,11 +38,11 @@ class CompletionRequest(NamedTuple):
     whole : array (P,)
         Trace of the information of all sites.
     weight : array (P,)
-        Of the places.
+        Weights of the places.
     d, kind, worst, fail : int
-        As in `optloc.sites.placement.branching.score`.
+        See `optloc.sites.placement.branching.score`.
     rules, limits : array (R, n), (R,)
-        rules @ w <= limits; the first has no negative entry.
+        rules @ w <= limits; the first rule has no negative entry.
     """
 
     sites: Array
@@ -57,16 +58,16 @@ class CompletionRequest(NamedTuple):
 
 
 class OtherSites(NamedTuple):
-    """Sites that may be added, in their order.
+    """Sites that can be added to a set, in the order of the search.
 
     Parameters
     ----------
     site : int array (q,)
-        Their numbers.
+        Numbers of the sites.
     rows : array (P, r, m, q)
-        Their rows.
+        Whitened rows of the sites.
     products : array (P, m (m + 1) / 2, q)
-        Products g_a g_b, b <= a, of their first rows.
+        Products g_a g_b, b <= a, of the first row of each site.
     """
 
     site: Array
@@ -75,7 +76,7 @@ class OtherSites(NamedTuple):
 
 
 class CompletionWorkspace(NamedTuple):
-    """Arrays that are overwritten: (m, m) twice, (d, d) three times, (d,), and the loss that was the worst, (1,)."""
+    """Scratch arrays: two (m, m), three (d, d), one (d,); `first` (1,) is the loss that failed the last test."""
 
     matrix: Array
     inverse: Array
@@ -88,7 +89,7 @@ class CompletionWorkspace(NamedTuple):
 
 @compiled
 def trace_of(matrix: Array, d: int) -> float:
-    """Return the trace of the leading (d, d)."""
+    """Return the trace of the leading (d, d) block."""
     total = 0.0
     for i in range(d):
         total += matrix[i, i]
@@ -99,9 +100,9 @@ def trace_of(matrix: Array, d: int) -> float:
 def inverse_of(
     asked: CompletionRequest, p: int, members: Array, size: int, lost: int, matrix: Array, out: Array
 ) -> bool:
-    """Write the inverse (m, m) of the information of members but entry `lost` (or -1); return whether there is one.
+    """Write the inverse (m, m) of the information of a set without entry `lost` (or -1); return whether it exists.
 
-    Of `members` the first `size` entries are taken; `matrix` (m, m) is overwritten.
+    The set is the first `size` entries of `members`; `matrix` (m, m) is overwritten.
     """
     _, _, r, m = asked.sites.shape
     for i in range(m):
@@ -116,12 +117,12 @@ def inverse_of(
                 x = row[i]
                 for k in range(i + 1):
                     matrix[i, k] += x * row[k]
-    return bool(np.isfinite(invert(matrix, out, matrix)))  # in place: what was read of it is not read again
+    return bool(np.isfinite(invert(matrix, out, matrix)))  # in place: each entry is read before it is overwritten
 
 
 @compiled
 def update(inverse: Array, row: Array, s: Array) -> None:
-    """Change the inverse of M (m, m) to that of M + g g', by Sherman and Morrison."""
+    """Replace the inverse of M (m, m) by the inverse of M + g g' (Sherman-Morrison)."""
     m, along = inverse.shape[0], 1.0
     for i in range(m):
         x = 0.0
@@ -145,9 +146,10 @@ def grow(
     out: Array,
     work: CompletionWorkspace,
 ) -> float:
-    """Write the inverses (P, m, m) of members from those `last` of all but the latest; return their condition at most.
+    """Write the inverses (P, m, m) of a set from `last`, without its newest member; return their condition number.
 
-    Where rounding would show they are computed from sums.
+    If an update loses too much accuracy, the inverse is recomputed from the sums. The returned condition number
+    is an upper bound.
     """
     places, _, r, m = asked.sites.shape
     most = 0.0
@@ -170,7 +172,10 @@ def grow(
 def worth(
     asked: CompletionRequest, members: Array, size: int, lost: int, enough: float, work: CompletionWorkspace
 ) -> float:
-    """Return the criterion of members but one, or, where it is not below `enough`, a number that is not either."""
+    """Return the criterion of a set without member `lost` (-1: the whole set), or any number not below `enough`.
+
+    The function stops early when the criterion cannot be below `enough`.
+    """
     d, worst = asked.d, asked.worst
     total = -np.inf if worst else 0.0
     for p in range(asked.prior.shape[0]):
@@ -182,16 +187,16 @@ def worth(
             put_rows(work.inverse[:d, :d], work.cov)
             top, _, _ = measure(asked.kind, work.cov, work.turn, work.basis, work.shares)
         total = max(total, top) if worst else total + asked.weight[p] * top
-        if total >= enough and (worst or asked.kind != VOLUME):  # a logarithm may be negative
+        if total >= enough and (worst or asked.kind != VOLUME):  # log det may be negative
             break
     return total
 
 
 @compiled
 def with_loss(asked: CompletionRequest, members: Array, size: int, enough: float, work: CompletionWorkspace) -> float:
-    """Return the criterion of a set, with its worst loss where one may fail; as `worth` does.
+    """Return the criterion of a set, after its worst loss if one site may fail, or any number not below `enough`.
 
-    The loss that was too bad in the set before is looked at first.
+    The loss that failed the test in the previous set is tested first.
     """
     if not asked.fail or not size:
         return worth(asked, members, size, -1, enough, work)
@@ -207,9 +212,11 @@ def with_loss(asked: CompletionRequest, members: Array, size: int, enough: float
 
 @compiled
 def trace_with(products: Array, inverse: Array, d: int, begin: int, along: Array, trace: Array) -> None:
-    """Write tr C (M + g g')^-1 C' = tr C M^-1 C' - |C M^-1 g|^2 / (1 + g'M^-1 g) of each row g from `begin` on.
+    """Write the trace of the position covariance (q,) after the addition of each row g from index `begin`.
 
-    Both forms are linear in the `products` of rows, (m (m + 1) / 2, q).
+    tr C (M + g g')^-1 C' = tr C M^-1 C' - |C M^-1 g|^2 / (1 + g'M^-1 g)
+
+    Both quadratic forms are linear in the `products` of the rows, (m (m + 1) / 2, q).
     """
     m, n, i = inverse.shape[0], products.shape[1], 0
     for j in range(begin, n):
@@ -235,12 +242,12 @@ def trace_with(products: Array, inverse: Array, d: int, begin: int, along: Array
 def one_more(
     asked: CompletionRequest, others: OtherSites, inverses: Array, begin: int, values: Array, work: CompletionWorkspace
 ) -> None:
-    """Write the criterion (q,) of a set with each other site from `begin` on, by updates of its inverses (P, m, m)."""
+    """Write the criterion (q,) of a set with each other site from index `begin`, by updates of its `inverses`."""
     d, n = asked.d, len(others.site)
     single, brought = np.empty(n), np.empty(n)
     values[begin:] = -np.inf if asked.worst else 0.0
     for p in range(len(asked.weight)):
-        if others.rows.shape[1] == 1 and asked.kind == TRACE:  # all sites at once: most of the time is spent here
+        if others.rows.shape[1] == 1 and asked.kind == TRACE:  # most of the time is spent here
             trace_with(others.products[p], inverses[p], d, begin, single, brought)
         else:
             for j in range(begin, n):
@@ -255,7 +262,7 @@ def one_more(
 
 @compiled
 def comparable(asked: CompletionRequest, inverses: Array, condition: float, enough: float) -> bool:
-    """Return whether updates of inverses (P, m, m) tell criteria near `enough` to the share that they may be wrong."""
+    """Return whether updates of inverses (P, m, m) are accurate enough to compare criteria with `enough`."""
     if asked.kind == VOLUME:
         return condition * condition < _COMPARE
     total = 0.0
@@ -267,7 +274,7 @@ def comparable(asked: CompletionRequest, inverses: Array, condition: float, enou
 
 @compiled
 def allowed(asked: CompletionRequest, members: Array, size: int, partly: bool) -> bool:
-    """Return whether members meet the rules; if they are a part of a set, those without a negative entry."""
+    """Return whether the members meet the rules; for a partial set, only rules without negative entries are tested."""
     for i in range(asked.rules.shape[0]):
         used, low = 0.0, 0.0
         for one in range(size):
@@ -295,9 +302,9 @@ def finish(
     best: Array,
     work: CompletionWorkspace,
 ) -> float:
-    """Return the least criterion below `enough` of members with `one` site more, or `two`; `best` (n,) gets the set.
+    """Return the least criterion below `enough` of a set with `one` or `two` more sites; write it to `best` (n,).
 
-    Two are added only where one may fail: then each of them is good enough without the other.
+    Two sites are added only if one may fail: then the set must be good enough without either of them.
     """
     count, keep, values = 0, np.empty(len(others.site), dtype=np.int64), np.full(len(others.site), -np.inf)
     limit = enough + _WRONG * abs(enough)
@@ -322,7 +329,7 @@ def finish(
 
 @compiled
 def picked(asked: CompletionRequest, order: Array) -> OtherSites:
-    """Return sites in an order (q,), with what is compared of them."""
+    """Return the sites in the given order (q,), with the arrays for their comparison."""
     places, _, r, m = asked.sites.shape
     count = len(order)
     rows, products = np.empty((places, r, m, count)), np.empty((places, m * (m + 1) // 2, count))
@@ -340,7 +347,7 @@ def picked(asked: CompletionRequest, order: Array) -> OtherSites:
 
 @compiled
 def scratch(m: int, d: int) -> CompletionWorkspace:
-    """Return arrays for `m` unknowns, of which `d` are the position."""
+    """Return scratch arrays for `m` unknowns with `d` position coordinates."""
     square, small = np.empty((2, m, m)), np.empty((3, d, d))
     return CompletionWorkspace(
         square[0], square[1], small[0], small[1], small[2], np.empty(d), np.zeros(1, dtype=np.int64)
@@ -349,7 +356,7 @@ def scratch(m: int, d: int) -> CompletionWorkspace:
 
 @compiled
 def is_counted(asked: CompletionRequest, order: Array) -> bool:
-    """Return whether all that rules say is how many of these sites are taken: then no set is a part of another."""
+    """Return whether the only rule is the number of these sites: then no allowed full set contains another."""
     for j in order:
         if asked.rules[0, j] != asked.rules[0, order[0]]:
             return False
@@ -358,18 +365,18 @@ def is_counted(asked: CompletionRequest, order: Array) -> bool:
 
 @compiled
 def exhaust(asked: CompletionRequest, state: Array, order: Array, most: int, enough: float, best: Array) -> float:
-    """Return the least criterion below `enough` of all sets of a node, or `enough`; `best` (n,) gets the set.
+    """Return the least criterion below `enough` of all sets of a node, or `enough`; write the set to `best` (n,).
 
     Parameters
     ----------
     asked : CompletionRequest
-        What sets are judged by.
+        Rows, criterion and rules.
     state : int array (n,)
         FREE, OUT or IN.
     order : int array (free,)
-        The free sites; those that promise most come last, so that what is added first is soon too bad.
+        The free sites, most promising last: then sets of the first sites soon fail the test.
     most : int
-        How many of them are added at the most.
+        Largest number of free sites to add.
     """
     places, n, _, m = asked.sites.shape
     room = min(most, number_left(asked.rules[0], asked.limits[0], state))

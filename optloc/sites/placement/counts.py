@@ -1,4 +1,4 @@
-"""How many sites the groups of a placement allow and need: a count that cannot be met is refused before a search."""
+"""Limits on the number of sites in groups, checked before the search starts."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 
 from optloc.problem import Array, InvalidProblem
 
-# Members of a group, and groups, that are named; the others are counted.
+# Members of a group, and groups, that a message names; it counts the others.
 _NAMED, _GROUPS = 8, 3
 
 
 @dataclass(frozen=True, slots=True)
 class CountGroup:
-    """A rule about some of the sites.
+    """A rule for the number of sites that are taken from a group.
 
     Parameters
     ----------
     members : tuple of str
-        Names of sites.
+        Names of the sites in the group.
     most, least : int, optional
-        How many of them may, or must, be taken, those that are kept included.
+        Largest and smallest number of members that are taken, kept sites included.
     """
 
     members: tuple[str, ...]
@@ -34,61 +34,51 @@ class CountGroup:
 def check_groups(
     groups: Sequence[CountGroup], members: Array, names: Sequence[str], state: Array, choose: int | None
 ) -> None:
-    """Refuse groups that no set of sites meets, and a number of sites that is too large or too small for them.
+    """Raise if no set of sites meets the groups, or if the wanted number of sites does not fit the groups.
 
-    Parameters
-    ----------
-    groups : sequence of CountGroup
-        The rules.
-    members : bool array (G, n)
-        Which sites belong to each.
-    names : sequence of n str
-        Of the sites.
-    state : int array (n,)
-        -1 for free sites, 0 and 1 for those that are left out and taken.
-    choose : int, optional
-        How many free sites are wanted; None: as many as the budget allows.
+    `members` (G, n) marks the sites of each group. `state` (n,) is -1 for free, 0 for forbidden and 1 for kept
+    sites. `choose` is the wanted number of free sites; None leaves the number to the budget.
 
     Raises
     ------
     InvalidProblem
-        Naming the groups and how many sites are possible.
+        The message names the groups and the possible number of sites.
     """
     for i, group in enumerate(groups):
-        _check_one(f"groups, entry {i + 1}", group, members[i], names, state)
+        _check_group(f"groups, entry {i + 1}", group, members[i], names, state)
     most, least = (_count(groups, members, state, sign) for sign in (-1.0, 1.0))
     if most is None or least is None:
-        what = f"no set of sites meets all of the groups {_told(groups)}"
-        raise InvalidProblem(what, "groups", "allow more sites of a group, or ask for fewer")
+        what = f"no set of sites meets the rules of groups {_group_numbers(groups)} together"
+        raise InvalidProblem(what, "groups", "raise most or lower least of a group")
     if choose is None:
         return
     if choose > most:
-        cause = _binding(groups, members, state, most)
-        rules = " and ".join(f"at most {groups[i].most} of {_listed(members[i], names)}" for i in cause[:_GROUPS])
+        cause = _limiting_groups(groups, members, state, most)
+        rules = " and ".join(f"at most {groups[i].most} of {_list_names(members[i], names)}" for i in cause[:_GROUPS])
         rules += f" and {len(cause) - _GROUPS} more groups" if len(cause) > _GROUPS else ""
-        what = f"{choose} sites are wanted, and the groups allow {most} at most ({rules})"
-        raise InvalidProblem(what, "choose", f"ask for {most} or fewer, or allow more sites of a group")
+        what = f"{choose} sites are wanted, but the groups allow at most {most} ({rules})"
+        raise InvalidProblem(what, "choose", f"choose {most} or fewer, or raise most of a group")
     if choose < least:
-        what = f"{choose} sites are wanted, and the groups need {least} at least"
-        raise InvalidProblem(what, "choose", f"ask for {least} or more, or ask for fewer sites of a group")
+        what = f"{choose} sites are wanted, but the groups need at least {least}"
+        raise InvalidProblem(what, "choose", f"choose {least} or more, or lower least of a group")
 
 
-def _check_one(where: str, group: CountGroup, own: Array, names: Sequence[str], state: Array) -> None:
-    """Refuse a group that cannot be met whatever the others say."""
-    kept, able, who = int((own & (state == 1)).sum()), int((own & (state != 0)).sum()), _listed(own, names)
+def _check_group(where: str, group: CountGroup, own: Array, names: Sequence[str], state: Array) -> None:
+    """Raise if no set of sites can meet this group, independent of the other groups."""
+    kept, able, who = int((own & (state == 1)).sum()), int((own & (state != 0)).sum()), _list_names(own, names)
     if group.most is not None and kept > group.most:
-        what = f"at most {group.most} of {who} may be taken, and {kept} of them are kept"
-        raise InvalidProblem(what, where, "allow more of them, or keep fewer")
+        what = f"at most {group.most} of {who} may be taken, but {kept} of them are kept"
+        raise InvalidProblem(what, where, "raise most, or keep fewer")
     if group.least is not None and group.least > able:
-        what = f"at least {group.least} of {who} are wanted, and {able} of them can be taken"
-        raise InvalidProblem(what, where, "ask for fewer of them, or name more candidates")
+        what = f"at least {group.least} of {who} are wanted, but only {able} of them can be taken"
+        raise InvalidProblem(what, where, "lower least, or add candidates")
     if group.least is not None and group.most is not None and group.least > group.most:
         what = f"at least {group.least} and at most {group.most} of {who} are wanted"
-        raise InvalidProblem(what, where, "correct one of the two")
+        raise InvalidProblem(what, where, "make least no larger than most")
 
 
 def _count(groups: Sequence[CountGroup], members: Array, state: Array, sign: float) -> int | None:
-    """Return the greatest (-1) or least (1) number of free sites that meets the groups; None where no set does."""
+    """Return the largest (sign -1) or smallest (sign 1) number of free sites that meets the groups, or None."""
     low = np.array([-np.inf if g.least is None else g.least for g in groups], dtype=float)
     high = np.array([np.inf if g.most is None else g.most for g in groups], dtype=float)
     rules = [LinearConstraint(members.astype(float), low, high)] if len(groups) else []
@@ -98,8 +88,12 @@ def _count(groups: Sequence[CountGroup], members: Array, state: Array, sign: flo
     return None if solved.x is None else round(float(free @ solved.x))
 
 
-def _binding(groups: Sequence[CountGroup], members: Array, state: Array, most: int) -> list[int]:
-    """Return the groups without which more sites were possible: a single one if that is enough, else all that limit."""
+def _limiting_groups(groups: Sequence[CountGroup], members: Array, state: Array, most: int) -> list[int]:
+    """Return the indices of the groups that limit the number of sites to `most`.
+
+    If the removal of one group allows more sites, the list has only this group. Otherwise it has all groups with
+    an upper limit.
+    """
     limiting = [i for i, group in enumerate(groups) if group.most is not None and group.most < members[i].sum()]
     for i in limiting:
         kept = [k for k in range(len(groups)) if k != i]
@@ -108,10 +102,12 @@ def _binding(groups: Sequence[CountGroup], members: Array, state: Array, most: i
     return limiting
 
 
-def _listed(own: Array, names: Sequence[str]) -> str:
-    told = [names[i] for i in np.flatnonzero(own).tolist()]
-    return ", ".join(told[:_NAMED]) + (f" and {len(told) - _NAMED} more" if len(told) > _NAMED else "")
+def _list_names(mask: Array, names: Sequence[str]) -> str:
+    """Return the names at the true entries of a mask (n,) as text; at most `_NAMED` names."""
+    members = [names[i] for i in np.flatnonzero(mask).tolist()]
+    return ", ".join(members[:_NAMED]) + (f" and {len(members) - _NAMED} more" if len(members) > _NAMED else "")
 
 
-def _told(groups: Sequence[CountGroup]) -> str:
+def _group_numbers(groups: Sequence[CountGroup]) -> str:
+    """Return the numbers of all groups as text."""
     return ", ".join(str(i + 1) for i in range(len(groups)))

@@ -1,13 +1,14 @@
 """Criteria of a relaxed choice of sites, with gradient and Hessian, as machine code.
 
-Sites have weights 0 <= w <= 1 and rows g, so that the information at place p is M_p = M0_p + sum_i w_i g_pi g_pi' and
-the covariance of the position Cov_p is the leading block of its inverse. All criteria are maxima of
+Site i has a weight 0 <= w_i <= 1 and whitened rows g_pi at place p. The information at place p is M_p = M0_p
++ sum_i w_i g_pi g_pi'. The covariance of the position, Cov_p, is the leading block of its inverse. All
+criteria are maxima of
 
     L(w; lambda, W) = sum_q lambda_q tr(W_q Cov_q(w)),   lambda >= 0, sum 1,  W_q >= 0
 
-over the multipliers lambda of places and failures, and W of directions: convex in w, with gradient
--lambda_q c_i' W_q c_i where c_i = C M^-1 g_i. (A determinant has W = Cov^-1 and the value log det Cov.)
-`formulations.placement` has the same in numpy.
+over the multipliers lambda of places and failures, and over the weights W of directions. L is convex in w;
+its gradient is -lambda_q c_i' W_q c_i with c_i = C M^-1 g_i. (For the determinant, W = Cov^-1 and the value
+is log det Cov.) `formulations.placement` contains the same functions in NumPy.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from optloc.problem import Array
 TRACE, VOLUME, AXIS = 0, 1, 2
 """Criteria: tr Cov, log det Cov, and the largest eigenvalue of Cov."""
 
-# Width of the smoothed largest eigenvalue, as a share of it: the bound loses less than this.
+# Width of the smoothed largest eigenvalue, as a share of the eigenvalue: the bound loses less than this share.
 _SMOOTH = 5e-3
 
 
 @compiled
 def invert(matrix: Array, inverse: Array, lower: Array) -> float:
-    """Write the inverse of a positive definite matrix (m, m); return its log determinant, or NaN."""
+    """Write the inverse of a matrix (m, m); return its log determinant, NaN if it is not positive definite."""
     m = matrix.shape[0]
     logdet = 0.0
     for j in range(m):
@@ -57,7 +58,7 @@ def invert(matrix: Array, inverse: Array, lower: Array) -> float:
 
 @compiled
 def eigen(matrix: Array, values: Array, vectors: Array) -> None:
-    """Write eigenvalues and eigenvectors (columns) of a small symmetric matrix, by Jacobi's rotations."""
+    """Write eigenvalues (d,) and eigenvectors (columns) of a small symmetric matrix (d, d), by Jacobi rotations."""
     d = matrix.shape[0]
     a = matrix.copy()
     for i in range(d):
@@ -97,10 +98,11 @@ def eigen(matrix: Array, values: Array, vectors: Array) -> None:
 
 @compiled
 def measure(kind: int, cov: Array, weight: Array, basis: Array, shares: Array) -> tuple[float, float, float]:
-    """Write the weight (d, d) of a covariance; return its value by a criterion, smoothed, and that of its tangent.
+    """Write the weight W (d, d) of a covariance; return criterion, smoothed criterion and tangent value tr(W Cov).
 
-    The largest eigenvalue e is smoothed to tau log sum exp(e / tau): its weight has the directions `basis` (d, d,
-    columns) in the `shares` (d,), and tr(W Cov) is below e, by nothing to speak of where the others are apart from it.
+    The largest eigenvalue e is smoothed to tau log sum exp(e / tau). Its weight W has the directions `basis` (d,
+    d, columns) in the `shares` (d,). tr(W Cov) is at most e; the difference is negligible if the other
+    eigenvalues are far from e.
     """
     d = cov.shape[0]
     value = 0.0
@@ -135,7 +137,7 @@ def measure(kind: int, cov: Array, weight: Array, basis: Array, shares: Array) -
 
 @compiled
 def gather(rows: Array, base: Array, w: Array, off: int, scale: float, out: Array, matrix: Array) -> None:
-    """Write sqrt(scale) times rows (r, m, n), none of site `off`, and base + sum w g g' (m, m) of these."""
+    """Write the rows (r, m, n) times sqrt(scale), with site `off` set to zero, and the sum base + sum w g g' (m, m)."""
     r, m, n = rows.shape
     root = np.sqrt(scale)
     for a in range(m):
@@ -159,7 +161,7 @@ def gather(rows: Array, base: Array, w: Array, off: int, scale: float, out: Arra
 
 @compiled
 def slope(rows: Array, inverse: Array, weight: Array, u: Array, v: Array, gradient: Array) -> None:
-    """Write u = M^-1 g, v = W C u, and add to the gradient (n,): minus u'v, summed over the rows of each site."""
+    """Write u = M^-1 g and v = W C u, and subtract u'v, summed over the rows of each site, from the gradient (n,)."""
     r, m, n = rows.shape
     d = weight.shape[0]
     for q in range(r):
@@ -186,7 +188,10 @@ def slope(rows: Array, inverse: Array, weight: Array, u: Array, v: Array, gradie
 def bend(
     rows: Array, u: Array, v: Array, factor: float, extra: float, hessian: Array, near: Array, along: Array
 ) -> None:
-    """Add factor * (2 (g_i'M^-1 g_j)(c_i'W c_j) + extra (c_i'W c_j)^2) to the lower triangle of a Hessian (n, n)."""
+    """Add the second derivatives of tr(W Cov) by the weights to the lower triangle of a Hessian (n, n).
+
+    The entry is factor * (2 (g_i'M^-1 g_j)(c_i'W c_j) + extra (c_i'W c_j)^2); for log det Cov, `extra` is -1.
+    """
     r, m, n = rows.shape
     d = v.shape[1]
     for q in range(r):
@@ -212,7 +217,7 @@ def bend(
 
 @compiled
 def add_square(vector: Array, factor: float, hessian: Array) -> None:
-    """Add factor * x x' to the lower triangle of a matrix."""
+    """Add factor * x x' to the lower triangle of a matrix (n, n)."""
     n = vector.shape[0]
     for i in range(n):
         x = factor * vector[i]
@@ -234,30 +239,34 @@ def evaluate(
     state: tuple[Array, ...],
     values: Array,
 ) -> float:
-    """Return the criterion at w, and keep what its derivatives need.
+    """Return the criterion at the weights w, and store the quantities that `derive` needs.
+
+    P places, n free sites, S scenarios (no loss, or the loss of one site), Q items of the maximum: places,
+    scenarios or both.
 
     Parameters
     ----------
     rows : array (P, r, m, n)
-        Of the free sites.
+        Whitened rows of the free sites.
     bases : array (S, P, m, m)
-        Information without them, of each scenario.
+        Information without the free sites, in each scenario.
     weight : array (P,)
-        Of the places, sum 1.
+        Weights of the places, sum 1.
     d : int
-        How many of the unknowns are the position.
+        Number of position coordinates among the m unknowns.
     w : array (n,)
         Weights of the sites.
     off : int array (S,)
-        Free site that fails, or -1.
+        Free site that fails in each scenario, or -1.
     scale : array (S,)
-        By which the weights of the free sites are multiplied.
+        Factor on the weights of the free sites in each scenario.
     kind, worst : int
-        TRACE, VOLUME or AXIS; whether the worst place counts, else their mean.
+        TRACE, VOLUME or AXIS; 1 for the maximum over the places, 0 for their mean.
     state : tuple of arrays
-        Written, of each scenario and place: inverse (S, P, m, m), weight and directions (S, P, d, d), shares (S, P, d).
+        Output for each scenario and place: inverse (S, P, m, m), weights and directions (S, P, d, d), shares (S,
+        P, d).
     values : array (2, Q)
-        Written, of each item that the maximum is taken over: smoothed value, and value of the tangent.
+        Output for each item of the maximum: smoothed value, and value of the tangent.
     """
     places, r, m, n = rows.shape
     inverse, turn, basis, shares = state
@@ -297,9 +306,9 @@ def derive(
     slopes: Array,
     hessian: Array,
 ) -> None:
-    """Write gradients (Q, n) of the items of positive share, and the Hessian (n, n) of their sum by shares.
+    """Write the gradients (Q, n) of the items with a positive share, and the Hessian (n, n) of their weighted sum.
 
-    Arguments as in `evaluate`, which goes before; of the Hessian the lower triangle.
+    Call `evaluate` first; the arguments are the same. Only the lower triangle of the Hessian is written.
     """
     places, r, m, n = rows.shape
     inverse, turn, basis, shares = state
@@ -330,7 +339,7 @@ def derive(
 def turned(
     cov: Array, u: Array, basis: Array, shares: Array, gradient: Array, factor: float, hessian: Array, along: Array
 ) -> None:
-    """Add what the smoothed largest eigenvalue bends beyond tr(W Cov): its eigenvalues trade places, and turn."""
+    """Add the change of eigenvectors and eigenvalue shares with w to the Hessian (n, n); tr(W Cov) omits it."""
     d, n = shares.shape[0], hessian.shape[0]
     values = np.empty(d)
     top = 0.0
@@ -342,7 +351,7 @@ def turned(
         top = max(top, values[k])
     for k in range(d):
         for i in range(k + 1):
-            # the divided difference of the shares, twice where both orders count
+            # divided difference of the shares; the factor 2 counts both orders of the pair (k, i)
             rate = shares[k] / (_SMOOTH * top)
             if i < k:
                 apart = values[k] - values[i]

@@ -1,4 +1,4 @@
-"""A map of the bound before and after a choice of stations, on one scale, and how the gap closed."""
+"""Maps of the accuracy bound before and after a choice of stations, and the gap during the search."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Taken stations that are named, and side of a map from which it is in kilometres, metres.
+# Largest number of taken stations with a label, and side of a map from which its axes are in kilometres,
+# metres.
 _NAMED, _FAR = 16, 5e3
 
 
@@ -27,22 +28,22 @@ def plot_placement(
     course: Array,
     titles: Sequence[str],
 ) -> Figure:
-    """Return two maps of the bound on one scale, and below them value and bound against time.
+    """Return a figure: two maps of the bound on one scale, above value and bound over time.
 
     Parameters
     ----------
     maps : sequence of 2 BoundMap
         Before and after; their stations are all candidates.
     taken : sequence of 2 bool array (s,)
-        Which of them are taken.
+        Taken stations of each map.
     places : array (P, 2)
-        Places of interest, as the maps' x and y.
+        Places of interest, in the coordinates of the maps.
     weights : array (P,)
-        How much they count.
+        Weights of the places.
     course : array (q, 3)
         Seconds, bound and value (both as standard deviations, metres).
     titles : sequence of 2 str
-        Of the maps.
+        Titles of the maps.
     """
     from matplotlib.colors import LogNorm
 
@@ -79,6 +80,7 @@ def plot_placement(
 
 
 def _mark(axes: Axes, found: BoundMap, chosen: Array, places: Array, weights: Array, scale: float) -> None:
+    """Draw places, candidates and taken stations into a map."""
     stations = found.stations * scale
     size = 30.0 + 50.0 * weights / weights.max()
     axes.scatter(
@@ -121,10 +123,11 @@ def _mark(axes: Axes, found: BoundMap, chosen: Array, places: Array, weights: Ar
 
 
 def _course(axes: Axes, course: Array) -> None:
+    """Draw bound and value over time."""
     seconds, bound, value = course.T
     seconds = seconds - seconds[0]
     axes.step(seconds, value, where="post", color=BLACK, linewidth=1.4, label="best set")
-    axes.step(seconds, bound, where="post", color="#0072B2", linewidth=1.4, label="no set is better than this")
+    axes.step(seconds, bound, where="post", color="#0072B2", linewidth=1.4, label="bound: no set is better")
     axes.fill_between(seconds, bound, value, step="post", color="#0072B2", alpha=0.12, linewidth=0)
     axes.set_xlabel("time since the first bound (s)")
     axes.set_ylabel("criterion (m)")

@@ -1,9 +1,11 @@
-"""The relaxed choice of a node of the search, as machine code: its least value from below, and what it forbids.
+"""Lower bound of the criterion in a node of the search, by a relaxation in machine code.
 
-For any weights w and any multipliers the tangent of L at w (`optloc.sites.placement.criteria`) lies below the criterion
-at every choice, so that its least value over the node is a bound, converged or not. A primal-dual interior-point method
-finds multipliers that make it a good one: those of the places and failures that count, of the rules, and of 0 <= w <=
-1. Nodes that are pruned, or that cannot be, need a few of its steps.
+A node of the branch and bound has sites that are taken, sites that are left out, and free sites. The
+relaxation gives each free site a weight between 0 and 1. At any weights w and with any multipliers, the
+tangent of L at w (`optloc.sites.placement.criteria`) is below the criterion of each choice. So the least
+value of the tangent over the node is a valid bound, even without convergence. A primal-dual interior-point
+method improves the multipliers of places, failures, rules and limits 0 <= w <= 1. Nodes that can be pruned,
+and nodes that must be branched, need only a few steps.
 
 S. Boyd and L. Vandenberghe, "Convex Optimization" (2004), sections 7.5 and 11.7.
 """
@@ -16,27 +18,28 @@ from optloc.engine import cholesky, compiled, put, solve_factored
 from optloc.problem import Array
 from optloc.sites.placement.criteria import VOLUME, add_square, derive, evaluate
 
-# Multipliers below this share of the largest are left out: they cost as much as the others, and move the bound by less.
+# Items with a multiplier below this share of the largest are omitted: they take the same time as the others but
+# hardly change the bound.
 _SHARE = 1e-3
-# Share of the way to the boundary that a step may go, and by how much the barrier falls at each.
+# Largest share of the way to the boundary in one step, and factor on the barrier parameter at each step.
 _REACH, _FALL = 0.9, 0.2
-# Rounding of a bound, as a share of what it is the difference of.
+# Rounding error of a bound, relative to the terms of its difference.
 _ROUNDING = 1e-9
-# Barrier of the first step, as a share of the criterion and for each site; how close bound and criterion end; and steps
-# that a node takes after it is known to be branched.
+# Barrier parameter of the first step, relative to the criterion and per site; relative gap of bound and
+# criterion at which the iteration ends; steps after it is certain that the node must be branched.
 _BEGIN, _CLOSE, _LATE = 0.15, 1e-4, 2
-# Distance of the first level from the largest item, as a share of the criterion.
+# Distance of the first level from the largest item, relative to the criterion.
 _ABOVE = 0.1
 
 
 @compiled
 def barrier_weights(values: Array, mu: float, weights: Array) -> None:
-    """Write mu / (t - values), with the t that makes their sum one: the multipliers of a smoothed maximum."""
+    """Write the weights mu / (t - values), with t such that their sum is 1: the multipliers of a smoothed maximum."""
     n = values.shape[0]
     top = values[0]
     for i in range(n):
         top = max(top, values[i])
-    # the sum falls with t and is convex: Newton from the left stays on the left
+    # The sum decreases with t and is convex, so Newton's method from the left never passes the root.
     t = top + mu
     for _ in range(50):
         total, slope = 0.0, 0.0
@@ -60,10 +63,11 @@ def barrier_weights(values: Array, mu: float, weights: Array) -> None:
 def share_out(
     values: Array, level: float, mu: float, share: Array, active: Array, slopes: Array, gradient: Array, hessian: Array
 ) -> tuple[float, Array]:
-    """Write the gradient (n,) that a step over items meets, and add what they bend; return the level's own part.
+    """Eliminate the level t from the Newton step: write the gradient (n,), add to the Hessian (n, n).
 
-    The maximum is min t with t >= f_q; s_q = t - f_q, multipliers `share`. With a_q = share_q / s_q the step of the
-    level is dt = (sum mu / s_q - 1 + sum a_q g_q'dw) / sum a_q, and is eliminated.
+    The maximum of the items is min t with t >= f_q. The slacks are s_q = t - f_q, the multipliers are `share`,
+    and a_q = share_q / s_q. The step of the level is dt = (sum mu / s_q - 1 + sum a_q g_q'dw) / sum a_q. The
+    function returns the constant part of dt and its derivative (n,) with respect to the step dw.
     """
     count, n = slopes.shape
     pull, push, total = np.zeros(n), -1.0, 0.0
@@ -88,7 +92,7 @@ def share_out(
 
 @compiled
 def cheapest(cost: Array, size: Array, most: float, at: Array) -> tuple[float, float]:
-    """Return the least cost'v over 0 <= v <= 1 with size'v <= most, and the multiplier of that rule; `at` gets v."""
+    """Return the minimum of cost'v over 0 <= v <= 1 with size'v <= most, and the rule's multiplier; write v to `at`."""
     n = cost.shape[0]
     rate = np.empty(n)
     total = 0.0
@@ -131,24 +135,24 @@ def step(
     change: Array,
     gain: Array,
 ) -> float:
-    """Write the step of the interior point: of w, multipliers and slacks; return how far it may go, 0 for none.
+    """Write the interior-point step of w, multipliers and slacks; return its feasible length, 0 if it failed.
 
     Parameters
     ----------
     w : array (n,)
-        Inside 0 < w < 1.
+        Weights, inside 0 < w < 1.
     left : array (R,)
-        Slack of the rules, positive.
+        Slacks of the rules, positive.
     duals : array (2 n + R,)
         Multipliers of w >= 0, of w <= 1 and of the rules, positive.
     rules, limits : array (R, n), (R,)
         rules @ w <= limits.
     mu : float
-        Where the products of slacks and multipliers are to be.
+        Target value of the products of slacks and multipliers.
     gradient, hessian : array (n,), (n, n)
-        Of the criterion; the Hessian is overwritten.
+        Derivatives of the criterion; the Hessian is overwritten.
     move, change, gain : array (n,), (2 n + R,), (R,)
-        Written.
+        Output: the changes of w, multipliers and slacks.
     """
     n, count = w.shape[0], rules.shape[0]
     for j in range(n):
@@ -184,7 +188,7 @@ def step(
 
 @compiled
 def advance(duals: Array, change: Array) -> None:
-    """Add the change of multipliers, as far as all stay positive."""
+    """Add the change to the multipliers, shortened so that all of them stay positive."""
     reach = 1.0
     for i in range(duals.shape[0]):
         if change[i] < 0.0:
@@ -197,7 +201,7 @@ def advance(duals: Array, change: Array) -> None:
 def bound_at(
     x: Array, low: float, gradient: Array, duals: Array, rules: Array, limits: Array, reduced: Array, at: Array
 ) -> float:
-    """Return the least value of a tangent over the node; write the reduced costs."""
+    """Return the least value of the tangent at x over the node; write the reduced costs (n,) of the sites."""
     n, held = x.shape[0], low
     for j in range(n):
         reduced[j] = gradient[j]
@@ -229,25 +233,26 @@ def relax(
     most: int,
     cost: Array,
 ) -> tuple[float, float, int]:
-    """Return bound, criterion and steps of a node; w becomes where the bound was found, cost what sites cost there.
+    """Return bound, criterion and number of steps of a node; write the weights and reduced costs at the bound.
 
     The bound is L - gradient'w - limits'nu + min over 0 <= v <= 1 with rules[0]'v <= limits[0] of (gradient +
-    rules'nu)'v, which holds for any w and any multipliers nu >= 0 of the other rules.
+    rules'nu)'v. It is valid for any w and any multipliers nu >= 0 of the other rules.
 
     Parameters
     ----------
     rows, bases, weight, d, off, scale, kind, worst
-        As in `evaluate`.
+        See `evaluate`.
     rules, limits : array (R, n), (R,)
-        rules @ w <= limits; the first has no negative entry.
+        rules @ w <= limits; the first rule has no negative entry.
     w : array (n,)
-        Where it begins, inside; overwritten.
+        Start, inside 0 < w < 1; overwritten with the weights at the best bound.
     enough : float
-        A node whose bound is no less needs no further steps, nor much does one whose criterion is less.
+        Value to beat. When the bound reaches it, the iteration ends. When the criterion is below it, the node
+        must be branched, and only a few steps follow.
     most : int
-        Steps.
+        Largest number of steps.
     cost : array (n,)
-        Written: by how much the bound rises where a site is taken (positive), or left out (negative).
+        Output: rise of the bound if a site is taken (positive), or left out (negative).
     """
     places, m, n = rows.shape[0], rows.shape[2], w.shape[0]
     scenarios, count = bases.shape[0], rules.shape[0]
@@ -295,7 +300,7 @@ def relax(
 
 @compiled
 def mix(turns: Array, slopes: Array, gradient: Array) -> None:
-    """Write the gradient of all items together from those of each."""
+    """Write the gradient (n,): the sum of the item gradients (Q, n), weighted by `turns` (Q,)."""
     for j in range(gradient.shape[0]):
         gradient[j] = 0.0
         for q in range(turns.shape[0]):
@@ -304,7 +309,7 @@ def mix(turns: Array, slopes: Array, gradient: Array) -> None:
 
 @compiled
 def product(x: Array, left: Array, duals: Array, level: float, values: Array, share: Array) -> float:
-    """Return the mean product of slacks and multipliers: those of the sites, of the rules, of the items if many."""
+    """Return the mean product of slacks and multipliers of sites, rules and (if there are several) items."""
     n, count, items = x.shape[0], left.shape[0], share.shape[0]
     total, terms = 0.0, 2 * n + count
     for j in range(n):
@@ -334,7 +339,7 @@ def go(
     gradient: Array,
     hessian: Array,
 ) -> tuple[float, float]:
-    """Take one step in all unknowns; return how far it went, 0 for none, and the new level of the items."""
+    """Take one interior-point step in all unknowns; return its length, 0 if it failed, and the new item level."""
     n, count, items = x.shape[0], left.shape[0], share.shape[0]
     move, change, gain = np.empty(n), np.empty(2 * n + count), np.empty(count)
     turn, pull, rise = np.empty(items), np.zeros(n), 0.0
@@ -365,7 +370,7 @@ def go(
 
 @compiled
 def weigh(values: Array, level: float, mu: float, share: Array, turns: Array) -> float:
-    """Write the shares of items, sum 1, of those that count; return the value of their tangent."""
+    """Write the shares (Q,), sum 1, of items with large multipliers to `turns`; return the value of their tangent."""
     items = share.shape[0]
     if items == 1:
         share[0] = turns[0] = 1.0
@@ -385,7 +390,7 @@ def weigh(values: Array, level: float, mu: float, share: Array, turns: Array) ->
 
 @compiled
 def meets(w: Array, rules: Array, limits: Array) -> bool:
-    """Return whether weights meet rules, to rounding."""
+    """Return whether the weights (n,) meet all rules, up to rounding."""
     for i in range(rules.shape[0]):
         used = 0.0
         for j in range(w.shape[0]):
@@ -397,7 +402,7 @@ def meets(w: Array, rules: Array, limits: Array) -> bool:
 
 @compiled
 def begin(w: Array, left: Array, duals: Array, rules: Array, limits: Array, mu: float) -> None:
-    """Write slacks of the rules and multipliers to begin with at w: all products are mu."""
+    """Write the first slacks (R,) and multipliers (2 n + R,) at w: each product of slack and multiplier is mu."""
     n, count = w.shape[0], rules.shape[0]
     for j in range(n):
         duals[j] = mu / w[j]

@@ -1,4 +1,4 @@
-"""Site selections as files: candidates, places, kinds and rules in tables; and the problem file of the chosen sites."""
+"""Selection files: candidates, places, measurements and rules; output of the chosen sites as a problem file."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from optloc.sites.placement.areas import (
 )
 from optloc.sites.placement.sites import CountGroup, Name, SiteSelection
 
-# Columns of stations and candidates that a problem file knows.
+# Columns of stations and candidates that a problem file accepts.
 _PLACE = (
     "x",
     "y",
@@ -70,14 +70,14 @@ _PLACE = (
     "tilt",
     "roll",
 )
-# What says where rows come from.
+# Keys for the source of rows.
 _ROWS = {"file", "rows", "columns", "separator"}
-# Places that an area may become.
+# Largest number of places in an area.
 _MANY = 10_000
 
 
 class _SelectionTable(BaseModel):
-    """A table of the file; keys that it does not know are refused."""
+    """A table of the file; unknown keys are an error."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -85,30 +85,30 @@ class _SelectionTable(BaseModel):
 
 
 class ChoiceTable(_SelectionTable):
-    """What to choose, by what, and when to stop."""
+    """Number of sites, criterion and limits of the search."""
 
     choose: int | None = Field(default=None, ge=1)
-    """How many candidates to take, beyond the stations that are there."""
+    """Number of candidates to take, in addition to existing stations."""
     budget: float | None = Field(default=None, ge=0.0)
-    """What they may cost together; candidates need a column cost."""
+    """Largest total cost of the new stations; candidates need a column cost."""
     criterion: Literal["rms", "volume", "axis"] = "rms"
     """Mean-square error (A), determinant (D) or largest eigenvalue (E) of the covariance of the position."""
     worst: bool = False
-    """The worst place counts, in place of the weighted mean."""
+    """Use the maximum over the places, instead of the weighted mean."""
     fail_one: bool = False
-    """The worst loss of any one station counts."""
+    """Use the value after the worst loss of one station."""
     gap: float = Field(default=0.01, gt=0.0, lt=1.0)
-    """Share of the value that the bound may be below it."""
+    """Relative gap between value and bound at which the search stops."""
     time: float = Field(default=60.0, gt=0.0)
-    """Seconds after which it stops."""
+    """Time limit of the search, seconds."""
     alternatives: int = Field(default=5, ge=1, le=100)
-    """How many of the best sets are told."""
+    """Number of best sets in the result."""
     kept: list[str] = Field(default_factory=list)
-    """Candidates that are taken in any case, and not counted."""
+    """Candidates that are always taken; `choose` does not count them."""
     forbidden: list[str] = Field(default_factory=list)
-    """Candidates that are not taken."""
+    """Candidates that are never taken."""
     seed: int = Field(default=0, ge=0)
-    """Decides the random sets."""
+    """Seed of the random sets."""
 
 
 class TargetsTable(DataTable):
@@ -117,72 +117,72 @@ class TargetsTable(DataTable):
     unit: str = "m"
     """Unit of x, y, z and height."""
     polygon: str | None = None
-    """GeoJSON file with a polygon: longitude and latitude on Earth, else metres of the frame."""
+    """GeoJSON file with a polygon: longitude and latitude in a geodetic frame, otherwise metres of the frame."""
     spacing: Amount | None = None
-    """Distance of the places in the area."""
+    """Distance between neighbouring places in the area."""
     height: Amount | None = None
-    """Their height, or third coordinate."""
+    """Height, or third coordinate, of the places in the area."""
 
 
 class ExpectedTable(MeasurementsTable):
-    """What each station would measure: as in a problem file, without values; by default every station has a row."""
+    """Expected measurements, as in a problem file but without values; the default is one row per station."""
 
     range_max: Amount | None = None
-    """Distance beyond which there is no measurement."""
+    """Largest distance of a measurement."""
 
 
 class SightTable(DataTable):
-    """What is in sight. Columns: candidate, place, sight (0, 1 or a factor on sigma); pairs left out are in sight."""
+    """Lines of sight. Columns: candidate, place, sight (0, 1 or a factor on sigma); the default of a pair is 1."""
 
     terrain: str | None = None
-    """CSV file with columns x, y, z on a grid, metres of the frame: what is behind the ground is out of sight."""
+    """CSV file with columns x, y, z on a grid, metres of the frame: terrain that blocks lines of sight."""
 
 
 class GroupTable(_SelectionTable):
-    """How many of some candidates: those of a mast, of a region, of an owner."""
+    """A rule for the number of candidates from a group, for instance of one mast, region or owner."""
 
     group: str | None = None
-    """Those with this word in their column group."""
+    """Word in the column group of the members."""
     members: list[str] | None = None
-    """Or their names."""
+    """Names of the members, instead of a word."""
     most: int | None = Field(default=None, ge=0)
-    """At most so many."""
+    """Largest number of members to take."""
     least: int | None = Field(default=None, ge=0)
-    """At least so many."""
+    """Smallest number of members to take."""
 
 
 class RefineTable(_SelectionTable):
-    """Where stations may move for the refinement."""
+    """Region of the stations during continuous refinement."""
 
     polygon: str
     """GeoJSON file with a polygon."""
     height: list[Amount] = Field(default=["0 m", "0 m"], min_length=2, max_length=2)
-    """Least and greatest height, or third coordinate; above the terrain where there is one."""
+    """Smallest and largest height, or third coordinate; with a terrain, above the ground."""
     terrain: str | None = None
     """CSV file with columns x, y, z on a grid."""
 
 
 class SelectionFile(_SelectionTable):
-    """A site selection: which of these candidates to take."""
+    """A site selection: candidates, places, measurements and rules."""
 
     format: Literal[1]
     """Version of the format."""
     title: str | None = None
-    """What it is."""
+    """Title of the selection."""
     propagation_speed: float | str | SoundTable | SpeedTable | None = None
     """As in a problem file."""
     frame: FrameTable = FrameTable()
     choice: ChoiceTable
     stations: StationsTable | None = None
-    """Stations that are there already, and kept."""
+    """Existing stations, which are kept."""
     candidates: StationsTable
-    """Where stations may stand. Columns as of stations; optional: cost, group, and sigma of their measurements."""
+    """Possible station sites. Columns as for stations; optional: cost, group, and sigma of their measurements."""
     targets: TargetsTable
     measurements: list[ExpectedTable] = Field(min_length=1)
     sight: SightTable | None = None
     groups: list[GroupTable] = Field(default_factory=list)
     priors: list[PriorTable] = Field(default_factory=list)
-    """What is known without any station, such as the position; by default the area of stations and places."""
+    """Priors of the target, such as its position; the default position is the area of stations and places."""
     refine: RefineTable | None = None
 
 
@@ -195,13 +195,13 @@ class LoadedSelection:
     selection : SiteSelection
         Candidates, places and rules.
     source, title : str
-        Name of the file, and what it says it is.
+        Name of the file, and its title.
     settings : dict
-        Tables of the problem file of all sites.
+        Tables of a problem file with all sites.
     regions : tuple of PlacementRegion
-        Where stations may move; none without a refinement.
+        Regions of the stations in the refinement; empty without a refinement.
     ground : PlacementGround, optional
-        What their heights are above.
+        Terrain; with it, the heights of the regions are heights above the ground.
     """
 
     selection: SiteSelection
@@ -224,14 +224,14 @@ def read_selection(path: Path) -> LoadedSelection:
     Raises
     ------
     InvalidProblem
-        Naming the file, the row and the column or key.
+        If the file is invalid; the message names file, row and column or key.
     """
     source, folder = name_of(path), path.parent
     file = validated(SelectionFile, parse_toml(read_text(path), source), source)
-    candidates = table_of(_bare(file.candidates), folder, join(source, "[candidates]"))
+    candidates = table_of(_data_only(file.candidates), folder, join(source, "[candidates]"))
     tables = [(candidates, file.candidates)]
     if file.stations is not None:
-        tables.append((table_of(_bare(file.stations), folder, join(source, "[stations]")), file.stations))
+        tables.append((table_of(_data_only(file.stations), folder, join(source, "[stations]")), file.stations))
     names = [table.labels("name").tolist() for table, _ in tables]
     check_once([name for own in names for name in own], "station name {!r} is used twice", source)
     settings = _settings(file, tables, folder, source)
@@ -269,17 +269,18 @@ def read_selection(path: Path) -> LoadedSelection:
     return LoadedSelection(selection, source, file.title or source, settings, regions, ground)
 
 
-def _bare(section: StationsTable) -> DataTable:
+def _data_only(section: StationsTable) -> DataTable:
+    """Return a station section with only the keys for the source of its rows."""
     return DataTable(file=section.file, rows=section.rows, columns=section.columns, separator=section.separator)
 
 
 def _settings(
     file: SelectionFile, tables: Sequence[tuple[Table, StationsTable]], folder: Path, source: str
 ) -> dict[str, Any]:
-    """Return the tables of a problem file with all stations and the rows that each would have."""
+    """Return the tables of a problem file with all stations and the rows that each station would have."""
     units = {(section.unit, section.speed_unit) for _, section in tables}
     if len(units) > 1:
-        raise InvalidProblem("stations and candidates are in different units", source, "give both the same")
+        raise InvalidProblem("stations and candidates have different units", source, "use the same unit for both")
     keys = [key for key in _PLACE if any(table.has(key) for table, _ in tables)]
     rows: list[dict[str, Any]] = []
     for table, section in tables:
@@ -310,11 +311,13 @@ def _settings(
 
 
 def _without_sigma(table: Table) -> Table:
+    """Return the table without its column sigma, which describes measurements here, not positions."""
     columns = {name: column for name, column in table.columns.items() if name != table.name("sigma")}
     return replace(table, columns=columns)
 
 
 def _own_sigma(table: Table) -> tuple[Sequence[str], Sequence[float]]:
+    """Return names and sigmas of the candidates; empty without a column sigma."""
     if not table.has("sigma"):
         return (), ()
     return table.labels("name").tolist(), table.numbers("sigma").tolist()
@@ -323,7 +326,7 @@ def _own_sigma(table: Table) -> tuple[Sequence[str], Sequence[float]]:
 def _expected_rows(
     section: ExpectedTable, stations: Sequence[dict[str, Any]], own: dict[str, float], folder: Path, where: str
 ) -> list[dict[str, Any]]:
-    """Return the rows that a section lists, or one of each station but the other end."""
+    """Return the rows that a section lists; without a list, one row for each station except its second station."""
     if section.kind is None:
         raise InvalidProblem("the key 'kind' is missing", where, 'write kind = "toa"')
     kind_model(section.kind, join(where, "key 'kind'"))
@@ -339,21 +342,24 @@ def _expected_rows(
             if own:
                 sigma = own.get(station["name"])
                 if sigma is None and section.sigma is None:
-                    raise InvalidProblem(f"{station['name']!r} has no sigma", where, "give sigma for all")
+                    raise InvalidProblem(
+                        f"station {station['name']!r} has no sigma", where, "give sigma for all stations"
+                    )
                 row["sigma"] = sigma if sigma is not None else float(str(section.sigma).split()[0])
             made.append(row)
     return made
 
 
 def _column(candidates: Table, key: str, problem: Problem) -> Array:
-    """Return a column of the candidates for all stations, zero for those that are there."""
+    """Return a candidate column (s,) for all stations of the problem, 0 for existing stations."""
     given = dict(zip(candidates.labels("name").tolist(), candidates.numbers(key).tolist(), strict=True))
     return np.array([given.get(name, 0.0) for name in problem.stations.names])
 
 
 def _group(table: GroupTable, candidates: Table, where: str) -> CountGroup:
+    """Return the rule of a group table, with the names of its members."""
     if (table.group is None) == (table.members is None):
-        raise InvalidProblem("a group is given once", where, "give group, a word of the column, or members")
+        raise InvalidProblem("a group needs either the key group or the key members", where, "give one of the two")
     if table.most is None and table.least is None:
         raise InvalidProblem("the group has no rule", where, "give most or least")
     if table.members is not None:
@@ -370,11 +376,13 @@ def _group(table: GroupTable, candidates: Table, where: str) -> CountGroup:
 def _places(
     section: TargetsTable, wanted: FrameTable, problem: Problem, folder: Path, source: str
 ) -> tuple[Array, tuple[str, ...], Array | None]:
-    """Return places (P, d), their names, and weights, None where they count alike."""
+    """Return places (P, d), metres, their names, and their weights (P,); the weights are None if they are equal."""
     where = join(source, "[targets]")
     if section.polygon is not None:
         if section.file is not None or section.rows is not None or section.spacing is None:
-            raise InvalidProblem("an area has a polygon and a spacing alone", where, 'write spacing = "5 m"')
+            raise InvalidProblem(
+                "an area needs a polygon and a spacing, without rows or file", where, 'write spacing = "5 m"'
+            )
         points = _area(section, problem.frame, problem.dimension, folder, where)
         return points, tuple(f"P{i + 1}" for i in range(len(points))), None
     table = table_of(section, folder, where)
@@ -384,7 +392,7 @@ def _places(
     found = survey(StationsTable(unit=section.unit), _without_sigma(table), wanted, table.source)[0]
     _, first, _ = distinct(table.labels("name"))
     if len(first) < table.count:
-        raise InvalidProblem("a place has the name of another", table.source, "give each a name of its own")
+        raise InvalidProblem("two places have the same name", table.source, "give each place a different name")
     weights = None
     if table.has("weight"):
         weights = table.numbers("weight")
@@ -396,7 +404,7 @@ def _places(
 
 
 def _area(section: TargetsTable, frame: Frame, dimension: int, folder: Path, where: str) -> Array:
-    """Return places (P, d) on a square grid inside a polygon."""
+    """Return places (P, d) on a square grid inside a polygon, metres."""
     assert section.polygon is not None
     step = Units("length").plain(section.spacing or 0.0, section.unit, join(where, "key 'spacing'"))
     if not step > 0.0:
@@ -408,20 +416,20 @@ def _area(section: TargetsTable, frame: Frame, dimension: int, folder: Path, whe
     ]
     low, high = np.min([r.min(0) for r in rings], axis=0), np.max([r.max(0) for r in rings], axis=0)
     if np.prod((high - low) / step + 1.0) > _MANY:
-        raise InvalidProblem(f"the spacing {step:g} m makes more than {_MANY} places", where, "widen it")
+        raise InvalidProblem(f"the spacing {step:g} m gives more than {_MANY} places", where, "use a larger spacing")
     axes = [np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     points = grid[np.any([inside(grid, ring) for ring in rings], axis=0)]
     if not len(points):
-        raise InvalidProblem("the spacing leaves no place in the area", where, "narrow it")
+        raise InvalidProblem("with this spacing, the area contains no place", where, "use a smaller spacing")
     return points if dimension == 2 else np.column_stack([points, np.full(len(points), height)])
 
 
 def _reach(file: SelectionFile, counts: Sequence[int], source: str) -> Array | None:
-    """Return the greatest range (m,) of each row, metres; None where all are without end."""
+    """Return the largest range (m,) of each row, metres; None if no section has a limit."""
     if all(section.range_max is None for section in file.measurements):
         return None
-    # blocks of rows stand in the order of the kinds' first appearance: `assemble` has put equal kinds together
+    # `assemble` orders the blocks of rows by the first appearance of their kind and joins equal kinds
     kinds: dict[str, list[float]] = {}
     for i, (section, count) in enumerate(zip(file.measurements, counts, strict=True)):
         place = join(source, f"[[measurements]] {i + 1}", "key 'range_max'")
@@ -435,7 +443,7 @@ def _reach(file: SelectionFile, counts: Sequence[int], source: str) -> Array | N
 def _sight(
     section: SightTable | None, problem: Problem, places: Array, labels: Sequence[str], folder: Path, source: str
 ) -> Array | None:
-    """Return the factor (P, s) of each pair, 0 where it is out of sight; None where all are in sight."""
+    """Return the sight factor (P, s) of each place and station, 0 if out of sight; None if all pairs are in sight."""
     if section is None:
         return None
     where, names = join(source, "[sight]"), problem.stations.names
@@ -453,8 +461,12 @@ def _sight(
                 raise InvalidProblem(f"there is no {key} {label!r}", table.where(key, row), nearest(label, list(known)))
     bad = np.flatnonzero(~((values == 0.0) | (values >= 1.0)))
     if len(bad):
-        what = f"the sight {values[bad[0]]:g} is neither 0 nor 1 nor a larger factor"
-        raise InvalidProblem(what, table.where("sight", int(bad[0])), "give 0 for out of sight, 1 for in sight")
+        what = f"the sight {values[bad[0]]:g} is neither 0 nor at least 1"
+        raise InvalidProblem(
+            what,
+            table.where("sight", int(bad[0])),
+            "give 0 for out of sight, 1 for in sight, or a larger factor on sigma",
+        )
     site, place = {n: i for i, n in enumerate(names)}, {n: i for i, n in enumerate(labels)}
     for one, other, value in zip(table.labels("candidate"), table.labels("place"), values, strict=True):
         out[place[other], site[one]] *= value
@@ -464,12 +476,15 @@ def _sight(
 def _regions(
     section: RefineTable | None, frame: Frame, dimension: int, folder: Path, source: str
 ) -> tuple[tuple[PlacementRegion, ...], PlacementGround | None]:
+    """Return the convex regions of the refinement, and its terrain."""
     if section is None:
         return (), None
     where = join(source, "[refine]")
     low, high = (Units("length").plain(v, "m", join(where, "key 'height'")) for v in section.height)
     if low > high:
-        raise InvalidProblem("the least height is above the greatest", join(where, "key 'height'"), "swap them")
+        raise InvalidProblem(
+            "the first height is above the second", join(where, "key 'height'"), "swap the two heights"
+        )
     path = within(folder, section.polygon, join(where, "key 'polygon'"))
     parts = [part for ring in polygons_of(path) for part in convex_parts(corners_in_frame(ring, frame, where))]
     ground = None
@@ -479,9 +494,9 @@ def _regions(
 
 
 def write_chosen(loaded: LoadedSelection, taken: Sequence[str], out: Path, source: Path) -> None:
-    """Write an ordinary problem file with the taken stations and their rows, ready for `crlb --map` and studies."""
+    """Write a problem file with the taken stations and their rows, as input of `crlb --map` and studies."""
     if out.suffix.lower() != ".toml":
-        raise InvalidProblem("the chosen stations are written as a problem file", str(out), "let its name end in .toml")
+        raise InvalidProblem("the output is a problem file, so its name must end in .toml", str(out), "change the name")
     claim(out, inputs=[source])
     kept, settings = {*taken}, dict(loaded.settings)
     others = {s.get("b") for s in settings["measurements"]}
@@ -497,7 +512,7 @@ def write_chosen(loaded: LoadedSelection, taken: Sequence[str], out: Path, sourc
 
 
 def criterion_name(name: str) -> Name:
-    """Return the name of a criterion; raise InvalidProblem for an unknown one."""
+    """Return the name of a criterion, or raise InvalidProblem if it is unknown."""
     known: tuple[Name, ...] = ("rms", "volume", "axis")
     for one in known:
         if name == one:

@@ -1,4 +1,9 @@
-"""Which sites to take for which places: the selection as it is given, and the linearised rows of each candidate."""
+"""The definition of a site selection, and its rows, rules and priors as arrays.
+
+A site is a possible position of a station. A place is a possible position of the target. `candidates_of`
+linearises the rows of all sites at all places, so that the search (`optloc.sites.placement.best_set`) needs
+no measurement model.
+"""
 
 from __future__ import annotations
 
@@ -20,65 +25,67 @@ Name = Literal["rms", "volume", "axis"]
 __all__ = ["LETTER", "Candidates", "CountGroup", "Name", "SiteSelection", "candidates_of"]
 
 LETTER: dict[str, Criterion] = {"rms": "A", "volume": "D", "axis": "E"}
-"""The criteria's names in the literature."""
+"""Letter of each criterion in the literature."""
 
-# Where the direction from a site to a place means nothing any more, metres.
+# Least distance of a site and a place, metres: closer, the direction between them has no meaning.
 _SAME = 1e-3
-# Variance of an arrival, as a share of the mean, below which it was made up: `as_arrivals` gives an exact one 1e-6.
+# Share of the mean variance below which the variance of an arrival is artificial: `as_arrivals` gives an exact
+# arrival 1e-6.
 _EXACT = 1e-5
-# The emission time is known to this many half extents of the area: far less than any arrival says.
+# Standard deviation of the emission time, in half extents of the area: so wide that any arrival is far more
+# precise.
 _EMISSION = 10.0
-# The least area that a prior is made of, metres: a single place has no extent.
+# Smallest half extent of the area that becomes a prior, metres: a single place has no extent.
 _EXTENT = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class SiteSelection:
-    """The question which of some sites to take: candidates, places, rules and the criterion.
+    """A site selection: candidate sites, places of the target, rules and criterion.
 
     Parameters
     ----------
     problem : Problem
-        One epoch and one target at rest or with a state of its own; every station that measures is a site, and its rows
-        are those it would add. The measured values do not matter. Priors are what is known without any site; where
-        there is none of the position it is the area of sites and places.
+        One epoch with one target, at rest or with a velocity. Each station that measures is a site and has the
+        rows that it would add. The measured values are not used. The priors describe the target before any site
+        measures; the default prior of the position covers the area of sites and places.
     places : array (p, d), or (p, n)
-        Where the target may be, metres; or whole parameter vectors, for states with a velocity.
+        Possible positions of the target, metres; for states with a velocity, whole parameter vectors.
     weights : array (p,), optional
-        How much each place counts, positive; alike by default.
+        Positive weight of each place in the mean; equal by default.
     choose : int, optional
-        How many sites to take beyond those that are kept; with a budget, at most so many.
+        Number of sites to take in addition to the kept sites; with a budget, the largest number.
     budget : float, optional
-        What the sites that are taken may cost together, kept ones not counted.
+        Largest total cost of the new sites; kept sites are free.
     cost : array (s,), optional
-        Of each station, not negative.
+        Cost of each station, not negative.
     kept, forbidden : tuple of str
-        Sites that are taken, and that are not, in any case.
+        Sites that are always taken, and sites that are never taken.
     groups : tuple of CountGroup
         Further rules.
     criterion : "rms", "volume" or "axis"
         Mean-square error (A), determinant (D) or largest eigenvalue (E) of the covariance of the position.
     worst : bool
-        The worst place counts, in place of the mean.
+        Whether the criterion is the maximum over the places, instead of the weighted mean.
     fail_one : bool
-        The worst loss of any one site counts.
+        Whether the criterion is the value after the worst loss of one site.
     sight : array (p, s), optional
-        Factor, 1 or more, by which the standard deviations of a station's rows grow at a place; 0 where it is out of
+        Factor, 1 or more, on the standard deviations of a station's rows at a place; 0 if the place is out of
         sight.
     reach : array (m,), optional
-        Distance to the target beyond which a row is not measured, metres.
+        Largest distance to the target at which a row is measured, metres.
     gap : float
-        Share of the value that the bound may be below it.
+        Relative gap between value and bound at which the search stops.
     seconds : float
-        After which the search stops.
+        Time limit of the search, seconds.
     alternatives : int
-        How many of the best sets are told.
+        Number of best sets in the result.
     by : "station" or "row"
-        Whether stations are chosen, or single rows.
+        Whether the selection takes whole stations or single rows.
     names : tuple of p str
-        Of the places.
+        Names of the places.
     seed : int
-        Decides the random sets.
+        Seed of the random sets.
     """
 
     problem: Problem
@@ -105,26 +112,27 @@ class SiteSelection:
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """The candidate sites of a selection as numbers: their rows at each place, the rules and the states.
+    """The candidate sites of a selection as arrays: rows at each place, rules and states.
 
     Parameters
     ----------
     selection : SiteSelection
-        As it was given.
+        The selection as given.
     problem : Problem
-        A batch of P problems: that of all sites for a target at each place, with priors, rows out of sight left out.
+        A batch of P problems, one for each place, with the rows of all sites and with priors. Rows out of sight
+        have weight 0.
     vectors : array (P, size)
-        Their parameter vectors.
+        Parameter vector of the target at each place.
     site : int array (m,)
         Site of each row.
     names : tuple of n str
-        Of the sites.
+        Names of the sites.
     design : Design
-        Rows and prior information of each place.
+        Whitened rows and prior information at each place.
     rules, limits : array (R, n), (R,)
-        rules @ w <= limits; the first counts or costs.
+        Linear rules rules @ w <= limits; the first rule is the count or the cost.
     state : int array (n,)
-        -1 for a free site, 0 for one that is forbidden, 1 for one that is kept.
+        -1 for a free site, 0 for a forbidden site, 1 for a kept site.
     """
 
     selection: SiteSelection
@@ -138,26 +146,26 @@ class Candidates:
     state: Array
 
     def assembled(self, chosen: Array) -> Problem:
-        """Return the batch of P problems that is left where the sites (n,) are taken: what `optloc.crlb` takes."""
+        """Return the batch of P problems with the rows of the taken sites (n,), as input of `optloc.crlb`."""
         taken = np.asarray(chosen, dtype=float)[self.site]
         return self.problem.with_rows(weight=self.problem.weight * taken)
 
 
 def candidates_of(selection: SiteSelection) -> Candidates:
-    """Return the candidate sites of a selection as numbers.
+    """Return the candidate sites of a selection as arrays.
 
     Raises
     ------
     InvalidProblem
-        Naming the argument, site or place that cannot be right.
+        If an argument, site or place is invalid; the message names it.
     """
-    selection = _checked(selection)
-    problem = _arrivals(selection.problem)
+    selection = _check_options(selection)
+    problem = _as_arrival_times(selection.problem)
     site, names = _sites(problem, selection)
     size, d = problem.layout.size, problem.dimension
     places = np.atleast_2d(np.asarray(selection.places, dtype=float))
     if places.ndim != 2 or places.shape[1] not in (d, size) or not np.isfinite(places).all() or not len(places):
-        what = f"the places have shape {np.shape(selection.places)}"
+        what = f"the places have shape {np.shape(selection.places)} or contain a number that is not finite"
         raise InvalidProblem(what, "places", f"give finite numbers (places, {d}), metres")
     vectors = np.zeros((len(places), size))
     vectors[:, : places.shape[1]] = places
@@ -168,11 +176,12 @@ def candidates_of(selection: SiteSelection) -> Candidates:
     design = Design(_rows(batch, vectors, site, len(names)), _prior(batch, vectors), weight, d)
     rules, limits, state = _rules(selection, names, site)
     candidates = Candidates(selection, batch, vectors, site, names, design, rules, limits, state)
-    _check_seen(candidates)
+    _check_determined(candidates)
     return candidates
 
 
-def _checked(selection: SiteSelection) -> SiteSelection:
+def _check_options(selection: SiteSelection) -> SiteSelection:
+    """Return the selection unchanged, or raise if an option is invalid."""
     if selection.criterion not in LETTER:
         what = f"there is no criterion {selection.criterion!r}"
         raise InvalidProblem(what, "criterion", nearest(str(selection.criterion), list(LETTER)))
@@ -181,33 +190,39 @@ def _checked(selection: SiteSelection) -> SiteSelection:
     if not selection.seconds > 0.0:
         raise InvalidProblem(f"the time {selection.seconds:g} s is not positive", "time", "give seconds, such as 60")
     if selection.choose is None and selection.budget is None:
-        raise InvalidProblem("nothing says how many sites to take", "choose", "give choose, or budget with cost")
+        raise InvalidProblem("the number of sites to take is missing", "choose", "give choose, or budget with cost")
     return selection
 
 
-def _arrivals(problem: Problem) -> Problem:
-    """Return the problem with arrival times for range differences: what a difference says depends on the whole set."""
+def _as_arrival_times(problem: Problem) -> Problem:
+    """Return the problem with arrival times instead of range differences.
+
+    The information of a difference depends on the other sites of a set; the information of arrival times adds up.
+    """
     if problem.epochs != 1 or len(problem.motions) != 1 or problem.motions[0].known is not None:
-        what = "a placement is for one target at one epoch whose position is unknown"
-        raise InvalidProblem(what, "problem", "give one epoch of one target, and places as an argument")
+        what = "a placement needs one target with an unknown position, at one epoch"
+        raise InvalidProblem(
+            what, "problem", "give a problem with one epoch and one target, and its positions as places"
+        )
     pairs = [rows.kind for rows in problem.rows if MODELS[rows.kind].signs == (1, -1)]
     if not pairs:
         return problem
     made = as_arrivals(problem.flat()) if pairs == ["tdoa"] else None
-    # pairs that are independent have a reference without noise, which no station is
+    # The rows of independent pairs are equal to arrivals with one noise-free reference. No station is such a
+    # reference.
     if made is None or (variance := variances(made.problem.noise, made.problem.count)).min() < _EXACT * variance.mean():
-        what = f"{pairs[0]} rows pair stations, and a set of stations has other pairs than another"
+        what = f"{pairs[0]} rows need pairs of stations, but each set of stations has other pairs"
         raise InvalidProblem(what, "measurements", "give toa rows, or tdoa rows with an arrival_sigma")
     return made.problem.take(np.zeros(1, dtype=int))
 
 
 def _sites(problem: Problem, selection: SiteSelection) -> tuple[Array, tuple[str, ...]]:
-    """Return the site of each row, and the names of the sites."""
+    """Return the site (m,) of each row, and the names (n,) of the sites."""
     a, b = (np.concatenate([getattr(rows, end) for rows in problem.rows]) for end in ("a", "b"))
     stations = problem.stations.names
     if (a < 0).any():
-        what = "a row without a station belongs to no site"
-        raise InvalidProblem(what, "measurements", "leave heights out, or give them as a prior of the position")
+        what = "a row without a station cannot belong to a site"
+        raise InvalidProblem(what, "measurements", "remove height rows, or use a prior of the position")
     if selection.by == "row":
         kinds = [rows.kind for rows in problem.rows for _ in range(rows.count)]
         named = [f"{kind} {stations[i]}" for kind, i in zip(kinds, a, strict=True)]
@@ -221,49 +236,53 @@ def _sites(problem: Problem, selection: SiteSelection) -> tuple[Array, tuple[str
     lone = set(names) - set(selection.kept)
     for other in np.unique(b[b >= 0]):
         if stations[other] in lone:
-            what = f"{stations[other]!r} is a candidate and the other end of a row"
-            raise InvalidProblem(what, "measurements", "keep that station, or give it no rows of its own")
+            what = f"station {stations[other]!r} is a candidate and also the second station of a row"
+            raise InvalidProblem(what, "measurements", "keep this station, or remove the rows that it measures")
     return site, names
 
 
 def _check_apart(problem: Problem, site: Array, names: Sequence[str], places: Array) -> None:
+    """Raise if a place is at a station, or if two stations have the same position."""
     stations = problem.stations.position.reshape(-1, problem.dimension)
     apart = np.linalg.norm(places[:, None] - stations[None], axis=-1)
     p, s = np.unravel_index(int(apart.argmin()), apart.shape)
     if apart[p, s] < _SAME:
-        what = f"place {p + 1} is where station {problem.stations.names[s]!r} stands"
-        raise InvalidProblem(what, "places", "move one of them by more than a millimetre")
+        what = f"place {p + 1} is at the position of station {problem.stations.names[s]!r}"
+        raise InvalidProblem(what, "places", "move the place or the station by more than a millimetre")
     own = np.unique(stations, axis=0, return_index=True)[1]
     twice = np.setdiff1d(np.arange(len(stations)), own)
     if len(twice):
         name = problem.stations.names[int(twice[0])]
-        raise InvalidProblem(f"station {name!r} stands where another one does", "candidates", "remove one of them")
+        raise InvalidProblem(
+            f"station {name!r} has the position of another station", "candidates", "remove one of them"
+        )
 
 
 def _weight(selection: SiteSelection, count: int) -> Array:
+    """Return the weights (P,) of the places, sum 1."""
     weight = np.ones(count) if selection.weights is None else np.asarray(selection.weights, dtype=float)
     if weight.shape != (count,) or not (weight > 0.0).all() or not np.isfinite(weight).all():
-        what = f"the weights of {count} places are not so many positive numbers"
+        what = f"the weights are not {count} positive numbers, one for each place"
         raise InvalidProblem(what, "weights", "give each place a weight above 0, or leave it out")
     return np.asarray(weight / weight.sum())
 
 
 def _weights(selection: SiteSelection, problem: Problem, places: Array) -> Array:
-    """Return the weights (P, m) of the rows: rows out of sight or range have none, less exact ones less."""
+    """Return the weights (P, m) of the rows: 0 out of sight or reach, and smaller where `sight` raises sigma."""
     count, stations = len(places), problem.stations.count
     weight = np.broadcast_to(problem.weight, (count, problem.count)).copy()
     end = np.concatenate([rows.a for rows in problem.rows])
     if selection.sight is not None:
         sight = np.asarray(selection.sight, dtype=float)
         if sight.shape != (count, stations) or not ((sight == 0.0) | (sight >= 1.0)).all():
-            what = f"the sight of {count} places and {stations} stations is not 0, 1 or a larger factor for each"
-            raise InvalidProblem(what, "sight", "give 0 where a station is out of sight, else a factor of sigma")
+            what = f"the sight is not an array of {count} places and {stations} stations with values 0 or at least 1"
+            raise InvalidProblem(what, "sight", "give 0 for a station out of sight, otherwise a factor on sigma")
         factor = sight[:, end]
         weight = np.where(factor > 0.0, weight / np.maximum(factor, 1.0) ** 2, 0.0)
     if selection.reach is not None:
         reach = np.asarray(selection.reach, dtype=float)
         if reach.shape != (problem.count,) or not (reach > 0.0).all():
-            what = f"the reach of {problem.count} rows is not so many positive numbers"
+            what = f"the reach is not {problem.count} positive numbers, one for each row"
             raise InvalidProblem(what, "reach", "give each row a distance in metres")
         position = problem.stations.position.reshape(-1, problem.dimension)[end]
         weight[np.linalg.norm(places[:, None] - position, axis=-1) > reach] = 0.0
@@ -271,7 +290,11 @@ def _weights(selection: SiteSelection, problem: Problem, places: Array) -> Array
 
 
 def _with_prior(problem: Problem, places: Array) -> Problem:
-    """Return the problem with priors that leave nothing unknown: the area of sites and places, and ten times that."""
+    """Return the problem with priors for position and emission time, so that the information is never singular.
+
+    The default prior of the position is half the extent of sites and places; for the emission time it is ten
+    times that length.
+    """
     known = {prior.name for prior in problem.priors}
     points = np.concatenate([places, problem.stations.position.reshape(-1, problem.dimension)])
     half = max(0.5 * float(np.ptp(points, axis=0).max()), _EXTENT)
@@ -284,15 +307,15 @@ def _with_prior(problem: Problem, places: Array) -> Problem:
 
 
 def _rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
-    """Return the whitened rows (P, r, m, n) of each site, filled up with zeros."""
+    """Return the whitened rows (P, r, m, n) of each site; sites with fewer than r rows are padded with zeros."""
     linear = linearise(problem, vectors)
     jacobian = np.concatenate([linear.shared, linear.local], axis=-1)
     found: list[list[Array]] = [[] for _ in range(count)]
     for whitener in linear.noise:
         owner = site[whitener.row]
         if (owner != owner[:, :1]).any():
-            what = "the noise correlates rows of different sites, so that what they say does not add up"
-            raise InvalidProblem(what, "measurements", "give each site noise of its own")
+            what = "the noise correlates rows of different sites, so their information does not add up"
+            raise InvalidProblem(what, "measurements", "give independent noise to each site")
         white = np.broadcast_to(whitener.apply(jacobian), (len(vectors), whitener.row.size, jacobian.shape[-1]))
         white = white.reshape(len(vectors), *whitener.row.shape, -1)
         for group, one in enumerate(owner[:, 0]):
@@ -305,7 +328,7 @@ def _rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
 
 
 def _prior(problem: Problem, vectors: Array) -> Array:
-    """Return the information (P, m, m) of the priors."""
+    """Return the prior information (P, m, m) at each place."""
     n, length, size = problem.layout.n_shared, problem.layout.n_local, len(vectors)
     none = Normal(
         np.zeros((size, n, n)),
@@ -320,16 +343,20 @@ def _prior(problem: Problem, vectors: Array) -> Array:
     out[:, :n, :n], out[:, n:, n:] = known.shared, known.local[:, 0]
     if (np.diagonal(out, axis1=1, axis2=2) <= 0.0).any():
         unknown = problem.layout.labels()[int(np.argmin(np.diagonal(out[0])))] if n else "emission"
-        what = f"nothing is known of {unknown!r} before anything is measured"
-        raise InvalidProblem(what, "priors", "give it a prior, however wide")
+        what = f"the unknown {unknown!r} has no prior"
+        raise InvalidProblem(what, "priors", "give it a prior, which can be wide")
     return out
 
 
 def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tuple[Array, Array, Array]:
-    """Return rules, limits and states of the sites; what is kept counts in groups alone."""
+    """Return rules (R, n), limits (R,) and states (n,) of the sites.
+
+    Only the group rules count the kept sites.
+    """
     n, place = len(names), {name: i for i, name in enumerate(names)}
 
     def where(wanted: Sequence[str], argument: str) -> Array:
+        """Return the indices of sites by name, or raise for an unknown name."""
         for name in wanted:
             if name not in place:
                 raise InvalidProblem(f"there is no site {name!r}", argument, nearest(name, list(names)))
@@ -339,14 +366,14 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
     kept = where(selection.kept, "kept")
     state[where(selection.forbidden, "forbidden")] = 0
     if (state[kept] == 0).any():
-        raise InvalidProblem("a site is kept and forbidden", "forbidden", "say one of the two")
+        raise InvalidProblem("a site is kept and forbidden", "forbidden", "remove it from one of the two lists")
     state[kept] = 1
     free = (state == -1).astype(float)
     rules, limits = [], []
     if selection.choose is not None:
         if not 1 <= selection.choose <= free.sum():
-            what = f"{selection.choose} sites are wanted of {int(free.sum())} candidates"
-            raise InvalidProblem(what, "choose", "ask for fewer, or name more candidates")
+            what = f"{selection.choose} sites are wanted, but there are {int(free.sum())} candidates"
+            raise InvalidProblem(what, "choose", "choose fewer sites, or add candidates")
         rules.append(free + 0.0)
         limits.append(float(selection.choose))
     if selection.budget is not None:
@@ -356,7 +383,8 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
     inside = np.array(own, dtype=bool).reshape(-1, n)
     check_groups(selection.groups, inside, names, state, selection.choose)
     if selection.choose is not None and selection.budget is None and selection.groups:
-        # one site more is always better, but for groups: there so many sites are a rule of their own
+        # Without groups, a full set is always best, so the upper limit is enough. Groups need the exact number as a
+        # second rule.
         rules.append(-free)
         limits.append(-float(selection.choose))
     for group, taken in zip(selection.groups, inside, strict=True):
@@ -367,19 +395,21 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
         if group.least is not None:
             rules.append(-members)
             limits.append(-float(group.least))
-    # in units of their largest entries: budgets and counts are alike to the interior point
+    # Divide each rule by its largest entry: then budgets and counts have the same scale for the interior-point
+    # method.
     size = np.array([np.abs(rule).max() or 1.0 for rule in rules])
     return np.array(rules) / size[:, None], np.array(limits) / size, state
 
 
 def _costs(selection: SiteSelection, n: int, site: Array) -> Array:
+    """Return the cost (n,) of each site."""
     stations = np.concatenate([rows.a for rows in selection.problem.rows])
     cost = None if selection.cost is None else np.asarray(selection.cost, dtype=float)
     if cost is None or cost.shape != (selection.problem.stations.count,) or not (cost >= 0.0).all():
-        what = "a budget needs a cost of each station that is not negative"
+        what = "a budget needs a cost for each station, and no cost is negative"
         raise InvalidProblem(what, "cost", "give one number for each station")
     if not np.isfinite(cost).all() or not 0.0 <= float(selection.budget or 0.0) < np.inf:
-        raise InvalidProblem("a cost or the budget is no finite number", "budget", "correct it")
+        raise InvalidProblem("a cost or the budget is not a finite number", "budget", "give finite numbers")
     out = np.zeros(n)
     measuring = np.unique(stations) if selection.by == "station" else None
     if measuring is None:
@@ -388,19 +418,19 @@ def _costs(selection: SiteSelection, n: int, site: Array) -> Array:
     return out
 
 
-def _check_seen(candidates: Candidates) -> None:
-    """Refuse a place at which all sites together leave the position open: no choice has a fix there."""
-    heard = (candidates.design.rows != 0.0).any(axis=(1, 2)) & (candidates.state != 0)
+def _check_determined(candidates: Candidates) -> None:
+    """Raise if all sites together do not determine the position at a place: then no set of sites has a fix there."""
+    in_sight = (candidates.design.rows != 0.0).any(axis=(1, 2)) & (candidates.state != 0)
     rows = candidates.design.rows[..., candidates.state != 0]
     places, r, m, n = rows.shape
     flat = np.moveaxis(rows, -1, 1).reshape(places, n * r, m)
     prior = candidates.design.prior
     scale = 1.0 / np.sqrt(np.diagonal(prior, axis1=1, axis2=2))
     for p in range(places):
-        # In units of what the prior knows, a direction that rows know no better than it is open.
+        # Scale each direction by the prior: if the rows determine it no better than the prior does, it is open.
         singular = np.linalg.svd(flat[p] * scale[p], compute_uv=False)
         known = int((singular > 1.0).sum())
         if known < m:
             name = candidates.selection.names[p] if candidates.selection.names else str(p + 1)
-            what = f"place {name!r} is in sight of {int(heard[p].sum())} sites, which leave its position open"
-            raise InvalidProblem(what, "places", "add candidates that see it, or leave the place out")
+            what = f"place {name!r} is in sight of {int(in_sight[p].sum())} sites, which do not determine its position"
+            raise InvalidProblem(what, "places", "add candidates in sight of this place, or remove it")

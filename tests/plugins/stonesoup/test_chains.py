@@ -15,8 +15,8 @@ from optloc.plugins.stonesoup.chains import (
     ChainTerms,
     ChainWork,
     DetectionChain,
-    _ahead,
-    _grouped,
+    _group_indices,
+    _predict,
     _starts,
     alone,
     grown,
@@ -63,7 +63,7 @@ def test_two_scans_give_the_velocity_between_their_places(scans):
     starts = _starts(first, second, TERMS)
     np.testing.assert_allclose(starts[-1, :3], second.x[0, :3])
     np.testing.assert_allclose(starts[-1, 3:], (second.x[0, :3] - first.x[0, :3]) / 2.0)
-    ahead = _ahead(first.x + np.array([0, 0, 0, 7.0, 0, 0]), first, scans[2], 3)
+    ahead = _predict(first.x + np.array([0, 0, 0, 7.0, 0, 0]), first, scans[2], 3)
     np.testing.assert_allclose(ahead[0, :3], first.x[0, :3] + np.array([14.0, 0.0, 0.0]))
 
 
@@ -102,4 +102,4 @@ def test_a_covariance_is_flat_where_it_is_small_against_the_range(scans):
 
 def test_equal_keys_are_grouped_in_their_order():
     step = dt.timedelta(seconds=1)
-    assert _grouped([step, "b", step, "c", "b"]) == [[0, 2], [1, 4], [3]]
+    assert _group_indices([step, "b", step, "c", "b"]) == [[0, 2], [1, 4], [3]]

@@ -23,9 +23,9 @@ def test_rates_begin_a_track_with_its_velocity():
         track = FixInitiator().initiate({found}, ZERO).pop()
         np.testing.assert_allclose(np.asarray(track.state_vector, dtype=float), state, atol=1e-3)
         assert np.sqrt(np.diag(np.asarray(track.covar, dtype=float))[swap[1] if not shape else 3]) < 5.0
-    with pytest.raises(InvalidProblem, match="name the places of the velocity"):
+    with pytest.raises(InvalidProblem, match="give the state indices of the velocity"):
         rates(FDOA, ndim_state=4, mapping=[1, 2, 3])
-    with pytest.raises(InvalidProblem, match="give one for each station"):
+    with pytest.raises(InvalidProblem, match="give one velocity for each station"):
         rates(FDOA, velocities=np.zeros((2, 3)))
 
 

@@ -113,4 +113,4 @@ def test_stations_in_one_plane_leave_a_side_open(case, words):
     at = lik.refine(truth)[0]
     told = determined(lik, at)
     found = flat(lik, at, told.covariance(told.free.T))
-    assert [line.split(" as far")[0] for line in found] == words
+    assert [line.split(" within")[0] for line in found] == words

@@ -10,10 +10,10 @@ from optloc.sites.calibration.likelihood import likelihood, together
 from optloc.sites.calibration.multi_start import (
     AGREEING,
     NetworkSearchResult,
-    _added,
     _fits,
     _key,
-    _swept,
+    _merge,
+    _sweep_block_moves,
     frame_size,
     search,
 )
@@ -37,11 +37,11 @@ def ends(*costs):
 
 
 def test_starts_agree_that_end_at_the_least_cost_or_lead_there():
-    found = _added(None, ends(5.0, 5.0 + 1e-4, 9.0), 8)
+    found = _merge(None, ends(5.0, 5.0 + 1e-4, 9.0), 8)
     assert (found.cost, found.agreeing) == (5.0, 2)
     found.onward[_key(9.0)] = 5.0
     assert found.agreeing == 3
-    cheaper = _added(found, ends(4.0), 16)
+    cheaper = _merge(found, ends(4.0), 16)
     assert (cheaper.cost, cheaper.agreeing, cheaper.made) == (4.0, 1, 16)
     assert isinstance(cheaper, NetworkSearchResult)
 
@@ -59,7 +59,7 @@ def test_a_sweep_puts_a_station_back_on_its_side():
     lik = likelihood(network_of(z, 0.01))
     least = lik.refine(truth)[1][0]
     wrong = settled(lik.network, reflected(lik.refine(truth)[0])[0])
-    cost = _swept(lik, wrong, float(lik.cost(wrong)[0]))[1]
+    cost = _sweep_block_moves(lik, wrong, float(lik.cost(wrong)[0]))[1]
     assert cost == pytest.approx(least, abs=0.01)
 
 

@@ -39,13 +39,13 @@ def test_some_pulses_keep_their_rows_and_labels():
     ("arguments", "said"),
     [
         ({"kind": "azimuth"}, "networks have no rows of kind 'azimuth'"),
-        ({"pairs": [(0, 1)]}, "pairs of stations belong to time differences"),
+        ({"pairs": [(0, 1)]}, "the argument pairs and the kind tdoa need each other"),
         ({"dimension": 4}, "a network has 4 dimensions"),
         ({"names": ["a", "b", "a", "c", "d"]}, "station name 'a' is used twice"),
         ({"sigma": 0.0}, "a standard deviation is not positive"),
         ({"place": np.zeros((4, 3))}, r"places have shape \(4, 3\)"),
-        ({"distances": [(0, 5, 1.0, 0.1)]}, "a distance names a station that is not there"),
-        ({"distances": [(0, 1, 1.0, 0.0)]}, "a distance has no deviation"),
+        ({"distances": [(0, 5, 1.0, 0.1)]}, "a distance has an unknown station"),
+        ({"distances": [(0, 1, 1.0, 0.0)]}, "a distance has no positive standard deviation"),
     ],
 )
 def test_what_cannot_be_is_one_sentence(arguments, said):

@@ -64,7 +64,7 @@ def test_a_pulse_that_one_station_measures_twice_has_two_columns(path):
         ('b = "C", z = 7.0', 'b = "A", z = 7.0', "names station 'A' twice"),
         ('sigma = "1 ns"\n', "", "the rows have no standard deviation"),
         ('{ epoch = "p", a = "A", z = 10.0 }', '{ a = "A", z = 10.0 }', "epoch"),
-        ("format = 1", "format = 1\ntarget = {}", "the key 'target' is that of a problem whose stations are known"),
+        ("format = 1", "format = 1\ntarget = {}", "the key 'target' belongs to a problem with known stations"),
     ],
 )
 def test_bad_files_are_one_sentence(path, old, new, said):
@@ -85,5 +85,5 @@ def test_what_is_found_is_a_problem_file_whose_clocks_are_taken_off(path, tmp_pa
     np.testing.assert_allclose(problem.stations.position[0], truth.stations[0])
     apart = np.linalg.norm(truth.pulses[0][:, None] - truth.stations[0], axis=-1)
     np.testing.assert_allclose(problem.observed.reshape(6, 5), apart + truth.emission[0][:, None], atol=1e-9)
-    with pytest.raises(InvalidProblem, match=r"let its name end in \.toml"):
+    with pytest.raises(InvalidProblem, match=r"its name must end in \.toml"):
         write_calibrated(found, "Hall", tmp_path / "found.csv", path)

@@ -57,7 +57,7 @@ def test_the_command_says_what_it_chose_and_how_good_that_is(folder):
     done = run("--out", "chosen.toml", "--plot", "map.png", "--fail-one")
     assert done.exit_code == 0, done.output
     assert "Yard: take C" in done.stdout
-    assert "What the loss of a station costs" in done.stdout
+    assert "Bound after the loss of a station" in done.stdout
     assert (folder / "map.png").stat().st_size > 10_000
 
 
@@ -133,18 +133,18 @@ def test_an_ordinary_problem_file_serves_too(folder):
 BROKEN = {
     "no such criterion": (("choose = 5", 'choose = 5\ncriterion = "trace"'), "'trace' is unknown"),
     "a misspelt key": (("choose = 5", "chose = 5"), "did you mean"),
-    "too many": (("choose = 5", "choose = 11"), "11 sites are wanted of 10"),
+    "too many": (("choose = 5", "choose = 11"), "11 sites are wanted, but there are 10"),
     "no file": (('"sites.csv"', '"nowhere.csv"'), "nowhere.csv"),
     "no noise": (('sigma = "30 cm"', ""), "no noise"),
     "pairs": (('kind = "toa"', 'kind = "tdoa"\nb = "Old"'), "arrival_sigma"),
     "twice": (('name = "Old"', 'name = "C1"'), "used twice"),
     "no kind": (('kind = "toa"', ""), "kind"),
-    "nothing to choose": (("choose = 5", ""), "how many sites"),
+    "nothing to choose": (("choose = 5", ""), "number of sites to take is missing"),
     "a number in words": (("choose = 5", 'choose = "five"'), "choose"),
     "format": (("format = 1", "format = 7"), "format"),
     "group": (("[candidates]", '[[groups]]\ngroup = "zz"\nmost = 1\n[candidates]'), "zz"),
     "weights": ("hall,3,6,2,0", "is not positive"),
-    "place": ("hall,-30,-30,0,3", "stands"),
+    "place": ("hall,-30,-30,0,3", "at the position of station"),
     "cell": ("hall,x,6,2,3", "row 1"),
 }
 
@@ -169,5 +169,5 @@ def test_groups_that_allow_fewer_sites_are_one_sentence(folder):
     )
     done = run()
     assert done.exit_code == 2
-    assert "5 sites are wanted, and the groups allow 3 at most" in " ".join(done.output.split())
+    assert "5 sites are wanted, but the groups allow at most 3" in " ".join(done.output.split())
     assert "Traceback" not in done.output

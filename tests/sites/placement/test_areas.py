@@ -40,7 +40,7 @@ def test_rings_are_read_from_every_shape_without_their_repeated_ends(tmp_path):
         (tmp_path / name).write_text(json.dumps(shape))
         rings = polygons_of(tmp_path / name)
         assert [ring.tolist() for ring in rings] == [SQUARE.tolist()] * count
-    for shape, said in (([[[0, 0], [1, 1]]], "no list of four corners"), ([], "no list of four corners")):
+    for shape, said in (([[[0, 0], [1, 1]]], "at least four corners"), ([], "at least four corners")):
         (tmp_path / "bad").write_text(json.dumps({"type": "Polygon", "coordinates": shape}))
         with pytest.raises(InvalidProblem, match=said):
             polygons_of(tmp_path / "bad")
@@ -51,7 +51,7 @@ def test_corners_on_earth_become_metres_of_the_frame():
     (corner,) = corners_in_frame(np.array([[11.0, 47.001]]), enu, "area")
     assert corner == pytest.approx([0.0, 111.2], abs=0.2)  # a thousandth of a degree to the north
     assert corners_in_frame(SQUARE, CARTESIAN, "area") is SQUARE
-    with pytest.raises(InvalidProblem, match="needs a frame with a plan"):
+    with pytest.raises(InvalidProblem, match="needs a local frame"):
         corners_in_frame(SQUARE, ECEF, "area")
 
 
@@ -105,5 +105,5 @@ def test_a_ridge_hides_what_is_behind_it(tmp_path):
         [0.0, 1.0, 1.0],
     ]
     (tmp_path / "part.csv").write_text("x,y,z\n" + "\n".join(rows[:-1]))
-    with pytest.raises(InvalidProblem, match="no full grid"):
+    with pytest.raises(InvalidProblem, match="not a full grid"):
         ground_of(tmp_path / "part.csv", "terrain")

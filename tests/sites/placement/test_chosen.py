@@ -7,7 +7,7 @@ from sites.placement.scenes import every_set, hall
 from formulations.placement import covariances
 from optloc import place
 from optloc.sites.placement import SiteSelection
-from optloc.sites.placement.chosen import _failed, _following, _swaps, _without, task_of
+from optloc.sites.placement.chosen import _ban_sets, _failed, _following, _swaps, task_of
 from optloc.sites.placement.sites import candidates_of
 
 
@@ -63,5 +63,5 @@ def test_what_each_loss_costs_and_each_addition_gains_are_sets_of_their_own(sele
 def test_a_banned_set_is_the_only_one_that_is_not_allowed(selection):
     task, sets = task_of(candidates_of(selection)), every_set(7, 4)
     assert task.fits(sets).all()
-    left = _without(task, [sets[3], sets[8]]).fits(sets)
+    left = _ban_sets(task, [sets[3], sets[8]]).fits(sets)
     assert np.flatnonzero(~left).tolist() == [3, 8]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sites.placement.scenes import CASES, every_set, task
 
-from optloc.sites.placement.best_set import _exhausted, exchanged, random_sets
+from optloc.sites.placement.best_set import _enumerate, exchanged, random_sets
 from optloc.sites.placement.completions import CompletionRequest
 
 ALL = np.array(np.meshgrid(*[[0, 1]] * 9)).reshape(9, -1).T
@@ -27,7 +27,7 @@ def test_nodes_are_exhausted_as_enumeration_says(criterion, worst, fail, seed):
         state, inside = np.full(10, -1), rng.integers(0, 5)
         state[order[:inside]], state[order[inside : inside + rng.integers(0, 6)]] = 1, 0
         best = least(one, state, sets)
-        value, found = _exhausted(asked, state, rng.random(10), np.inf)
+        value, found = _enumerate(asked, state, rng.random(10), np.inf)
         if (state >= 0).all() or not np.isfinite(best):
             continue
         assert value == pytest.approx(best, rel=1e-9)
@@ -35,8 +35,8 @@ def test_nodes_are_exhausted_as_enumeration_says(criterion, worst, fail, seed):
         assert one.fits(found[None])[0]
         # a limit just above the best lets it pass, one just below does not
         step = 1e-7 * abs(best)
-        assert _exhausted(asked, state, rng.random(10), best + step)[0] == pytest.approx(best, rel=1e-9)
-        assert not _exhausted(asked, state, rng.random(10), best - step)[1].any()
+        assert _enumerate(asked, state, rng.random(10), best + step)[0] == pytest.approx(best, rel=1e-9)
+        assert not _enumerate(asked, state, rng.random(10), best - step)[1].any()
 
 
 @pytest.mark.parametrize("fail", [False, True])
@@ -48,7 +48,7 @@ def test_budgets_groups_and_demands_are_met(fail, seed):
     for _ in range(20):
         state = np.where(rng.random(9) < 0.2, rng.integers(0, 2, 9), -1)
         best = least(one, state, ALL)
-        value, found = _exhausted(one.asked(), state, rng.random(9), np.inf)
+        value, found = _enumerate(one.asked(), state, rng.random(9), np.inf)
         if np.isfinite(best) and (state == -1).any():
             # without an addition that fits, the node itself is the set: that is not asked of it
             own = least(one, np.where(state == -1, 0, state), ALL)
@@ -64,7 +64,7 @@ def test_priors_that_know_nothing_leave_no_rounding(wide, fail):
     one = task(4, 9, 4, 3, fail=fail)
     prior = np.tile(np.diag([wide**-2] * 3 + [0.01 * wide**-2]), (3, 1, 1))
     one = replace(one, design=replace(one.design, prior=prior))
-    value, _ = _exhausted(one.asked(), np.full(9, -1), np.zeros(9), np.inf)
+    value, _ = _enumerate(one.asked(), np.full(9, -1), np.zeros(9), np.inf)
     assert value == pytest.approx(one.score(every_set(9, 4)).min(), rel=1e-7)
 
 
@@ -73,7 +73,7 @@ def test_sites_with_several_rows_are_updated_row_by_row():
     rows = np.random.default_rng(1).normal(size=(3, 2, 4, 9)) * 0.5
     for fail in (False, True):
         two = replace(one, fail=fail, design=replace(one.design, rows=rows))
-        value, _ = _exhausted(two.asked(), np.full(9, -1), np.zeros(9), np.inf)
+        value, _ = _enumerate(two.asked(), np.full(9, -1), np.zeros(9), np.inf)
         assert value == pytest.approx(two.score(every_set(9, 4)).min(), rel=1e-9)
 
 
@@ -94,4 +94,4 @@ def test_a_last_site_that_is_not_lost_would_be_seen():
     one = task(3, 10, 5, 3, fail=True)
     spared = CompletionRequest(*one.asked()[:7], 0, *one.asked()[8:])
     sets = every_set(10, 5)
-    assert _exhausted(spared, np.full(10, -1), np.zeros(10), np.inf)[0] < 0.95 * one.score(sets).min()
+    assert _enumerate(spared, np.full(10, -1), np.zeros(10), np.inf)[0] < 0.95 * one.score(sets).min()

@@ -28,14 +28,14 @@ def at_least(count, *numbers):
 @pytest.mark.parametrize(
     ("choose", "groups", "kept", "said"),
     [
-        (7, (at_most(1, 0, 5, 6, 7),), (), r"7 sites are wanted, and the groups allow 5 .*S0, S5, S6, S7"),
-        (6, (at_most(1, 0, 1, 2), at_most(1, 2, 3, 4)), (), "6 sites are wanted, and the groups allow 5"),
-        (8, tuple(at_most(1, 0, i) for i in range(1, 8)), (), "8 sites are wanted, and the groups allow 7"),
-        (5, (at_most(1, 0, 5, 6, 7),), ("S0",), "5 sites are wanted, and the groups allow 4"),
-        (3, (at_least(2, 0, 1), at_least(2, 2, 3)), (), "3 sites are wanted, and the groups need 4"),
-        (4, (at_least(3, 0, 1),), (), "at least 3 of S0, S1 are wanted, and 2 of them can be taken"),
-        (2, (at_most(1, 0, 5),), ("S0", "S5"), "at most 1 of S0, S5 may be taken, and 2 of them are kept"),
-        (4, (at_least(2, 0, 1), at_most(0, 1, 2)), (), "no set of sites meets all of the groups 1, 2"),
+        (7, (at_most(1, 0, 5, 6, 7),), (), r"7 sites are wanted, but the groups allow at most 5 .*S0, S5, S6, S7"),
+        (6, (at_most(1, 0, 1, 2), at_most(1, 2, 3, 4)), (), "6 sites are wanted, but the groups allow at most 5"),
+        (8, tuple(at_most(1, 0, i) for i in range(1, 8)), (), "8 sites are wanted, but the groups allow at most 7"),
+        (5, (at_most(1, 0, 5, 6, 7),), ("S0",), "5 sites are wanted, but the groups allow at most 4"),
+        (3, (at_least(2, 0, 1), at_least(2, 2, 3)), (), "3 sites are wanted, but the groups need at least 4"),
+        (4, (at_least(3, 0, 1),), (), "at least 3 of S0, S1 are wanted, but only 2 of them can be taken"),
+        (2, (at_most(1, 0, 5),), ("S0", "S5"), "at most 1 of S0, S5 may be taken, but 2 of them are kept"),
+        (4, (at_least(2, 0, 1), at_most(0, 1, 2)), (), "no set of sites meets the rules of groups 1, 2 together"),
     ],
 )
 def test_a_number_that_groups_do_not_allow_is_refused(choose, groups, kept, said):
@@ -66,5 +66,5 @@ def test_as_many_as_were_asked_for_are_taken(seed, choose, groups):
 def test_a_budget_that_pays_for_fewer_is_told():
     found = place(selection(choose=7, budget=3.0, cost=np.ones(SITES), groups=(at_most(1, 0, 5),)))
     assert len(found.chosen) == 3
-    assert "3 of the 7 sites that were asked for" in found.reason
-    assert "asked for" not in place(selection(budget=3.0, cost=np.ones(SITES))).reason
+    assert "only 3 of the 7 wanted sites" in found.reason
+    assert "wanted" not in place(selection(budget=3.0, cost=np.ones(SITES))).reason

@@ -211,20 +211,20 @@ def test_refinement_never_worsens_and_stays_inside(more, ground):
 
 
 BAD = {
-    "fewer candidates than k": ({"choose": 13}, "13 sites are wanted of 12 candidates"),
-    "nothing says how many": ({"choose": None}, "nothing says how many"),
+    "fewer candidates than k": ({"choose": 13}, "13 sites are wanted, but there are 12 candidates"),
+    "no number of sites": ({"choose": None}, "the number of sites to take is missing"),
     "no cost": ({"choose": None, "budget": 3.0}, "a budget needs a cost"),
     "unknown site": ({"kept": ("S99",)}, "there is no site 'S99'"),
     "kept and forbidden": ({"kept": ("S1",), "forbidden": ("S1",)}, "kept and forbidden"),
     "groups that contradict k": (
         {"groups": (CountGroup(tuple(f"S{i}" for i in range(12)), least=6),)},
-        "the groups need 6 at least",
+        "the groups need at least 6",
     ),
     "criterion": ({"criterion": "trace"}, "there is no criterion 'trace'"),
     "gap": ({"gap": 0.0}, "the gap 0 is not between"),
     "time": ({"seconds": 0.0}, "the time 0 s is not positive"),
     "place of another size": ({"places": np.zeros((3, 2))}, "the places have shape"),
-    "sight": ({"sight": np.full((4, 12), 0.5)}, "is not 0, 1 or a larger factor"),
+    "sight": ({"sight": np.full((4, 12), 0.5)}, "with values 0 or at least 1"),
 }
 
 
@@ -245,17 +245,17 @@ def test_a_place_that_too_few_sites_see_is_named():
 def test_places_and_sites_that_coincide_are_named():
     problem, at = hall()
     at[1] = problem.stations.position[0, 4]
-    with pytest.raises(InvalidProblem, match="place 2 is where station 'S4' stands"):
+    with pytest.raises(InvalidProblem, match="place 2 is at the position of station 'S4'"):
         place(SiteSelection(problem, at, choose=5))
     twice = assemble(np.vstack([problem.stations.position[0], problem.stations.position[0, 3]]), *MIXED["toa"](13))
-    with pytest.raises(InvalidProblem, match="stands where another one does"):
+    with pytest.raises(InvalidProblem, match="has the position of another station"):
         place(SiteSelection(twice, hall()[1], choose=5))
 
 
 def test_pairs_without_arrivals_are_refused():
     sites, at = drawn(1, 8, 2)
     pairs = assemble(sites, measured("tdoa", a=np.arange(1, 8), b=0, sigma=0.3))
-    with pytest.raises(InvalidProblem, match="pairs than another"):
+    with pytest.raises(InvalidProblem, match="each set of stations has other pairs"):
         place(SiteSelection(pairs, at, choose=4))
 
 

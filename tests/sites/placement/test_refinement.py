@@ -10,7 +10,7 @@ from sites.placement.scenes import hall
 from optloc import InvalidProblem
 from optloc.sites.placement import SiteSelection
 from optloc.sites.placement.areas import region_of
-from optloc.sites.placement.refinement import _check, _home, _information, _inside, _value
+from optloc.sites.placement.refinement import _check, _information, _inside, _nearest_region, _value
 from optloc.sites.placement.sites import candidates_of
 
 
@@ -44,7 +44,7 @@ def test_the_value_at_the_places_of_the_candidates_is_that_of_their_set(candidat
 def test_a_site_moves_to_the_nearest_region():
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     near, far = region_of(square, 0.0, 2.0), region_of(square + 10.0, 0.0, 2.0)
-    region, place = _home(np.array([2.0, 0.5, 3.0]), [far, near], None)
+    region, place = _nearest_region(np.array([2.0, 0.5, 3.0]), [far, near], None)
     assert region is near
     assert place == pytest.approx([1.0, 0.5, 2.0], abs=1e-6)
     assert _inside(np.array([0.5, 0.5, 1.0]), near, None)

@@ -102,7 +102,7 @@ def test_chosen_stations_are_written_with_their_rows(path, tmp_path):
     problem = read(tmp_path / "chosen.toml", values=False).problem
     assert {*problem.stations.names} == {"Old", "C2", "C4"}
     assert problem.count == 3
-    with pytest.raises(InvalidProblem, match=r"let its name end in \.toml"):
+    with pytest.raises(InvalidProblem, match=r"its name must end in \.toml"):
         write_chosen(read_selection(path), ("Old",), tmp_path / "chosen.csv", path)
 
 

@@ -68,12 +68,12 @@ def test_sets_of_sites_are_problems_without_the_other_rows(selection):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"choose": 7}, "7 sites are wanted of 6 candidates"),
-        ({"choose": None}, "nothing says how many sites"),
+        ({"choose": 7}, "7 sites are wanted, but there are 6 candidates"),
+        ({"choose": None}, "the number of sites to take is missing"),
         ({"gap": 1.0}, "the gap 1 is not between 0 and 1"),
         ({"criterion": "rmse"}, "there is no criterion 'rmse'; did you mean 'rms'"),
         ({"kept": ("Z",)}, "there is no site 'Z'"),
-        ({"weights": np.array([1.0, 0.0, 1.0])}, "are not so many positive numbers"),
+        ({"weights": np.array([1.0, 0.0, 1.0])}, "the weights are not 3 positive numbers"),
     ],
 )
 def test_what_cannot_be_selected_is_one_sentence(selection, change, said):
