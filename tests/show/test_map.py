@@ -148,5 +148,5 @@ def test_an_ellipse_that_does_not_cover_is_dotted_on_the_map(monkeypatch):
     fix = optloc.solve(problem)
     assert fixed_spots(problem, [fix], []).local.all()
     page = fix_page(problem, fix, "far from an ellipse")
-    assert "dotted: an ellipse that does not" in page
+    assert "dotted: a local ellipse, not valid" in page
     assert 'class="ring local"' in page

@@ -112,7 +112,7 @@ def test_what_does_not_cover_has_no_ellipse_anywhere(status, chart):
     results = on_earth(status, chart)
     root = ET.fromstring(kml(results))
     assert root.find(f".//{KML}Polygon") is None
-    assert "no ellipse covers" in root.find(f".//{KML}Placemark/{KML}description").text
+    assert "no valid ellipse" in root.find(f".//{KML}Placemark/{KML}description").text
     assert (status == "ok") != (f": {status}" in root.find(f".//{KML}Placemark/{KML}name").text)
     point = ET.fromstring(cot(results)).find("point")
     assert float(point.get("ce")) == float(point.get("le")) == 9999999.0
