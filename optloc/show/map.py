@@ -89,7 +89,7 @@ _SIZE = 1000.0
 # Extent of the drawn coast, in half sizes of the map along x and y. The script zooms out to 2.5 times the map, a screen
 # can be wider than the map, and the user can drag the map.
 _AROUND = np.array([6.0, 4.0])
-# Least ratio of the half sizes for the extent of the coast: the window of a narrow map is as wide as the page.
+# Minimum ratio of the half sizes for the extent of the coast: the window of a narrow map is as wide as the page.
 _NARROWEST = 0.8
 
 

@@ -148,7 +148,7 @@ def _asset(name: str) -> str:
 
 # Pages with an interactive map: of fixes or tracks, with ellipses and lines of position, or of a bound.
 
-# Most ellipses on a map: more are unreadable, and each ellipse adds 70 corners to the file.
+# Maximum number of ellipses on a map: more are unreadable, and each ellipse adds 70 corners to the file.
 _ELLIPSES = 200
 # Decimals of the units of the drawing: an ellipse of centimetres on a map of 1000 km is still round.
 _DIGITS = 5
@@ -156,7 +156,7 @@ _DIGITS = 5
 _LEAST = 1e-5
 # Share of the map on each side that stays free of marks, as room for the names of stations.
 _RIM = 0.22
-# Least ratio of the shorter side of a map to the longer side.
+# Minimum ratio of the shorter side of a map to the longer side.
 _SLIMMEST = 0.6
 # Size of a dot in pixels: a station, its white centre, a mark, and a mark if there are more than `_FEW`.
 _STATION, _MIDDLE, _MARK, _SMALL = 11, 7, 11, 5
@@ -359,7 +359,8 @@ def _dots(found: Spots, plane: Plane, middle: float, size: float) -> list[Drawn]
 
 # The map of a bound: coastlines, bound, stations and trials.
 
-# Most dots of trials: enough to show the distribution, few enough to see the bound below and to move the page smoothly.
+# Maximum number of dots of trials: enough to show the distribution, few enough to see the bound below and to move the
+# page smoothly.
 _DOTS = 400
 _RIGHT, _WRONG = 3, 5  # Pixels: wrong trials must be visible among many right trials.
 

@@ -118,7 +118,7 @@ def _spelled(position: Array) -> str:
 
 # g2o.
 
-# Least standard deviation of a prior, m: an exactly fixed coordinate has no finite information matrix.
+# Minimum standard deviation of a prior, m: an exactly fixed coordinate has no finite information matrix.
 _HELD = 1e-4
 _POINTS = {2: ("VERTEX_XY", "EDGE_PRIOR_XY"), 3: ("VERTEX_TRACKXYZ", "EDGE_POINTXYZ_PRIOR")}
 

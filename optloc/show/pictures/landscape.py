@@ -1,4 +1,4 @@
-"""The cost over the place of a target: why a fix is where it is, and where else it could be."""
+"""Pictures of the cost around a fix, and of the starts from which iterations reach the best fit."""
 
 from __future__ import annotations
 
@@ -34,18 +34,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = "YlGnBu_r"
-"""Dark where the cost is low, in steps of lightness."""
+"""Colour map of the cost: dark for a low cost; lightness increases with the cost."""
 
-# Points along each side of a panel: each is a problem of its own, and lines drawn through fewer show corners.
+# Points along each side of a panel: each point is a separate problem, and isolines through fewer points have corners.
 _POINTS = 121
-# Levels of the surroundings, standard deviations: a covariance holds near the fix, curvature shows further out.
+# Levels of the isolines around the fix, standard deviations. Near the fix the covariance describes them; farther away
+# their shape shows the nonlinearity.
 _SIGMAS = (1, 2, 3, 4, 5, 7, 10)
-# Chi-square of two degrees of freedom that holds 95 %: a plan has two coordinates.
+# 95 % quantile of chi-square with two degrees of freedom, the coordinates of a plan.
 _CHI2_95 = 5.991464547107979
-# Half the side of the surroundings in standard deviations of the larger coordinate: the 95 % ellipse (2.4) and a rim.
+# Half the side of the panel around the fix, in standard deviations of the larger coordinate: the 95 % ellipse (2.4) and
+# a margin.
 _AROUND = 4.2
 _NAME = "cost above that of the fix, square root (standard deviations)"
-# Rows times starts that are iterated at once, which memory holds; and the starts along a side that this allows.
+# Maximum number of rows times starts in one batch, limited by memory; and the resulting limits of the starts along a
+# side.
 _ROWS, _STARTS = 4e6, (31, 161)
 _NAMES = {"taylor": "plain Taylor iteration", "lsr": "damped least squares"}
 _ENDS = {
@@ -57,16 +60,16 @@ _COLOURS = {End.REACHED: BLUE, End.ELSEWHERE: YELLOW, End.NOWHERE: "#e4e4e4"}
 
 
 def plot_landscape(problem: Problem, fix: Fix, title: str = "") -> Figure:
-    """Return a plan of the cost around a fix: of everything, and of the surroundings of the fix.
+    """Return two plans of the cost: an overview, and the surroundings of the fix.
 
-    Colour is the root of the cost above that of the fix, in standard deviations. What else is unknown takes the values
-    that fit best at each place. In space the plan of everything is at the height of the fix; around the fix the height
-    takes the value that fits best, too, so that the line of 95 % and the ellipse say the same.
+    The colour is the root of the cost minus the cost of the fix, in standard deviations. At each point, the other
+    unknowns have the values of the best fit. In three dimensions, the overview is at the height of the fix. Around the
+    fix, the height has the value of the best fit too, so that the 95 % line can be compared with the ellipse.
 
     Parameters
     ----------
     problem : Problem
-        A single problem with one target that stands for the run.
+        A single problem with one target that has one position in the whole run.
     fix : Fix
         Its fix.
     title : str
@@ -75,12 +78,12 @@ def plot_landscape(problem: Problem, fix: Fix, title: str = "") -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.show.pictures.save`.
+        The picture; write it with `optloc.show.pictures.save`.
 
     Raises
     ------
     InvalidProblem
-        Where there are several fixes or targets, or no answer.
+        If there are several fixes or targets, or no fix.
     """
     flat, answer = single(problem, fix)
     scene = scene_of(flat, [answer])
@@ -94,7 +97,7 @@ def plot_landscape(problem: Problem, fix: Fix, title: str = "") -> Figure:
 
 
 def single(problem: Problem, fix: Fix) -> tuple[Problem, Fix]:
-    """Return a problem and its fix as flat batches of one; refuse what has no answer or not one position."""
+    """Return a problem and its fix as flat batches of one; raise InvalidProblem unless there is one position."""
     flat, answer = problem.flat(), fix.flat()
     sought = sum(motion.known is None for motion in problem.motions)
     if len(answer) != 1 or sought != 1 or not flat.layout.shares("position"):
@@ -106,7 +109,7 @@ def single(problem: Problem, fix: Fix) -> tuple[Problem, Fix]:
 
 
 def limits(scene: PictureScene, widen: float = 0.25) -> Array:
-    """Return the square [[x0, y0], [x1, y1]] that holds stations, fix and alternatives with a rim, metres."""
+    """Return the square [[x0, y0], [x1, y1]], m, that holds stations, fix and alternatives with a margin."""
     points = np.concatenate([scene.stations, scene.fixes, scene.alternatives])[:, :2]
     low, high = points.min(0), points.max(0)
     half = (0.5 + widen) * float((high - low).max() or 1.0)
@@ -115,7 +118,7 @@ def limits(scene: PictureScene, widen: float = 0.25) -> Array:
 
 
 def plane(corners: Array, count: int, above: Array) -> tuple[Array, Array, Array]:
-    """Return the grid of a square as x (n,), y (n,) and points (n n, d), at the height of a point (d,)."""
+    """Return the grid of a square: x (n,), y (n,) and points (n n, d), m, at the height of the point `above` (d,)."""
     x, y = (np.linspace(low, high, count) for low, high in corners.T)
     east, north = np.meshgrid(x, y)
     points = np.tile(above, (count * count, 1))
@@ -124,18 +127,18 @@ def plane(corners: Array, count: int, above: Array) -> tuple[Array, Array, Array
 
 
 def _excess(problem: Problem, fix: Fix, points: Array, held: int) -> Array:
-    """Return the root (n,) of the cost at points (n, d) along the picture's axes above the fix's.
+    """Return the root (n,) of the cost at points minus the cost of the fix, in standard deviations.
 
     Parameters
     ----------
     problem, fix : Problem, Fix
-        Of one position.
+        Problem and fix with one position.
     points : array (n, d)
-        Along the picture's axes.
+        Points along the axes of the picture, m.
     held : int
-        Coordinates that stay: all, or the plan while the height takes the value that fits best.
+        Number of fixed coordinates: all coordinates, or only the plan while the height has the value of the best fit.
     """
-    # The solver works in the problem's frame; what is held are directions of the picture.
+    # The solver works in the frame of the problem, but the fixed coordinates are along the axes of the picture.
     places, axes = placed_points(problem, points)
     cost = profile_cost(problem, fix.x[0], places, axes[:held])
     return np.asarray(np.sqrt(np.maximum(cost - fix.cost[0], 0.0)))
@@ -149,7 +152,7 @@ def _whole(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None
     x, y, grid = plane(corners, _POINTS, scene.fixes[0])
     excess = _excess(problem, fix, grid, problem.dimension).reshape(_POINTS, _POINTS)
     steps = levels(excess)
-    # At least a factor of two, or the scale would have one colour.
+    # The scale spans at least a factor of two, otherwise it has only one colour.
     norm = LogNorm(steps[0], max(steps[-1], 2.0 * steps[0]), clip=True)
     drawn = panel.pcolormesh(x / size, y / size, excess, norm=norm, cmap=COLOURS, rasterized=True, shading="nearest")
     panel.contour(x / size, y / size, excess, levels=steps, colors="white", linewidths=0.7)
@@ -171,7 +174,7 @@ def _near(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
     corners = np.stack([centre[:2] - half, centre[:2] + half])
     unit, size = unit_of(corners - centre[:2])
     x, y, grid = plane(corners, _POINTS, centre)
-    # The height takes the value that fits best: what the line of 95 % is then is the ellipse of the plan.
+    # The height has the value of the best fit, so the 95 % line of a linear problem is the ellipse of the plan.
     excess = _excess(problem, fix, grid, 2).reshape(_POINTS, _POINTS)
     x, y, corners = (x - centre[0]) / size, (y - centre[1]) / size, (corners - centre[:2]) / size
     drawn = panel.contourf(x, y, excess, levels=[0, *_SIGMAS], cmap=COLOURS, extend="max")
@@ -194,40 +197,39 @@ def _square(panel: Axes, scene: PictureScene, corners: Array, unit: str) -> None
     panel.set_ylim(*corners[:, 1])
 
 
-# Where iterations from many starts end, beside the fix that needs no start.
+# Convergence: results of iterations from many starts, compared with the fix, which needs no start.
 
 
 def plot_convergence(
     problem: Problem, fix: Fix, title: str = "", *, reach: float | None = None, starts: int | None = None
 ) -> Figure:
-    """Return a map of starts, coloured by where plain and damped iterations from there end, beside the fix.
+    """Return a map of starts, coloured by the result of plain and damped iterations from each start.
 
-    The fix is drawn with its lines of position, and what is around it.
-
-    Starts lie in the horizontal plane of the fix: the plain iteration is told the height.
+    A third panel shows the fix with its lines of position and its surroundings. Starts are in the horizontal plane of
+    the fix, so the plain iteration starts with the right height.
 
     Parameters
     ----------
     problem : Problem
-        A single problem with one target that stands for the run.
+        A single problem with one target that has one position in the whole run.
     fix : Fix
         Its fix, without a guess.
     title : str
         Title of the picture.
     reach : float, optional
-        Half the side of the square of starts, metres; by default it holds stations and fix three times.
+        Half the side of the square of starts, m. By default, the square is three times as wide as stations and fix.
     starts : int, optional
         Starts along each side of the square: 161, or fewer for long runs.
 
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.show.pictures.save`.
+        The picture; write it with `optloc.show.pictures.save`.
 
     Raises
     ------
     InvalidProblem
-        Where there are several fixes or targets, or no answer.
+        If there are several fixes or targets, or no fix.
     """
     flat, answer = single(problem, fix)
     scene = scene_of(flat, [answer])
@@ -257,7 +259,7 @@ def plot_convergence(
 
 
 def _inset(panel: Axes, scene: PictureScene) -> None:
-    """Draw the surroundings of the fix in a corner: in the plan of all starts its ellipse is a dot."""
+    """Draw the surroundings of the fix in a corner, because its ellipse is only a dot in the plan of all starts."""
     centre, covariance = scene.fixes[0], scene.covariances[0]
     half = _AROUND * float(np.sqrt(np.diagonal(covariance)[:2].max()))
     if not (np.isfinite(half) and half > 0.0):
@@ -279,7 +281,7 @@ def _inset(panel: Axes, scene: PictureScene) -> None:
 
 
 def verdict(fix: Fix) -> str:
-    """Return the status of a flat fix of one, and what is listed or proven."""
+    """Return the status of a flat fix of one, with the number of positions or the extent of the proof."""
     code, proof = int(fix.code[0]), fix.certificates[0].proof
     if code == Status.AMBIGUOUS:
         return f"ambiguous: {1 + int(np.isfinite(fix.alternatives.gap[0]).sum())} places listed"
