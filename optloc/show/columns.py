@@ -132,7 +132,7 @@ def fix_columns(
         targets = list(enumerate(_states_of(fix))) or [(0, ("position",))]
     if labels is None:
         labels = _numbered(flat, len(targets))
-    words = _told_in_words(
+    words = _text_columns(
         flat, any(map(len, fix.active.ravel())) if constrained is None and fix.active is not None else bool(constrained)
     )
     return join_tables([_of_target(flat, names, i, labels, dimension, words) for i, names in targets])
@@ -172,13 +172,15 @@ def _of_target(
     # solver was asked to compute it.
     spread = position.ndim == 3
     count = position.shape[1] if spread else 1
-    told = estimated and (not spread or fix.local is not None)
+    has_covariance = estimated and (not spread or fix.local is not None)
     columns = dict(labels(target, spread))
     position = position.reshape(n * count, d)
-    covariance = fix.covariance(names[0]).reshape(n * count, d, d) if told else np.full((n * count, d, d), np.nan)
-    open_ = fix.undetermined(names[0]).reshape(n * count, d) if told else np.zeros((n * count, d), dtype=bool)
+    covariance, undetermined = np.full((n * count, d, d), np.nan), np.zeros((n * count, d), dtype=bool)
+    if has_covariance:
+        covariance = fix.covariance(names[0]).reshape(n * count, d, d)
+        undetermined = fix.undetermined(names[0]).reshape(n * count, d)
     local = geodetic_columns(fix.frame, position, covariance)
-    covariance, lost = without_open(covariance, open_, "xyz")
+    covariance, undetermined_names = without_open(covariance, undetermined, "xyz")
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     columns |= _repeat(count, status=[one.label for one in statuses_of(fix.code)], reason=list(fix.reason))
     columns |= {axis: position[:, i] for i, axis in enumerate("xyz"[:d])}
@@ -186,15 +188,17 @@ def _of_target(
     columns |= covariance_columns(covariance, "xyz")
     for name in names[1:] if estimated else ():
         letter = _RATES[name.partition("[")[0]]
-        own = fix.sigma(name).reshape(n * count, d) if told else np.full((n * count, d), np.nan)
-        if told:
-            wild = fix.undetermined(name).reshape(n * count, d)
-            own, lost = np.where(wild, np.nan, own), _named_open(wild, [f"{letter}{axis}" for axis in "xyz"], lost)
-        for values, prefix in ((fix.take(name).reshape(n * count, d), letter), (own, f"sigma_{letter}")):
+        sigmas = fix.sigma(name).reshape(n * count, d) if has_covariance else np.full((n * count, d), np.nan)
+        if has_covariance:
+            undetermined = fix.undetermined(name).reshape(n * count, d)
+            sigmas = np.where(undetermined, np.nan, sigmas)
+            rates = [f"{letter}{axis}" for axis in "xyz"]
+            undetermined_names = _named_open(undetermined, rates, undetermined_names)
+        for values, prefix in ((fix.take(name).reshape(n * count, d), letter), (sigmas, f"sigma_{letter}")):
             columns |= {f"{prefix}{axis}": v for axis, v in zip("xyz", values.T, strict=False)}
     if "cov_ee" in local:
         limit = np.repeat(fix.widest(names[0]), count) if estimated else np.full(n * count, np.inf)
-        local, lost = _without_open_level(local, limit, lost)
+        local, undetermined_names = _without_open_level(local, limit, undetermined_names)
     columns |= local
     # Compute in blocks: the eigenvectors of a long table need more memory than the table.
     blocks = np.array_split(covariance, 1 + len(covariance) // _BLOCK)
@@ -207,45 +211,46 @@ def _of_target(
     tails = fix.has(Status.TAILS)
     columns |= {"tails": np.repeat(np.atleast_1d(tails), count)} if tails.any() else {}
     columns["alternatives"] = np.repeat(np.isfinite(fix.alternatives.gap).sum(-1), count)
-    columns |= {"undetermined": np.array(lost, dtype=object)} if any(lost) else {}
+    columns |= {"undetermined": np.array(undetermined_names, dtype=object)} if any(undetermined_names) else {}
     return columns | _repeat(count, **words)
 
 
-def without_open(covariance: Array, wild: Array, axes: str) -> tuple[Array, list[str]]:
+def without_open(covariance: Array, undetermined: Array, axes: str) -> tuple[Array, list[str]]:
     """Return covariances (n, d, d) with NaN for undetermined axes, and the names of these axes (n).
 
-    `wild` (n, d) is true for each undetermined axis.
+    `undetermined` (n, d) is true for each undetermined axis.
     """
-    hidden = np.where(wild[:, :, None] | wild[:, None, :], np.nan, covariance)
-    return hidden, _named_open(wild, axes, [""] * len(wild))
+    hidden = np.where(undetermined[:, :, None] | undetermined[:, None, :], np.nan, covariance)
+    return hidden, _named_open(undetermined, axes, [""] * len(undetermined))
 
 
-def _named_open(wild: Array, names: Sequence[str], before: Sequence[str]) -> list[str]:
-    """Return the texts in `before` (n), extended by the names of the undetermined entries `wild` (n, d)."""
-    if not wild.any():
+def _named_open(undetermined: Array, names: Sequence[str], before: Sequence[str]) -> list[str]:
+    """Return the texts in `before` (n), extended by the names of the entries (n, d) that are `undetermined`."""
+    if not undetermined.any():
         return list(before)
-    told = [[names[i] for i in np.flatnonzero(row).tolist()] for row in wild]
-    return ["; ".join([*([old] if old else []), *new]) for old, new in zip(before, told, strict=True)]
+    new_names = [[names[i] for i in np.flatnonzero(row).tolist()] for row in undetermined]
+    return ["; ".join([*([old] if old else []), *new]) for old, new in zip(before, new_names, strict=True)]
 
 
 _LEVEL = {"e": "east", "n": "north", "u": "up"}
 
 
-def _without_open_level(local: Columns, limit: Array, lost: Sequence[str]) -> tuple[Columns, list[str]]:
+def _without_open_level(local: Columns, limit: Array, before: Sequence[str]) -> tuple[Columns, list[str]]:
     """Return geodetic columns with NaN for undetermined level axes, and the names of all undetermined entries (n).
 
-    A level axis is undetermined if its standard deviation exceeds `limit` (n,), m. `lost` holds the names found before.
+    A level axis is undetermined if its standard deviation exceeds `limit` (n,), m. `before` (n) holds earlier names.
     """
     axes = [axis for axis in _LEVEL if f"cov_{axis}{axis}" in local]
     with np.errstate(invalid="ignore"):
-        wild = np.stack([local[f"cov_{axis}{axis}"] > limit**2 for axis in axes], axis=-1)
-    if not wild.any():
-        return local, list(lost)
-    pairs = {f"cov_{a}{b}": wild[:, i] | wild[:, i + j] for i, a in enumerate(axes) for j, b in enumerate(axes[i:])}
+        undetermined = np.stack([local[f"cov_{axis}{axis}"] > limit**2 for axis in axes], axis=-1)
+    if not undetermined.any():
+        return local, list(before)
+    numbered = list(enumerate(axes))
+    pairs = {f"cov_{a}{b}": undetermined[:, i] | undetermined[:, j] for i, a in numbered for j, b in numbered[i:]}
     hidden = {
         name: np.where(pairs[name], np.nan, values) if name in pairs else values for name, values in local.items()
     }
-    return hidden, _named_open(wild, [_LEVEL[axis] for axis in axes], lost)
+    return hidden, _named_open(undetermined, [_LEVEL[axis] for axis in axes], before)
 
 
 def level_covariance(columns: Columns, i: int) -> Array:
@@ -261,7 +266,7 @@ def _repeat(count: int, **texts: Sequence[str]) -> Columns:
     return {name: np.repeat(np.array(list(values), dtype=object), count) for name, values in texts.items()}
 
 
-def _told_in_words(fix: Fix, constrained: bool) -> dict[str, list[str]]:
+def _text_columns(fix: Fix, constrained: bool) -> dict[str, list[str]]:
     """Return text columns (n entries each): proof, findings, chart, active constraints and suspects.
 
     "A; B" means A and B together. "A | B" means either A or B explains the data.
@@ -272,9 +277,9 @@ def _told_in_words(fix: Fix, constrained: bool) -> dict[str, list[str]]:
     texts["findings"] = [found[each] for each in findings]
     texts["chart"] = [""] * len(fix) if fix.chart is None else list(fix.chart.name)
     if constrained:
-        held = [()] * len(fix) if fix.active is None else fix.active
-        texts["active"] = ["; ".join(active.name for active in each) for each in held]
-        texts["multipliers"] = ["; ".join(f"{active.multiplier:.6g}" for active in each) for each in held]
+        active_sets = [()] * len(fix) if fix.active is None else fix.active
+        texts["active"] = ["; ".join(active.name for active in each) for each in active_sets]
+        texts["multipliers"] = ["; ".join(f"{active.multiplier:.6g}" for active in each) for each in active_sets]
     if fix.explanations is not None:
         texts["suspects"] = [" | ".join("; ".join(e.names) for e in each) for each in fix.explanations]
     return texts
@@ -369,13 +374,13 @@ def _chart_json(fix: Fix) -> dict[str, Any] | None:
     chart = fix.chart
     if chart is None or not bool(fix.answered):
         return None
-    told: dict[str, Any] = {"name": str(chart.name), "centre": chart.centre}
+    record: dict[str, Any] = {"name": str(chart.name), "centre": chart.centre}
     if chart.kind == INVERSE_RANGE:
-        told |= {"distance": chart.distance, "direction": chart.direction, "basis": chart.basis}
-        told |= {"mean": chart.mean, "covariance": chart.spread}
+        record |= {"distance": chart.distance, "direction": chart.direction, "basis": chart.basis}
+        record |= {"mean": chart.mean, "covariance": chart.spread}
     if chart.cut_off:
-        told["mean"] = fix.gaussian()[0][: chart.position.shape[-1]]
-        told |= {f"{axis}95": fix.interval(axis) for axis in AXES[: chart.position.shape[-1]]}
+        record["mean"] = fix.gaussian()[0][: chart.position.shape[-1]]
+        record |= {f"{axis}95": fix.interval(axis) for axis in AXES[: chart.position.shape[-1]]}
     if chart.kind != CURVED and not fix.undetermined().any():
-        told["range95"] = fix.interval("range")
-    return told
+        record["range95"] = fix.interval("range")
+    return record

@@ -128,18 +128,18 @@ def known_features(fix: Fix, frame: Frame) -> list[tuple[dict[str, Any], dict[st
         return []
     found = fix.determined
     assert found is not None
-    told: list[tuple[dict[str, Any], dict[str, Any]]] = []
+    features: list[tuple[dict[str, Any], dict[str, Any]]] = []
     for one, about in zip(shown_directions(fix, found), found.to_dict()["directions"], strict=False):
         kept = {name: value for name, value in about.items() if name not in ("vector", "outline")}
         reach = reach_of(fix, one)
         wedge = polygon_geometry([[earth_line(frame, _fine(found.wedge(one, reach)))]])
-        told.append((wedge, {"role": "direction95", "cut": not one.mixed, **kept}))
+        features.append((wedge, {"role": "direction95", "cut": not one.mixed, **kept}))
         ray = line_geometry([earth_line(frame, _fine(found.ray(one, reach)))])
-        told.append((ray, {"role": "ray", "cut": not one.mixed, "gap": one.gap}))
+        features.append((ray, {"role": "ray", "cut": not one.mixed, "gap": one.gap}))
     if found.curve is not None:
         line = line_geometry([earth_line(frame, found.curve)])
-        told.append((line, {"role": "curve", "name": found.curve_name}))
-    return told
+        features.append((line, {"role": "curve", "name": found.curve_name}))
+    return features
 
 
 def reach_of(fix: Fix, one: Direction) -> float:

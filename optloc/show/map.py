@@ -337,10 +337,10 @@ def fixed_spots(problem: Problem, fixes: Sequence[Fix], labels: Sequence[str]) -
         for fix in fixes
         for code, alone in zip(np.ravel(fix.code), np.ravel(fix.unchecked), strict=True)
     ]
-    named = list(labels) if len(labels) == len(position) > 1 else [""] * len(position)
-    told = status if len(status) == len(position) else ["" if ok else "status not ok" for ok in clean]
+    names = list(labels) if len(labels) == len(position) > 1 else [""] * len(position)
+    status_texts = status if len(status) == len(position) else ["" if ok else "status not ok" for ok in clean]
     sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
-    sentences = [sentence(*each) for each in zip(named, told, degrees(problem, position), sigma, strict=True)]
+    sentences = [sentence(*each) for each in zip(names, status_texts, degrees(problem, position), sigma, strict=True)]
     outlines = regions_of(problem, fixes, len(position), [level_planes(problem, position)])
     for i, regions in enumerate(outlines):
         sentences[i] += ", 95 % region larger than drawn" if any(region.cut for region in regions) else ""
@@ -383,9 +383,9 @@ def ground_tracks(problem: Problem) -> list[tuple[str, Array]]:
 
     Longitudes continue beyond 180 degrees, so that a track has no jump at the antimeridian.
     """
-    heard = [index for rows in problem.rows if MODELS[rows.kind].velocity for index in (rows.a, rows.b)]
+    used = [index for rows in problem.rows if MODELS[rows.kind].velocity for index in (rows.a, rows.b)]
     found = []
-    for station in np.unique(np.concatenate([*heard, [-1]]))[1:].tolist():
+    for station in np.unique(np.concatenate([*used, [-1]]))[1:].tolist():
         track = problem.stations.position.reshape(-1, *problem.stations.position.shape[-3:])[0, :, station]
         lat, lon, height = problem.frame.to_geodetic(thinned(track))
         if height.min() > _SKY:

@@ -351,8 +351,8 @@ def _ellipses(found: Spots, plane: Plane, middle: float) -> list[Drawn]:
 
 def _dots(found: Spots, plane: Plane, middle: float, size: float) -> list[Drawn]:
     return [
-        dot(x, y, BLUE if ok else ORANGE, size, told)
-        for (x, y), ok, told in zip(plane(_turn(found.place, middle)), found.clean, found.text, strict=True)
+        dot(x, y, BLUE if ok else ORANGE, size, text)
+        for (x, y), ok, text in zip(plane(_turn(found.place, middle)), found.clean, found.text, strict=True)
         if np.isfinite(x)
     ]
 

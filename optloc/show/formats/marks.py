@@ -363,5 +363,5 @@ def geojson(results: Results) -> dict[str, Any]:
         for other in mark.others:
             doubt = {"gap": other.gap, "probability": other.probability}
             features.append(feature(point_geometry(other.place), {"role": "alternative", **about, **doubt}))
-        features += [feature(geometry, {**own, **about}) for geometry, own in known]
+        features += [feature(geometry, {**attributes, **about}) for geometry, attributes in known]
     return {"type": "FeatureCollection", "features": features}

@@ -132,8 +132,8 @@ def _mark_stations(axes: Axes, stations: Array, names: Sequence[str], x: Array, 
 def _drawn(found: BoundMap, *, dilution: bool) -> tuple[Array, str]:
     values = found.dilution if dilution else found.sigma
     if dilution and not np.isfinite(found.row):
-        advice = "ask for the bound in metres"
-        raise InvalidProblem("rows that are not all lengths have no common dilution", "map", advice)
+        advice = "draw the bound in metres"
+        raise InvalidProblem("the rows are not all lengths, so they have no dilution of precision", "map", advice)
     if not np.isfinite(values).any():
         advice = "add rows, or choose another height or place"
         raise InvalidProblem("the geometry is singular everywhere on the map", "map", advice)
@@ -222,7 +222,8 @@ def status_geojson(found: StatusMap) -> dict[str, Any]:
     features = _station_features(grid)
     for j, lat in enumerate(grid.y):
         for i, lon in enumerate(grid.x):
-            told = {one.label: float(share) for one, share in zip(shares.statuses, shares.share[j, i], strict=True)}
-            about = {"role": "status", "height": grid.height, "trials": shares.trials, "share": told}
+            pairs = zip(shares.statuses, shares.share[j, i], strict=True)
+            by_status = {status.label: float(share) for status, share in pairs}
+            about = {"role": "status", "height": grid.height, "trials": shares.trials, "share": by_status}
             features.append(feature(point_geometry(np.array([lon, lat]), _DIGITS), about))
     return {"type": "FeatureCollection", "features": features}

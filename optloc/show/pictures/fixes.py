@@ -283,7 +283,7 @@ def draw_lines(panel: Axes, found: Sequence[PositionLine], centre: Array, size: 
 
     for kind, colour in zip(dict.fromkeys(one.kind for one in found), cycle((PURPLE, SKY, GREEN, YELLOW))):
         lines = [(one.line - centre) / size for one in found if one.kind == kind]
-        label = _SHAPES.get(kind, f"where one {kind.removeprefix(RAY)} alone would put it")
+        label = _SHAPES.get(kind, f"positions that fit one {kind.removeprefix(RAY)}")
         # Curves do not change the limits of a plan (autolim=False), because they can be much longer than the scene.
         look: dict[str, Any] = {"colors": colour, "linewidths": 1.0, "alpha": 0.8, "zorder": 1}
         panel.add_collection(LineCollection(lines, label=label, **look), autolim=False)
@@ -401,7 +401,7 @@ def isodopplers(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -
 def _spread(rates: Sequence[Rows], target: int) -> list[tuple[Rows, int]]:
     """Return the rows of a target with positive weight; if they are many, evenly chosen rows."""
     present = [(rows.weight.reshape(-1, rows.count)[0] > 0.0) & (rows.target == target) for rows in rates]
-    every = [(rows, i) for rows, own in zip(rates, present, strict=True) for i in np.flatnonzero(own).tolist()]
+    every = [(rows, i) for rows, mask in zip(rates, present, strict=True) for i in np.flatnonzero(mask).tolist()]
     return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(_CURVES, len(every))).astype(int)).tolist()]
 
 

@@ -46,7 +46,7 @@ _CHI2_95 = 5.991464547107979
 # Half the side of the panel around the fix, in standard deviations of the larger coordinate: the 95 % ellipse (2.4) and
 # a margin.
 _AROUND = 4.2
-_NAME = "cost above that of the fix, square root (standard deviations)"
+_NAME = "root of the cost minus the cost of the fix (standard deviations)"
 # Maximum number of rows times starts in one batch, limited by memory; and the resulting limits of the starts along a
 # side.
 _ROWS, _STARTS = 4e6, (31, 161)
@@ -54,7 +54,7 @@ _NAMES = {"taylor": "plain Taylor iteration", "lsr": "damped least squares"}
 _ENDS = {
     End.REACHED: "the best fit",
     End.ELSEWHERE: "a worse fit elsewhere",
-    End.NOWHERE: "nowhere: it does not converge",
+    End.NOWHERE: "no convergence",
 }
 _COLOURS = {End.REACHED: BLUE, End.ELSEWHERE: YELLOW, End.NOWHERE: "#e4e4e4"}
 
@@ -101,10 +101,10 @@ def single(problem: Problem, fix: Fix) -> tuple[Problem, Fix]:
     flat, answer = problem.flat(), fix.flat()
     sought = sum(motion.known is None for motion in problem.motions)
     if len(answer) != 1 or sought != 1 or not flat.layout.shares("position"):
-        what = f"{len(answer)} fixes of {sought} targets are more than one position"
+        what = f"the picture shows one position, but there are {len(answer)} fixes of {sought} targets"
         raise InvalidProblem(what, "plot", "draw one epoch, or a run of one target")
     if not np.isfinite(answer.x).all():
-        raise InvalidProblem(f"there is no fix to draw around: {answer.reason[0]}", "plot", "see `optloc fix`")
+        raise InvalidProblem(f"the problem has no fix: {answer.reason[0]}", "plot", "see `optloc fix`")
     return flat, answer
 
 
@@ -126,7 +126,7 @@ def plane(corners: Array, count: int, above: Array) -> tuple[Array, Array, Array
     return x, y, points
 
 
-def _excess(problem: Problem, fix: Fix, points: Array, held: int) -> Array:
+def _excess(problem: Problem, fix: Fix, points: Array, fixed: int) -> Array:
     """Return the root (n,) of the cost at points minus the cost of the fix, in standard deviations.
 
     Parameters
@@ -135,12 +135,12 @@ def _excess(problem: Problem, fix: Fix, points: Array, held: int) -> Array:
         Problem and fix with one position.
     points : array (n, d)
         Points along the axes of the picture, m.
-    held : int
+    fixed : int
         Number of fixed coordinates: all coordinates, or only the plan while the height has the value of the best fit.
     """
     # The solver works in the frame of the problem, but the fixed coordinates are along the axes of the picture.
     places, axes = placed_points(problem, points)
-    cost = profile_cost(problem, fix.x[0], places, axes[:held])
+    cost = profile_cost(problem, fix.x[0], places, axes[:fixed])
     return np.asarray(np.sqrt(np.maximum(cost - fix.cost[0], 0.0)))
 
 
@@ -159,7 +159,7 @@ def _whole(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None
     style.stations(panel, scene, PLAN, size, edgecolors="white", linewidths=0.8)
     style.points(panel, scene, PLAN, size)
     _square(panel, scene, corners / size, unit)
-    panel.set_title("everything" if problem.dimension == 2 else "everything, at the height of the fix")
+    panel.set_title("overview" if problem.dimension == 2 else "overview, at the height of the fix")
     bar = panel.figure.colorbar(drawn, ax=panel, label=_NAME, ticks=steps, format=lambda value, _: f"{value:g}")
     bar.ax.minorticks_off()
 
@@ -179,9 +179,9 @@ def _near(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
     x, y, corners = (x - centre[0]) / size, (y - centre[1]) / size, (corners - centre[:2]) / size
     drawn = panel.contourf(x, y, excess, levels=[0, *_SIGMAS], cmap=COLOURS, extend="max")
     panel.contour(x, y, excess, levels=_SIGMAS, colors="white", linewidths=0.7)
-    panel.figure.colorbar(drawn, ax=panel, label="the same (standard deviations)")
+    panel.figure.colorbar(drawn, ax=panel, label=_NAME)
     panel.contour(x, y, excess, levels=[np.sqrt(_CHI2_95)], colors=ORANGE, linewidths=2.0)
-    panel.plot([], [], color=ORANGE, linewidth=2.0, label="95 % by the cost")
+    panel.plot([], [], color=ORANGE, linewidth=2.0, label="95 % region by the cost")
     moved = scene.moved(lambda place: place - np.pad(centre[:2], (0, len(centre) - 2)))
     style.ellipses(panel, moved, PLAN, size, color=BLACK, linestyle="--", linewidth=1.4)
     panel.scatter(0.0, 0.0, marker="o", s=50, color=BLUE, edgecolors="white", zorder=4)
@@ -284,7 +284,7 @@ def verdict(fix: Fix) -> str:
     """Return the status of a flat fix of one, with the number of positions or the extent of the proof."""
     code, proof = int(fix.code[0]), fix.certificates[0].proof
     if code == Status.AMBIGUOUS:
-        return f"ambiguous: {1 + int(np.isfinite(fix.alternatives.gap[0]).sum())} places listed"
+        return f"ambiguous: {1 + int(np.isfinite(fix.alternatives.gap[0]).sum())} positions listed"
     proven = {"global": ": proven best everywhere", "region": ": proven best in its region"}
     return f"status {Status(code).label}{proven.get(proof, '')}"
 

@@ -48,14 +48,14 @@ def outlines_of(problem: Problem, fix: Fix, planes: Sequence[Array], level: floa
     if flat.chart is None:
         return [[] for _ in range(len(flat))]
     shaped = ((flat.chart.kind != CARTESIAN) | flat.chart.cut_off) & np.isfinite(flat.cov).all((-1, -2))
-    own = _one_each(problem, len(flat))
-    if own is None or shaped.sum() > _MOST:
+    problems = _one_each(problem, len(flat))
+    if problems is None or shaped.sum() > _MOST:
         return [[] for _ in range(len(flat))]
     found: list[list[Outline]] = []
     for i in range(len(flat)):
         made = []
         if shaped[i]:
-            one, fixed = own.take(np.array([i])), flat[i]
+            one, fixed = problems.take(np.array([i])), flat[i]
             made = [outline_of(one, fixed, plane if plane.ndim == 2 else plane[i], level) for plane in planes]
         found.append([] if any(one is None for one in made) else [one for one in made if one is not None])
     return found
@@ -212,15 +212,15 @@ def _cut(rings: Sequence[Array]) -> list[list[Array]]:
 def _joined(parts: list[Array]) -> list[Array]:
     """Return closed lines from parts that begin and end on the edge of the map, joined along the edge."""
     begins = [_along(part[0]) for part in parts]
-    left, found = set(range(len(parts))), []
-    while left:
-        first = here = min(left)
+    unused, found = set(range(len(parts))), []
+    while unused:
+        first = here = min(unused)
         line: list[Array] = []
         while here != first or not line:
-            left.discard(here)
+            unused.discard(here)
             line.append(parts[here])
             end = _along(parts[here][-1])
-            here = min({*left, first}, key=lambda i: (begins[i] - end) % _AROUND)
+            here = min({*unused, first}, key=lambda i: (begins[i] - end) % _AROUND)
             way = (begins[here] - end) % _AROUND
             for corner, place in sorted(_EDGES.items(), key=lambda each: (each[0] - end) % _AROUND):
                 if (corner - end) % _AROUND < way:

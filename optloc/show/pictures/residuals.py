@@ -74,7 +74,9 @@ def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
         what = f"{len(answers)} fixes do not belong to {flat.batch_shape[0]} problems"
         raise InvalidProblem(what, "plot", "give the problem that was fixed; see `optloc.problem.by_epoch`")
     if not len(good):
-        raise InvalidProblem("nothing was fixed, so there are no residuals", "plot", "see `optloc fix` for the reasons")
+        raise InvalidProblem(
+            "no epoch has a fix, so there are no residuals", "plot", "see `optloc fix` for the reasons"
+        )
     part, vectors = flat.take(good), answers.x[good]
     residual = differentiate(part, vectors)[0]
     sigma = np.broadcast_to(np.sqrt(variances(weighed(part, vectors).noise, part.count)), residual.shape)
@@ -92,10 +94,10 @@ def _sets(problem: Problem, rows: Rows, residual: Array, sigma: Array, weight: A
     labels = [_label(names, a, b) for a, b in zip(rows.a, rows.b, strict=True)]
     found: Sets = {}
     for name in dict.fromkeys(labels):
-        own = np.array([label == name for label in labels])
-        present = weight[:, own] > 0.0
+        mask = np.array([label == name for label in labels])
+        present = weight[:, mask] > 0.0
         if present.any():
-            found[name] = (residual[:, own][present], float(np.median(sigma[:, own][present])))
+            found[name] = (residual[:, mask][present], float(np.median(sigma[:, mask][present])))
     # Keep the stations with the largest residuals in sigmas, in the order of the file.
     worst = sorted(found, key=lambda name: -float(np.abs(found[name][0]).max() / found[name][1]))[:_SHOWN]
     return {name: values for name, values in found.items() if name in worst}
@@ -128,30 +130,30 @@ def _panel(panel: Axes, kind: str, sets: Sets) -> None:
     # Use milliradians: residuals in radians have too many zeros.
     factor, unit = (1e3, f"m{unit}") if unit == "rad" else (1.0, unit)
     for place, (values, sigma) in enumerate(sets.values()):
-        own, bar = factor * values, 2.0 * factor * sigma
+        scaled, bar = factor * values, 2.0 * factor * sigma
         panel.hlines(place, -bar, bar, color=GREY, linewidth=5.0, alpha=0.5, label=_once(place, "± 2 sigma of a row"))
-        if len(own) > _FEW:
+        if len(scaled) > _FEW:
             low, left, middle, right, high = np.percentile(
-                own, (_WHISKERS[0], _MIDDLE[0], 50.0, _MIDDLE[1], _WHISKERS[1])
+                scaled, (_WHISKERS[0], _MIDDLE[0], 50.0, _MIDDLE[1], _WHISKERS[1])
             )
             panel.hlines(place, low, high, color=BLUE, linewidth=1.2, zorder=3, label=_once(place, "95 % of residuals"))
             style: dict[str, Any] = {"height": 0.5, "color": SKY, "edgecolor": BLUE, "zorder": 3}
             panel.barh(place, right - left, left=left, label=_once(place, "middle half"), **style)
             panel.scatter(middle, place, marker="|", s=70, color=BLACK, zorder=4, label=_once(place, "median"))
             continue
-        far = np.abs(own) > _BEYOND * factor * sigma
+        far = np.abs(scaled) > _BEYOND * factor * sigma
         for chosen, colour, mark, name in (
             (~far, BLUE, "o", "residual"),
             (far, ORANGE, "X", "residual beyond 3 sigma"),
         ):
             if chosen.any():
                 panel.scatter(
-                    own[chosen], np.full(chosen.sum(), place), color=colour, marker=mark, zorder=4, label=name
+                    scaled[chosen], np.full(chosen.sum(), place), color=colour, marker=mark, zorder=4, label=name
                 )
     panel.axvline(0.0, color=BLACK, linewidth=0.8, zorder=1)
     panel.set_yticks(range(len(sets)), [literal(name) for name in sets])
     panel.set_ylim(len(sets) - 0.4, -0.6)
-    panel.set_xlabel(f"measured less modelled ({unit})" if unit != "1" else "measured less modelled")
+    panel.set_xlabel(f"measured minus modelled ({unit})" if unit != "1" else "measured minus modelled")
     panel.set_title(kind, fontsize=10)
     grid(panel)
 
@@ -214,7 +216,8 @@ def _health_panel(panel: Axes, health: Health, unit: str, groups: Array) -> None
     _limit(panel, np.abs([low, high]).max(0), factor * health.bias[groups], shown)
     panel.axvline(0.0, color=BLACK, linewidth=0.8, zorder=0)
     panel.set_yticks(place, [literal(health.names[g]) for g in groups])
-    panel.set_xlabel(f"measured less predicted by the others ({shown})" if shown != "1" else "measured less predicted")
+    label = "measured minus predicted from other stations"
+    panel.set_xlabel(f"{label} ({shown})" if shown != "1" else label)
     panel.set_ylim(-0.7, len(groups) - 0.3)
     panel.grid(axis="x", color=GREY, alpha=0.3, linewidth=0.6)
     words = [f"{health.outliers[g]:.1%} of {health.count[g]}" for g in groups]
@@ -226,9 +229,9 @@ def _health_panel(panel: Axes, health: Health, unit: str, groups: Array) -> None
 
 def _well_checked(health: Health, group: int) -> Array:
     """Return the residuals of a group, without residuals whose prediction error is much larger than the median."""
-    own = health.group == group
-    sigma = health.sigma[own]
-    return np.asarray(health.residual[own][sigma <= _VAGUE * np.median(sigma)])
+    mask = health.group == group
+    sigma = health.sigma[mask]
+    return np.asarray(health.residual[mask][sigma <= _VAGUE * np.median(sigma)])
 
 
 def _limit(panel: Axes, whisker: Array, bias: Array, unit: str) -> None:

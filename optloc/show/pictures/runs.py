@@ -85,10 +85,10 @@ def plot_accuracy(
     for name, values in {"the bound": bound, **errors}.items():
         if np.shape(values) != noise.shape:
             raise InvalidProblem(
-                f"{name} has {np.size(values)} values for {noise.size} noises", "plot", "give one each"
+                f"{name} has {np.size(values)} values for {noise.size} noises", "plot", "give one value for each noise"
             )
     if not (noise > 0.0).all():
-        raise InvalidProblem("a noise is not positive", "noise", "leave it out: the axis is logarithmic")
+        raise InvalidProblem("a noise is not positive", "noise", "omit it, because the axis is logarithmic")
     figure = figure_class()(figsize=(6.2, 4.4), layout="constrained")
     axes = figure.subplots()
     # Draw the bound wide and pale behind the methods: curves of efficient methods are on top of it.

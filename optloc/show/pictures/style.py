@@ -217,8 +217,8 @@ def _settle(note: Annotation, panel: Axes, taken: list[Any]) -> Any:
     for place in _PLACES:
         _put(note, place)
         box = note.get_window_extent()
-        held = inside.x0 <= box.x0 and box.x1 <= inside.x1 and inside.y0 <= box.y0 and box.y1 <= inside.y1
-        if held and not any(box.overlaps(other) for other in taken):
+        fits = inside.x0 <= box.x0 and box.x1 <= inside.x1 and inside.y0 <= box.y0 and box.y1 <= inside.y1
+        if fits and not any(box.overlaps(other) for other in taken):
             return box
     _put(note, _PLACES[0])
     return note.get_window_extent()
@@ -480,8 +480,9 @@ def states_of(fix: Fix) -> list[tuple[Array, Array, Array]]:
             # Positions of single epochs in a run have a covariance only if the solver was asked to compute it.
             covariance = np.full((len(position), d, d), np.nan)
             if shared:  # NaN removes the undetermined axes only.
-                wild = flat.undetermined(slot.name)
-                covariance = np.where(wild[:, :, None] | wild[:, None, :], np.nan, flat.covariance(slot.name))
+                undetermined = flat.undetermined(slot.name)
+                hidden = undetermined[:, :, None] | undetermined[:, None, :]
+                covariance = np.where(hidden, np.nan, flat.covariance(slot.name))
             found.append((position, covariance, np.repeat(flat.code == Status.OK, len(position) // len(flat))))
     return found
 
@@ -552,7 +553,7 @@ def ellipses(panel: Axes, scene: PictureScene, view: View, size: float, **style:
     for i, (centre, covariance, regions) in enumerate(zip(scene.fixes, scene.covariances, outlines, strict=True)):
         region, place = regions.get(view), centre[list(view)]
         around = [] if region is None else [np.append(place + line, [[np.nan] * 2], axis=0) for line in region.lines]
-        label = "local ellipse: it does not cover" if local[i] else "95 % ellipse"
+        label = "local ellipse: not valid as 95 % region" if local[i] else "95 % ellipse"
         if region is not None:
             label = "95 % region, cut off" if region.cut else "95 % region"
         dashes = {"linestyle": ":"} if local[i] else {}

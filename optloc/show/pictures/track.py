@@ -200,7 +200,7 @@ def _heights(panel: Axes, lines: Sequence[_Line], name: str) -> None:
         band = (line.position[:, 2] - _95 * sigma, line.position[:, 2] + _95 * sigma)
         panel.fill_between(line.times, *band, color=colour, alpha=0.2, linewidth=0.0)
     panel.set_ylabel(f"{name} (m)")
-    panel.set_title("height, and 95 % of it")
+    panel.set_title("height, with 95 % interval")
 
 
 def _sigmas(panel: Axes, lines: Sequence[_Line]) -> None:
