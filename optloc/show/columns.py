@@ -26,8 +26,8 @@ Columns = dict[str, Array]
 """A table: columns (rows,) by name, in SI units and degrees; NaN marks a missing number."""
 
 UNCHECKED = "no redundancy: a wrong measurement would not be noticed"
-TAILS = "the 95 % figures hold, the 99.9 % region does not"
-ROBUST = "the minima of the loss were found by a search"
+TAILS = "the 95 % region is valid, the 99.9 % region is not"
+ROBUST = "a search found the minima of the loss"
 RESCALED = "the noise is larger than stated"
 """Notes that follow the status of a fix: `unchecked`, `tails`, `robust` and `rescaled`."""
 
@@ -135,7 +135,7 @@ def fix_columns(
     words = _text_columns(
         flat, any(map(len, fix.active.ravel())) if constrained is None and fix.active is not None else bool(constrained)
     )
-    return join_tables([_of_target(flat, names, i, labels, dimension, words) for i, names in targets])
+    return join_tables([_target_rows(flat, names, i, labels, dimension, words) for i, names in targets])
 
 
 def _states_of(fix: Fix) -> list[tuple[str, ...]]:
@@ -158,7 +158,7 @@ def _numbered(fix: Fix, targets: int) -> Labels:
     return labels
 
 
-def _of_target(
+def _target_rows(
     fix: Fix, names: Sequence[str], target: int, labels: Labels, dimension: int, words: Mapping[str, Sequence[str]]
 ) -> Columns:
     """Return the rows of one target; `names` holds the names of its position, velocity and acceleration.
@@ -193,12 +193,12 @@ def _of_target(
             undetermined = fix.undetermined(name).reshape(n * count, d)
             sigmas = np.where(undetermined, np.nan, sigmas)
             rates = [f"{letter}{axis}" for axis in "xyz"]
-            undetermined_names = _named_open(undetermined, rates, undetermined_names)
+            undetermined_names = _append_names(undetermined, rates, undetermined_names)
         for values, prefix in ((fix.take(name).reshape(n * count, d), letter), (sigmas, f"sigma_{letter}")):
             columns |= {f"{prefix}{axis}": v for axis, v in zip("xyz", values.T, strict=False)}
     if "cov_ee" in local:
         limit = np.repeat(fix.widest(names[0]), count) if estimated else np.full(n * count, np.inf)
-        local, undetermined_names = _without_open_level(local, limit, undetermined_names)
+        local, undetermined_names = _hide_undetermined_levels(local, limit, undetermined_names)
     columns |= local
     # Compute in blocks: the eigenvectors of a long table need more memory than the table.
     blocks = np.array_split(covariance, 1 + len(covariance) // _BLOCK)
@@ -221,10 +221,10 @@ def without_open(covariance: Array, undetermined: Array, axes: str) -> tuple[Arr
     `undetermined` (n, d) is true for each undetermined axis.
     """
     hidden = np.where(undetermined[:, :, None] | undetermined[:, None, :], np.nan, covariance)
-    return hidden, _named_open(undetermined, axes, [""] * len(undetermined))
+    return hidden, _append_names(undetermined, axes, [""] * len(undetermined))
 
 
-def _named_open(undetermined: Array, names: Sequence[str], before: Sequence[str]) -> list[str]:
+def _append_names(undetermined: Array, names: Sequence[str], before: Sequence[str]) -> list[str]:
     """Return the texts in `before` (n), extended by the names of the entries (n, d) that are `undetermined`."""
     if not undetermined.any():
         return list(before)
@@ -235,7 +235,7 @@ def _named_open(undetermined: Array, names: Sequence[str], before: Sequence[str]
 _LEVEL = {"e": "east", "n": "north", "u": "up"}
 
 
-def _without_open_level(local: Columns, limit: Array, before: Sequence[str]) -> tuple[Columns, list[str]]:
+def _hide_undetermined_levels(local: Columns, limit: Array, before: Sequence[str]) -> tuple[Columns, list[str]]:
     """Return geodetic columns with NaN for undetermined level axes, and the names of all undetermined entries (n).
 
     A level axis is undetermined if its standard deviation exceeds `limit` (n,), m. `before` (n) holds earlier names.
@@ -250,7 +250,7 @@ def _without_open_level(local: Columns, limit: Array, before: Sequence[str]) -> 
     hidden = {
         name: np.where(pairs[name], np.nan, values) if name in pairs else values for name, values in local.items()
     }
-    return hidden, _named_open(undetermined, [_LEVEL[axis] for axis in axes], before)
+    return hidden, _append_names(undetermined, [_LEVEL[axis] for axis in axes], before)
 
 
 def level_covariance(columns: Columns, i: int) -> Array:

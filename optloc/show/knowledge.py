@@ -56,14 +56,14 @@ def known_rows(fix: Fix) -> list[tuple[str, str]]:
     rows += [(f"95 % {one.name}", _quantity_text(one)) for one in found.quantities]
     if found.quantities and found.axis is not None:
         way = ", ".join(f"{value:.2f}" for value in found.axis)
-        shape = "line along" if any(one.name == "angle to line" for one in found.quantities) else "plane across"
-        rows.append(("stations", f"on a {shape} ({way}) through {_place(found)}"))
+        shape = "line along" if any(one.name == "angle to line" for one in found.quantities) else "plane normal to"
+        rows.append(("stations", f"on a {shape} ({way}) through {_centre_text(found)}"))
     if found.curve is not None:
         rows.append(("curve", f"{found.curve_name}: fix.determined.curve"))
     return rows
 
 
-def _place(found: Determined) -> str:
+def _centre_text(found: Determined) -> str:
     """Return the text of the centre of the stations, m."""
     return "(" + ", ".join(f"{value:.6g}" for value in found.origin) + ") m, the middle of the stations"
 
@@ -72,15 +72,15 @@ def _direction_text(found: Determined, one: Direction) -> str:
     """Return the text of a direction with its cone, degrees."""
     if found.north:
         middle, low, high = bearing_of(one.azimuth)
-        text = f"bearing {_ends(middle, low, high)}"
+        text = f"bearing {_angle_text(middle, low, high)}"
     else:
-        text = f"azimuth {_ends(*np.degrees(one.azimuth).tolist())}"
-    text += f", elevation {_ends(*np.degrees(one.elevation).tolist())}" if one.elevation else ""
+        text = f"azimuth {_angle_text(*np.degrees(one.azimuth).tolist())}"
+    text += f", elevation {_angle_text(*np.degrees(one.elevation).tolist())}" if one.elevation else ""
     half = " x ".join(f"{value:.2g}" for value in np.degrees(one.half_angles))
     return f"{text}; cone of ± {half} deg from the middle of the stations"
 
 
-def _ends(middle: float, low: float, high: float) -> str:
+def _angle_text(middle: float, low: float, high: float) -> str:
     """Return the text of an angle with its interval, degrees.
 
     The width of the interval sets the number of digits: one digit more than the width needs.
@@ -103,7 +103,7 @@ def _quantity_text(one: Quantity) -> str:
     """Return the text of an interval."""
     value, low, high, unit = one.value, one.low, one.high, one.unit
     if unit == "rad":
-        return _ends(*np.degrees([value, low, high]).tolist())
+        return _angle_text(*np.degrees([value, low, high]).tolist())
     far = f"{high:.4g} {unit}" if np.isfinite(high) else "infinity"
     near = f"{low:.4g}" if np.isfinite(low) else "minus infinity"
     return f"{near} to {far}"
@@ -132,9 +132,9 @@ def known_features(fix: Fix, frame: Frame) -> list[tuple[dict[str, Any], dict[st
     for one, about in zip(shown_directions(fix, found), found.to_dict()["directions"], strict=False):
         kept = {name: value for name, value in about.items() if name not in ("vector", "outline")}
         reach = reach_of(fix, one)
-        wedge = polygon_geometry([[earth_line(frame, _fine(found.wedge(one, reach)))]])
+        wedge = polygon_geometry([[earth_line(frame, _with_points_between(found.wedge(one, reach)))]])
         features.append((wedge, {"role": "direction95", "cut": not one.mixed, **kept}))
-        ray = line_geometry([earth_line(frame, _fine(found.ray(one, reach)))])
+        ray = line_geometry([earth_line(frame, _with_points_between(found.ray(one, reach)))])
         features.append((ray, {"role": "ray", "cut": not one.mixed, "gap": one.gap}))
     if found.curve is not None:
         line = line_geometry([earth_line(frame, found.curve)])
@@ -153,7 +153,7 @@ def reach_of(fix: Fix, one: Direction) -> float:
 _PIECES = 16
 
 
-def _fine(line: Array) -> Array:
+def _with_points_between(line: Array) -> Array:
     """Return a line (n, d) with extra points between its corners."""
     share = np.arange(_PIECES)[:, None] / _PIECES
     parts = [start + share * (end - start) for start, end in pairwise(line)]

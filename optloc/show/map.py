@@ -390,7 +390,7 @@ def ground_tracks(problem: Problem) -> list[tuple[str, Array]]:
         lat, lon, height = problem.frame.to_geodetic(thinned(track))
         if height.min() > _SKY:
             line = np.degrees(np.stack([np.unwrap(lon), lat], axis=-1))
-            found.append((f"below {problem.stations.names[station]}", line))
+            found.append((f"ground track of {problem.stations.names[station]}", line))
     return found
 
 
@@ -400,7 +400,7 @@ def lines_on_map(problem: Problem, fix: Fix, limits: tuple[float, float, float, 
     flat = fix.flat()
     if len(flat) != 1 or not np.isfinite(flat.x).all() or not flat.layout.shares("position"):
         return []
-    lon, lat = _beyond(*limits[:2]), np.clip(_beyond(*limits[2:]), -_POLE, _POLE)
+    lon, lat = _grid_beyond(*limits[:2]), np.clip(_grid_beyond(*limits[2:]), -_POLE, _POLE)
     height = float(problem.frame.to_geodetic(flat.take("position")[0])[2])
     east, north = (np.radians(v.ravel()) for v in np.meshgrid(lon, lat))
     # The grid continues beyond the antimeridian: wrap its longitudes to ±180 degrees.
@@ -409,7 +409,7 @@ def lines_on_map(problem: Problem, fix: Fix, limits: tuple[float, float, float, 
     return [(one.name if one.kind == "isodoppler" else f"{one.kind} {one.name}", one.line) for one in found]
 
 
-def _beyond(low: float, high: float) -> Array:
+def _grid_beyond(low: float, high: float) -> Array:
     """Return grid points from beyond the lower limit to beyond the upper limit: a window can be larger than the map."""
     rim = _RIM * (high - low)
     return np.linspace(low - rim, high + rim, _GRID)

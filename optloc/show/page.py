@@ -255,7 +255,7 @@ def _page(
     few = len(found.place) <= _FEW
     layers: dict[str, Sequence[Drawn]] = {
         **({"lines of position": _curves(lines, plane)} if lines else {}),
-        **({"ground tracks": _curves(_around(tracks, middle), plane, "line")} if tracks else {}),
+        **({"ground tracks": _curves(_nearest_turn(tracks, middle), plane, "line")} if tracks else {}),
         "stations": _stations(stations, plane, middle),
         **({"alternatives": _dots(others, plane, middle, _MARK)} if len(others.place) else {}),
         what: [*_ellipses(found, plane, middle), *_dots(found, plane, middle, _MARK if few else _SMALL)],
@@ -313,7 +313,7 @@ def _focus(found: Spots, plane: Plane, middle: float) -> list[float] | None:
     return [float(x), float(y), width] if width < plane.half[0] else None
 
 
-def _around(lines: Sequence[tuple[str, Array]], middle: float) -> list[tuple[str, Array]]:
+def _nearest_turn(lines: Sequence[tuple[str, Array]], middle: float) -> list[tuple[str, Array]]:
     """Return lines after shifting each by a multiple of 360 degrees, so that it is nearest to the middle of the map."""
     return [(name, line - [360.0 * np.round((line[:, 0].mean() - middle) / 360.0), 0.0]) for name, line in lines]
 

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from optloc.uncertainty.outline import Outline
 
 # Statuses with a valid covariance: a fix with status `ok`, and a track that is followed or has just started.
-_SURE = {Status.OK.label, "started"}
+_VALID_STATUSES = {Status.OK.label, "started"}
 # Statuses with a valid 95 % region. For `curved`, the region is an outline instead of an ellipse.
-_SHAPED = {*_SURE, Status.CURVED.label}
+_STATUSES_WITH_REGION = {*_VALID_STATUSES, Status.CURVED.label}
 # Corners of an ellipse on a map, one for every 5 degrees: it looks smooth at any zoom that shows the whole ellipse.
 _CORNERS = 72
 # Times from this value on, s, count from 1970; smaller times count from the start of a run. A run is shorter than the
@@ -101,7 +101,7 @@ class Mark:
     @property
     def sure(self) -> bool:
         """Return whether the mark has a position and a status without doubt: `ok`, or a track that has just started."""
-        return self.known and self.status in _SURE
+        return self.known and self.status in _VALID_STATUSES
 
     @property
     def covers(self) -> bool:
@@ -146,7 +146,7 @@ def mark_of(
     If the status has no valid covariance, the covariance of the mark is NaN. `named` holds other fields of `Mark`.
     """
     place, axes = np.full(3, np.nan), np.eye(len(position))
-    covers = status in _SURE and bool(np.isfinite(covariance).all())
+    covers = status in _VALID_STATUSES and bool(np.isfinite(covariance).all())
     if frame.geodetic and np.isfinite(position).all():
         lat, lon, height = frame.to_geodetic(position)
         place = np.array([np.degrees(lon), np.degrees(lat), height])
@@ -278,10 +278,10 @@ class Results:
                 for i in range(len(flat)):
                     # Alternatives are (q, k, d) if each epoch of a run has a position, else (q, d).
                     each = np.moveaxis(places[i], -2, 0) if places.ndim == 4 else places[i][None]
-                    found += [self._of(flat, i, position) for position in each]
+                    found += [self._alternatives_of(flat, i, position) for position in each]
         return found if len(found) == self._count else [()] * self._count
 
-    def _of(self, fix: Fix, i: int, position: Array) -> tuple[Other, ...]:
+    def _alternatives_of(self, fix: Fix, i: int, position: Array) -> tuple[Other, ...]:
         gap, doubt = fix.alternatives.gap[i], fix.alternatives.doubt[i]
         place = np.full((len(gap), 3), np.nan)
         if self.frame.geodetic and len(gap):
@@ -293,12 +293,16 @@ class Results:
         return tuple(Other(position[j], place[j], float(gap[j]), float(doubt[j])) for j in shown)
 
     def _area(self, row: dict[str, Any], region: Outline | None) -> Area | None:
-        if row.get("lat_deg") is None or row["status"] not in _SHAPED:
+        if row.get("lat_deg") is None or row["status"] not in _STATUSES_WITH_REGION:
             return None
         centre = np.array([row[axis] for axis in self.axes])
         if region is not None:
             return Area("region95", _region(self.frame, centre, region), region.cut)
-        if row["status"] not in _SURE or row["cov_ee"] is None or row.get("chart") not in (None, "", NAMES[CARTESIAN]):
+        if (
+            row["status"] not in _VALID_STATUSES
+            or row["cov_ee"] is None
+            or row.get("chart") not in (None, "", NAMES[CARTESIAN])
+        ):
             return None
         level = np.array([[row["cov_ee"], row["cov_en"]], [row["cov_en"], row["cov_nn"]]])
         return Area("ellipse95", _ellipse(self.frame, centre, level))

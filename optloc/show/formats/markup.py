@@ -99,13 +99,16 @@ def _kml_mark(document: Element, mark: Mark, area: Area | None) -> None:
         word = area.role.replace("95", ", 95 %, cut off" if area.cut else ", 95 %")
         _polygons(_placemark(document, f"{mark.name}: {word}", mark.words, style), area)
     for number, other in enumerate(mark.others, 1):
-        place = _placemark(document, _named(mark, number), _doubt(mark, other), "alternative")
+        place = _placemark(document, _alternative_name(mark, number), _alternative_text(mark, other), "alternative")
         _point(place, other.place, flat)
 
 
 def _kml_known(document: Element, mark: Mark, geometry: dict[str, Any], about: dict[str, Any]) -> None:
     """Add the wedge, ray or curve of a fix that has no valid position."""
-    words = {"direction95": "direction, 95 %" + (", cut off" if about.get("cut") else ""), "ray": "likeliest direction"}
+    words = {
+        "direction95": "direction, 95 %" + (", cut off" if about.get("cut") else ""),
+        "ray": "most likely direction",
+    }
     name = words.get(about["role"], about.get("name", ""))
     placemark = _placemark(document, f"{mark.name}: {name}", mark.words, "doubtful")
     if geometry["type"] != "MultiLineString":
@@ -119,11 +122,11 @@ def _kml_known(document: Element, mark: Mark, geometry: dict[str, Any], about: d
         _add(line, "coordinates", _line(np.array(part)))
 
 
-def _named(mark: Mark, number: int) -> str:
+def _alternative_name(mark: Mark, number: int) -> str:
     return f"{mark.name}: alternative {number}"
 
 
-def _doubt(mark: Mark, other: Other) -> str:
+def _alternative_text(mark: Mark, other: Other) -> str:
     return f"alternative to the position of {mark.name}; probability {other.probability:.2g}"
 
 
@@ -194,7 +197,11 @@ def gpx(results: Results) -> str:
                 _gpx_point(root, "wpt", mark.place, flat, _time(mark), name=label, desc=mark.words, type="fix"), mark
             )
         for number, other in enumerate(mark.others, 1):
-            texts = {"name": _named(mark, number), "desc": _doubt(mark, other), "type": "alternative"}
+            texts = {
+                "name": _alternative_name(mark, number),
+                "desc": _alternative_text(mark, other),
+                "type": "alternative",
+            }
             _gpx_point(root, "wpt", other.place, flat, _time(mark), **texts)
     for target, parts in _courses(marks) if results.course else ():
         track = _add(root, "trk")
@@ -256,8 +263,10 @@ def event(mark: Mark) -> str:
     rise = float(np.sqrt(max(mark.level[2, 2], 0.0))) if mark.covers and len(mark.level) == 3 else _UNKNOWN
     lines = [_event(mark, mark.name, mark.place, (major, rise), atom, mark.words)]
     for number, other in enumerate(mark.others, 1):
-        name = _named(mark, number)
-        lines.append(_event(mark, name, other.place, (_UNKNOWN, _UNKNOWN), "a-p-G", _doubt(mark, other), moves=False))
+        name = _alternative_name(mark, number)
+        lines.append(
+            _event(mark, name, other.place, (_UNKNOWN, _UNKNOWN), "a-p-G", _alternative_text(mark, other), moves=False)
+        )
     return "\n".join(lines)
 
 

@@ -108,7 +108,9 @@ def _pose(mark: Mark, frame: str) -> str:
 def _comment(mark: Mark) -> str:
     """Return comment lines with the name, the status and the position of a mark, and with its alternatives."""
     lines = [f"{mark.name}: {mark.words}" + (f" at {_spelled(mark.position)}" if mark.known else "")]
-    lines += [f"or {_spelled(other.position)}, probability {other.probability:.2g}" for other in mark.others]
+    lines += [
+        f"alternative at {_spelled(other.position)}, probability {other.probability:.2g}" for other in mark.others
+    ]
     return "\n".join(f"# {visible(line)}".replace("\n", " ") for line in lines)
 
 

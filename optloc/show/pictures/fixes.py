@@ -101,21 +101,21 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     every = [fixes] if isinstance(fixes, Fix) else fixes
     scene = scene_of(problem, every, outlined=True)
     spatial = scene.stations.shape[-1] == 3
-    count = 1 + spatial + (near := _nearby(scene))
+    count = 1 + spatial + (near := _needs_surroundings(scene))
     figure = figure_class()(figsize=(0.4 + 5.0 * count, 5.2), layout="constrained")
     # Panels: overview, height in three dimensions, and the surroundings if a fix is only a dot in the overview.
     panels = figure.subplots(1, count, squeeze=False)[0]
-    sizes = [_overview(panels[0], scene, PLAN)]
+    sizes = [_draw_overview(panels[0], scene, PLAN)]
     if spatial:
-        _overview(panels[1], scene, HEIGHT)
+        _draw_overview(panels[1], scene, HEIGHT)
     if near:
-        sizes.append(_close(panels[-1], scene))
+        sizes.append(_draw_surroundings(panels[-1], scene))
     if len(every) == 1 and every[0].code.size == 1 and np.isfinite(scene.fixes).all():
         centres = (np.zeros(2), scene.fixes[0, :2])
         for panel, size, centre in zip((panels[0], panels[-1]), sizes, centres, strict=False):
-            if _position_lines(panel, problem, every[0], centre, size) and spatial and panel is panels[0]:
+            if _draw_position_lines(panel, problem, every[0], centre, size) and spatial and panel is panels[0]:
                 panel.set_title("plan, lines at the height of the fix")
-    _cones(panels[0], problem, every, sizes[0])
+    _draw_directions(panels[0], problem, every, sizes[0])
     finish(figure, title, panels[:1])
     # Limits of a plan are final only after the layout of the figure.
     figure.draw_without_rendering()
@@ -126,15 +126,15 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     return figure
 
 
-def _overview(panel: Axes, scene: PictureScene, view: View) -> float:
+def _draw_overview(panel: Axes, scene: PictureScene, view: View) -> float:
     """Draw stations, fixes, alternatives and tracks, and return the size of the unit of the axes, m."""
     lines = (*scene.tracks, *scene.paths, *scene.other_paths, *scene.known)
     everything = np.concatenate([scene.stations, scene.fixes, scene.alternatives, *lines])
     unit, size = unit_of(everything[:, view])
     if view == PLAN:
-        _edges(panel, scene, size)
+        _draw_constraints(panel, scene, size)
     style.ellipses(panel, scene, view, size)
-    _lines(panel, scene, view, size)
+    _draw_tracks(panel, scene, view, size)
     style.stations(panel, scene, view, size)
     style.points(panel, scene, view, size)
     style.name_axes(panel, scene, view, unit)
@@ -142,7 +142,7 @@ def _overview(panel: Axes, scene: PictureScene, view: View) -> float:
     return size
 
 
-def _edges(panel: Axes, scene: PictureScene, size: float) -> None:
+def _draw_constraints(panel: Axes, scene: PictureScene, size: float) -> None:
     """Draw the regions of constraints: polygons and boxes."""
     label: str | None = "region"
     for corners in scene.regions:
@@ -151,7 +151,7 @@ def _edges(panel: Axes, scene: PictureScene, size: float) -> None:
         label = None
 
 
-def _lines(panel: Axes, scene: PictureScene, view: View, size: float) -> None:
+def _draw_tracks(panel: Axes, scene: PictureScene, view: View, size: float) -> None:
     """Draw tracks of stations, paths of targets and known targets as lines."""
     spots: dict[str, Any] = {"marker": "s", "markersize": 4, "markevery": [0]}
     styles: tuple[tuple[tuple[Array, ...], dict[str, Any]], ...] = (
@@ -165,7 +165,7 @@ def _lines(panel: Axes, scene: PictureScene, view: View, size: float) -> None:
             panel.plot(*xy(part, view, size), zorder=2, **(look if i == 0 else look | {"label": None}))
 
 
-def _cones(panel: Axes, problem: Problem, fixes: Sequence[Fix], size: float) -> None:
+def _draw_directions(panel: Axes, problem: Problem, fixes: Sequence[Fix], size: float) -> None:
     """Draw the directions of a single fix without a valid position as wedges and rays up to the limits of the plan."""
     if len(fixes) != 1 or fixes[0].code.size != 1 or int(fixes[0].code.ravel()[0]) not in WITHOUT_PLACE:
         return
@@ -181,7 +181,7 @@ def _cones(panel: Axes, problem: Problem, fixes: Sequence[Fix], size: float) -> 
     drawn: list[Collection] = []
     if wedges:
         drawn.append(PolyCollection(wedges, color=SKY, alpha=0.35, label="95 % direction", zorder=0))
-        drawn.append(LineCollection(rays, colors=BLUE, linestyles="--", label="likeliest direction", zorder=1))
+        drawn.append(LineCollection(rays, colors=BLUE, linestyles="--", label="most likely direction", zorder=1))
     if curves:
         drawn.append(LineCollection(curves, colors=PURPLE, label=found.curve_name, zorder=1))
     for each in drawn:
@@ -194,7 +194,7 @@ def _plan(problem: Problem, line: Array) -> Array:
     return np.asarray((line if local is None else local.from_ecef(line))[:, :2])
 
 
-def _nearby(scene: PictureScene) -> bool:
+def _needs_surroundings(scene: PictureScene) -> bool:
     """Return whether the fixes are so close together that the picture needs a panel around them."""
     known = np.asarray(np.isfinite(scene.fixes).all(-1))
     if not known.any():
@@ -204,7 +204,7 @@ def _nearby(scene: PictureScene) -> bool:
     return reach < _CLOSE * float(np.ptp(np.concatenate([scene.stations, *scene.tracks])[:, :2]))
 
 
-def _close(panel: Axes, scene: PictureScene) -> float:
+def _draw_surroundings(panel: Axes, scene: PictureScene) -> float:
     """Draw the surroundings of the fixes with their ellipses, and return the size of the unit of the axes, m."""
     known: Array = np.asarray(np.isfinite(scene.fixes).all(-1))
     view = PLAN
@@ -217,9 +217,9 @@ def _close(panel: Axes, scene: PictureScene) -> float:
     extent = _reach(scene, known, centre)
     unit, size = unit_of(np.array([centre - extent, centre + extent]) - centre)
     shifted = _shift(scene, centre)
-    _edges(panel, shifted, size)
+    _draw_constraints(panel, shifted, size)
     style.ellipses(panel, shifted, view, size)
-    _lines(panel, shifted, view, size)
+    _draw_tracks(panel, shifted, view, size)
     style.points(panel, shifted, view, size)
     style.stations(panel, shifted, view, size, named=False)
     style.name_axes(panel, shifted, view, unit)
@@ -261,7 +261,7 @@ class PositionLine(NamedTuple):
     line: Array
 
 
-def _position_lines(panel: Axes, problem: Problem, fix: Fix, centre: Array, size: float) -> bool:
+def _draw_position_lines(panel: Axes, problem: Problem, fix: Fix, centre: Array, size: float) -> bool:
     """Draw the lines of position in a plan whose origin is `centre`, m, and return whether there are lines."""
     if _only_target(problem.flat(), fix.flat()) is None:
         return False

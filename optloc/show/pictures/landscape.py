@@ -89,8 +89,8 @@ def plot_landscape(problem: Problem, fix: Fix, title: str = "") -> Figure:
     scene = scene_of(flat, [answer])
     figure = figure_class()(figsize=(12.0, 5.4), layout="constrained")
     whole, near = figure.subplots(1, 2)
-    _whole(whole, flat, answer, scene)
-    _near(near, flat, answer, scene)
+    _draw_overview(whole, flat, answer, scene)
+    _draw_surroundings(near, flat, answer, scene)
     finish(figure, title, (whole, near))
     apart(figure)
     return figure
@@ -144,7 +144,7 @@ def _excess(problem: Problem, fix: Fix, points: Array, fixed: int) -> Array:
     return np.asarray(np.sqrt(np.maximum(cost - fix.cost[0], 0.0)))
 
 
-def _whole(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
+def _draw_overview(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
     from matplotlib.colors import LogNorm
 
     corners = limits(scene)
@@ -164,7 +164,7 @@ def _whole(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None
     bar.ax.minorticks_off()
 
 
-def _near(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
+def _draw_surroundings(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
     centre, spread = scene.fixes[0], np.sqrt(np.diagonal(scene.covariances[0])[:2])
     if not np.isfinite(spread).all():
         panel.set_axis_off()
@@ -244,7 +244,7 @@ def plot_convergence(
     unit, size = unit_of(corners)
     for panel, method in zip(panels, _NAMES, strict=False):
         found = basins(flat, answer, places.reshape(starts, starts, -1), method)
-        _ends(panel, found, x / size, y / size)
+        _draw_ends(panel, found, x / size, y / size)
         share = f"{100.0 * found.share(End.REACHED):.1f} % of {starts**2} starts"
         panel.set_title(f"{_NAMES[method]}:\n{share} reach the best fit")
     panels[2].set_title(f"optloc needs no start:\n{verdict(answer)}")
@@ -253,12 +253,12 @@ def plot_convergence(
         _marks(panel, scene, size, corners / size, unit, last=panel is panels[2])
     _legend(figure, panels[2])
     finish(figure, f"{title}: from which starts is the best fit found?" if title else "")
-    _inset(panels[2], scene)
+    _draw_inset(panels[2], scene)
     apart(figure)
     return figure
 
 
-def _inset(panel: Axes, scene: PictureScene) -> None:
+def _draw_inset(panel: Axes, scene: PictureScene) -> None:
     """Draw the surroundings of the fix in a corner, because its ellipse is only a dot in the plan of all starts."""
     centre, covariance = scene.fixes[0], scene.covariances[0]
     half = _AROUND * float(np.sqrt(np.diagonal(covariance)[:2].max()))
@@ -289,7 +289,7 @@ def verdict(fix: Fix) -> str:
     return f"status {Status(code).label}{proven.get(proof, '')}"
 
 
-def _ends(panel: Axes, found: Basins, x: Array, y: Array) -> None:
+def _draw_ends(panel: Axes, found: Basins, x: Array, y: Array) -> None:
     from matplotlib.colors import ListedColormap
 
     colours = ListedColormap([_COLOURS[end] for end in End])

@@ -48,7 +48,7 @@ def outlines_of(problem: Problem, fix: Fix, planes: Sequence[Array], level: floa
     if flat.chart is None:
         return [[] for _ in range(len(flat))]
     shaped = ((flat.chart.kind != CARTESIAN) | flat.chart.cut_off) & np.isfinite(flat.cov).all((-1, -2))
-    problems = _one_each(problem, len(flat))
+    problems = _problem_of_each_fix(problem, len(flat))
     if problems is None or shaped.sum() > _MOST:
         return [[] for _ in range(len(flat))]
     found: list[list[Outline]] = []
@@ -71,7 +71,7 @@ def level_planes(problem: Problem, position: Array) -> Array:
     return np.stack([problem.frame.enu_axes(place)[:2] for place in known]).reshape(-1, 2, problem.dimension)
 
 
-def _one_each(problem: Problem, count: int) -> Problem | None:
+def _problem_of_each_fix(problem: Problem, count: int) -> Problem | None:
     """Return a flat batch with one problem for each of `count` fixes; None if the numbers do not match."""
     flat = problem.flat()
     if flat.batch_shape[0] != count and problem.batch_shape == () and separable(problem):

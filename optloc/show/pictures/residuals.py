@@ -131,15 +131,21 @@ def _panel(panel: Axes, kind: str, sets: Sets) -> None:
     factor, unit = (1e3, f"m{unit}") if unit == "rad" else (1.0, unit)
     for place, (values, sigma) in enumerate(sets.values()):
         scaled, bar = factor * values, 2.0 * factor * sigma
-        panel.hlines(place, -bar, bar, color=GREY, linewidth=5.0, alpha=0.5, label=_once(place, "± 2 sigma of a row"))
+        panel.hlines(
+            place, -bar, bar, color=GREY, linewidth=5.0, alpha=0.5, label=_label_of_first(place, "± 2 sigma of a row")
+        )
         if len(scaled) > _FEW:
             low, left, middle, right, high = np.percentile(
                 scaled, (_WHISKERS[0], _MIDDLE[0], 50.0, _MIDDLE[1], _WHISKERS[1])
             )
-            panel.hlines(place, low, high, color=BLUE, linewidth=1.2, zorder=3, label=_once(place, "95 % of residuals"))
+            panel.hlines(
+                place, low, high, color=BLUE, linewidth=1.2, zorder=3, label=_label_of_first(place, "95 % of residuals")
+            )
             style: dict[str, Any] = {"height": 0.5, "color": SKY, "edgecolor": BLUE, "zorder": 3}
-            panel.barh(place, right - left, left=left, label=_once(place, "middle half"), **style)
-            panel.scatter(middle, place, marker="|", s=70, color=BLACK, zorder=4, label=_once(place, "median"))
+            panel.barh(place, right - left, left=left, label=_label_of_first(place, "middle half"), **style)
+            panel.scatter(
+                middle, place, marker="|", s=70, color=BLACK, zorder=4, label=_label_of_first(place, "median")
+            )
             continue
         far = np.abs(scaled) > _BEYOND * factor * sigma
         for chosen, colour, mark, name in (
@@ -158,7 +164,7 @@ def _panel(panel: Axes, kind: str, sets: Sets) -> None:
     grid(panel)
 
 
-def _once(place: int, label: str) -> str:
+def _label_of_first(place: int, label: str) -> str:
     return "" if place else label
 
 

@@ -215,7 +215,7 @@ def _bias_panel(panel: Axes, found: GrowingRun, slot: Slot, truth: Array | None)
     hidden = len(slot.entries) - _MOST
     panel.set_title(literal(slot.name) + (f" (first {_MOST} of {len(slot.entries)})" if hidden > 0 else ""))
     panel.set_xlabel("time (s)")
-    panel.set_ylabel(f"estimate and 95 % ({slot.unit})" if slot.unit else "estimate and 95 %")
+    panel.set_ylabel(f"estimate with 95 % interval ({slot.unit})" if slot.unit else "estimate with 95 % interval")
     panel.legend(frameon=False, fontsize=8, ncols=2)
     grid(panel)
 

@@ -144,7 +144,7 @@ def test_alternatives_are_shown(tmp_path):
     assert roles.count("alternative") == count
     assert "ellipse95" not in roles
     assert (tmp_path / "out.nmea").read_text().split(",")[6] == "0"
-    assert (tmp_path / "out.g2o").read_text().count("# or ") == count
+    assert (tmp_path / "out.g2o").read_text().count("# alternative at ") == count
     assert list(yaml.safe_load_all((tmp_path / "out.yaml").read_text())) == []
 
 
