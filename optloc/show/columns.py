@@ -236,9 +236,9 @@ _LEVEL = {"e": "east", "n": "north", "u": "up"}
 
 
 def _hide_undetermined_levels(local: Columns, limit: Array, before: Sequence[str]) -> tuple[Columns, list[str]]:
-    """Return geodetic columns with NaN for undetermined level axes, and the names of all undetermined entries (n).
+    """Return geodetic columns with NaN for undetermined axes (east, north, up), and all undetermined names (n).
 
-    A level axis is undetermined if its standard deviation exceeds `limit` (n,), m. `before` (n) holds earlier names.
+    An axis is undetermined if its standard deviation exceeds `limit` (n,), m. `before` (n) holds earlier names.
     """
     axes = [axis for axis in _LEVEL if f"cov_{axis}{axis}" in local]
     with np.errstate(invalid="ignore"):

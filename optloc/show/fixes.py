@@ -184,7 +184,7 @@ def _state(columns: Columns, i: int, whose: str) -> list[tuple[str, str]]:
 
 
 def _undetermined(columns: Columns, i: int) -> set[str]:
-    """Return the names of the undetermined entries of row `i`: coordinates, rates and level axes."""
+    """Return the names of the undetermined entries of row `i`: coordinates, rates, and axes east, north, up."""
     names = columns["undetermined"][i] if "undetermined" in columns else ""
     return set(names.split("; ")) if isinstance(names, str) else set()
 

@@ -1,6 +1,7 @@
 """Fixes and tracks as marks: the common input of all map formats, and the GeoJSON format.
 
-A `Mark` is one position with covariance, status and alternatives. `Results` makes the marks from a table of fixes.
+A `Mark` is one position with covariance, status and alternatives. `Results` makes the marks from a table of fixes. A
+covariance, an ellipse or a region is *valid* if it covers the true position with the stated probability.
 """
 
 from __future__ import annotations

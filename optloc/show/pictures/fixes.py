@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# If the extent of the fixes is at least this share of the extent of the stations, the overview shows the fixes well and
-# no panel around the fixes is needed.
+# The overview shows the fixes well if their extent is at least this share of the extent of the stations. Otherwise the
+# picture has a panel around the fixes.
 _CLOSE = 0.3
 # Half the side of the panel around the fixes: `_SEMI_AXES` largest semi-axes plus `_SPREAD` times the distance that
 # holds 95 % of the fixes. If both are zero, as for a fix that constraints determine, `_HELD` times the extent of the
@@ -71,8 +71,8 @@ _SHAPES = {
 }
 # Length of an unlimited wedge, in widths of the plan that it crosses.
 _BEYOND = 3.0
-# Distance from the origin of the picture, m, at which the surface of the Earth is almost vertical in the plan, and
-# iterations to find the surface.
+# Horizontal distance from the origin, m, at which the surface of the Earth is almost vertical; and iterations to find
+# the surface.
 _STEEP, _STEPS = 5.5e6, 12
 
 

@@ -1,7 +1,7 @@
 """Outlines of 95 % regions whose ellipse is not valid, in pictures and as GeoJSON on Earth.
 
-The region of a far fix is egg-shaped; other regions can be bananas or rings. GeoJSON lines are cut at the antimeridian
-and closed around the poles.
+An ellipse is *valid* if it covers the true position with the stated probability. The region of a far fix is egg-shaped;
+other regions can be bananas or rings. GeoJSON lines are cut at the antimeridian and closed around the poles.
 """
 
 from __future__ import annotations

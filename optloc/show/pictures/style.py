@@ -1,4 +1,7 @@
-"""Common parts of all pictures: colours, units of axes, labels without overlap, the scene of a fix, and image files."""
+"""Common parts of all pictures: colours, units of axes, labels without overlap, the scene of a fix, and image files.
+
+An ellipse is *valid* if it covers the true position with the stated probability.
+"""
 
 from __future__ import annotations
 
