@@ -1,4 +1,7 @@
-"""Pages that need no network, and what a fix says: reports of studies, maps of bounds, fixes and tracks, words."""
+"""Output for people and other programs: text, HTML pages, pictures, maps and result files.
+
+The package formats fixes, tracks, bounds and study reports. HTML pages need no network.
+"""
 
 from typing import TYPE_CHECKING
 

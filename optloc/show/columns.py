@@ -1,4 +1,8 @@
-"""Fixes as columns of a long table and as JSON: what files of results hold."""
+"""Tables of fixes and JSON records, the content of result files.
+
+`fix_columns` returns one row for each target and epoch. `fix_detail` returns the values of a single fix that a table
+cannot hold, such as alternatives and biases.
+"""
 
 from __future__ import annotations
 
@@ -19,24 +23,24 @@ from optloc.problem.fix import Active, Fix
 from optloc.show.knowledge import is_shown
 
 Columns = dict[str, Array]
-"""A long table: columns (rows,) by name, in SI units and degrees, NaN where there is no number."""
+"""A table: columns (rows,) by name, in SI units and degrees; NaN marks a missing number."""
 
 UNCHECKED = "no redundancy: a wrong measurement would not be noticed"
-TAILS = "the 95 % figures hold, the 99.9 % region does not"
-ROBUST = "the minima of the loss were found by a search"
+TAILS = "the 95 % region is valid, the 99.9 % region is not"
+ROBUST = "a search found the minima of the loss"
 RESCALED = "the noise is larger than stated"
-"""The sentence beside the status of a fix that nothing checks."""
+"""Notes that follow the status of a fix: `unchecked`, `tails`, `robust` and `rescaled`."""
 
 _RATES = {"velocity": "v", "acceleration": "a"}
-# Fixes whose ellipses are found together: some megabytes.
+# Fixes whose ellipses are computed in one batch: this limits the memory to some megabytes.
 _BLOCK = 8192
 _STATES = ("position", *_RATES)
 
-# Numbers and tables.
+# Conversion of values and tables.
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON knows it: arrays as lists, what is not finite as null."""
+    """Return a value in JSON types: arrays as lists, non-finite numbers as None."""
     if isinstance(value, dict):
         return {key: plain(inner) for key, inner in value.items()}
     if isinstance(value, np.ndarray):
@@ -49,13 +53,13 @@ def plain(value: Any) -> Any:
 
 
 def records(columns: Columns) -> list[dict[str, Any]]:
-    """Return a table as one record for each row, ready for JSON."""
+    """Return a table as a list of dictionaries in JSON types, one for each row."""
     lists = {name: plain(values) for name, values in columns.items()}
     return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
 
 
 def join_tables(parts: Sequence[Columns]) -> Columns:
-    """Return tables below each other; a column that one lacks is NaN there."""
+    """Return one table with the rows of all parts in order; if a part lacks a column, its rows have NaN there."""
     names = dict.fromkeys(name for part in parts for name in part)
     sizes = [len(next(iter(part.values()))) for part in parts]
     return {
@@ -65,16 +69,22 @@ def join_tables(parts: Sequence[Columns]) -> Columns:
 
 
 def covariance_columns(covariance: Array, axes: str) -> Columns:
-    """Return the upper triangles of covariances (n, d, d) along named axes."""
+    """Return the upper triangles of covariances (n, d, d) as columns `cov_xx`, `cov_xy` and so on.
+
+    `axes` holds one letter for each axis.
+    """
     d = covariance.shape[-1]
     return {f"cov_{axes[i]}{axes[j]}": covariance[:, i, j] for i in range(d) for j in range(i, d)}
 
 
 def geodetic_columns(frame: Frame, position: Array, covariance: Array) -> Columns:
-    """Return latitude and longitude (degrees), height (metres) and covariance along east, north, up."""
+    """Return latitude and longitude (degrees), height (m) and the covariance along east, north, up (m^2) as columns.
+
+    If the frame is not on Earth, the result is empty. Positions are (n, d), m; covariances are (n, d, d), m^2.
+    """
     if not frame.geodetic:
         return {}
-    with np.errstate(invalid="ignore"):  # epochs without a fix are NaN
+    with np.errstate(invalid="ignore"):  # Epochs without a fix are NaN.
         lat, lon, height = frame.to_geodetic(position)
         axes = frame.enu_axes(position)
     local = axes @ covariance @ np.swapaxes(axes, -1, -2)
@@ -82,7 +92,7 @@ def geodetic_columns(frame: Frame, position: Array, covariance: Array) -> Column
     return degrees | covariance_columns(local, "enu")
 
 
-# The long table: one row for each target and epoch.
+# The table of fixes: one row for each target and epoch.
 
 Labels = Callable[[int, bool], Columns]
 
@@ -95,46 +105,48 @@ def fix_columns(
     dimension: int = 3,
     constrained: bool | None = None,
 ) -> Columns:
-    """Return the table of fixes.
+    """Return the table of fixes, one row for each target and epoch.
 
     Parameters
     ----------
     fix : Fix
-        One fix, or a batch (n,) of them.
+        One fix, or a batch (n,) of fixes.
     targets : sequence of (int, tuple of str), optional
-        Number of each target and the names of its position, velocity and acceleration; by default those of the layout.
+        Number of each target and the names of its position, velocity and acceleration. By default, the targets of the
+        layout.
     labels : callable of (int, bool), optional
-        Returns the columns that say which row is which, of a target, and whether it has a position at each epoch.
+        Returns the columns that identify the rows of a target, such as `epoch` and `target`. Arguments: number of the
+        target, and whether the target has one position for each epoch.
     dimension : int
-        Of positions, where none is estimated.
+        Dimension of the positions if the fix estimates no position.
     constrained : bool, optional
-        Whether there are constraints that may hold it; by default whether any does.
+        Whether the table has the columns `active` and `multipliers`. By default, it has them if a constraint is active.
 
     Returns
     -------
     dict of str to array (rows,)
-        Metres, seconds and degrees; NaN where there is no number.
+        Columns in metres, seconds and degrees; NaN marks a missing number.
     """
     flat = fix if len(fix.shape) == 1 else fix.flat()
     if targets is None:
         targets = list(enumerate(_states_of(fix))) or [(0, ("position",))]
     if labels is None:
         labels = _numbered(flat, len(targets))
-    words = _told_in_words(
+    words = _text_columns(
         flat, any(map(len, fix.active.ravel())) if constrained is None and fix.active is not None else bool(constrained)
     )
-    return join_tables([_of_target(flat, names, i, labels, dimension, words) for i, names in targets])
+    return join_tables([_target_rows(flat, names, i, labels, dimension, words) for i, names in targets])
 
 
 def _states_of(fix: Fix) -> list[tuple[str, ...]]:
-    """Return the names of position, velocity and acceleration of each target that is estimated."""
+    """Return the names of position, velocity and acceleration of each estimated target."""
     names = [slot.name for slot in (*fix.layout.shared, *fix.layout.local)]
     numbers = [name.removeprefix("position") for name in names if name.partition("[")[0] == "position"]
     return [tuple(f"{word}{number}" for word in _STATES if f"{word}{number}" in names) for number in numbers]
 
 
 def _numbered(fix: Fix, targets: int) -> Labels:
-    """Return labels of fixes that nobody has named: their numbers in the batch, of epochs and of targets."""
+    """Return labels for unnamed fixes: the index in the batch, the index of the epoch and the index of the target."""
     n, k = len(fix), fix.layout.epochs
 
     def labels(target: int, spread: bool) -> Columns:
@@ -146,23 +158,29 @@ def _numbered(fix: Fix, targets: int) -> Labels:
     return labels
 
 
-def _of_target(
+def _target_rows(
     fix: Fix, names: Sequence[str], target: int, labels: Labels, dimension: int, words: Mapping[str, Sequence[str]]
 ) -> Columns:
-    """Return the rows of one target: `names` are those of its position, velocity and acceleration."""
+    """Return the rows of one target; `names` holds the names of its position, velocity and acceleration.
+
+    The columns in `words` (n entries each) are appended; every fix repeats its text in all its rows.
+    """
     estimated = names[0] in {slot.name for slot in (*fix.layout.shared, *fix.layout.local)}
     position = fix.take(names[0]) if estimated else np.full((len(fix), dimension), np.nan)
     n, d = len(fix), position.shape[-1]
-    # A position of each epoch of a run has an axis of epochs (1, k, d), and a covariance where that was asked for.
+    # If the target has one position for each epoch of a run, its shape is (1, k, d). Its covariance exists only if the
+    # solver was asked to compute it.
     spread = position.ndim == 3
     count = position.shape[1] if spread else 1
-    told = estimated and (not spread or fix.local is not None)
+    has_covariance = estimated and (not spread or fix.local is not None)
     columns = dict(labels(target, spread))
     position = position.reshape(n * count, d)
-    covariance = fix.covariance(names[0]).reshape(n * count, d, d) if told else np.full((n * count, d, d), np.nan)
-    open_ = fix.undetermined(names[0]).reshape(n * count, d) if told else np.zeros((n * count, d), dtype=bool)
+    covariance, undetermined = np.full((n * count, d, d), np.nan), np.zeros((n * count, d), dtype=bool)
+    if has_covariance:
+        covariance = fix.covariance(names[0]).reshape(n * count, d, d)
+        undetermined = fix.undetermined(names[0]).reshape(n * count, d)
     local = geodetic_columns(fix.frame, position, covariance)
-    covariance, lost = without_open(covariance, open_, "xyz")
+    covariance, undetermined_names = without_open(covariance, undetermined, "xyz")
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     columns |= _repeat(count, status=[one.label for one in statuses_of(fix.code)], reason=list(fix.reason))
     columns |= {axis: position[:, i] for i, axis in enumerate("xyz"[:d])}
@@ -170,20 +188,22 @@ def _of_target(
     columns |= covariance_columns(covariance, "xyz")
     for name in names[1:] if estimated else ():
         letter = _RATES[name.partition("[")[0]]
-        own = fix.sigma(name).reshape(n * count, d) if told else np.full((n * count, d), np.nan)
-        if told:
-            wild = fix.undetermined(name).reshape(n * count, d)
-            own, lost = np.where(wild, np.nan, own), _named_open(wild, [f"{letter}{axis}" for axis in "xyz"], lost)
-        for values, prefix in ((fix.take(name).reshape(n * count, d), letter), (own, f"sigma_{letter}")):
+        sigmas = fix.sigma(name).reshape(n * count, d) if has_covariance else np.full((n * count, d), np.nan)
+        if has_covariance:
+            undetermined = fix.undetermined(name).reshape(n * count, d)
+            sigmas = np.where(undetermined, np.nan, sigmas)
+            rates = [f"{letter}{axis}" for axis in "xyz"]
+            undetermined_names = _append_names(undetermined, rates, undetermined_names)
+        for values, prefix in ((fix.take(name).reshape(n * count, d), letter), (sigmas, f"sigma_{letter}")):
             columns |= {f"{prefix}{axis}": v for axis, v in zip("xyz", values.T, strict=False)}
     if "cov_ee" in local:
         limit = np.repeat(fix.widest(names[0]), count) if estimated else np.full(n * count, np.inf)
-        local, lost = _without_open_level(local, limit, lost)
+        local, undetermined_names = _hide_undetermined_levels(local, limit, undetermined_names)
     columns |= local
-    # in blocks: the eigenvectors of a long table are larger than its columns
+    # Compute in blocks: the eigenvectors of a long table need more memory than the table.
     blocks = np.array_split(covariance, 1 + len(covariance) // _BLOCK)
     semi_axes = np.concatenate([error_ellipse(block)[0] for block in blocks])
-    # Longest axis first.
+    # `error_ellipse` sorts in ascending order; the first column is the longest axis.
     columns |= {f"ellipse95_{i + 1}": semi_axes[:, d - 1 - i] for i in range(d)}
     for name, numbers in {"cost": fix.cost, "dof": fix.dof, "p_value": np.asarray(fix.p_value)}.items():
         columns[name] = np.repeat(numbers, count)
@@ -191,43 +211,50 @@ def _of_target(
     tails = fix.has(Status.TAILS)
     columns |= {"tails": np.repeat(np.atleast_1d(tails), count)} if tails.any() else {}
     columns["alternatives"] = np.repeat(np.isfinite(fix.alternatives.gap).sum(-1), count)
-    columns |= {"undetermined": np.array(lost, dtype=object)} if any(lost) else {}
+    columns |= {"undetermined": np.array(undetermined_names, dtype=object)} if any(undetermined_names) else {}
     return columns | _repeat(count, **words)
 
 
-def without_open(covariance: Array, wild: Array, axes: str) -> tuple[Array, list[str]]:
-    """Return covariances (n, d, d) without the entries (n, d) that are not determined, NaN, and their names (n)."""
-    hidden = np.where(wild[:, :, None] | wild[:, None, :], np.nan, covariance)
-    return hidden, _named_open(wild, axes, [""] * len(wild))
+def without_open(covariance: Array, undetermined: Array, axes: str) -> tuple[Array, list[str]]:
+    """Return covariances (n, d, d) with NaN for undetermined axes, and the names of these axes (n).
+
+    `undetermined` (n, d) is true for each undetermined axis.
+    """
+    hidden = np.where(undetermined[:, :, None] | undetermined[:, None, :], np.nan, covariance)
+    return hidden, _append_names(undetermined, axes, [""] * len(undetermined))
 
 
-def _named_open(wild: Array, names: Sequence[str], before: Sequence[str]) -> list[str]:
-    """Return the names of entries (n, d) that are not determined behind those that were found before."""
-    if not wild.any():
+def _append_names(undetermined: Array, names: Sequence[str], before: Sequence[str]) -> list[str]:
+    """Return the texts in `before` (n), extended by the names of the entries (n, d) that are `undetermined`."""
+    if not undetermined.any():
         return list(before)
-    told = [[names[i] for i in np.flatnonzero(row).tolist()] for row in wild]
-    return ["; ".join([*([old] if old else []), *new]) for old, new in zip(before, told, strict=True)]
+    new_names = [[names[i] for i in np.flatnonzero(row).tolist()] for row in undetermined]
+    return ["; ".join([*([old] if old else []), *new]) for old, new in zip(before, new_names, strict=True)]
 
 
 _LEVEL = {"e": "east", "n": "north", "u": "up"}
 
 
-def _without_open_level(local: Columns, limit: Array, lost: Sequence[str]) -> tuple[Columns, list[str]]:
-    """Return geodetic columns without the level axes whose variance is beyond a limit (n,), and the names of all."""
+def _hide_undetermined_levels(local: Columns, limit: Array, before: Sequence[str]) -> tuple[Columns, list[str]]:
+    """Return geodetic columns with NaN for undetermined axes (east, north, up), and all undetermined names (n).
+
+    An axis is undetermined if its standard deviation exceeds `limit` (n,), m. `before` (n) holds earlier names.
+    """
     axes = [axis for axis in _LEVEL if f"cov_{axis}{axis}" in local]
     with np.errstate(invalid="ignore"):
-        wild = np.stack([local[f"cov_{axis}{axis}"] > limit**2 for axis in axes], axis=-1)
-    if not wild.any():
-        return local, list(lost)
-    pairs = {f"cov_{a}{b}": wild[:, i] | wild[:, i + j] for i, a in enumerate(axes) for j, b in enumerate(axes[i:])}
+        undetermined = np.stack([local[f"cov_{axis}{axis}"] > limit**2 for axis in axes], axis=-1)
+    if not undetermined.any():
+        return local, list(before)
+    numbered = list(enumerate(axes))
+    pairs = {f"cov_{a}{b}": undetermined[:, i] | undetermined[:, j] for i, a in numbered for j, b in numbered[i:]}
     hidden = {
         name: np.where(pairs[name], np.nan, values) if name in pairs else values for name, values in local.items()
     }
-    return hidden, _named_open(wild, [_LEVEL[axis] for axis in axes], lost)
+    return hidden, _append_names(undetermined, [_LEVEL[axis] for axis in axes], before)
 
 
 def level_covariance(columns: Columns, i: int) -> Array:
-    """Return the covariance (d, d) of one row in level axes: east, north and up where there is a ground."""
+    """Return the covariance (d, d), m^2, of row `i` along east, north, up; without geodetic columns along x, y, z."""
     axes = "enu" if "cov_ee" in columns else "xyz"
     axes = axes[: 3 if f"cov_{2 * axes[2]}" in columns else 2]
     pairs = [[f"cov_{min(a, b, key=axes.index)}{max(a, b, key=axes.index)}" for b in axes] for a in axes]
@@ -235,42 +262,45 @@ def level_covariance(columns: Columns, i: int) -> Array:
 
 
 def _repeat(count: int, **texts: Sequence[str]) -> Columns:
-    """Return texts of each fix (n,) as columns, each so often as the fix has rows."""
+    """Return texts (n,) as columns; each text is repeated `count` times, once for each row of its fix."""
     return {name: np.repeat(np.array(list(values), dtype=object), count) for name, values in texts.items()}
 
 
-def _told_in_words(fix: Fix, constrained: bool) -> dict[str, list[str]]:
-    """Return the proof of each fix, the constraints that hold it, and its suspects: "A; B" together, "A | B" either."""
+def _text_columns(fix: Fix, constrained: bool) -> dict[str, list[str]]:
+    """Return text columns (n entries each): proof, findings, chart, active constraints and suspects.
+
+    "A; B" means A and B together. "A | B" means either A or B explains the data.
+    """
     texts = {"proof": [PROOFS[number] for number in fix.claims.proof.tolist()]}
-    findings: Any = fix.findings  # of a batch: one tuple for each fix
+    findings: Any = fix.findings  # In a batch, each fix has one tuple.
     found = {each: "; ".join(one.label for one in each) for each in set(findings)}
     texts["findings"] = [found[each] for each in findings]
     texts["chart"] = [""] * len(fix) if fix.chart is None else list(fix.chart.name)
     if constrained:
-        held = [()] * len(fix) if fix.active is None else fix.active
-        texts["active"] = ["; ".join(active.name for active in each) for each in held]
-        texts["multipliers"] = ["; ".join(f"{active.multiplier:.6g}" for active in each) for each in held]
+        active_sets = [()] * len(fix) if fix.active is None else fix.active
+        texts["active"] = ["; ".join(active.name for active in each) for each in active_sets]
+        texts["multipliers"] = ["; ".join(f"{active.multiplier:.6g}" for active in each) for each in active_sets]
     if fix.explanations is not None:
         texts["suspects"] = [" | ".join("; ".join(e.names) for e in each) for each in fix.explanations]
     return texts
 
 
-# What a single fix has besides its numbers.
+# Values of a single fix that its table row does not hold.
 
 
 def explanations_of(fix: Fix) -> tuple[Explanation, ...]:
-    """Return what explains the data of a single fix."""
+    """Return the explanations of a single fix: sets of suspects whose exclusion makes the data consistent."""
     return () if fix.explanations is None else tuple(fix.explanations[()])
 
 
 def active_of(fix: Fix) -> tuple[Active, ...]:
-    """Return the constraints that hold a single fix with equality."""
+    """Return the constraints that are active at a single fix: equalities, and bounds that the fix has reached."""
     return () if fix.active is None else tuple(fix.active[()])
 
 
 def alternative_position(fix: Fix, x: Array) -> Array:
-    """Return the positions of all targets of a parameter vector, metres."""
-    # Two targets are called position[0] and position[1].
+    """Return the position (d,) in a parameter vector `x`, m; for several targets (targets, d)."""
+    # With two targets, the names are position[0] and position[1].
     names = [slot.name for slot in (*fix.layout.shared, *fix.layout.local) if slot.name.partition("[")[0] == "position"]
     parts = [fix.layout.take(x, name) for name in names]
     return parts[0] if len(parts) == 1 else np.stack(parts)
@@ -284,7 +314,8 @@ def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
     fix : Fix
         A single fix.
     seen : Observability, optional
-        What its data show.
+        Observability of the biases. It gives `from_data`, the share of the information that comes from the data.
+        Without `seen`, the share is NaN.
     """
     found = []
     for slot in fix.layout.shared:
@@ -301,16 +332,16 @@ def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
 
 
 def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool = False) -> dict[str, Any]:
-    """Return what a single fix has besides the columns of its table, for JSON.
+    """Return the values of a single fix that its table row does not hold, for JSON.
 
     Parameters
     ----------
     fix : Fix
         A single fix.
     seen : Observability, optional
-        What its data show of its biases.
+        Observability of the biases.
     reweighted : bool
-        Whether rows have other weights than they came with.
+        Whether the solver changed the weights of rows; if so, the weights are part of the result.
     """
     others = fix.alternatives
     shown = np.isfinite(others.gap)
@@ -336,17 +367,20 @@ def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool 
 
 
 def _chart_json(fix: Fix) -> dict[str, Any] | None:
-    """Return in which coordinates a single fix is Gaussian, and its Gaussian there."""
+    """Return the coordinates in which a single fix is Gaussian, with its mean and covariance.
+
+    Without a chart or without a fix, the result is None.
+    """
     chart = fix.chart
     if chart is None or not bool(fix.answered):
         return None
-    told: dict[str, Any] = {"name": str(chart.name), "centre": chart.centre}
+    record: dict[str, Any] = {"name": str(chart.name), "centre": chart.centre}
     if chart.kind == INVERSE_RANGE:
-        told |= {"distance": chart.distance, "direction": chart.direction, "basis": chart.basis}
-        told |= {"mean": chart.mean, "covariance": chart.spread}
+        record |= {"distance": chart.distance, "direction": chart.direction, "basis": chart.basis}
+        record |= {"mean": chart.mean, "covariance": chart.spread}
     if chart.cut_off:
-        told["mean"] = fix.gaussian()[0][: chart.position.shape[-1]]
-        told |= {f"{axis}95": fix.interval(axis) for axis in AXES[: chart.position.shape[-1]]}
+        record["mean"] = fix.gaussian()[0][: chart.position.shape[-1]]
+        record |= {f"{axis}95": fix.interval(axis) for axis in AXES[: chart.position.shape[-1]]}
     if chart.kind != CURVED and not fix.undetermined().any():
-        told["range95"] = fix.interval("range")
-    return told
+        record["range95"] = fix.interval("range")
+    return record

@@ -1,4 +1,4 @@
-"""Figures of pages: how methods look, panels, and figures of matplotlib as SVG that stands in the text of a page."""
+"""Figures of HTML pages: the line style of each method, empty panels, and matplotlib figures as inline SVG."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# How methods look in every figure of a report: a colour, a mark and a dash each, told apart without colour too.
+# Line styles: each method has a colour, a mark and a dash, the same in every figure of a report. Marks and dashes also
+# distinguish methods in grey print and for colour-blind readers.
 
-# Colours and marks together repeat after 24 methods, and then the dashes differ: 96 methods look different. Dashes
-# change every second method, and once more where the colours begin again.
+# Colour and mark together repeat after 24 methods, and then the dash differs. So 96 methods look different. The dash
+# changes at every second method, and once more when the colours repeat.
 _COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, YELLOW, BLACK, GREY)
 _MARKS = "osD^vP*X<>hp"
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
@@ -26,16 +27,16 @@ _DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """The look of a method.
+    """The line style of a method.
 
     Parameters
     ----------
     number : int
-        Of the method, in the order of the report.
+        Index of the method in the report.
     name : str
-        The method.
+        Name of the method.
     colour, mark : str
-        As matplotlib takes them.
+        Colour and marker of matplotlib.
     dash : str or tuple
         Line style of matplotlib.
     """
@@ -48,17 +49,17 @@ class Look:
 
     @property
     def dashes(self) -> str:
-        """Return its dashes as SVG has them, at twice the size of a figure; empty of a whole line."""
+        """Return the dashes as an SVG `stroke-dasharray`, twice as long as in a figure; empty for a solid line."""
         return "" if isinstance(self.dash, str) else " ".join(f"{2 * length:g}" for length in self.dash[1])
 
     @property
     def line(self) -> str:
-        """Return the identity of the method's lines in SVG, by which a page finds them."""
+        """Return the SVG class of the method's lines, by which the script of a page finds them."""
         return f"method-{self.number}"
 
 
 def marks(methods: list[str]) -> dict[str, Look]:
-    """Return the look of every method."""
+    """Return the line style of each method, by name."""
     return {
         name: Look(i, name, _COLOURS[i % len(_COLOURS)], _MARKS[i % len(_MARKS)], _DASHES[(i // 2 + i // 8) % 4])
         for i, name in enumerate(methods)
@@ -67,14 +68,15 @@ def marks(methods: list[str]) -> dict[str, Look]:
 
 Looks = dict[str, Look]
 
-# Inches, with texts of 8 to 10 points: two panels beside each other on a desk, one on a phone, and both can be read.
+# Inches, with texts of 8 to 10 points. Two panels fit side by side on a desktop screen and one on a phone, and texts
+# stay readable on both.
 SIZE = (5.2, 3.5)
-# Letters of a name with which only two columns of a legend fit the width of a figure; inches of one of its lines.
+# Letters: if a name is longer, only two columns of a legend fit the width of a panel. Inches: height of a legend line.
 _WIDE, _LEGEND_LINE = 22, 0.16
 
 
 def panel(title: str, size: tuple[float, float] = SIZE) -> tuple[Figure, Axes]:
-    """Return an empty figure of one panel with a grid."""
+    """Return an empty figure with one panel and a grid; `size` is in inches."""
     figure, (axes,) = panels("", 1, size)
     if title:
         axes.set_title(literal(title), fontsize=10)
@@ -82,7 +84,7 @@ def panel(title: str, size: tuple[float, float] = SIZE) -> tuple[Figure, Axes]:
 
 
 def panels(title: str, count: int, size: tuple[float, float] = SIZE) -> tuple[Figure, list[Axes]]:
-    """Return an empty figure of panels with grids side by side."""
+    """Return an empty figure with `count` panels side by side, each with a grid; `size` of a panel is in inches."""
     figure = figure_class()(figsize=(count * size[0], size[1]), layout="constrained")
     made = figure.subplots(1, count, squeeze=False).ravel().tolist()
     for axes in made:
@@ -94,12 +96,12 @@ def panels(title: str, count: int, size: tuple[float, float] = SIZE) -> tuple[Fi
 
 
 def with_legend(figure: Figure) -> Figure:
-    """Return a figure with a legend of the methods of all its panels below them."""
+    """Return the figure after adding one legend below all panels; it lists each method once."""
     shown: dict[str, Any] = {}
     for axes in figure.axes:
         handles, labels = axes.get_legend_handles_labels()
         shown |= dict(zip(labels, handles, strict=True))
-    # Names of 22 letters leave room for two columns a panel, shorter ones for three.
+    # With names longer than 22 letters, two columns fit below a panel; with shorter names, three columns fit.
     columns = len(figure.axes) * (2 if max(map(len, shown), default=0) > _WIDE else 3)
     figure.legend(shown.values(), shown, loc="outside lower center", ncols=columns, frameon=False, fontsize=7)
     width, height = figure.get_size_inches()
@@ -110,16 +112,16 @@ def with_legend(figure: Figure) -> Figure:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure and what it shows.
+    """A matplotlib figure with its file name and title.
 
     Parameters
     ----------
     name : str
-        Name of its file.
+        File name without an ending.
     title : str
-        What it shows.
+        Description of the figure.
     figure : matplotlib.figure.Figure
-        The drawing.
+        The figure.
     """
 
     name: str
@@ -127,44 +129,45 @@ class Picture:
     figure: Figure
 
 
-# Figures of matplotlib as SVG that stands in the text of a page.
+# Matplotlib figures as inline SVG.
 
 _IDENTITY = re.compile(r'\bid="([^"]*)"')
 _METHOD = re.compile(r'<g id="(method-\d+)"')
 
 
 def svg_text(figure: Figure) -> str:
-    """Return a figure as an SVG file, with text as text and equal bytes for equal figures."""
+    """Return a figure as an SVG file; equal figures give equal bytes."""
     from matplotlib import rc_context
 
     text = StringIO()
-    # Text stays text, to be found and read aloud; the salt makes identities depend on the figure alone.
+    # Write text as text, so that readers can search it and screen readers can read it. With a fixed salt, ids depend
+    # only on the figure.
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "optloc"}):
         figure.savefig(text, format="svg", metadata={"Date": None})
-    figure.set_layout_engine("none")  # what is drawn again stays where it is: to find the place takes as long
+    figure.set_layout_engine("none")  # Keep the layout for later drawings: computing a layout takes as long as drawing.
     return text.getvalue()
 
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """A figure as SVG that stands in the text of a page, and its name."""
+    """A figure as inline SVG, with its name."""
 
     name: str
     svg: str
 
 
 def inline(picture: Picture) -> Drawing:
-    """Return a figure as an element of a page.
+    """Return a figure as an inline SVG element of a page.
 
-    Identities are made unique by the name of the figure, lines of methods get a class, and the width is that of the
-    place where it stands.
+    The name of the figure becomes part of each id, so that ids are unique in the page. Lines of methods get a class
+    instead of an id. The element has no fixed size and fills the width of its container.
     """
     name, text = picture.name, svg_text(picture.figure)
     text = text[text.index("<svg") :]
-    # Every figure would bring its own: who made it, and when.
+    # Remove the metadata, which matplotlib writes into each figure.
     text = re.sub(r"\s*<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = _METHOD.sub(r'<g class="\1"', text)
-    # Identities of one page must differ, and matplotlib gives equal ones to equal shapes of two figures.
+    # Ids must be unique in a page, but matplotlib gives equal shapes in two figures the same id.
     known = set(_IDENTITY.findall(text))
     text = _IDENTITY.sub(lambda m: f'id="{name}-{m[1]}"', text)
     text = re.sub(r"url\(#([^)]*)\)", lambda m: f"url(#{name}-{m[1]})", text)

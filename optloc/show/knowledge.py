@@ -1,4 +1,8 @@
-"""Directions, ranges and curves of fixes without a trustworthy position: in words, and as geometries on the Earth."""
+"""Directions, ranges and curves of fixes without a reliable position, as text and as GeoJSON.
+
+If the data determine no position, they may still determine a direction, a range or a curve. `known_rows` returns these
+as text, and `known_features` returns them as geometries on Earth.
+"""
 
 from __future__ import annotations
 
@@ -12,30 +16,31 @@ from optloc.base.types import Array, Status
 from optloc.problem.determined import WITHOUT_PLACE, Determined, Direction, Quantity, bearing_of
 from optloc.problem.fix import Fix
 
-# Statuses with a region that numbers about a line or plane of stations describe.
+# Statuses that have a valid position and also intervals relative to a line or plane of stations.
 _WITH_REGION = (Status.AMBIGUOUS, Status.CURVED)
-# A wedge without an end is cut off at 3 least ranges or 10 sizes of the array, and at 1 000 km.
+# If the range of a direction has no upper limit, its wedge is cut off: at 3 times the smallest range or at 10 times
+# the size of the array, whichever is farther, but at most at 1 000 km.
 _LEAST, _SIZES, _MOST = 3.0, 10.0, 1e6
 
 
 def is_shown(fix: Fix) -> bool:
-    """Return whether a single fix has directions, ranges or curves to show in place of a position, or with it."""
+    """Return whether a single fix has directions, ranges or curves to show, with or without a position."""
     kept = fix.source is not None and fix.source[()] is not None
     return kept and Status(int(fix.code)) in (*WITHOUT_PLACE, *_WITH_REGION)
 
 
 def has_place(fix: Fix) -> bool:
-    """Return whether the position of a single fix is a place."""
+    """Return whether a single fix has a status with a valid position."""
     return Status(int(fix.code)) not in WITHOUT_PLACE
 
 
 def shown_directions(fix: Fix, found: Determined) -> tuple[Direction, ...]:
-    """Return the directions that are shown of a single fix: none where it has a place."""
+    """Return the directions of a single fix to show; empty if the fix has a valid position."""
     return () if has_place(fix) else found.directions
 
 
 def known_rows(fix: Fix) -> list[tuple[str, str]]:
-    """Return directions, numbers and curve of a single fix as labels and texts of its sheet."""
+    """Return directions, intervals and the curve of a single fix as pairs of label and text."""
     if not is_shown(fix):
         return []
     found = fix.determined
@@ -43,7 +48,7 @@ def known_rows(fix: Fix) -> list[tuple[str, str]]:
     rows = []
     directions = shown_directions(fix, found)
     if directions and found.outside:
-        rows.append(("assumed", "the target is farther away from their middle than the stations"))
+        rows.append(("assumed", "the target is farther from the middle of the stations than any station"))
     for i, one in enumerate(directions, 1):
         number = f" {i}" if len(directions) > 1 else ""
         rows.append((f"95 % direction{number}", _direction_text(found, one)))
@@ -51,32 +56,35 @@ def known_rows(fix: Fix) -> list[tuple[str, str]]:
     rows += [(f"95 % {one.name}", _quantity_text(one)) for one in found.quantities]
     if found.quantities and found.axis is not None:
         way = ", ".join(f"{value:.2f}" for value in found.axis)
-        shape = "line along" if any(one.name == "angle to line" for one in found.quantities) else "plane across"
-        rows.append(("stations", f"on a {shape} ({way}) through {_place(found)}"))
+        shape = "line along" if any(one.name == "angle to line" for one in found.quantities) else "plane normal to"
+        rows.append(("stations", f"on a {shape} ({way}) through {_centre_text(found)}"))
     if found.curve is not None:
         rows.append(("curve", f"{found.curve_name}: fix.determined.curve"))
     return rows
 
 
-def _place(found: Determined) -> str:
-    """Return the middle of the stations in words."""
-    return "(" + ", ".join(f"{value:.6g}" for value in found.origin) + ") m, their middle"
+def _centre_text(found: Determined) -> str:
+    """Return the text of the centre of the stations, m."""
+    return "(" + ", ".join(f"{value:.6g}" for value in found.origin) + ") m, the middle of the stations"
 
 
 def _direction_text(found: Determined, one: Direction) -> str:
-    """Return a direction with its cone in words, degrees."""
+    """Return the text of a direction with its cone, degrees."""
     if found.north:
         middle, low, high = bearing_of(one.azimuth)
-        text = f"bearing {_ends(middle, low, high)}"
+        text = f"bearing {_angle_text(middle, low, high)}"
     else:
-        text = f"azimuth {_ends(*np.degrees(one.azimuth).tolist())}"
-    text += f", elevation {_ends(*np.degrees(one.elevation).tolist())}" if one.elevation else ""
+        text = f"azimuth {_angle_text(*np.degrees(one.azimuth).tolist())}"
+    text += f", elevation {_angle_text(*np.degrees(one.elevation).tolist())}" if one.elevation else ""
     half = " x ".join(f"{value:.2g}" for value in np.degrees(one.half_angles))
     return f"{text}; cone of ± {half} deg from the middle of the stations"
 
 
-def _ends(middle: float, low: float, high: float) -> str:
-    """Return an angle with its interval, with a digit more than the interval is wide."""
+def _angle_text(middle: float, low: float, high: float) -> str:
+    """Return the text of an angle with its interval, degrees.
+
+    The width of the interval sets the number of digits: one digit more than the width needs.
+    """
     width = high - low
     if width >= 360.0:
         return "not determined"
@@ -92,27 +100,27 @@ def _range_text(one: Direction) -> str:
 
 
 def _quantity_text(one: Quantity) -> str:
-    """Return a number with its interval."""
+    """Return the text of an interval."""
     value, low, high, unit = one.value, one.low, one.high, one.unit
     if unit == "rad":
-        return _ends(*np.degrees([value, low, high]).tolist())
+        return _angle_text(*np.degrees([value, low, high]).tolist())
     far = f"{high:.4g} {unit}" if np.isfinite(high) else "infinity"
     near = f"{low:.4g}" if np.isfinite(low) else "minus infinity"
     return f"{near} to {far}"
 
 
-# On the Earth.
+# GeoJSON on Earth.
 
 
 def known_features(fix: Fix, frame: Frame) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Return geometries of GeoJSON with their properties: of each direction a wedge and a ray, and the curve.
+    """Return GeoJSON geometries with their properties: a wedge and a ray for each direction, and the curve.
 
     Parameters
     ----------
     fix : Fix
         A single fix.
     frame : Frame
-        Its frame, on Earth.
+        Frame of the fix, on Earth.
     """
     from optloc.show.pictures.outlines import earth_line, line_geometry, polygon_geometry
 
@@ -120,32 +128,33 @@ def known_features(fix: Fix, frame: Frame) -> list[tuple[dict[str, Any], dict[st
         return []
     found = fix.determined
     assert found is not None
-    told: list[tuple[dict[str, Any], dict[str, Any]]] = []
+    features: list[tuple[dict[str, Any], dict[str, Any]]] = []
     for one, about in zip(shown_directions(fix, found), found.to_dict()["directions"], strict=False):
         kept = {name: value for name, value in about.items() if name not in ("vector", "outline")}
         reach = reach_of(fix, one)
-        wedge = polygon_geometry([[earth_line(frame, _fine(found.wedge(one, reach)))]])
-        told.append((wedge, {"role": "direction95", "cut": not one.mixed, **kept}))
-        ray = line_geometry([earth_line(frame, _fine(found.ray(one, reach)))])
-        told.append((ray, {"role": "ray", "cut": not one.mixed, "gap": one.gap}))
+        wedge = polygon_geometry([[earth_line(frame, _with_points_between(found.wedge(one, reach)))]])
+        features.append((wedge, {"role": "direction95", "cut": not one.mixed, **kept}))
+        ray = line_geometry([earth_line(frame, _with_points_between(found.ray(one, reach)))])
+        features.append((ray, {"role": "ray", "cut": not one.mixed, "gap": one.gap}))
     if found.curve is not None:
         line = line_geometry([earth_line(frame, found.curve)])
-        told.append((line, {"role": "curve", "name": found.curve_name}))
-    return told
+        features.append((line, {"role": "curve", "name": found.curve_name}))
+    return features
 
 
 def reach_of(fix: Fix, one: Direction) -> float:
-    """Return the distance, metres, at which the wedge of a direction without an end is cut off."""
+    """Return the distance, m, at which the wedge of an unlimited direction ends."""
     size = 0.0 if fix.reach is None else float(np.nan_to_num(fix.reach))
     return float(np.clip(max(_LEAST * one.least_range, _SIZES * size), 1.0, _MOST))
 
 
-# Pieces of an edge on the Earth, which bends away from a straight line by a kilometre in 100.
+# Pieces of each edge. The surface of the Earth drops about 1 km below a straight line of 100 km, so a long edge needs
+# points in between.
 _PIECES = 16
 
 
-def _fine(line: Array) -> Array:
-    """Return a line (n, d) with points between its corners."""
+def _with_points_between(line: Array) -> Array:
+    """Return a line (n, d) with extra points between its corners."""
     share = np.arange(_PIECES)[:, None] / _PIECES
     parts = [start + share * (end - start) for start, end in pairwise(line)]
     return np.concatenate([*parts, line[-1:]])

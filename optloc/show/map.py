@@ -1,4 +1,8 @@
-"""What an interactive map shows: a plane of longitude and latitude, coasts, marks in layers; fixes as such marks."""
+"""Interactive maps: projection, coastlines, layers of marks, and the marks of fixes, tracks and stations.
+
+A `Plane` projects longitude and latitude to the units of an SVG drawing. `Spots` are marks on Earth, and a `Canvas` is
+a map that a template writes as SVG.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +27,9 @@ from optloc.uncertainty.outline import Outline
 
 # Coastlines for maps without a network.
 #
-# The land polygons of Natural Earth at 1:50 million (https://www.naturalearthdata.com, version 4.1, public domain), by
-# way of the package world-atlas 2.0.2, to a hundredth of a degree: differences of the corners of all rings, and the
-# lengths of the rings.
+# Source: the land polygons of Natural Earth at 1:50 million, version 4.1, public domain
+# (https://www.naturalearthdata.com), from the package world-atlas 2.0.2. Coordinates are rounded to a hundredth of a
+# degree. The file stores the differences between corners of all rings, and the lengths of the rings.
 
 Window = tuple[float, float, float, float]
 """West, east, south, north in degrees; east may exceed 180."""
@@ -33,11 +37,11 @@ Window = tuple[float, float, float, float]
 
 @cache
 def rings() -> tuple[Array, ...]:
-    """Return the shores of all land, and of seas in it, as closed rings (n, 2) of longitude and latitude in degrees.
+    """Return the shores of all land and of inland seas as closed rings (n, 2): longitude and latitude, degrees.
 
-    Each is in one piece, so that some go beyond 180 degrees; that of Antarctica goes along the pole.
+    A ring that crosses the antimeridian has longitudes beyond 180 degrees. The ring of Antarctica runs along the pole.
     """
-    # Differences in hundredths of a degree: integers that a zip archive makes small.
+    # The file stores differences in hundredths of a degree, as integers, which compress well.
     with (files("optloc.show") / "natural-earth-50m.npz").open("rb") as file, np.load(file) as data:
         delta, length = data["delta"].astype(np.int64), data["length"]
     starts = np.cumsum(length)[:-1]
@@ -45,14 +49,14 @@ def rings() -> tuple[Array, ...]:
 
 
 def land(window: Window) -> list[Array]:
-    """Return the land in a window as polygons (n, 2); to be filled by the even-odd rule."""
+    """Return the land in a window as polygons (n, 2), degrees; fill them by the even-odd rule."""
     west, east, south, north = window
     found = []
     for ring in rings():
         low, high = ring.min(0), ring.max(0)
         if high[1] < south or low[1] > north:
             continue
-        # A ring that crosses the date line is in one piece, on one side of it or the other.
+        # A ring that crosses the antimeridian can overlap the window after a turn of 360 degrees.
         for turn in (-360.0, 0.0, 360.0):
             if low[0] + turn < east and high[0] + turn > west:
                 cut = _clip(ring + np.array([turn, 0.0]), window)
@@ -62,9 +66,9 @@ def land(window: Window) -> list[Array]:
 
 
 def _clip(ring: Array, window: Window) -> Array:
-    """Return a ring cut at four straight lines.
+    """Return a ring (n, 2) clipped to a window, degrees.
 
-    I. E. Sutherland and G. W. Hodgman, "Reentrant polygon clipping", Communications of the ACM 17 (1974).
+    Source: I. E. Sutherland and G. W. Hodgman, "Reentrant polygon clipping", Communications of the ACM 17 (1974).
     """
     for axis, limit, sign in ((0, window[0], 1.0), (0, window[1], -1.0), (1, window[2], 1.0), (1, window[3], -1.0)):
         if not len(ring):
@@ -80,43 +84,43 @@ def _clip(ring: Array, window: Window) -> Array:
     return ring
 
 
-# Units of the drawing along its longer side; with one decimal a coast is true to a ten-thousandth of the map.
+# Units of the drawing along its longer side. With one decimal, a coast is accurate to a ten-thousandth of the map.
 _SIZE = 1000.0
-# What is drawn of the coast, in halves of the map along x and y: the script zooms out to 2.5 times the map, on screens
-# that are wider than it, and then it can be dragged.
+# Extent of the drawn coast, in half sizes of the map along x and y. The script zooms out to 2.5 times the map, a screen
+# can be wider than the map, and the user can drag the map.
 _AROUND = np.array([6.0, 4.0])
-# A map that is narrow has surroundings like one of this shape: its window is as wide as the page.
+# Minimum ratio of the half sizes for the extent of the coast: the window of a narrow map is as wide as the page.
 _NARROWEST = 0.8
 
 
 class Plane:
-    """Longitude and latitude to the units of the drawing, true to scale in the middle of the map.
+    """The projection of longitude and latitude to units of the drawing; true to scale in the middle of the map.
 
     Parameters
     ----------
     west, east, south, north : float
-        Limits of the map, degrees; east may exceed 180.
+        Limits of the map, degrees; east can exceed 180.
     """
 
     def __init__(self, west: float, east: float, south: float, north: float) -> None:
         self.middle = np.array([(west + east) / 2.0, (south + north) / 2.0])
-        # A degree of longitude is so much shorter than one of latitude.
+        # A degree of longitude is shorter than a degree of latitude by this factor.
         self.squeeze = float(np.cos(np.radians(self.middle[1])))
         self.unit = _SIZE / max((east - west) * self.squeeze, north - south)
         self.half = np.array([(east - west) * self.squeeze, north - south]) * self.unit / 2.0
 
     def __call__(self, place: Array) -> Array:
-        """Return longitude and latitude (..., 2) in the units of the drawing."""
+        """Return longitude and latitude (..., 2), degrees, in units of the drawing."""
         shift = np.asarray(place, dtype=float) - self.middle
         return np.asarray(shift * [self.squeeze * self.unit, -self.unit])
 
     @property
     def scale(self) -> list[float]:
-        """Return units of the drawing in a degree of longitude and of latitude."""
+        """Return the units of the drawing in a degree of longitude and in a degree of latitude."""
         return [self.squeeze * self.unit, -self.unit]
 
     def window(self) -> Window:
-        """Return what is drawn of the coast: the map and its surroundings."""
+        """Return the extent of the drawn coast: the map and its surroundings, degrees."""
         half = np.maximum(self.half, self.half.max() * _NARROWEST) * _AROUND / [self.squeeze * self.unit, self.unit]
         (west, south), (east, north) = self.middle - half, self.middle + half
         return max(west, self.middle[0] - 180.0), min(east, self.middle[0] + 180.0), max(south, -90.0), min(north, 90.0)
@@ -124,20 +128,20 @@ class Plane:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A path of SVG; a dot is one without length, whose round end is as wide as its stroke.
+    """A path of SVG. A dot is a path of length zero: the stroke has round ends, so its width is the size of the dot.
 
     Parameters
     ----------
     kind : str
-        Its class in the style sheet.
+        Class of the style sheet.
     d : str
-        Its data, units of the drawing.
+        Path data, in units of the drawing.
     colour : str
-        Of the stroke, where the style sheet has none.
+        Colour of the stroke if the style sheet sets no colour.
     width : float
-        Of the stroke, pixels at any zoom.
+        Width of the stroke, pixels at any zoom.
     tell : str
-        What the page says when it is pointed at.
+        Text that the page shows while the pointer is on the curve.
     """
 
     kind: str
@@ -150,7 +154,7 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A text (`kind` is its class in the style sheet) at a place of the drawing."""
+    """A text at a position of the drawing; `kind` is its class in the style sheet."""
 
     kind: str
     x: float
@@ -161,7 +165,7 @@ class Label:
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """A picture whose corner is at a place of the drawing; its source is an address that holds it."""
+    """A picture; `x` and `y` are its upper left corner, and `source` is a data URL with its content."""
 
     x: float
     y: float
@@ -176,23 +180,23 @@ Drawn = Curve | Label | Image
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
-    """A map as a template draws it.
+    """A map, ready for a template.
 
     Parameters
     ----------
     name : str
-        Identity of the element.
+        Id of the element.
     title : str
-        What it shows.
+        Description of the map.
     layers : mapping of str to sequence of Curve, Label and Image
-        What is drawn, from the lowest layer on; a box switches it off.
+        Layers from bottom to top; a checkbox hides each layer.
     text : str
-        Stands below the map while nothing is pointed at.
+        Text below the map while the pointer is on no mark.
     box, shore : str
-        View box of the SVG, and data of the path of all land.
+        View box of the SVG, and path data of all land.
     data : dict
-        What the script needs: `middle` and `scale` of the plane; `x`, `y` and `values` of a bound; `focus`, middle and
-        width of a part that deserves a button, and `nearest`, how far one can zoom.
+        Values for the script: `middle` and `scale` of the plane; `x`, `y` and `values` of a bound; `focus`, the centre
+        and width of a part that a button shows; `nearest`, the largest zoom.
     """
 
     name: str
@@ -207,7 +211,7 @@ class Canvas:
 def map_canvas(
     plane: Plane, name: str, title: str, layers: Mapping[str, Sequence[Drawn]], data: dict[str, Any], text: str
 ) -> Canvas:
-    """Return a map of a plane; the arguments are those of `Canvas`, `data` without middle and scale."""
+    """Return the map of a plane. For the arguments see `Canvas`; `data` needs no `middle` and no `scale`."""
     shore = path([plane(ring) for ring in land(plane.window())], close=True)
     width, height = 2.0 * plane.half
     box = f"{-plane.half[0]:.1f} {-plane.half[1]:.1f} {width:.1f} {height:.1f}"
@@ -217,48 +221,49 @@ def map_canvas(
 
 
 def path(lines: Sequence[Array], *, close: bool, digits: int = 1) -> str:
-    """Return lines (n, 2) of the drawing as the data of an SVG path."""
+    """Return lines (n, 2), in units of the drawing, as the data of an SVG path."""
     end = "Z" if close else ""
     return "".join("M" + "L".join(f"{x:.9g} {y:.9g}" for x, y in np.round(line, digits)) + end for line in lines)
 
 
 def dot(x: float, y: float, colour: str, size: float, title: str = "") -> Curve:
-    """Return a dot whose size does not depend on the zoom; the page shows its title when it is pointed at."""
+    """Return a dot of `size` pixels at any zoom; the page shows `title` while the pointer is on the dot."""
     return Curve("dot", f"M{x:.9g} {y:.9g}h0", colour, size, title)
 
 
-# Fixes and tracks as marks on the Earth: longitude, latitude, ellipse, a line of text.
+# Fixes and tracks as marks on Earth: longitude, latitude, ellipse and a line of text.
 
-# Corners of an ellipse: one every five degrees, the first again as the last.
+# Corners of an ellipse: one for every five degrees; the last corner repeats the first.
 _RING = 73
-# Metres above the ellipsoid where space begins by convention: satellites have no place on a map.
+# Height, m, at which space begins by convention. Satellites have no position on a map.
 _SKY = 100e3
-# Points along an axis on which lines of position are sought: 112 steps across the map, and beyond each of its sides as
-# much as `_RIM` says in widths, for windows that are wider or taller; 80 000 points are evaluated in one batch.
+# Points along an axis of the grid on which lines of position are traced: 112 steps across the map. The grid extends
+# beyond each side by `_RIM` times the width, for windows that are wider or taller than the map. One batch evaluates
+# 80 000 points.
 _GRID, _RIM = 281, 0.75
-# Short of the poles, where longitude has no meaning.
+# Largest latitude of the grid, degrees: at a pole, the longitude is undefined.
 _POLE = 89.9
 
 
 @dataclass(frozen=True, slots=True)
 class Spots:
-    """Marks on the Earth.
+    """Marks on Earth.
 
     Parameters
     ----------
     place : array (n, 2)
-        Longitude and latitude, degrees; NaN where there is none.
-    rings : tuple of array (r, 2)
-        The 95 % ellipse of each, or the outline of the region where no ellipse covers, degrees; empty where there is no
-        covariance.
+        Longitude and latitude, degrees; NaN for a missing position.
+    rings : tuple of n arrays (r, 2)
+        95 % ellipse of each mark, degrees. If no ellipse is valid, the outline of the 95 % region; if there is no
+        covariance, an empty array.
     clean : bool array (n,)
-        Where the status is ok.
+        Whether the status is `ok`.
     text : tuple of n str
-        What is told of each.
+        Text that the page shows for each mark.
     more : tuple of array (r, 2)
-        Outlines of the other parts of regions, degrees.
+        Outlines of the other parts of regions that have several parts, degrees.
     local : bool array (n,), optional
-        Where the ring is an ellipse that does not cover, and what does is not known.
+        Whether the ring is an ellipse that is not valid, while the valid region is unknown.
     """
 
     place: Array
@@ -277,20 +282,20 @@ def spots(
     text: Sequence[str],
     outlines: Sequence[Sequence[Outline]] = (),
 ) -> Spots:
-    """Return positions in a problem's frame as marks on the Earth.
+    """Return positions in the frame of a problem as marks on Earth.
 
     Parameters
     ----------
     problem : Problem
         Gives the frame.
     position, covariance : array (n, d), (n, d, d)
-        Metres, square metres.
+        Positions, m, and covariances, m^2.
     clean : bool array (n,)
-        Where the status is ok.
+        Whether the status is `ok`.
     text : sequence of n str
-        What is told of each.
+        Text that the page shows for each mark.
     outlines : sequence of n sequences of Outline, optional
-        The plan of each region that no ellipse covers, along east and north; empty for the others.
+        Outlines along east and north of the 95 % regions of fixes without a valid ellipse; empty for other fixes.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, _RING)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -300,7 +305,7 @@ def spots(
         if not (np.isfinite(centre).all() and np.isfinite(spread).all()):
             rings.append(np.zeros((0, 2)))
             continue
-        # The ellipse of east and north, whatever the height is worth.
+        # Use the marginal covariance of east and north.
         axes = problem.frame.enu_axes(centre)[:2]
         if regions:
             lines = [degrees(problem, centre + line @ axes) for region in regions for line in region.lines]
@@ -314,7 +319,7 @@ def spots(
 
 
 def degrees(problem: Problem, position: Array) -> Array:
-    """Return longitude and latitude (n, 2) of positions (n, d), NaN where these are."""
+    """Return longitude and latitude (n, 2), degrees, of positions (n, d), m; NaN for NaN positions."""
     out = np.full((len(position), 2), np.nan)
     known = np.isfinite(position).all(-1)
     if known.any():
@@ -324,7 +329,7 @@ def degrees(problem: Problem, position: Array) -> Array:
 
 
 def fixed_spots(problem: Problem, fixes: Sequence[Fix], labels: Sequence[str]) -> Spots:
-    """Return the marks of fixes; labels name them where there are as many."""
+    """Return the marks of fixes; `labels` are their names if there is one label for each position."""
     parts = [part for fix in fixes for part in states_of(fix)]
     position, covariance, clean = (np.concatenate(each) for each in zip(*parts, strict=True))
     status = [
@@ -332,25 +337,25 @@ def fixed_spots(problem: Problem, fixes: Sequence[Fix], labels: Sequence[str]) -
         for fix in fixes
         for code, alone in zip(np.ravel(fix.code), np.ravel(fix.unchecked), strict=True)
     ]
-    named = list(labels) if len(labels) == len(position) > 1 else [""] * len(position)
-    told = status if len(status) == len(position) else ["" if ok else "status not ok" for ok in clean]
+    names = list(labels) if len(labels) == len(position) > 1 else [""] * len(position)
+    status_texts = status if len(status) == len(position) else ["" if ok else "status not ok" for ok in clean]
     sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
-    sentences = [sentence(*each) for each in zip(named, told, degrees(problem, position), sigma, strict=True)]
+    sentences = [sentence(*each) for each in zip(names, status_texts, degrees(problem, position), sigma, strict=True)]
     outlines = regions_of(problem, fixes, len(position), [level_planes(problem, position)])
     for i, regions in enumerate(outlines):
-        sentences[i] += ", 95 % region cut off: it goes on" if any(region.cut for region in regions) else ""
+        sentences[i] += ", 95 % region larger than drawn" if any(region.cut for region in regions) else ""
     found = spots(problem, position, covariance, clean, sentences, outlines)
     return replace(found, local=is_local(fixes, [bool(each) for each in outlines], len(position)))
 
 
 def sentence(name: str, status: str, place: Array, sigma: float) -> str:
-    """Return what is told of a fix."""
+    """Return the text of a fix: name, status, latitude and longitude, sigma."""
     parts = [name, status, f"{place[1]:.5f}°, {place[0]:.5f}°" if np.isfinite(place).all() else "no position"]
     return ", ".join(part for part in [*parts, f"sigma {sigma:.3g} m" if np.isfinite(sigma) else ""] if part)
 
 
 def other_spots(problem: Problem, fixes: Sequence[Fix]) -> Spots:
-    """Return the marks of the alternatives of single fixes."""
+    """Return the marks of the alternatives of fixes."""
     places, text = [np.zeros((0, problem.dimension))], []
     for fix in fixes:
         flat = fix if len(fix.shape) == 1 else fix.flat()
@@ -358,14 +363,14 @@ def other_spots(problem: Problem, fixes: Sequence[Fix]) -> Spots:
         for slot in flat.layout.shared:
             if slot.name.partition("[")[0] == "position":
                 places.append(flat.layout.take(flat.alternatives.x, slot.name)[shown])
-                text += [f"alternative, costs {gap:.3g} more" for gap in flat.alternatives.gap[shown]]
+                text += [f"alternative, cost gap {gap:.3g}" for gap in flat.alternatives.gap[shown]]
     position = np.concatenate(places)
     count, d = position.shape
     return spots(problem, position, np.full((count, d, d), np.nan), np.zeros(count, dtype=bool), text)
 
 
 def station_spots(problem: Problem) -> Spots:
-    """Return the marks of the stations of the first epoch; those in the sky have no place on a map."""
+    """Return the marks of the stations in the first epoch; stations in space have no position on a map."""
     position = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
     place = degrees(problem, position)
     place[problem.frame.to_geodetic(position)[2] > _SKY] = np.nan
@@ -374,37 +379,37 @@ def station_spots(problem: Problem) -> Spots:
 
 
 def ground_tracks(problem: Problem) -> list[tuple[str, Array]]:
-    """Return the lines (n, 2) in degrees below stations in the sky that range rates are measured from, by name.
+    """Return the names and ground tracks (n, 2), degrees, of satellites with range rate measurements.
 
-    Their longitudes go on beyond the date line.
+    Longitudes continue beyond 180 degrees, so that a track has no jump at the antimeridian.
     """
-    heard = [index for rows in problem.rows if MODELS[rows.kind].velocity for index in (rows.a, rows.b)]
+    used = [index for rows in problem.rows if MODELS[rows.kind].velocity for index in (rows.a, rows.b)]
     found = []
-    for station in np.unique(np.concatenate([*heard, [-1]]))[1:].tolist():
+    for station in np.unique(np.concatenate([*used, [-1]]))[1:].tolist():
         track = problem.stations.position.reshape(-1, *problem.stations.position.shape[-3:])[0, :, station]
         lat, lon, height = problem.frame.to_geodetic(thinned(track))
         if height.min() > _SKY:
             line = np.degrees(np.stack([np.unwrap(lon), lat], axis=-1))
-            found.append((f"below {problem.stations.names[station]}", line))
+            found.append((f"ground track of {problem.stations.names[station]}", line))
     return found
 
 
 def lines_on_map(problem: Problem, fix: Fix, limits: tuple[float, float, float, float]) -> list[tuple[str, Array]]:
-    """Return the lines of position of a single fix, at its height: kind and stations, and line (n, 2) in degrees."""
-    figure_class()  # one sentence where matplotlib, which brings contourpy, is missing
+    """Return the lines of position of a single fix at its height: label, and line (n, 2) in degrees."""
+    figure_class()  # Raise one clear error if matplotlib, which installs contourpy, is missing.
     flat = fix.flat()
     if len(flat) != 1 or not np.isfinite(flat.x).all() or not flat.layout.shares("position"):
         return []
-    lon, lat = _beyond(*limits[:2]), np.clip(_beyond(*limits[2:]), -_POLE, _POLE)
+    lon, lat = _grid_beyond(*limits[:2]), np.clip(_grid_beyond(*limits[2:]), -_POLE, _POLE)
     height = float(problem.frame.to_geodetic(flat.take("position")[0])[2])
     east, north = (np.radians(v.ravel()) for v in np.meshgrid(lon, lat))
-    # Longitudes back between half a turn west and east: the grid goes on beyond the date line.
+    # The grid continues beyond the antimeridian: wrap its longitudes to ±180 degrees.
     place = problem.frame.from_geodetic(north, (east + np.pi) % (2.0 * np.pi) - np.pi, np.full(east.size, height))
     found = lines_of_position(problem, fix, lon, lat, place[:, : problem.dimension])
     return [(one.name if one.kind == "isodoppler" else f"{one.kind} {one.name}", one.line) for one in found]
 
 
-def _beyond(low: float, high: float) -> Array:
-    """Return a grid that goes beyond the limits of a map, whose window may be wider or taller."""
+def _grid_beyond(low: float, high: float) -> Array:
+    """Return grid points from beyond the lower limit to beyond the upper limit: a window can be larger than the map."""
     rim = _RIM * (high - low)
     return np.linspace(low - rim, high + rim, _GRID)

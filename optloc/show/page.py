@@ -1,7 +1,7 @@
-"""A page: one HTML file that needs nothing else, from the templates of this package; pages with a map that moves.
+"""HTML pages: one self-contained file from the templates of this package, with interactive maps.
 
-Python prepares values and templates write HTML: every text is escaped where it is written, but for what `asset` reads
-and the SVG of figures.
+Python prepares the values, and templates write the HTML. Templates escape all texts except the style sheets and scripts
+that `asset` reads, and the SVG of figures.
 """
 
 from __future__ import annotations
@@ -50,28 +50,28 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PagePart:
-    """A section of a page; what is empty is left out, the rest stands in this order.
+    """A section of a page. The page shows the parts of a section in the order of this list and omits empty parts.
 
     Parameters
     ----------
     name, title : str
-        Its identity and its heading.
+        Id and heading of the section.
     text : str
         A paragraph.
     tables : sequence of Sheet
         Tables.
     drawings : sequence of Drawing
-        Figures, side by side as the width allows.
+        Figures, side by side if the width allows.
     wide : bool
         Whether each figure has the whole width.
     maps : sequence of Canvas or Drawing
-        Maps that move, and such as do not.
+        Interactive maps, or figures of maps.
     headings : bool
-        Whether the titles of maps that move stand above them.
+        Whether interactive maps have their titles as headings.
     folded : sequence of Sheet
-        Tables that open at a press.
+        Tables that are folded until the reader opens them.
     source : str
-        The text of a study file, which opens at a press.
+        Text of a study file, folded until the reader opens it.
     note : str
         A paragraph in small print.
     """
@@ -90,7 +90,7 @@ class PagePart:
 
     @property
     def moving(self) -> bool:
-        """Return whether it needs the script of maps."""
+        """Return whether the section has an interactive map and so needs the script of maps."""
         return any(isinstance(one, Canvas) for one in self.maps)
 
 
@@ -103,22 +103,22 @@ def write_page(
     methods: Iterable[Look] = (),
     live: bool = False,
 ) -> str:
-    """Return a page.
+    """Return a page as HTML.
 
     Parameters
     ----------
     title : str
-        Of the page.
+        Title of the page.
     parts : sequence of PagePart
-        Its sections; where there are several, links to them stand at the top.
+        Sections of the page; if there are several, the page begins with links to them.
     opening : sequence of str
-        Paragraphs above them.
+        Paragraphs above the sections.
     facts : str
-        The same in small print.
+        A paragraph in small print above the sections.
     methods : iterable of Look
-        Looks of methods for a legend that stays in view.
+        Methods for a legend that stays visible.
     live : bool
-        Whether the map asks its server for fixes, once a second.
+        Whether the map requests new fixes from its server once a second.
     """
     page = _environment().get_template("page.html")
     return page.render(title=title, parts=parts, opening=opening, facts=facts, methods=list(methods), live=live)
@@ -126,10 +126,10 @@ def write_page(
 
 @cache
 def _environment() -> Environment:
-    # Imported where a page is written: the command line answers without it.
+    # Import here: commands that write no page run without jinja2.
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    # Strict: a misspelt value is an error and not a hole in the page.
+    # With StrictUndefined, a misspelt value raises an error instead of leaving a gap in the page.
     made = Environment(
         loader=PackageLoader("optloc.show"),
         autoescape=True,
@@ -142,34 +142,34 @@ def _environment() -> Environment:
 
 
 def _asset(name: str) -> str:
-    """Return a style sheet or a script, whose braces must not be read as those of a template."""
+    """Return a style sheet or a script as text; its braces must not be parsed as template syntax."""
     return (files("optloc.show") / "templates" / name).read_text(encoding="utf-8")
 
 
-# Pages with a map that moves: fixes or tracks with ellipses and lines of position; a bound, as reports show it.
+# Pages with an interactive map: of fixes or tracks, with ellipses and lines of position, or of a bound.
 
-# Ellipses of more fixes are left out: a thicket that nobody reads, and 70 corners each.
+# Maximum number of ellipses on a map: more are unreadable, and each ellipse adds 70 corners to the file.
 _ELLIPSES = 200
 # Decimals of the units of the drawing: an ellipse of centimetres on a map of 1000 km is still round.
 _DIGITS = 5
-# Degrees; a map of a single place is so wide at least, some metres.
+# Extent of the marks, degrees, if all marks have the same position; the map is then about 1 m wide.
 _LEAST = 1e-5
-# Share of the map on each side that stays free of marks, so that names of stations have room.
+# Share of the map on each side that stays free of marks, as room for the names of stations.
 _RIM = 0.22
-# The shorter side of a map over the longer, at least.
+# Minimum ratio of the shorter side of a map to the longer side.
 _SLIMMEST = 0.6
-# Pixels of a dot: of a station and its white middle, of a mark, and of a mark where there are more than `_FEW`.
+# Size of a dot in pixels: a station, its white centre, a mark, and a mark if there are more than `_FEW`.
 _STATION, _MIDDLE, _MARK, _SMALL = 11, 7, 11, 5
 _FEW = 12
 
 
 def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: Sequence[str] = ()) -> str:
-    """Return an HTML page with an interactive map of fixes; it needs no server and no network.
+    """Return an HTML page with an interactive map of fixes; the page needs no server and no network.
 
     Parameters
     ----------
     problem : Problem
-        On Earth; gives the stations.
+        Gives the stations; its frame is on Earth.
     fixes : Fix or sequence of Fix
         Single fixes or batches.
     title : str
@@ -180,7 +180,7 @@ def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: S
     Raises
     ------
     InvalidProblem
-        Where the frame is not on Earth, nothing has a place, or matplotlib is missing.
+        If the frame is not on Earth, nothing has a position, or matplotlib is missing.
     """
     _on_earth(problem.frame.geodetic)
     several = [fixes] if isinstance(fixes, Fix) else list(fixes)
@@ -193,44 +193,44 @@ def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: S
 
 
 def track_page(problem: Problem, tracks: Spots, title: str) -> str:
-    """Return the same of the scans of tracks."""
+    """Return an HTML page with an interactive map of the scans of tracks; `tracks` are their marks."""
     _on_earth(problem.frame.geodetic)
     return _page(problem, tracks, Spots(np.zeros((0, 2)), (), np.zeros(0, dtype=bool), ()), title, "track", None)
 
 
 def live_page(problem: Problem, title: str) -> str:
-    """Return an HTML page with a map of stations, on which the fixes of the server that it comes from appear.
+    """Return an HTML page with a map of stations and of the latest fixes, which it requests from its server.
 
     Parameters
     ----------
     problem : Problem
-        On Earth; gives the stations.
+        Gives the stations; its frame is on Earth.
     title : str
         Title of the page.
 
     Raises
     ------
     InvalidProblem
-        Where the frame is not on Earth, or matplotlib is missing.
+        If the frame is not on Earth, or matplotlib is missing.
     """
     _on_earth(problem.frame.geodetic)
     stations = station_spots(problem)
     limits = _limits([stations.place])
     plane, middle = Plane(*limits), (limits[0] + limits[1]) / 2.0
     layers: dict[str, Sequence[Drawn]] = {"stations": _stations(stations, plane, middle), "fixes": ()}
-    text = "Stations (white) and the latest fixes (blue; orange where the status is not ok). Point at a mark."
+    text = "White: stations. Blue: the latest fixes; orange if the status is not ok. Point at a mark for details."
     canvas = map_canvas(plane, "map-1", title, layers, {}, text)
     note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
     return write_page(title, [PagePart("map", "Map", maps=[canvas], note=note)], live=True)
 
 
 def map_page(found: BoundMap, title: str) -> str:
-    """Return an HTML page with the interactive map of a bound; it needs no network.
+    """Return an HTML page with the interactive map of a bound; the page needs no network.
 
     Raises
     ------
     InvalidProblem
-        Where the frame is not on Earth, or matplotlib is missing.
+        If the frame is not on Earth, or matplotlib is missing.
     """
     _on_earth(found.geodetic)
     text = "Root of the trace of the Cramer-Rao bound of the position, in metres. Shores: Natural Earth."
@@ -240,14 +240,14 @@ def map_page(found: BoundMap, title: str) -> str:
 
 def _on_earth(geodetic: bool) -> None:
     if not geodetic:
-        advice = "write a picture (.png, .svg, .pdf), or give a frame of the Earth"
+        advice = 'write a picture (.png, .svg, .pdf), or give a [frame] of kind "geodetic", "ecef" or "enu"'
         raise InvalidProblem("an interactive map needs positions on Earth", "map", advice)
 
 
 def _page(
     problem: Problem, found: Spots, others: Spots, title: str, what: str, single: Fix | None, first: str = ""
 ) -> str:
-    """Return the page of a map, with a first line of text where something is to be told."""
+    """Return the page of a map; the paragraph `first`, if there is one, is above the map."""
     stations, tracks = station_spots(problem), ground_tracks(problem)
     limits = _limits([stations.place, found.place, others.place, *(line for _, line in tracks)])
     plane, middle = Plane(*limits), (limits[0] + limits[1]) / 2.0
@@ -255,31 +255,34 @@ def _page(
     few = len(found.place) <= _FEW
     layers: dict[str, Sequence[Drawn]] = {
         **({"lines of position": _curves(lines, plane)} if lines else {}),
-        **({"ground tracks": _curves(_around(tracks, middle), plane, "line")} if tracks else {}),
+        **({"ground tracks": _curves(_nearest_turn(tracks, middle), plane, "line")} if tracks else {}),
         "stations": _stations(stations, plane, middle),
         **({"alternatives": _dots(others, plane, middle, _MARK)} if len(others.place) else {}),
         what: [*_ellipses(found, plane, middle), *_dots(found, plane, middle, _MARK if few else _SMALL)],
     }
-    # The part that deserves a button is three ellipses wide; a map that is not wider needs none.
+    # A button zooms to the fix: its view is three ellipses wide. A map that is less than twice as wide has no button.
     data: dict[str, object] = {}
     if focus := _focus(found, plane, middle):
-        # One can zoom until the part fills a tenth of the width, at least as far as on maps without one.
+        # Allow zooming until a tenth of this view fills the map, and at least as far as on other maps.
         data = {"focus": focus, "nearest": max(200.0, 10.0 * 2.0 * float(plane.half[0]) / focus[2])}
-    text = f"Stations (white), {what} (blue; orange where the status is not ok) with what holds 95 %. Point at a mark."
+    text = f"White: stations. Blue: {what}, with 95 % region; orange if not ok. Point at a mark for details."
     if found.local is not None and found.local.any():
-        text = text.replace("holds 95 %.", "holds 95 % (dotted: an ellipse that does not).")
+        text = text.replace("95 % region;", "95 % region (dotted: a local ellipse, not valid);")
     canvas = map_canvas(plane, "map-1", title, layers, data, text)
     note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
     return write_page(title, [PagePart("map", "Map", first[:1].upper() + first[1:], maps=[canvas], note=note)])
 
 
 def _limits(places: Sequence[Array]) -> tuple[float, float, float, float]:
-    """Return west, east, south, north that hold all places with a rim; of two ways around the Earth the shorter."""
+    """Return west, east, south, north, degrees, around all points with a margin.
+
+    If points are on both sides of the antimeridian, the shorter way around the Earth is used.
+    """
     points = np.concatenate(places)
     points = points[np.isfinite(points).all(-1)]
     if not len(points):
-        raise InvalidProblem("nothing has a place on the map", "map", "see `optloc fix` for the reasons")
-    # Everything within half a turn of the first place.
+        raise InvalidProblem("nothing has a position on the map", "map", "see `optloc fix` for the reasons")
+    # Move all longitudes to within 180 degrees of the first point.
     points = _turn(points, points[0, 0])
     low, high = points.min(0), points.max(0)
     squeeze = np.array([np.cos(np.radians((low + high)[1] / 2.0)), 1.0])
@@ -291,14 +294,17 @@ def _limits(places: Sequence[Array]) -> tuple[float, float, float, float]:
 
 
 def _turn(place: Array, middle: float) -> Array:
-    """Return longitude and latitude (n, 2) with longitudes within half a turn of the middle of the map."""
+    """Return longitude and latitude (n, 2), degrees, with longitudes within 180 degrees of the middle of the map."""
     out = np.array(place, dtype=float)
     out[:, 0] = (out[:, 0] - middle + 180.0) % 360.0 - 180.0 + middle
     return out
 
 
 def _focus(found: Spots, plane: Plane, middle: float) -> list[float] | None:
-    """Return middle and width, in units of the drawing, of what holds a single ellipse, where that is small."""
+    """Return the centre and width of a view of a single fix, in units of the drawing.
+
+    The width is three times the size of its ellipse. If it is at least half the width of the map, the result is None.
+    """
     rings = [ring for ring in found.rings if len(ring)]
     if len(found.place) != 1 or not rings:
         return None
@@ -307,8 +313,8 @@ def _focus(found: Spots, plane: Plane, middle: float) -> list[float] | None:
     return [float(x), float(y), width] if width < plane.half[0] else None
 
 
-def _around(lines: Sequence[tuple[str, Array]], middle: float) -> list[tuple[str, Array]]:
-    """Return lines each in one piece, on the turn of longitudes that is nearest to the middle of the map."""
+def _nearest_turn(lines: Sequence[tuple[str, Array]], middle: float) -> list[tuple[str, Array]]:
+    """Return lines after shifting each by a multiple of 360 degrees, so that it is nearest to the middle of the map."""
     return [(name, line - [360.0 * np.round((line[:, 0].mean() - middle) / 360.0), 0.0]) for name, line in lines]
 
 
@@ -334,28 +340,29 @@ def _ellipses(found: Spots, plane: Plane, middle: float) -> list[Drawn]:
     drawn: list[Drawn] = []
     for kind, rings in (
         ("ring", [*covers, *found.more]),
-        # What does not hold 95 % must not look as if it did.
+        # An ellipse that is not valid must look different from a valid ellipse.
         ("ring local", [ring for ring, bare in zip(found.rings, local, strict=True) if bare]),
     ):
         lines = [plane(_turn(ring, middle)) for ring in rings if len(ring)]
-        tell = "local ellipse: it does not cover" if kind == "ring local" else ""
+        tell = "local ellipse: not valid as 95 % region" if kind == "ring local" else ""
         drawn += [Curve(kind, path(lines, close=True, digits=_DIGITS), BLUE, tell=tell)] if lines else []
     return drawn
 
 
 def _dots(found: Spots, plane: Plane, middle: float, size: float) -> list[Drawn]:
     return [
-        dot(x, y, BLUE if ok else ORANGE, size, told)
-        for (x, y), ok, told in zip(plane(_turn(found.place, middle)), found.clean, found.text, strict=True)
+        dot(x, y, BLUE if ok else ORANGE, size, text)
+        for (x, y), ok, text in zip(plane(_turn(found.place, middle)), found.clean, found.text, strict=True)
         if np.isfinite(x)
     ]
 
 
 # The map of a bound: coastlines, bound, stations and trials.
 
-# Dots of trials: enough to show where they are, few enough that the bound below is seen and the page moves smoothly.
+# Maximum number of dots of trials: enough to show the distribution, few enough to see the bound below and to move the
+# page smoothly.
 _DOTS = 400
-_RIGHT, _WRONG = 3, 5  # pixels: those that were answered wrong must be seen among many that were not
+_RIGHT, _WRONG = 3, 5  # Pixels: wrong trials must be visible among many right trials.
 
 
 def map_element(found: BoundMap, name: str, title: str, trials: tuple[Array, Array] | None = None) -> Canvas:
@@ -366,11 +373,11 @@ def map_element(found: BoundMap, name: str, title: str, trials: tuple[Array, Arr
     found : BoundMap
         The bound over a grid of longitude and latitude.
     name : str
-        Identity of the element.
+        Id of the element.
     title : str
-        What it shows.
+        Description of the map.
     trials : (places, off), optional
-        Longitude and latitude (n, 2) of true places, and which of them (n,) were not answered right.
+        Longitude and latitude (n, 2), degrees, of true positions, and whether each trial (n,) had a wrong result.
     """
     plane = Plane(found.x[0], found.x[-1], found.y[0], found.y[-1])
     layers: dict[str, Sequence[Drawn]] = {
@@ -384,7 +391,8 @@ def map_element(found: BoundMap, name: str, title: str, trials: tuple[Array, Arr
 def _help(found: BoundMap) -> str:
     steps = levels(found.sigma)
     low, high = _metres(steps[0]), _metres(steps[-1])
-    return f"Bound from {low} (light) to {high} (dark), {found.height:.0f} m above the ellipsoid. Point at a place."
+    where = f"{found.height:.0f} m above the ellipsoid"
+    return f"Bound from {low} (light) to {high} (dark), {where}. Point at the map to read the bound."
 
 
 def _metres(level: float) -> str:
@@ -397,14 +405,14 @@ def _image(found: BoundMap, plane: Plane) -> Image:
     from matplotlib.image import imsave
 
     steps = levels(found.sigma)
-    # A bound that is the same everywhere still has two ends of a scale.
+    # A colour scale needs two different ends, also if the bound is constant.
     norm = LogNorm(steps[0], max(steps[-1], 2.0 * steps[0]), clip=True)
     rgba = colormaps[COLOURS](norm(np.ma.masked_invalid(found.sigma)))
-    # Where there is no bound nothing is drawn.
+    # Cells without a bound are transparent.
     rgba[~np.isfinite(found.sigma)] = 0.0
     file = BytesIO()
     imsave(file, np.ascontiguousarray(rgba[::-1]), format="png")
-    # A pixel stands around its point, so the picture reaches half a step beyond the grid.
+    # Grid points are centres of pixels, so the picture extends half a step beyond the grid.
     dx, dy = ((v[1] - v[0]) / 2.0 for v in (found.x, found.y))
     x, y = plane(np.array([found.x[0] - dx, found.y[-1] + dy]))
     right, low = plane(np.array([found.x[-1] + dx, found.y[0] - dy]))
@@ -417,7 +425,7 @@ def _lines(found: BoundMap, plane: Plane) -> list[Drawn]:
         drawn = [plane(line) for line in lines]
         if not drawn:
             continue
-        # One label a level, in the middle of its longest line.
+        # Write one label for each level, in the middle of its longest line.
         longest = max(drawn, key=len)
         x, y = longest[len(longest) // 2]
         parts += [Curve("line", path(drawn, close=False)), Label("level", x, y, _metres(level))]
@@ -431,7 +439,7 @@ def _map_stations(found: BoundMap, plane: Plane) -> list[Drawn]:
 
 def _trials(plane: Plane, places: Array, off: Array) -> list[Drawn]:
     kept = np.unique(np.linspace(0, len(places) - 1, min(_DOTS, len(places))).astype(int))
-    order = kept[np.argsort(off[kept], kind="stable")]  # those that were wrong on top
+    order = kept[np.argsort(off[kept], kind="stable")]  # Draw wrong trials last, on top.
     return [
         dot(x, y, ORANGE if bad else BLUE, _WRONG if bad else _RIGHT)
         for (x, y), bad in zip(plane(places[order]), off[order], strict=True)
@@ -439,7 +447,7 @@ def _trials(plane: Plane, places: Array, off: Array) -> list[Drawn]:
 
 
 def _data(found: BoundMap) -> dict[str, Any]:
-    """Return what the script of the page needs to tell the bound at a place."""
+    """Return the values from which the script of the page reads the bound at the pointer."""
     return {
         "x": [float(found.x[0]), float(found.x[-1]), len(found.x)],
         "y": [float(found.y[0]), float(found.y[-1]), len(found.y)],

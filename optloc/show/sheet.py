@@ -1,4 +1,4 @@
-"""Tables of pages: text cells, and the same as plain numbers."""
+"""Tables of pages, with text cells and with plain numbers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 ABSENT = "–"
-"""What stands for a number that there is not: of a smaller sample, or of a trial that is lost."""
+"""Text of a cell without a number, for instance because a sample is too small or a trial was lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,15 +21,15 @@ class TextTable:
     Parameters
     ----------
     name : str
-        Name of its files.
+        File name without an ending.
     title : str
-        What it shows.
+        Title of the table.
     header : tuple of str
-        One name for each column.
+        Name of each column.
     rows : tuple of tuple of str
-        Cells.
+        Cells of each row.
     note : str
-        How to read it.
+        Explanation that is printed below the table.
     """
 
     name: str
@@ -39,13 +39,13 @@ class TextTable:
     note: str = ""
 
     def markdown(self) -> str:
-        """Return the table with its note."""
+        """Return the table in Markdown, with its note below."""
         rule = ("---", *["---:"] * (len(self.header) - 1))
         lines = ["| " + " | ".join(cells) + " |" for cells in (self.header, rule, *self.rows)]
         return "\n".join(lines) + (f"\n\n{self.note}" if self.note else "")
 
     def cell(self, *place: str) -> str:
-        """Return the cell of a row, named by its first cells, and a column; a dash where a sample was too small for it.
+        """Return the text of a cell; `ABSENT` if the row or the column does not exist.
 
         Parameters
         ----------
@@ -53,28 +53,28 @@ class TextTable:
             First cells of the row, then the name of the column.
         """
         *row, column = place
-        # The first that fits: rows are told apart by as many cells as the page cares to name.
+        # Return the first match: a caller gives only the cells that identify the row.
         found = next((cells for cells in self.rows if list(cells[: len(row)]) == row), None)
         return ABSENT if found is None or column not in self.header else found[self.header.index(column)]
 
     def value(self, *place: str, part: int = 0) -> float:
-        """Return a number of such a cell, the first by default; NaN where there is none."""
+        """Return number `part` in the text of a cell, counted from 0; NaN if the cell has fewer numbers."""
         found = re.findall(r"-?\d+\.?\d*(?:e[-+]?\d+)?", self.cell(*place))
         return float(found[part]) if part < len(found) else nan
 
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A table twice.
+    """A table in two forms: numbers and text.
 
     Parameters
     ----------
     frame : DataFrame
-        Plain numbers in SI units, as CSV.
+        Plain numbers in SI units, for CSV.
     shown : TextTable
-        The same as text, as HTML and LaTeX.
+        The same table as text, for HTML and LaTeX.
     words : int
-        How many columns at the left are words.
+        Number of text columns at the left.
     """
 
     frame: pd.DataFrame

@@ -69,10 +69,10 @@ def test_a_pass_has_its_ground_track_on_the_map():
     fix = optloc.solve(problem, start=np.append(near, 0.0))
     ((name, line),) = ground_tracks(problem)
     lat, lon, _ = problem.frame.to_geodetic(problem.stations.position[[0, -1], 0])
-    assert name == "below SAT"
+    assert name == "ground track of SAT"
     np.testing.assert_allclose(line[[0, -1]], np.degrees(np.stack([lon, lat], axis=-1)))
     page = fix_page(problem, fix, "pass")
-    assert "below SAT" in page
+    assert "ground track of SAT" in page
     assert page.count("range_rate SAT") >= 13
     # turned to the date line its track stays in one piece
     over = np.array([[np.cos(turn), np.sin(turn), 0.0] for turn in np.radians([178.0, 181.0, 184.0])]) * 7e6
@@ -148,5 +148,5 @@ def test_an_ellipse_that_does_not_cover_is_dotted_on_the_map(monkeypatch):
     fix = optloc.solve(problem)
     assert fixed_spots(problem, [fix], []).local.all()
     page = fix_page(problem, fix, "far from an ellipse")
-    assert "dotted: an ellipse that does not" in page
+    assert "dotted: a local ellipse, not valid" in page
     assert 'class="ring local"' in page

@@ -34,7 +34,7 @@ def test_a_map_goes_the_shorter_way_around_the_earth():
     assert 181.0 < east < 190.0
     assert south < 10.0
     assert north > 12.0
-    with pytest.raises(InvalidProblem, match="nothing has a place"):
+    with pytest.raises(InvalidProblem, match="nothing has a position"):
         _limits([np.full((1, 2), np.nan)])
 
 

@@ -1,7 +1,7 @@
 """Execution of a study into its output folder, on this machine, a Dask cluster or Ray, through joblib.
 
-With every executor, each method runs in a separate worker process (`WorkerProcess`). The worker has limits of time and memory,
-its replies are checked, and it ends with the process that started it.
+With every executor, each method runs in a separate worker process (`WorkerProcess`). The worker has limits of time and
+memory, its replies are checked, and it ends with the process that started it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Formats that fixes and tracks are written in: one table, by the ending of a file, for commands, streams and pages."""
+"""File formats of fixes and tracks, for commands, streams and pages.
+
+`FORMATS` lists the formats. The ending of a file name selects the format.
+"""
 
 from __future__ import annotations
 
@@ -22,24 +25,24 @@ __all__ = ["FORMATS", "Format", "Mark", "Results", "format_of", "write_csv", "wr
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A format of files.
+    """A file format.
 
     Parameters
     ----------
     endings : tuple of str
-        Of names of files, the usual one first.
+        Endings of file names, the usual ending first.
     summary : str
-        Whose it is.
+        Programs or standard that use the format.
     uncertainty : str
-        What of the uncertainty of a fix that is ok it carries.
+        Uncertainty that the file contains for a fix with status `ok`.
     doubt : str
-        What it holds of a fix that is not ok, and of alternatives.
+        Content of the file for other fixes, and for alternatives.
     write : callable of (Path, Results)
         Writes a file.
     earth : bool
-        Whether its positions are on Earth.
+        Whether the format needs positions on Earth.
     each : callable of Mark, optional
-        Returns the text of one mark, empty where it has none: what streams write.
+        Returns the text of one mark, for streams; empty if the format omits the mark.
     """
 
     endings: tuple[str, ...]
@@ -55,21 +58,21 @@ def _text(of: Callable[[Results], str]) -> Callable[[Path, Results], None]:
     def write(path: Path, results: Results) -> None:
         text = of(results) + "\n"
         with written(path) as file:
-            # as bytes: NMEA has line ends of its own
+            # Write bytes: NMEA has other line ends than the operating system.
             file.write_bytes(text.encode("utf-8", errors="replace"))
 
     return write
 
 
 def write_csv(path: Path, columns: Columns) -> None:
-    """Write a long table as CSV; NaN is an empty cell."""
-    from optloc.files import writer  # with the schema, which not every command needs
+    """Write a table as CSV; NaN becomes an empty cell."""
+    from optloc.files import writer  # Import here: the module loads the schema, which most commands do not need.
 
     writer.write_csv(path, columns, for_people=True)
 
 
 def write_parquet(path: Path, columns: Columns) -> None:
-    """Write a long table as Parquet; NaN is a missing value."""
+    """Write a table as Parquet; NaN becomes a missing value."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -78,13 +81,13 @@ def write_parquet(path: Path, columns: Columns) -> None:
         parquet.write_table(table, file)
 
 
-_ROW = "status, reason and number of alternatives of each row"
+_ROW = "status, reason and number of alternatives in each row"
 
 FORMATS = {
     "csv": Format(
         (".csv",),
-        "table, a row for each target and epoch",
-        "standard deviations, covariance along the axes of the frame and along east, north, up",
+        "table, one row for each target and epoch",
+        "standard deviations; covariances along the axes of the frame and along east, north, up",
         _ROW,
         lambda path, results: write_csv(path, results.columns),
     ),
@@ -97,33 +100,33 @@ FORMATS = {
     ),
     "geojson": Format(
         (".geojson",),
-        "maps of the web, RFC 7946",
-        "95 % ellipse, or the region as it is; standard deviations as properties",
+        "web maps, RFC 7946",
+        "95 % ellipse, or outline of the 95 % region; standard deviations as properties",
         "point with its status, no ellipse; alternatives with gap and probability",
         _text(lambda results: json.dumps(plain(geojson(results)), allow_nan=False, indent=2)),
         earth=True,
     ),
     "kml": Format(
         (".kml",),
-        "Google Earth and others, OGC KML 2.2",
-        "95 % ellipse, or the region as it is; covariance along east, north, up as data",
-        "point in another colour with its status in its name, no ellipse; alternatives as points",
+        "Google Earth and other maps, OGC KML 2.2",
+        "95 % ellipse, or outline of the 95 % region; covariance along east, north, up as data",
+        "point in another colour, its status in its name, no ellipse; alternatives as points",
         _text(kml),
         earth=True,
     ),
     "gpx": Format(
         (".gpx",),
         "receivers and outdoor maps, GPX 1.1",
-        "none of its own: words in `desc`, covariance in `extensions`",
-        "waypoint with its status in its name; alternatives as waypoints; a track is interrupted",
+        "no standard field: text in `desc`, covariance in `extensions`",
+        "waypoint with its status in its name; alternatives as waypoints; a gap in a track",
         _text(gpx),
         earth=True,
     ),
     "cot": Format(
         (".cot",),
-        "situation displays (TAK), Cursor on Target 2.0, an event a line",
-        "`ce`: standard deviation along the longest axis; `le`: of the height",
-        "pending, `ce` and `le` unknown (9999999); alternatives as pending events",
+        "situation displays (TAK), Cursor on Target 2.0, one event on each line",
+        "`ce`: standard deviation along the longest axis; `le`: standard deviation of the height",
+        "pending event, `ce` and `le` unknown (9999999); alternatives as pending events",
         _text(cot),
         earth=True,
         each=event,
@@ -132,15 +135,15 @@ FORMATS = {
         (".nmea",),
         "instruments, NMEA 0183: GGA and GST",
         "GST: ellipse and standard deviations of latitude, longitude, height, 1 sigma",
-        "GGA with fix quality 0 and without a place; no alternatives",
+        "GGA with fix quality 0 and without a position; no alternatives",
         _text(nmea),
         earth=True,
         each=sentences,
     ),
     "ros": Format(
         (".yaml",),
-        "robots: PoseWithCovarianceStamped of ROS as YAML, x y z and rotations, row by row",
-        "covariance in the frame; 1e6 of what is not estimated",
+        "robots: ROS message PoseWithCovarianceStamped as YAML; covariance of x, y, z and rotations, row by row",
+        "covariance in the frame; 1e6 for coordinates that are not estimated",
         "a comment, with alternatives; no message",
         _text(ros),
     ),
@@ -156,12 +159,12 @@ FORMATS = {
 
 
 def format_of(path: Path, frame: Frame | None = None) -> Format:
-    """Return the format of a file by the ending of its name; pipes and other streams without one get CSV.
+    """Return the format that the ending of a file name selects; for a pipe or stream without an ending, CSV.
 
     Raises
     ------
     InvalidProblem
-        For an ending that none has, and for a frame without an Earth where the format needs one.
+        If the ending is unknown, or the format needs positions on Earth and `frame` is cartesian.
     """
     ending = path.suffix.lower()
     for name, one in FORMATS.items():
@@ -177,23 +180,25 @@ def format_of(path: Path, frame: Frame | None = None) -> Format:
 
 
 def write_fixes(path: str | Path, fix: Fix, problem: Problem | None = None, title: str = "optloc") -> None:
-    """Write a fix, or a batch of them, in the format that the ending of the name says.
+    """Write a fix, or a batch of fixes, in the format that the ending of the file name selects.
 
     Parameters
     ----------
     path : str or Path
-        File to write: one of the endings of `FORMATS`. A file that exists is replaced.
+        File to write; its ending is one of the endings of `FORMATS`. An existing file is replaced.
     fix : Fix
-        What `optloc.solve` returns.
+        Result of `optloc.solve`.
     problem : Problem, optional
-        What was solved: its stations and regions are written where the format has them.
+        The problem of the fix. With it, the file contains the stations and the 95 % regions if the format supports
+        them.
     title : str
-        What the file is called within.
+        Title inside the file.
 
     Raises
     ------
     InvalidProblem
-        For an unknown ending, a place that cannot be written, or a frame without an Earth where the format needs one.
+        If the ending is unknown, the file cannot be written, or the format needs positions on Earth and the frame is
+        cartesian.
     """
     place = Path(path)
     format_of(place, fix.frame).write(place, Results(fix_columns(fix), fix.frame, (fix,), problem, title))

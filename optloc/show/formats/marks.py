@@ -1,4 +1,8 @@
-"""Fixes and tracks as marks on a map: what a format is given, what of it covers, and the same as GeoJSON."""
+"""Fixes and tracks as marks: the common input of all map formats, and the GeoJSON format.
+
+A `Mark` is one position with covariance, status and alternatives. `Results` makes the marks from a table of fixes. A
+covariance, an ellipse or a region is *valid* if it covers the true position with the stated probability.
+"""
 
 from __future__ import annotations
 
@@ -22,18 +26,19 @@ from optloc.show.knowledge import known_features
 if TYPE_CHECKING:
     from optloc.uncertainty.outline import Outline
 
-# What has a covariance that covers: a fix that is ok, and a track that is followed or has just begun.
-_SURE = {Status.OK.label, "started"}
-# What has a region that covers where its chart says so.
-_SHAPED = {*_SURE, Status.CURVED.label}
-# Corners of an ellipse on a map, one for every 5 degrees: no edge is seen at any zoom that shows the whole.
+# Statuses with a valid covariance: a fix with status `ok`, and a track that is followed or has just started.
+_VALID_STATUSES = {Status.OK.label, "started"}
+# Statuses with a valid 95 % region. For `curved`, the region is an outline instead of an ellipse.
+_STATUSES_WITH_REGION = {*_VALID_STATUSES, Status.CURVED.label}
+# Corners of an ellipse on a map, one for every 5 degrees: it looks smooth at any zoom that shows the whole ellipse.
 _CORNERS = 72
-# Seconds that are a date since 1970: no run counts its time for three years.
+# Times from this value on, s, count from 1970; smaller times count from the start of a run. A run is shorter than the
+# three years that this value means.
 _DATED = 1e8
 
 
 class Other(NamedTuple):
-    """Another position that the data allow: metres in the frame (d,), longitude, latitude (degrees), height (3,)."""
+    """An alternative: `position` (d,) in the frame, m, and `place` (3,): longitude, latitude (degrees), height (m)."""
 
     position: Array
     place: Array
@@ -42,7 +47,7 @@ class Other(NamedTuple):
 
 
 class Area(NamedTuple):
-    """What holds 95 %: "ellipse95" or "region95", its plan as a geometry of GeoJSON, and whether that is cut off."""
+    """A 95 % region on a map: the role ("ellipse95" or "region95"), the GeoJSON geometry, and whether it is cut off."""
 
     role: str
     geometry: dict[str, Any]
@@ -56,25 +61,25 @@ class Mark:
     Parameters
     ----------
     name : str
-        Of the target and, of several, of its epoch.
+        Name of the target, with the name of the epoch if there are several epochs.
     target : str
-        Whose it is.
+        Name of the target.
     time : float
-        Seconds, NaN where there are none.
+        Time, s; NaN if unknown.
     status, reason : str
-        As of the fix, or of the scan of a track.
+        Status and reason of the fix, or of the scan of a track.
     position : array (d,)
-        Metres in the frame; NaN where there is none.
+        Position in the frame, m; NaN if unknown.
     covariance : array (d, d)
-        Square metres along the axes of the frame; NaN where there is none, or where it does not cover.
+        Covariance along the axes of the frame, m^2; NaN if unknown or not valid.
     place : array (3,)
-        Longitude, latitude (degrees) and height (metres); NaN where there is no Earth.
+        Longitude, latitude (degrees) and height (m); NaN if the frame is not on Earth.
     level : array (d, d)
-        The covariance along east, north and up; NaN likewise.
+        Covariance along east, north and up, m^2; NaN if unknown or not valid.
     velocity : array (d,), optional
-        Metres per second along east, north and up.
+        Velocity along east, north and up, m/s.
     others : tuple of Other
-        Positions that the data allow beside it.
+        Alternatives.
     """
 
     name: str
@@ -91,43 +96,44 @@ class Mark:
 
     @property
     def known(self) -> bool:
-        """Return whether there is a position."""
+        """Return whether the mark has a position."""
         return bool(np.isfinite(self.position).all())
 
     @property
     def sure(self) -> bool:
-        """Return whether nothing stands against the position."""
-        return self.known and self.status in _SURE
+        """Return whether the mark has a position and a status without doubt: `ok`, or a track that has just started."""
+        return self.known and self.status in _VALID_STATUSES
 
     @property
     def covers(self) -> bool:
-        """Return whether the covariance covers as it promises."""
+        """Return whether the mark has a valid covariance."""
         return bool(np.isfinite(self.covariance).all())
 
     @property
     def date(self) -> datetime | None:
-        """Return the time as a date, UTC; None where seconds are not counted from 1970."""
-        # Microseconds are added: a float of seconds since 1970 holds no more digits.
+        """Return the time as a date, UTC; None if the time does not count from 1970."""
+        # A float of seconds since 1970 is accurate to less than a microsecond, the resolution of `timedelta`.
         return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=self.time) if self.time >= _DATED else None
 
     @property
     def words(self) -> str:
-        """Return status, uncertainty and number of alternatives in words."""
+        """Return a sentence with the status, the uncertainty and the number of alternatives."""
         parts = [self.status + (f" ({self.reason})" if self.reason else "")]
         if self.covers:
             major, minor, bearing = ellipse(self.level)
             scale = float(error_ellipse(np.eye(2))[0][0])
-            parts.append(f"95 % within {scale * major:.3g} m x {scale * minor:.3g} m, long axis at {bearing:.0f} deg")
+            axes = f"{scale * major:.3g} m x {scale * minor:.3g} m"
+            parts.append(f"95 % ellipse {axes} (semi-axes), bearing of the long axis {bearing:.0f} deg")
             if len(self.level) == 3:
                 parts.append(f"sigma of the height {np.sqrt(self.level[2, 2]):.3g} m")
         elif self.known:
-            parts.append("no ellipse covers")
+            parts.append("no valid ellipse")
         parts += [f"{len(self.others)} alternatives"] if self.others else []
         return "; ".join(parts)
 
 
 def need_earth(frame: Frame, what: str, where: str) -> None:
-    """Raise InvalidProblem where positions of a frame are not on Earth."""
+    """Raise InvalidProblem if the positions of a frame are not on Earth."""
     if not frame.geodetic:
         advice = 'give a [frame] of kind "geodetic", "ecef" or "enu"'
         raise InvalidProblem(f"{what} needs positions on Earth, but the frame is cartesian", where, advice)
@@ -136,9 +142,12 @@ def need_earth(frame: Frame, what: str, where: str) -> None:
 def mark_of(
     frame: Frame, position: Array, covariance: Array, status: str, *, velocity: Array | None = None, **named: Any
 ) -> Mark:
-    """Return the mark of a position (d,) with its covariance (d, d) and velocity (d,) in a frame."""
+    """Return the mark of a position (d,), m, with covariance (d, d), m^2, and velocity (d,), m/s, in a frame.
+
+    If the status has no valid covariance, the covariance of the mark is NaN. `named` holds other fields of `Mark`.
+    """
     place, axes = np.full(3, np.nan), np.eye(len(position))
-    covers = status in _SURE and bool(np.isfinite(covariance).all())
+    covers = status in _VALID_STATUSES and bool(np.isfinite(covariance).all())
     if frame.geodetic and np.isfinite(position).all():
         lat, lon, height = frame.to_geodetic(position)
         place = np.array([np.degrees(lon), np.degrees(lat), height])
@@ -157,9 +166,9 @@ def mark_of(
 
 
 def ellipse(level: Array) -> tuple[float, float, float]:
-    """Return the standard deviations along the axes of a level covariance, and the bearing of the longer one, degrees.
+    """Return the 1-sigma semi-axes of a level covariance, m, and the bearing of the major axis, degrees.
 
-    The bearing counts from north towards east, 0 to 180.
+    The bearing counts from north towards east, 0 to 180. `level` has at least the axes east and north.
     """
     values, vectors = np.linalg.eigh(level[:2, :2])
     minor, major = np.sqrt(np.maximum(values, 0.0))
@@ -168,20 +177,20 @@ def ellipse(level: Array) -> tuple[float, float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """Fixes or tracks that are to be written.
+    """Fixes or tracks, ready to write.
 
     Parameters
     ----------
     columns : dict of str to array
-        Their long table.
+        Table of the fixes or scans, one row for each target and epoch.
     frame : Frame
-        Of their positions.
+        Frame of the positions.
     fixes : sequence of Fix
-        In the order of the table; none of tracks.
+        Fixes in the order of the table; empty for tracks.
     problem : Problem, optional
-        Whose stations are told, and by which regions are known.
+        The problem of the fixes. It gives the stations, and it is needed for the 95 % regions.
     title : str
-        What it is of.
+        Title inside the file.
     """
 
     columns: Columns
@@ -192,7 +201,7 @@ class Results:
 
     @property
     def course(self) -> bool:
-        """Return whether the rows of a target are one track."""
+        """Return whether the results are tracks, so that the rows of a target form one line."""
         return not self.fixes
 
     @property
@@ -205,12 +214,12 @@ class Results:
         return "".join(axis for axis in "xyz" if axis in self.columns)
 
     def marks(self) -> list[Mark]:
-        """Return a mark for each row of the table."""
+        """Return one mark for each row of the table."""
         found = self._others()
         return [self._mark(row, others) for row, others in zip(records(self.columns), found, strict=True)]
 
     def stations(self) -> list[tuple[str, Array]]:
-        """Return names of the stations, and their longitudes, latitudes (degrees) and heights (3,)."""
+        """Return the name of each station with its longitude, latitude (degrees) and height (m) (3,)."""
         from optloc.show.pictures.outlines import earth_points
 
         if self.problem is None or not self.frame.geodetic:
@@ -220,16 +229,16 @@ class Results:
         return list(zip(stations.names, earth_points(self.frame, place), strict=True))
 
     def areas(self) -> list[Area | None]:
-        """Return what holds 95 % of each row; None where nothing does, or nothing is known of it."""
+        """Return the 95 % region of each row; None if the row has no valid region, or the region is unknown."""
         outlines: dict[int, Outline] = {}
         if self.problem is not None and self.fixes:
             outlines = self._outlines(self.problem)
         return [self._area(row, outlines.get(i)) for i, row in enumerate(records(self.columns))]
 
     def known(self) -> list[list[tuple[dict[str, Any], dict[str, Any]]]]:
-        """Return geometries and their properties of what each row determines without a place; see `known_features`."""
+        """Return GeoJSON geometries with properties for each row without a valid position; see `known_features`."""
         flat = [fix if len(fix.shape) == 1 else fix.flat() for fix in self.fixes]
-        # fixes of one position each: a row is a fix
+        # This needs fixes of one position each, so that each row is a fix.
         if not self.frame.geodetic or sum(map(len, flat)) != self._count:
             return [[] for _ in range(self._count)]
         return [known_features(fix[i], self.frame) for fix in flat for i in range(len(fix))]
@@ -255,12 +264,12 @@ class Results:
         )
 
     def _name(self, row: dict[str, Any]) -> str:
-        """Return the target where there are several, and the epoch where there are several."""
-        told = [n for n in ("target", "number", "epoch") if n in row and len(set(self.columns[n].tolist())) > 1]
-        return " ".join(str(row[name]) for name in told) or str(row.get("target", "fix"))
+        """Return the name of a row: target, number and epoch, each only if the table has several."""
+        several = [n for n in ("target", "number", "epoch") if n in row and len(set(self.columns[n].tolist())) > 1]
+        return " ".join(str(row[name]) for name in several) or str(row.get("target", "fix"))
 
     def _others(self) -> list[tuple[Other, ...]]:
-        """Return the alternatives of each row; none where rows are not one each of a position that was estimated."""
+        """Return the alternatives of each row; empty unless each row is one estimated position."""
         found: list[tuple[Other, ...]] = []
         for fix in self.fixes:
             flat = fix if len(fix.shape) == 1 else fix.flat()
@@ -268,12 +277,12 @@ class Results:
             for name in (slot.name for slot in slots if slot.name.partition("[")[0] == "position"):
                 places = flat.layout.take(flat.alternatives.x, name)
                 for i in range(len(flat)):
-                    # Of each epoch of a run (q, k, d), else one (q, d).
+                    # Alternatives are (q, k, d) if each epoch of a run has a position, else (q, d).
                     each = np.moveaxis(places[i], -2, 0) if places.ndim == 4 else places[i][None]
-                    found += [self._of(flat, i, position) for position in each]
+                    found += [self._alternatives_of(flat, i, position) for position in each]
         return found if len(found) == self._count else [()] * self._count
 
-    def _of(self, fix: Fix, i: int, position: Array) -> tuple[Other, ...]:
+    def _alternatives_of(self, fix: Fix, i: int, position: Array) -> tuple[Other, ...]:
         gap, doubt = fix.alternatives.gap[i], fix.alternatives.doubt[i]
         place = np.full((len(gap), 3), np.nan)
         if self.frame.geodetic and len(gap):
@@ -285,25 +294,29 @@ class Results:
         return tuple(Other(position[j], place[j], float(gap[j]), float(doubt[j])) for j in shown)
 
     def _area(self, row: dict[str, Any], region: Outline | None) -> Area | None:
-        if row.get("lat_deg") is None or row["status"] not in _SHAPED:
+        if row.get("lat_deg") is None or row["status"] not in _STATUSES_WITH_REGION:
             return None
         centre = np.array([row[axis] for axis in self.axes])
         if region is not None:
             return Area("region95", _region(self.frame, centre, region), region.cut)
-        if row["status"] not in _SURE or row["cov_ee"] is None or row.get("chart") not in (None, "", NAMES[CARTESIAN]):
+        if (
+            row["status"] not in _VALID_STATUSES
+            or row["cov_ee"] is None
+            or row.get("chart") not in (None, "", NAMES[CARTESIAN])
+        ):
             return None
         level = np.array([[row["cov_ee"], row["cov_en"]], [row["cov_en"], row["cov_nn"]]])
         return Area("ellipse95", _ellipse(self.frame, centre, level))
 
     def _outlines(self, problem: Problem) -> dict[int, Outline]:
-        """Return the plans of the regions of rows whose ellipses do not cover; of those that are known."""
+        """Return the horizontal outlines of known 95 % regions, by row, for rows whose ellipse is not valid."""
         from optloc.show.pictures.outlines import level_planes, outlines_of
 
         if not self.frame.geodetic:
             return {}
         charts = [fix.chart for fix in self.fixes]
         kinds = [np.ravel(chart.kind) for chart in charts if chart is not None]
-        # Fixes of one position each: a row is a fix.
+        # This needs fixes of one position each, so that each row is a fix.
         if len(kinds) != len(charts) or sum(map(len, kinds)) != self._count:
             return {}
         found: list[list[Outline]] = []
@@ -314,7 +327,7 @@ class Results:
 
 
 def _region(frame: Frame, centre: Array, region: Outline) -> dict[str, Any]:
-    """Return the plan of a region along east and north as a geometry."""
+    """Return the outline of a region along east and north, centred at a position (d,), as a GeoJSON geometry."""
     from optloc.show.pictures.outlines import earth_line, polygon_geometry
 
     axes = frame.enu_axes(centre)[:2]
@@ -322,11 +335,11 @@ def _region(frame: Frame, centre: Array, region: Outline) -> dict[str, Any]:
 
 
 def _ellipse(frame: Frame, centre: Array, level: Array) -> dict[str, Any]:
-    """Return the horizontal 95 % ellipse of a level covariance (2, 2) as a geometry, counter-clockwise."""
+    """Return the horizontal 95 % ellipse of a level covariance (2, 2), m^2, as a counter-clockwise GeoJSON geometry."""
     from optloc.show.pictures.outlines import earth_line, polygon_geometry
 
     semi_axes, directions = error_ellipse(level)
-    # Eigenvectors may be left-handed: the sign of the turn makes up for it.
+    # Eigenvectors can be left-handed: the sign of the determinant keeps the corners counter-clockwise.
     angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS + 1) * np.sign(np.linalg.det(directions))
     plane = (np.stack([np.cos(angle), np.sin(angle)], axis=-1) * semi_axes) @ directions.T
     plane[-1] = plane[0]
@@ -334,9 +347,10 @@ def _ellipse(frame: Frame, centre: Array, level: Array) -> dict[str, Any]:
 
 
 def geojson(results: Results) -> dict[str, Any]:
-    """Return stations, fixes, alternatives and what holds 95 % as a GeoJSON feature collection (RFC 7946).
+    """Return stations, fixes, alternatives and 95 % regions as a GeoJSON feature collection (RFC 7946).
 
-    An ellipse where it covers, else the outline of the region; what is not ok, or curved without a region, has neither.
+    If the ellipse of an `ok` fix is valid, it is the region; otherwise the outline is the region. Fixes that are not
+    `ok` have no region, except `curved` fixes whose outline is known.
     """
     from optloc.show.pictures.outlines import feature, point_geometry
 
@@ -346,13 +360,13 @@ def geojson(results: Results) -> dict[str, Any]:
     rows = records(results.columns)
     for row, mark, area, known in zip(rows, results.marks(), results.areas(), results.known(), strict=True):
         about: dict[str, Any] = {name: row[name] for name in ("number", "epoch", "target") if name in row}
-        told = {name: value for name, value in row.items() if name not in skipped and not name.startswith("cov_")}
+        properties = {name: value for name, value in row.items() if name not in skipped and not name.startswith("cov_")}
         if mark.known:
-            features.append(feature(point_geometry(mark.place), {"role": "fix", **told}))
+            features.append(feature(point_geometry(mark.place), {"role": "fix", **properties}))
         if area is not None:
             features.append(feature(area.geometry, {"role": area.role, **({"cut": True} if area.cut else {}), **about}))
         for other in mark.others:
             doubt = {"gap": other.gap, "probability": other.probability}
             features.append(feature(point_geometry(other.place), {"role": "alternative", **about, **doubt}))
-        features += [feature(geometry, {**own, **about}) for geometry, own in known]
+        features += [feature(geometry, {**attributes, **about}) for geometry, attributes in known]
     return {"type": "FeatureCollection", "features": features}

@@ -1,4 +1,4 @@
-"""Marks as XML: KML for maps, GPX for receivers, Cursor on Target for situation displays.
+"""XML formats: KML for maps, GPX for receivers, Cursor on Target for situation displays.
 
 Sources: OGC 07-147r2, OGC KML 2.2; GPX 1.1 Schema, Topografix (2004); M. J. Kristan et al., Cursor-on-Target Message
 Router User's Guide, MITRE MP090284 (2009), and its base event schema.
@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from itertools import groupby
 from typing import Any
-from xml.etree.ElementTree import Element, SubElement, indent, tostring  # it writes and reads nothing
+from xml.etree.ElementTree import Element, SubElement, indent, tostring  # only writes XML: no unsafe input
 
 import numpy as np
 
@@ -18,13 +18,13 @@ from optloc.base.outputs import visible
 from optloc.base.types import Array
 from optloc.show.formats.marks import Area, Mark, Other, Results, ellipse
 
-# Decimals of a degree and of a metre: a tenth of a millimetre, and one.
+# Decimals of a degree and of a metre: a resolution of 0.1 mm and of 1 mm.
 _DEGREES, _METRES = 9, 3
 _HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n'
 
 
 def _add(parent: Element, tag: str, text: str | None = None, /, **attributes: str) -> Element:
-    """Return a new last child; what XML cannot hold is spelled."""
+    """Return a new last child of an element; characters that XML cannot contain are escaped."""
     child = SubElement(parent, tag, {key: visible(value) for key, value in attributes.items()})
     child.text = None if text is None else visible(text)
     return child
@@ -40,31 +40,31 @@ def _iso(when: datetime) -> str:
 
 
 def _number(value: float, digits: int = _METRES) -> str:
-    """Return a number as XML has decimals, without an exponent."""
+    """Return a number as decimal text without an exponent, as XML schemas require."""
     return f"{value:.{digits}f}"
 
 
 def _courses(marks: Sequence[Mark]) -> Iterator[tuple[str, list[list[Mark]]]]:
-    """Yield targets with the parts of their tracks between which they were lost."""
+    """Yield each target with the parts of its track; a part ends where the track is lost."""
     for target in dict.fromkeys(mark.target for mark in marks):
-        own = (mark for mark in marks if mark.target == target)
-        yield target, [list(part) for sure, part in groupby(own, key=lambda mark: mark.sure) if sure]
+        marks_of_target = (mark for mark in marks if mark.target == target)
+        yield target, [list(part) for sure, part in groupby(marks_of_target, key=lambda mark: mark.sure) if sure]
 
 
 def _covariance(level: Array) -> str:
-    """Return the upper triangle of a level covariance as text: ee en eu nn nu uu."""
+    """Return the upper triangle of a level covariance, m^2, as text: ee en eu nn nu uu."""
     return " ".join(f"{value:.9g}" for value in level[np.triu_indices(len(level))])
 
 
 # KML.
 
-# Colours aabbggrr: green, amber and grey as on optloc's own maps, areas half transparent.
+# Colours aabbggrr: green, amber and grey as on the maps of optloc; areas are half transparent.
 _STYLES = {"ok": "ff50a030", "doubtful": "ff00a0f0", "alternative": "ff909090", "station": "ffb06020"}
 _PADDLE = {"PolyStyle": "60", "LineStyle": "ff", "IconStyle": "ff"}
 
 
 def kml(results: Results) -> str:
-    """Return marks as KML 2.2: a point each, what holds 95 % as an area, alternatives beside them, tracks as lines."""
+    """Return the results as KML 2.2: fixes and alternatives as points, 95 % regions as areas, tracks as lines."""
     root = Element("kml", {"xmlns": "http://www.opengis.net/kml/2.2"})
     document = _add(root, "Document")
     _add(document, "name", results.title)
@@ -99,13 +99,16 @@ def _kml_mark(document: Element, mark: Mark, area: Area | None) -> None:
         word = area.role.replace("95", ", 95 %, cut off" if area.cut else ", 95 %")
         _polygons(_placemark(document, f"{mark.name}: {word}", mark.words, style), area)
     for number, other in enumerate(mark.others, 1):
-        place = _placemark(document, _named(mark, number), _doubt(mark, other), "alternative")
+        place = _placemark(document, _alternative_name(mark, number), _alternative_text(mark, other), "alternative")
         _point(place, other.place, flat)
 
 
 def _kml_known(document: Element, mark: Mark, geometry: dict[str, Any], about: dict[str, Any]) -> None:
-    """Add a wedge, ray or curve in the place of a position."""
-    words = {"direction95": "direction, 95 %" + (", cut off" if about.get("cut") else ""), "ray": "likeliest direction"}
+    """Add the wedge, ray or curve of a fix that has no valid position."""
+    words = {
+        "direction95": "direction, 95 %" + (", cut off" if about.get("cut") else ""),
+        "ray": "most likely direction",
+    }
     name = words.get(about["role"], about.get("name", ""))
     placemark = _placemark(document, f"{mark.name}: {name}", mark.words, "doubtful")
     if geometry["type"] != "MultiLineString":
@@ -119,16 +122,16 @@ def _kml_known(document: Element, mark: Mark, geometry: dict[str, Any], about: d
         _add(line, "coordinates", _line(np.array(part)))
 
 
-def _named(mark: Mark, number: int) -> str:
+def _alternative_name(mark: Mark, number: int) -> str:
     return f"{mark.name}: alternative {number}"
 
 
-def _doubt(mark: Mark, other: Other) -> str:
-    return f"another position that the data of {mark.name} allow; probability {other.probability:.2g}"
+def _alternative_text(mark: Mark, other: Other) -> str:
+    return f"alternative to the position of {mark.name}; probability {other.probability:.2g}"
 
 
 def _placemark(document: Element, name: str, about: str, style: str, mark: Mark | None = None) -> Element:
-    """Return a placemark that lacks its geometry alone, which comes last."""
+    """Return a placemark without a geometry; the caller appends the geometry, which the schema requires last."""
     placemark = _add(document, "Placemark")
     _add(placemark, "name", name)
     _add(placemark, "description", about)
@@ -178,7 +181,10 @@ _OWN = "urn:optloc:fix"
 
 
 def gpx(results: Results) -> str:
-    """Return marks as GPX 1.1: fixes and alternatives as waypoints, tracks as segments between which they are lost."""
+    """Return the results as GPX 1.1: fixes and alternatives as waypoints, tracks as segments.
+
+    A segment ends where the track is lost.
+    """
     names = {"xmlns": "http://www.topografix.com/GPX/1/1", "xmlns:optloc": _OWN, "version": "1.1", "creator": "optloc"}
     root, marks, flat = Element("gpx", names), results.marks(), len(results.axes)
     _add(_add(root, "metadata"), "name", results.title)
@@ -187,17 +193,23 @@ def gpx(results: Results) -> str:
     for mark in marks:
         if mark.known and not (results.course and mark.sure):
             label = mark.name if mark.sure else f"{mark.name}: {mark.status}"
-            _told(_gpx_point(root, "wpt", mark.place, flat, _time(mark), name=label, desc=mark.words, type="fix"), mark)
+            _add_extensions(
+                _gpx_point(root, "wpt", mark.place, flat, _time(mark), name=label, desc=mark.words, type="fix"), mark
+            )
         for number, other in enumerate(mark.others, 1):
-            told = {"name": _named(mark, number), "desc": _doubt(mark, other), "type": "alternative"}
-            _gpx_point(root, "wpt", other.place, flat, _time(mark), **told)
+            texts = {
+                "name": _alternative_name(mark, number),
+                "desc": _alternative_text(mark, other),
+                "type": "alternative",
+            }
+            _gpx_point(root, "wpt", other.place, flat, _time(mark), **texts)
     for target, parts in _courses(marks) if results.course else ():
         track = _add(root, "trk")
         _add(track, "name", target)
         for part in parts:
             segment = _add(track, "trkseg")
             for mark in part:
-                _told(_gpx_point(segment, "trkpt", mark.place, flat, _time(mark)), mark)
+                _add_extensions(_gpx_point(segment, "trkpt", mark.place, flat, _time(mark)), mark)
     return _document(root)
 
 
@@ -208,7 +220,7 @@ def _time(mark: Mark) -> str | None:
 def _gpx_point(
     parent: Element, tag: str, place: Array, dimension: int, when: str | None = None, /, **about: str
 ) -> Element:
-    """Return a point whose children have the order of the schema: ele, time, name, desc, type."""
+    """Return a new point with its children in the order of the schema: ele, time, name, desc, type."""
     point = _add(parent, tag, lat=_number(place[1], _DEGREES), lon=_number(place[0], _DEGREES))
     children = {"ele": _number(place[2]) if dimension == 3 else None, "time": when}
     children |= {key: about.get(key) for key in ("name", "desc", "type")}
@@ -218,8 +230,8 @@ def _gpx_point(
     return point
 
 
-def _told(point: Element, mark: Mark) -> None:
-    """Add status and covariance as an extension, which the schema has last."""
+def _add_extensions(point: Element, mark: Mark) -> None:
+    """Add status and covariance as an extension, which the schema requires last."""
     extensions = _add(point, "extensions")
     _add(extensions, "optloc:status", mark.status)
     if mark.covers:
@@ -228,31 +240,33 @@ def _told(point: Element, mark: Mark) -> None:
 
 # Cursor on Target.
 
-# What the schema has for a length that is not known.
+# Value of the schema for an unknown length.
 _UNKNOWN = 9999999.0
-# Seconds after which an event is stale: what maps of aircraft take.
+# Seconds after which an event is stale: the usual value of aircraft maps.
 _STALE = 60.0
 
 
 def cot(results: Results) -> str:
-    """Return an event of Cursor on Target for each mark and each alternative, a line each."""
+    """Return the events of Cursor on Target for all marks and alternatives, one event on each line."""
     return "\n".join(filter(None, map(event, results.marks())))
 
 
 def event(mark: Mark) -> str:
-    """Return a mark as an event of Cursor on Target 2.0, and its alternatives below it; empty without a place.
+    """Return a mark and its alternatives as events of Cursor on Target 2.0, one on each line; empty without a position.
 
-    `ce` and `le` are one standard deviation: that of the longest axis of the ellipse, and that of the height.
+    `ce` is the standard deviation along the longest axis of the ellipse, `le` the standard deviation of the height, m.
     """
     if not np.isfinite(mark.place).all():
         return ""
-    atom = "a-u-G" if mark.sure else "a-p-G"  # an unknown thing, or one that is pending
+    atom = "a-u-G" if mark.sure else "a-p-G"  # "a-u-G" is an unknown object, "a-p-G" is a pending object.
     major = ellipse(mark.level)[0] if mark.covers else _UNKNOWN
     rise = float(np.sqrt(max(mark.level[2, 2], 0.0))) if mark.covers and len(mark.level) == 3 else _UNKNOWN
     lines = [_event(mark, mark.name, mark.place, (major, rise), atom, mark.words)]
     for number, other in enumerate(mark.others, 1):
-        name = _named(mark, number)
-        lines.append(_event(mark, name, other.place, (_UNKNOWN, _UNKNOWN), "a-p-G", _doubt(mark, other), moves=False))
+        name = _alternative_name(mark, number)
+        lines.append(
+            _event(mark, name, other.place, (_UNKNOWN, _UNKNOWN), "a-p-G", _alternative_text(mark, other), moves=False)
+        )
     return "\n".join(lines)
 
 
@@ -261,7 +275,7 @@ def _event(
 ) -> str:
     now = datetime.now(UTC)
     start = mark.date or now
-    # m-f: by a machine, fused from several sources
+    # m-f: made by a machine, fused from several sources.
     root = Element("event", {"version": "2.0", "uid": visible(f"optloc.{name}"), "type": atom, "how": "m-f"})
     times = {"time": now, "start": start, "stale": start + timedelta(seconds=_STALE)}
     root.attrib |= {key: _iso(value) for key, value in times.items()}

@@ -1,4 +1,4 @@
-"""Marks as lines: NMEA 0183 for instruments, poses with covariance for ROS, vertices and priors for g2o.
+"""Line formats: NMEA 0183 for instruments, poses with covariance for ROS, vertices and priors for g2o.
 
 Sources: NMEA 0183 4.10 (2012), GGA and GST; geometry_msgs/PoseWithCovarianceStamped and REP 103, 105 of ROS;
 R. Kuemmerle et al., "g2o: a general framework for graph optimization", ICRA (2011), and its types slam2d and slam3d.
@@ -18,27 +18,30 @@ from optloc.show.formats.marks import Mark, Results, ellipse
 
 # NMEA 0183.
 
-# An electronic positioning system that is none of the others: neither of its numbers comes from satellites.
+# Talker "electronic positioning system, other": the positions do not come from satellites.
 _TALKER = "SN"
-# Decimals of a minute of arc: a fifth of a millimetre.
+# Decimals of a minute of arc: a resolution of 0.2 mm.
 _MINUTES = 7
 
 
 def nmea(results: Results) -> str:
-    """Return a GGA sentence of each mark, and a GST sentence of each whose covariance covers."""
+    """Return a GGA sentence for each mark, and a GST sentence for each mark with a valid covariance."""
     return "".join(map(sentences, results.marks())).removesuffix("\n")
 
 
 def sentences(mark: Mark) -> str:
-    """Return GGA, and GST where the covariance covers; what is not sure has fix quality 0 and no place."""
+    """Return the GGA sentence of a mark, and the GST sentence if the covariance is valid.
+
+    If the status is in doubt, the GGA sentence has fix quality 0 and no position.
+    """
     clock = "" if mark.date is None else mark.date.strftime("%H%M%S.") + f"{mark.date.microsecond // 10000:02d}"
     if not mark.sure:
         return _sentence("GGA", clock, "", "", "", "", "0", "00", "", "", "M", "", "M", "", "")
     lon, lat, height = mark.place
     place = (_angle(lat, 2), "N" if lat >= 0.0 else "S", _angle(lon, 3), "E" if lon >= 0.0 else "W")
-    # There is no geoid here: a height above the ellipsoid is one above a geoid that is the ellipsoid.
-    told = (f"{height:.3f}", "M", "0.0", "M") if len(mark.position) == 3 else ("", "M", "", "M")
-    line = _sentence("GGA", clock, *place, "1", "00", "", *told, "", "")
+    # optloc has no geoid model: the height is above the ellipsoid, and the geoid separation field is 0.0.
+    height_fields = (f"{height:.3f}", "M", "0.0", "M") if len(mark.position) == 3 else ("", "M", "", "M")
+    line = _sentence("GGA", clock, *place, "1", "00", "", *height_fields, "", "")
     if not mark.covers:
         return line
     major, minor, bearing = ellipse(mark.level)
@@ -49,7 +52,10 @@ def sentences(mark: Mark) -> str:
 
 
 def _angle(degrees: float, digits: int) -> str:
-    """Return an angle as degrees and minutes in one number, rounded as a whole: 60 minutes are a degree."""
+    """Return an angle in degrees as the NMEA number dddmm.mmmmmmm.
+
+    The angle is rounded before it is split into degrees and minutes, so that minutes stay below 60.
+    """
     units = round(abs(float(degrees)) * 60.0 * 10**_MINUTES)
     whole, rest = divmod(units, 60 * 10**_MINUTES)
     minutes, part = divmod(rest, 10**_MINUTES)
@@ -57,20 +63,20 @@ def _angle(degrees: float, digits: int) -> str:
 
 
 def _sentence(name: str, *fields: str) -> str:
-    """Return a sentence with its checksum: all characters between $ and * by exclusive or."""
+    """Return a sentence with its checksum: the exclusive or of all characters between $ and *."""
     text = f"{_TALKER}{name},{','.join(fields)}"
     return f"${text}*{reduce(lambda sum_, letter: sum_ ^ ord(letter), text, 0):02X}\r\n"
 
 
 # ROS.
 
-# Variance of what is not estimated, m² and rad²: above 1e4, from where programs of ROS take one for unknown.
+# Variance of coordinates that are not estimated, m^2 and rad^2. ROS programs treat variances from 1e4 on as unknown.
 _OPEN = 1e6
 _FRAMES = {"ecef": "earth", "enu": "map", "cartesian": "map"}
 
 
 def ros(results: Results) -> str:
-    """Return a PoseWithCovarianceStamped of each mark that covers, as YAML documents; all others are comments."""
+    """Return YAML documents: a PoseWithCovarianceStamped for each mark with a valid covariance, else a comment."""
     frame = _FRAMES[results.frame.kind]
     return "\n".join(_pose(mark, frame) for mark in results.marks())
 
@@ -100,9 +106,11 @@ def _pose(mark: Mark, frame: str) -> str:
 
 
 def _comment(mark: Mark) -> str:
-    """Return what is said of a mark that has no covariance, and of its alternatives, in the frame."""
+    """Return comment lines with the name, the status and the position of a mark, and with its alternatives."""
     lines = [f"{mark.name}: {mark.words}" + (f" at {_spelled(mark.position)}" if mark.known else "")]
-    lines += [f"or {_spelled(other.position)}, probability {other.probability:.2g}" for other in mark.others]
+    lines += [
+        f"alternative at {_spelled(other.position)}, probability {other.probability:.2g}" for other in mark.others
+    ]
     return "\n".join(f"# {visible(line)}".replace("\n", " ") for line in lines)
 
 
@@ -112,13 +120,13 @@ def _spelled(position: Array) -> str:
 
 # g2o.
 
-# Least standard deviation of a prior, metres: what is held exactly has no information matrix.
+# Minimum standard deviation of a prior, m: an exactly fixed coordinate has no finite information matrix.
 _HELD = 1e-4
 _POINTS = {2: ("VERTEX_XY", "EDGE_PRIOR_XY"), 3: ("VERTEX_TRACKXYZ", "EDGE_POINTXYZ_PRIOR")}
 
 
 def g2o(results: Results) -> str:
-    """Return a vertex of each mark, and a prior with its information matrix where the covariance covers."""
+    """Return a vertex for each mark, and a prior with its information matrix if the covariance is valid."""
     lines = []
     vertex, prior = _POINTS[len(results.axes)]
     for number, mark in enumerate(results.marks()):
@@ -134,6 +142,6 @@ def g2o(results: Results) -> str:
 
 
 def _information(covariance: Array) -> Array:
-    """Return the inverse of a covariance (d, d) none of whose axes is shorter than 0.1 mm."""
+    """Return the inverse of a covariance (d, d), m^-2; standard deviations along its axes are at least 0.1 mm."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray((vectors / np.maximum(values, _HELD**2)) @ vectors.T)

@@ -1,6 +1,7 @@
-"""Pictures: fixes and the cost around them, where iterations end, residuals, biases, tracks, bounds, errors of methods.
+"""Pictures of fixes, cost landscapes, convergence, residuals, biases, tracks, bounds and errors of methods.
 
-matplotlib is imported where it is used. Colours are those of Okabe and Ito, and every kind of point has its own mark.
+The modules import matplotlib inside functions, so that other commands do not load it. The colours are the palette of
+Okabe and Ito, and each kind of point has a different mark.
 """
 
 from optloc.show.pictures.bound_map import map_geojson, plot_bound_map, plot_status_map, status_geojson

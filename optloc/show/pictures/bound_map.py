@@ -1,4 +1,4 @@
-"""Maps of the Cramer-Rao bound and of the share of `ok` fixes, as pictures, isolines and places."""
+"""Maps of the Cramér-Rao bound and of the share of `ok` fixes: pictures, isolines and GeoJSON."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ if TYPE_CHECKING:
     from optloc.solvers.shares import StatusMap
 
 COLOURS = "GnBu"
-"""Light to dark in one hue: legible in grey and without colour vision, and black lines stay visible."""
+"""Colour map from light to dark in one hue: readable in grey and with any colour vision, below black lines."""
 
-# Levels in each decade, and what may stand between them where there are few.
+# Levels in each decade, and extra levels between them if a map has few levels.
 _STEPS = (1.0, 2.0, 5.0)
 _BETWEEN = {1.0: (1.2, 1.5), 2.0: (3.0,), 5.0: (7.0,)}
-# Levels at most: lines of more run into each other.
+# Maximum number of levels: isolines of more levels would merge.
 _LEVELS = 9
-# Stations that are named.
+# Maximum number of stations with names on the map.
 _NAMED = 12
-# Decimals of a degree of isolines: a tenth of a metre.
+# Decimals of a degree of isolines: 0.1 m.
 _DIGITS = 6
-# Isolines of a share, percent: few fixes, half of them, most, nearly all.
+# Isolines of the share of `ok` fixes, percent: few, half, most and nearly all fixes.
 _SHARES = (10.0, 50.0, 90.0, 99.0)
-# Side of a map from which it is in kilometres, metres.
+# A map is in kilometres if its longer side is at least this, m.
 _FAR = 5e3
 
 
@@ -48,17 +48,17 @@ def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) 
     title : str
         Title of the picture.
     dilution : bool
-        Draw the dilution of precision in the place of the bound.
+        Draw the dilution of precision instead of the bound.
 
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.show.pictures.save`.
+        The picture; write it with `optloc.show.pictures.save`.
 
     Raises
     ------
     InvalidProblem
-        Where the geometry is singular everywhere, or the dilution has no meaning.
+        If the geometry is singular everywhere, or the rows have no common dilution of precision.
     """
     from matplotlib.colors import LogNorm
 
@@ -81,7 +81,7 @@ def plot_status_map(found: StatusMap, title: str = "") -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.show.pictures.save`.
+        The picture; write it with `optloc.show.pictures.save`.
     """
     from matplotlib.colors import Normalize
 
@@ -90,10 +90,10 @@ def plot_status_map(found: StatusMap, title: str = "") -> Figure:
 
 
 def _draw(grid: Grid, values: Array, steps: list[float], norm: Normalize, name: str, title: str) -> Figure:
-    """Return a map of values (ny, nx) with isolines at steps."""
+    """Return a map of values (ny, nx) with isolines at `steps`."""
     scale = 1.0 if grid.geodetic or max(np.ptp(grid.x), np.ptp(grid.y)) < _FAR else 1e-3
     x, y = grid.x * scale, grid.y * scale
-    # A degree of longitude is shorter than one of latitude: one scale on both axes, at the middle of the map.
+    # A degree of longitude is shorter than a degree of latitude: use the ratio at the middle of the map for both axes.
     squeeze = np.cos(np.radians(grid.y.mean())) if grid.geodetic else 1.0
     tall = float(np.clip(np.ptp(y) / (np.ptp(x) * squeeze), 0.4, 1.6))
     figure = figure_class()(figsize=(6.4, 0.9 + 5.2 * tall), layout="compressed")
@@ -119,7 +119,7 @@ def _draw(grid: Grid, values: Array, steps: list[float], norm: Normalize, name: 
 
 
 def _mark_stations(axes: Axes, stations: Array, names: Sequence[str], x: Array, y: Array) -> None:
-    """Draw stations, and name those on the map where they are few."""
+    """Draw the stations; if they are few, write their names."""
     style: dict[str, Any] = {"marker": "^", "s": 50, "color": "white", "edgecolors": BLACK, "linewidths": 1.2}
     axes.scatter(stations[:, 0], stations[:, 1], zorder=4, **style)
     inside = (np.abs(stations - [x.mean(), y.mean()]) <= [np.ptp(x) / 2, np.ptp(y) / 2]).all(-1)
@@ -132,8 +132,8 @@ def _mark_stations(axes: Axes, stations: Array, names: Sequence[str], x: Array, 
 def _drawn(found: BoundMap, *, dilution: bool) -> tuple[Array, str]:
     values = found.dilution if dilution else found.sigma
     if dilution and not np.isfinite(found.row):
-        advice = "ask for the bound in metres"
-        raise InvalidProblem("rows that are not all lengths have no common dilution", "map", advice)
+        advice = "draw the bound in metres"
+        raise InvalidProblem("the rows are not all lengths, so they have no dilution of precision", "map", advice)
     if not np.isfinite(values).any():
         advice = "add rows, or choose another height or place"
         raise InvalidProblem("the geometry is singular everywhere on the map", "map", advice)
@@ -141,9 +141,10 @@ def _drawn(found: BoundMap, *, dilution: bool) -> tuple[Array, str]:
 
 
 def levels(values: Array) -> list[float]:
-    """Return the levels of isolines: 1, 2, 5 times powers of ten that hold the middle 98 % of values."""
+    """Return the levels of isolines, 1, 2, 5 times powers of ten, around the middle 98 % of the values."""
     good = values[np.isfinite(values) & (values > 0.0)]
-    # Near stations and beyond them the bound runs to zero and infinity: one per cent at either end has no line.
+    # Near stations the bound approaches zero, and far away it approaches infinity: the outer 1 % at either end has no
+    # isoline.
     low, high = (float(np.quantile(good, share)) for share in (0.01, 0.99))
     decades = range(int(np.floor(np.log10(low))) - 1, int(np.ceil(np.log10(high))) + 1)
     steps = [step * 10.0**power for power in decades for step in _STEPS]
@@ -159,18 +160,18 @@ def levels(values: Array) -> list[float]:
 
 
 def _finer(steps: list[float]) -> list[float]:
-    """Return steps with one or two round numbers between each."""
+    """Return steps with one or two round numbers between neighbours."""
     full = []
     for step in steps[:-1]:
-        # A hair more than the step, as the logarithm of 1000 may be less than 3.
+        # Enlarge the step a little: rounding can make the logarithm of 1000 less than 3.
         power = 10.0 ** np.floor(np.log10(step * 1.0001))
         full += [step, *(more * power for more in _BETWEEN[float(round(step / power))])]
     return [*full, steps[-1]]
 
 
 def isolines(found: BoundMap) -> list[tuple[float, list[Array]]]:
-    """Return the isolines of the bound: each level in metres with its lines (n, 2) of x and y."""
-    figure_class()  # one sentence where matplotlib, which brings contourpy, is missing
+    """Return the isolines of the bound: each level, m, with its lines (n, 2) of x and y."""
+    figure_class()  # Raise one clear error if matplotlib, which installs contourpy, is missing.
     from contourpy import contour_generator
 
     values, _ = _drawn(found, dilution=False)
@@ -179,12 +180,12 @@ def isolines(found: BoundMap) -> list[tuple[float, list[Array]]]:
 
 
 def map_geojson(found: BoundMap) -> dict[str, Any]:
-    """Return stations and isolines of a map as a GeoJSON feature collection (RFC 7946).
+    """Return the stations and isolines of a map as a GeoJSON feature collection (RFC 7946).
 
     Raises
     ------
     InvalidProblem
-        Where the frame is not on Earth, or matplotlib is missing.
+        If the frame is not on Earth, or matplotlib is missing.
     """
     _demand_earth(found)
     features = _station_features(found)
@@ -209,19 +210,20 @@ def _station_features(grid: Grid) -> list[dict[str, Any]]:
 
 
 def status_geojson(found: StatusMap) -> dict[str, Any]:
-    """Return stations and places with the shares of all statuses as a GeoJSON feature collection (RFC 7946).
+    """Return stations and grid points, with the shares of all statuses, as a GeoJSON feature collection (RFC 7946).
 
     Raises
     ------
     InvalidProblem
-        Where the frame is not on Earth.
+        If the frame is not on Earth.
     """
     grid, shares = found.grid, found.shares
     _demand_earth(grid)
     features = _station_features(grid)
     for j, lat in enumerate(grid.y):
         for i, lon in enumerate(grid.x):
-            told = {one.label: float(share) for one, share in zip(shares.statuses, shares.share[j, i], strict=True)}
-            about = {"role": "status", "height": grid.height, "trials": shares.trials, "share": told}
+            pairs = zip(shares.statuses, shares.share[j, i], strict=True)
+            by_status = {status.label: float(share) for status, share in pairs}
+            about = {"role": "status", "height": grid.height, "trials": shares.trials, "share": by_status}
             features.append(feature(point_geometry(np.array([lon, lat]), _DIGITS), about))
     return {"type": "FeatureCollection", "features": features}

@@ -1,4 +1,4 @@
-"""Pictures of fixes: stations, estimate, the ellipse or region of 95 % and the other positions that the data allow."""
+"""Pictures of fixes: stations, estimates, 95 % ellipses or regions, alternatives and lines of position."""
 
 from __future__ import annotations
 
@@ -48,17 +48,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Reach of the fixes, as a share of the spread of the stations, from which the overview shows them well enough.
+# The overview shows the fixes well if their extent is at least this share of the extent of the stations. Otherwise the
+# picture has a panel around the fixes.
 _CLOSE = 0.3
-# Panel around the fixes: so many semi-axes of the largest ellipse, and of the distance that holds 95 % of the fixes.
-# The last is the share of the stations' spread where both are zero, as of a fix that constraints hold.
+# Half the side of the panel around the fixes: `_SEMI_AXES` largest semi-axes plus `_SPREAD` times the distance that
+# holds 95 % of the fixes. If both are zero, as for a fix that constraints determine, `_HELD` times the extent of the
+# stations.
 _SEMI_AXES, _SPREAD, _HELD = 1.6, 1.1, 0.1
-# Range rates of a run that have curves, evenly among them; points along a side of the grid on which these are sought;
-# and the side in widths of what is shown, for a panel may be wider or taller than that.
+# Maximum number of range rates with curves, evenly spread over a run; points along a side of the grid on which curves
+# are traced; and the side of the grid in widths of the panel, because a panel can be wider or taller than its limits.
 _CURVES, _GRID, _WIDE = 9, 161, 2.0
-# Rows that have lines of position: more cannot be told apart.
+# Maximum number of rows with lines of position: more lines are unreadable.
 _LINES = 24
-# What the lines of kinds are called.
+# Legend of the lines of each kind.
 _SHAPES = {
     "tdoa": "hyperbola of a time difference",
     "toa": "hyperbola of two arrivals",
@@ -67,23 +69,25 @@ _SHAPES = {
     "azimuth": "ray of a bearing",
     "isodoppler": "equal Doppler through the fix",
 }
-# Length of a wedge without an end, widths of the plan that it crosses.
+# Length of an unlimited wedge, in widths of the plan that it crosses.
 _BEYOND = 3.0
-# Metres from the picture's origin at which the Earth's surface stands almost upright in its plan, and steps to it.
+# Horizontal distance from the origin, m, at which the surface of the Earth is almost vertical; and iterations to find
+# the surface.
 _STEEP, _STEPS = 5.5e6, 12
 
 
 def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") -> Figure:
-    """Return a picture of fixes.
+    """Return a picture of fixes: an overview, the surroundings of the fixes and, in 3-D, a view of the height.
 
-    A plan of everything and a plan of the surroundings of the fix; in three dimensions a view of the height between
-    them. One scale on both axes of each. Of a single fix the plans show on which line each row alone would put the
-    target, at the height of the fix: hyperbolas, circles, rays; of many range rates isodoppler curves.
+    Both axes of a panel have the same scale. If there is a single fix, the plans also show lines of position at its
+    height: the positions that fit one row exactly, such as hyperbolas, circles and rays. If there are many range rates,
+    the lines are isodoppler curves.
 
     Parameters
     ----------
     problem : Problem
-        Gives the stations and the frame; ECEF is drawn along east, north and up at the stations' centre.
+        Gives the stations and the frame. If the frame is ECEF, the axes are east, north and up at the centre of the
+        stations.
     fixes : Fix or sequence of Fix
         Single fixes or batches.
     title : str
@@ -92,28 +96,28 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.show.pictures.save`.
+        The picture; write it with `optloc.show.pictures.save`.
     """
     every = [fixes] if isinstance(fixes, Fix) else fixes
     scene = scene_of(problem, every, outlined=True)
     spatial = scene.stations.shape[-1] == 3
-    count = 1 + spatial + (near := _nearby(scene))
+    count = 1 + spatial + (near := _needs_surroundings(scene))
     figure = figure_class()(figsize=(0.4 + 5.0 * count, 5.2), layout="constrained")
-    # Overview, height in space, and the surroundings where the overview shows no more than a dot.
+    # Panels: overview, height in three dimensions, and the surroundings if a fix is only a dot in the overview.
     panels = figure.subplots(1, count, squeeze=False)[0]
-    sizes = [_overview(panels[0], scene, PLAN)]
+    sizes = [_draw_overview(panels[0], scene, PLAN)]
     if spatial:
-        _overview(panels[1], scene, HEIGHT)
+        _draw_overview(panels[1], scene, HEIGHT)
     if near:
-        sizes.append(_close(panels[-1], scene))
+        sizes.append(_draw_surroundings(panels[-1], scene))
     if len(every) == 1 and every[0].code.size == 1 and np.isfinite(scene.fixes).all():
         centres = (np.zeros(2), scene.fixes[0, :2])
         for panel, size, centre in zip((panels[0], panels[-1]), sizes, centres, strict=False):
-            if _position_lines(panel, problem, every[0], centre, size) and spatial and panel is panels[0]:
+            if _draw_position_lines(panel, problem, every[0], centre, size) and spatial and panel is panels[0]:
                 panel.set_title("plan, lines at the height of the fix")
-    _cones(panels[0], problem, every, sizes[0])
+    _draw_directions(panels[0], problem, every, sizes[0])
     finish(figure, title, panels[:1])
-    # The limits of a plan are settled once the figure was laid out.
+    # Limits of a plan are final only after the layout of the figure.
     figure.draw_without_rendering()
     for panel in panels[:: len(panels) - 1] if near else panels[:1]:
         if panel.axison:
@@ -122,15 +126,15 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     return figure
 
 
-def _overview(panel: Axes, scene: PictureScene, view: View) -> float:
-    """Draw everything, and return the size of the unit."""
+def _draw_overview(panel: Axes, scene: PictureScene, view: View) -> float:
+    """Draw stations, fixes, alternatives and tracks, and return the size of the unit of the axes, m."""
     lines = (*scene.tracks, *scene.paths, *scene.other_paths, *scene.known)
     everything = np.concatenate([scene.stations, scene.fixes, scene.alternatives, *lines])
     unit, size = unit_of(everything[:, view])
     if view == PLAN:
-        _edges(panel, scene, size)
+        _draw_constraints(panel, scene, size)
     style.ellipses(panel, scene, view, size)
-    _lines(panel, scene, view, size)
+    _draw_tracks(panel, scene, view, size)
     style.stations(panel, scene, view, size)
     style.points(panel, scene, view, size)
     style.name_axes(panel, scene, view, unit)
@@ -138,8 +142,8 @@ def _overview(panel: Axes, scene: PictureScene, view: View) -> float:
     return size
 
 
-def _edges(panel: Axes, scene: PictureScene, size: float) -> None:
-    """Draw the outlines of the regions that must hold the target."""
+def _draw_constraints(panel: Axes, scene: PictureScene, size: float) -> None:
+    """Draw the regions of constraints: polygons and boxes."""
     label: str | None = "region"
     for corners in scene.regions:
         ring = np.concatenate([corners, corners[:1]]) / size
@@ -147,8 +151,8 @@ def _edges(panel: Axes, scene: PictureScene, size: float) -> None:
         label = None
 
 
-def _lines(panel: Axes, scene: PictureScene, view: View, size: float) -> None:
-    """Draw what moves as lines, and known targets."""
+def _draw_tracks(panel: Axes, scene: PictureScene, view: View, size: float) -> None:
+    """Draw tracks of stations, paths of targets and known targets as lines."""
     spots: dict[str, Any] = {"marker": "s", "markersize": 4, "markevery": [0]}
     styles: tuple[tuple[tuple[Array, ...], dict[str, Any]], ...] = (
         (scene.tracks, {"label": "track of a station", "color": BLACK, "linewidth": 1.0}),
@@ -161,8 +165,8 @@ def _lines(panel: Axes, scene: PictureScene, view: View, size: float) -> None:
             panel.plot(*xy(part, view, size), zorder=2, **(look if i == 0 else look | {"label": None}))
 
 
-def _cones(panel: Axes, problem: Problem, fixes: Sequence[Fix], size: float) -> None:
-    """Draw the directions of a single fix that has no place as wedges and rays, cut off by the limits of the plan."""
+def _draw_directions(panel: Axes, problem: Problem, fixes: Sequence[Fix], size: float) -> None:
+    """Draw the directions of a single fix without a valid position as wedges and rays up to the limits of the plan."""
     if len(fixes) != 1 or fixes[0].code.size != 1 or int(fixes[0].code.ravel()[0]) not in WITHOUT_PLACE:
         return
     from matplotlib.collections import Collection, LineCollection, PolyCollection
@@ -177,7 +181,7 @@ def _cones(panel: Axes, problem: Problem, fixes: Sequence[Fix], size: float) -> 
     drawn: list[Collection] = []
     if wedges:
         drawn.append(PolyCollection(wedges, color=SKY, alpha=0.35, label="95 % direction", zorder=0))
-        drawn.append(LineCollection(rays, colors=BLUE, linestyles="--", label="likeliest direction", zorder=1))
+        drawn.append(LineCollection(rays, colors=BLUE, linestyles="--", label="most likely direction", zorder=1))
     if curves:
         drawn.append(LineCollection(curves, colors=PURPLE, label=found.curve_name, zorder=1))
     for each in drawn:
@@ -185,37 +189,37 @@ def _cones(panel: Axes, problem: Problem, fixes: Sequence[Fix], size: float) -> 
 
 
 def _plan(problem: Problem, line: Array) -> Array:
-    """Return the plan (n, 2) of a line (n, d) of the problem's frame, metres."""
+    """Return the horizontal coordinates (n, 2), m, of a line (n, d) in the frame of the problem."""
     local = local_frame(problem)
     return np.asarray((line if local is None else local.from_ecef(line))[:, :2])
 
 
-def _nearby(scene: PictureScene) -> bool:
-    """Return whether the fixes are so close together that they deserve a panel of their own."""
+def _needs_surroundings(scene: PictureScene) -> bool:
+    """Return whether the fixes are so close together that the picture needs a panel around them."""
     known = np.asarray(np.isfinite(scene.fixes).all(-1))
     if not known.any():
         return True
     reach = _reach(scene, known, np.median(scene.fixes[known][:, :2], axis=0))
-    # A single station that moves is as wide as its track.
+    # Tracks count too: the extent of a single moving station is the extent of its track.
     return reach < _CLOSE * float(np.ptp(np.concatenate([scene.stations, *scene.tracks])[:, :2]))
 
 
-def _close(panel: Axes, scene: PictureScene) -> float:
-    """Draw the surroundings of the fixes, their ellipses or their own spread, and return the size of the unit."""
+def _draw_surroundings(panel: Axes, scene: PictureScene) -> float:
+    """Draw the surroundings of the fixes with their ellipses, and return the size of the unit of the axes, m."""
     known: Array = np.asarray(np.isfinite(scene.fixes).all(-1))
     view = PLAN
     if not known.any():
         panel.set_axis_off()
         panel.text(0.5, 0.5, "no fix", ha="center", va="center", transform=panel.transAxes)
         return 1.0
-    # Medians: one wild fix of many must not move the panel.
+    # Use medians, so that one outlier among many fixes does not move the panel.
     centre = np.median(scene.fixes[known][:, view], axis=0)
     extent = _reach(scene, known, centre)
     unit, size = unit_of(np.array([centre - extent, centre + extent]) - centre)
     shifted = _shift(scene, centre)
-    _edges(panel, shifted, size)
+    _draw_constraints(panel, shifted, size)
     style.ellipses(panel, shifted, view, size)
-    _lines(panel, shifted, view, size)
+    _draw_tracks(panel, shifted, view, size)
     style.points(panel, shifted, view, size)
     style.stations(panel, shifted, view, size, named=False)
     style.name_axes(panel, shifted, view, unit)
@@ -238,7 +242,7 @@ def _reach(scene: PictureScene, known: Array, centre: Array) -> float:
     largest = np.max(semi_axes[np.isfinite(semi_axes)], initial=0.0)
     for fix, regions in zip(scene.fixes, scene.outlines, strict=False):
         for line in regions[PLAN].lines if regions else []:
-            # The part around the fix, whole; other parts are other positions, which the overview shows.
+            # Only the part around the fix counts; other parts are other positions, which the overview shows.
             if (line.min(0) <= 0.0).all() and (line.max(0) >= 0.0).all():
                 largest = max(float(largest), float(np.abs(fix[:2] + line - centre).max()) / _SPREAD)
     away = np.abs(scene.fixes[known][:, :2] - centre).max(-1)
@@ -246,25 +250,25 @@ def _reach(scene: PictureScene, known: Array, centre: Array) -> float:
     return reach if reach > 0.0 else _HELD * float(np.ptp(scene.stations[:, :2]) or 1.0)
 
 
-# Lines of position: where the target would be by one row alone.
+# Lines of position: positions that fit one row exactly.
 
 
 class PositionLine(NamedTuple):
-    """A line (p, 2) in x and y on which one row of a kind, of stations by name, would put the target."""
+    """The positions that fit one row exactly: a line (p, 2) in x and y, m. `kind` and `name` give kind and stations."""
 
     kind: str
     name: str
     line: Array
 
 
-def _position_lines(panel: Axes, problem: Problem, fix: Fix, centre: Array, size: float) -> bool:
-    """Draw where each row alone would put the target, in a plan whose origin is a centre; return whether there are."""
+def _draw_position_lines(panel: Axes, problem: Problem, fix: Fix, centre: Array, size: float) -> bool:
+    """Draw the lines of position in a plan whose origin is `centre`, m, and return whether there are lines."""
     if _only_target(problem.flat(), fix.flat()) is None:
         return False
     (west, east), (south, north) = panel.get_xlim(), panel.get_ylim()
     middle, half = np.array([west + east, south + north]) / 2.0, _WIDE * max(east - west, north - south) / 2.0
     corners = size * np.stack([middle - half, middle + half]) + centre
-    # Rays through layers take a thousand times longer than straight lines.
+    # Use a coarser grid for layers: a bent ray takes a thousand times longer to compute than a straight ray.
     side = _GRID if not isinstance(problem.medium, Layers) else _GRID // 3
     x, y = (np.linspace(low, high, side) for low, high in corners.T)
     places = _at_height(problem, fix, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
@@ -274,33 +278,33 @@ def _position_lines(panel: Axes, problem: Problem, fix: Fix, centre: Array, size
 
 
 def draw_lines(panel: Axes, found: Sequence[PositionLine], centre: Array, size: float) -> None:
-    """Draw lines of position in a plan whose origin is a centre, metres, and whose unit has a size."""
+    """Draw lines of position in a plan with the origin `centre`, m, and the unit `size`, m."""
     from matplotlib.collections import LineCollection
 
     for kind, colour in zip(dict.fromkeys(one.kind for one in found), cycle((PURPLE, SKY, GREEN, YELLOW))):
         lines = [(one.line - centre) / size for one in found if one.kind == kind]
-        label = _SHAPES.get(kind, f"where one {kind.removeprefix(RAY)} alone would put it")
-        # The limits of a plan are those of what is known, not of curves.
+        label = _SHAPES.get(kind, f"positions that fit one {kind.removeprefix(RAY)}")
+        # Curves do not change the limits of a plan (autolim=False), because they can be much longer than the scene.
         look: dict[str, Any] = {"colors": colour, "linewidths": 1.0, "alpha": 0.8, "zorder": 1}
         panel.add_collection(LineCollection(lines, label=label, **look), autolim=False)
 
 
 def lines_of_position(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -> list[PositionLine]:
-    """Return where a target would be by each row alone, other unknowns as the fix has them.
+    """Return the positions that fit each row exactly, as lines; other unknowns have their values at the fix.
 
-    Hyperbolas of time differences, and of arrivals against the first of them; circles of ranges, rays of bearings. Of
-    many rows only range rates have lines, some of them, through the fix.
+    Time differences give hyperbolas; arrivals give hyperbolas with the first arrival; ranges give circles, bearings
+    rays. If there are many rows, only some range rates have lines: the isodoppler curves through the fix.
 
     Parameters
     ----------
     problem : Problem
-        With one target that is not known.
+        A problem with one unknown target.
     fix : Fix
         Its fix.
     x, y : array (n,), (m,)
         Grid of a plan or a map.
     places : array (m n, d)
-        Its points in the problem's frame, metres; NaN where there is none.
+        Points of the grid in the frame of the problem, m; NaN for points without a position.
     """
     flat, answer = problem.flat(), fix.flat()
     target = _only_target(flat, answer)
@@ -321,7 +325,7 @@ def lines_of_position(problem: Problem, fix: Fix, x: Array, y: Array, places: Ar
 
 
 def _only_target(flat: Problem, answer: Fix) -> int | None:
-    """Return the number of the only target that is not known, None where there are several or it has no one fix."""
+    """Return the index of the only unknown target; None if there are several or the target has no single fix."""
     sought = [i for i, motion in enumerate(flat.motions) if motion.known is None]
     single = flat.batch_shape == (1,) and bool(np.isfinite(answer.x).all())
     if len(sought) != 1 or not single or flat.motions[sought[0]].span == "epoch":
@@ -330,7 +334,7 @@ def _only_target(flat: Problem, answer: Fix) -> int | None:
 
 
 def _lines_of(problem: Problem, rows: Rows, target: int, residual: Array, x: Array, y: Array) -> list[PositionLine]:
-    """Return the lines of a target's rows of one kind, where their residuals (n, m) on a grid are zero."""
+    """Return the zero lines of the residuals (n, m) on a grid, for the rows of one kind and one target."""
     from contourpy import contour_generator
 
     model, names = MODELS[rows.kind], problem.stations.names
@@ -339,14 +343,15 @@ def _lines_of(problem: Problem, rows: Rows, target: int, residual: Array, x: Arr
     for i in np.flatnonzero(present).tolist():
         values, ends = residual[:, i], [names[k] for k in (rows.a[i], rows.b[i]) if k >= 0]
         if model.emission:
-            # When the signal was sent nobody measured: what was is how much later another station heard it.
+            # The emission time is unknown, so subtract the residual of the first arrival: the difference is a measured
+            # quantity.
             same = np.flatnonzero(present & (rows.epoch == rows.epoch[i]))
             first = same[np.argmin(rows.z.reshape(-1, rows.count)[0, same])]
             if first == i:
                 continue
             values, ends = values - residual[:, first], [*ends, names[rows.a[first]]]
         if model.period is not None:
-            # Behind a station a bearing jumps by a turn: a change of sign there is no line.
+            # Behind a station, a bearing jumps by a full turn: mask this sign change, which is no line of position.
             values = np.where(np.abs(values) < 0.25 * model.period, values, np.nan)
         made = contour_generator(x, y, np.ma.masked_invalid(values.reshape(len(y), len(x)))).lines(0.0)
         found += [PositionLine(rows.kind, " – ".join(ends), np.asarray(line)) for line in made]
@@ -354,23 +359,23 @@ def _lines_of(problem: Problem, rows: Rows, target: int, residual: Array, x: Arr
 
 
 def isodopplers(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -> list[tuple[str, Array]]:
-    """Return curves on which a range rate, or a difference of two, is what it is at the fix.
+    """Return curves on which a range rate, or a difference of range rates, has the same value as at the fix.
 
     Parameters
     ----------
     problem : Problem
-        With one target that is not known.
+        A problem with one unknown target.
     fix : Fix
         Its fix.
     x, y : array (n,), (m,)
         Grid of a plan or a map.
     places : array (m n, d)
-        Its points in the problem's frame, metres; NaN where there is none.
+        Points of the grid in the frame of the problem, m; NaN for points without a position.
 
     Returns
     -------
     list of (str, array (p, 2))
-        Names of rows, nine at most, and lines in x and y; none where the target moves in the course of a run, or
+        Names of at most nine rows, and their lines in x and y. The list is empty if the target moves during a run, or
         there is no fix.
     """
     from contourpy import contour_generator
@@ -380,7 +385,7 @@ def isodopplers(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -
     target = _only_target(flat, answer)
     if target is None or not rates or (flat.motions[target].order > 0 and flat.epochs > 1):
         return []
-    # The fix is the last point: what it has is the level of its curve.
+    # The last point is the fix; its value is the level of the curve.
     places = np.concatenate([places, answer.position.reshape(1, -1)])
     velocity = answer.velocity.reshape(-1) if flat.motions[target].order else np.zeros(flat.dimension)
     found = []
@@ -394,14 +399,14 @@ def isodopplers(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -
 
 
 def _spread(rates: Sequence[Rows], target: int) -> list[tuple[Rows, int]]:
-    """Return a target's rows that count, evenly chosen where they are many."""
+    """Return the rows of a target with positive weight; if they are many, evenly chosen rows."""
     present = [(rows.weight.reshape(-1, rows.count)[0] > 0.0) & (rows.target == target) for rows in rates]
-    every = [(rows, i) for rows, own in zip(rates, present, strict=True) for i in np.flatnonzero(own).tolist()]
+    every = [(rows, i) for rows, mask in zip(rates, present, strict=True) for i in np.flatnonzero(mask).tolist()]
     return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(_CURVES, len(every))).astype(int)).tolist()]
 
 
 def _rate(problem: Problem, rows: Rows, row: int, places: Array, velocity: Array) -> Array:
-    """Return what a row would measure of a target at places (n, d)."""
+    """Return the modelled value of a row for a target at positions (n, d), m, with `velocity`, m/s."""
 
     def at(array: Array | None, index: int) -> tuple[float, ...]:
         if array is None:
@@ -413,12 +418,15 @@ def _rate(problem: Problem, rows: Rows, row: int, places: Array, velocity: Array
     a, b = (Point(at(stations.position, i[row]), at(stations.velocity, i[row])) for i in (rows.a, rows.b))
     target = Point(tuple(places.T), tuple(velocity))
     with np.errstate(all="ignore"):
-        # Of rays that bend the picture takes straight ones: the curve goes through the fix either way.
+        # Use straight rays also for media with bent rays: the curve still passes through the fix.
         return np.asarray(MODELS[MODELS[rows.kind].straight or rows.kind].h(target, a, b))
 
 
 def _at_height(problem: Problem, fix: Fix, plan: Array) -> Array:
-    """Return points (n, d) of the problem's frame above a plan (n, 2), as high as the fix; NaN beyond the horizon."""
+    """Return points (n, d), m, in the frame of the problem, above a plan (n, 2) and at the height of the fix.
+
+    Points beyond the horizon are NaN.
+    """
     fixed = fix.position.reshape(1, -1)
     if problem.dimension == 2:
         return plan
@@ -430,7 +438,7 @@ def _at_height(problem: Problem, fix: Fix, plan: Array) -> Array:
 
 
 def _up(frame: Frame, plan: Array, height: float) -> Array:
-    """Return the third coordinate (n,) of points above a plan whose height above the ellipsoid is given."""
+    """Return the third coordinate (n,), m, of points above a plan that have a given height above the ellipsoid."""
     across = np.linalg.norm(plan, axis=1)
     near = across < _STEEP
     centre = np.linalg.norm(frame.origin_ecef())
@@ -438,7 +446,7 @@ def _up(frame: Frame, plan: Array, height: float) -> Array:
     up[near] = np.sqrt(centre**2 - across[near] ** 2) - centre
     for _ in range(_STEPS):
         at = np.column_stack([plan[near], up[near]])
-        # How much higher a point is for each metre along the picture's third axis, on a sphere.
+        # Increase of the height for each metre along the third axis of the picture, for a spherical Earth.
         gain = (up[near] + centre) / np.hypot(across[near], up[near] + centre)
         up[near] -= (frame.to_geodetic(at)[2] - height) / gain
     return up

@@ -1,4 +1,4 @@
-"""The cost over the place of a target: why a fix is where it is, and where else it could be."""
+"""Pictures of the cost around a fix, and of the starts from which iterations reach the best fit."""
 
 from __future__ import annotations
 
@@ -34,39 +34,42 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = "YlGnBu_r"
-"""Dark where the cost is low, in steps of lightness."""
+"""Colour map of the cost: dark for a low cost; lightness increases with the cost."""
 
-# Points along each side of a panel: each is a problem of its own, and lines drawn through fewer show corners.
+# Points along each side of a panel: each point is a separate problem, and isolines through fewer points have corners.
 _POINTS = 121
-# Levels of the surroundings, standard deviations: a covariance holds near the fix, curvature shows further out.
+# Levels of the isolines around the fix, standard deviations. Near the fix the covariance describes them; farther away
+# their shape shows the nonlinearity.
 _SIGMAS = (1, 2, 3, 4, 5, 7, 10)
-# Chi-square of two degrees of freedom that holds 95 %: a plan has two coordinates.
+# 95 % quantile of chi-square with two degrees of freedom, the coordinates of a plan.
 _CHI2_95 = 5.991464547107979
-# Half the side of the surroundings in standard deviations of the larger coordinate: the 95 % ellipse (2.4) and a rim.
+# Half the side of the panel around the fix, in standard deviations of the larger coordinate: the 95 % ellipse (2.4) and
+# a margin.
 _AROUND = 4.2
-_NAME = "cost above that of the fix, square root (standard deviations)"
-# Rows times starts that are iterated at once, which memory holds; and the starts along a side that this allows.
+_NAME = "root of the cost minus the cost of the fix (standard deviations)"
+# Maximum number of rows times starts in one batch, limited by memory; and the resulting limits of the starts along a
+# side.
 _ROWS, _STARTS = 4e6, (31, 161)
 _NAMES = {"taylor": "plain Taylor iteration", "lsr": "damped least squares"}
 _ENDS = {
     End.REACHED: "the best fit",
     End.ELSEWHERE: "a worse fit elsewhere",
-    End.NOWHERE: "nowhere: it does not converge",
+    End.NOWHERE: "no convergence",
 }
 _COLOURS = {End.REACHED: BLUE, End.ELSEWHERE: YELLOW, End.NOWHERE: "#e4e4e4"}
 
 
 def plot_landscape(problem: Problem, fix: Fix, title: str = "") -> Figure:
-    """Return a plan of the cost around a fix: of everything, and of the surroundings of the fix.
+    """Return two plans of the cost: an overview, and the surroundings of the fix.
 
-    Colour is the root of the cost above that of the fix, in standard deviations. What else is unknown takes the values
-    that fit best at each place. In space the plan of everything is at the height of the fix; around the fix the height
-    takes the value that fits best, too, so that the line of 95 % and the ellipse say the same.
+    The colour is the root of the cost minus the cost of the fix, in standard deviations. At each point, the other
+    unknowns have the values of the best fit. In three dimensions, the overview is at the height of the fix. Around the
+    fix, the height has the value of the best fit too, so that the 95 % line can be compared with the ellipse.
 
     Parameters
     ----------
     problem : Problem
-        A single problem with one target that stands for the run.
+        A single problem with one target that has one position in the whole run.
     fix : Fix
         Its fix.
     title : str
@@ -75,38 +78,38 @@ def plot_landscape(problem: Problem, fix: Fix, title: str = "") -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.show.pictures.save`.
+        The picture; write it with `optloc.show.pictures.save`.
 
     Raises
     ------
     InvalidProblem
-        Where there are several fixes or targets, or no answer.
+        If there are several fixes or targets, or no fix.
     """
     flat, answer = single(problem, fix)
     scene = scene_of(flat, [answer])
     figure = figure_class()(figsize=(12.0, 5.4), layout="constrained")
     whole, near = figure.subplots(1, 2)
-    _whole(whole, flat, answer, scene)
-    _near(near, flat, answer, scene)
+    _draw_overview(whole, flat, answer, scene)
+    _draw_surroundings(near, flat, answer, scene)
     finish(figure, title, (whole, near))
     separate_notes(figure)
     return figure
 
 
 def single(problem: Problem, fix: Fix) -> tuple[Problem, Fix]:
-    """Return a problem and its fix as flat batches of one; refuse what has no answer or not one position."""
+    """Return a problem and its fix as flat batches of one; raise InvalidProblem unless there is one position."""
     flat, answer = problem.flat(), fix.flat()
     sought = sum(motion.known is None for motion in problem.motions)
     if len(answer) != 1 or sought != 1 or not flat.layout.shares("position"):
-        what = f"{len(answer)} fixes of {sought} targets are more than one position"
+        what = f"the picture shows one position, but there are {len(answer)} fixes of {sought} targets"
         raise InvalidProblem(what, "plot", "draw one epoch, or a run of one target")
     if not np.isfinite(answer.x).all():
-        raise InvalidProblem(f"there is no fix to draw around: {answer.reason[0]}", "plot", "see `optloc fix`")
+        raise InvalidProblem(f"the problem has no fix: {answer.reason[0]}", "plot", "see `optloc fix`")
     return flat, answer
 
 
 def limits(scene: PictureScene, widen: float = 0.25) -> Array:
-    """Return the square [[x0, y0], [x1, y1]] that holds stations, fix and alternatives with a rim, metres."""
+    """Return the square [[x0, y0], [x1, y1]], m, that holds stations, fix and alternatives with a margin."""
     points = np.concatenate([scene.stations, scene.fixes, scene.alternatives])[:, :2]
     low, high = points.min(0), points.max(0)
     half = (0.5 + widen) * float((high - low).max() or 1.0)
@@ -115,7 +118,7 @@ def limits(scene: PictureScene, widen: float = 0.25) -> Array:
 
 
 def plane(corners: Array, count: int, above: Array) -> tuple[Array, Array, Array]:
-    """Return the grid of a square as x (n,), y (n,) and points (n n, d), at the height of a point (d,)."""
+    """Return the grid of a square: x (n,), y (n,) and points (n n, d), m, at the height of the point `above` (d,)."""
     x, y = (np.linspace(low, high, count) for low, high in corners.T)
     east, north = np.meshgrid(x, y)
     points = np.tile(above, (count * count, 1))
@@ -123,25 +126,25 @@ def plane(corners: Array, count: int, above: Array) -> tuple[Array, Array, Array
     return x, y, points
 
 
-def _excess(problem: Problem, fix: Fix, points: Array, held: int) -> Array:
-    """Return the root (n,) of the cost at points (n, d) along the picture's axes above the fix's.
+def _excess(problem: Problem, fix: Fix, points: Array, fixed: int) -> Array:
+    """Return the root (n,) of the cost at points minus the cost of the fix, in standard deviations.
 
     Parameters
     ----------
     problem, fix : Problem, Fix
-        Of one position.
+        Problem and fix with one position.
     points : array (n, d)
-        Along the picture's axes.
-    held : int
-        Coordinates that stay: all, or the plan while the height takes the value that fits best.
+        Points along the axes of the picture, m.
+    fixed : int
+        Number of fixed coordinates: all coordinates, or only the plan while the height has the value of the best fit.
     """
-    # The solver works in the problem's frame; what is held are directions of the picture.
+    # The solver works in the frame of the problem, but the fixed coordinates are along the axes of the picture.
     places, axes = placed_points(problem, points)
-    cost = profile_cost(problem, fix.x[0], places, axes[:held])
+    cost = profile_cost(problem, fix.x[0], places, axes[:fixed])
     return np.asarray(np.sqrt(np.maximum(cost - fix.cost[0], 0.0)))
 
 
-def _whole(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
+def _draw_overview(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
     from matplotlib.colors import LogNorm
 
     corners = limits(scene)
@@ -149,19 +152,19 @@ def _whole(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None
     x, y, grid = plane(corners, _POINTS, scene.fixes[0])
     excess = _excess(problem, fix, grid, problem.dimension).reshape(_POINTS, _POINTS)
     steps = levels(excess)
-    # At least a factor of two, or the scale would have one colour.
+    # The scale spans at least a factor of two, otherwise it has only one colour.
     norm = LogNorm(steps[0], max(steps[-1], 2.0 * steps[0]), clip=True)
     drawn = panel.pcolormesh(x / size, y / size, excess, norm=norm, cmap=COLOURS, rasterized=True, shading="nearest")
     panel.contour(x / size, y / size, excess, levels=steps, colors="white", linewidths=0.7)
     style.stations(panel, scene, PLAN, size, edgecolors="white", linewidths=0.8)
     style.points(panel, scene, PLAN, size)
     _square(panel, scene, corners / size, unit)
-    panel.set_title("everything" if problem.dimension == 2 else "everything, at the height of the fix")
+    panel.set_title("overview" if problem.dimension == 2 else "overview, at the height of the fix")
     bar = panel.figure.colorbar(drawn, ax=panel, label=_NAME, ticks=steps, format=lambda value, _: f"{value:g}")
     bar.ax.minorticks_off()
 
 
-def _near(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
+def _draw_surroundings(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
     centre, spread = scene.fixes[0], np.sqrt(np.diagonal(scene.covariances[0])[:2])
     if not np.isfinite(spread).all():
         panel.set_axis_off()
@@ -171,14 +174,14 @@ def _near(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
     corners = np.stack([centre[:2] - half, centre[:2] + half])
     unit, size = unit_of(corners - centre[:2])
     x, y, grid = plane(corners, _POINTS, centre)
-    # The height takes the value that fits best: what the line of 95 % is then is the ellipse of the plan.
+    # The height has the value of the best fit, so the 95 % line of a linear problem is the ellipse of the plan.
     excess = _excess(problem, fix, grid, 2).reshape(_POINTS, _POINTS)
     x, y, corners = (x - centre[0]) / size, (y - centre[1]) / size, (corners - centre[:2]) / size
     drawn = panel.contourf(x, y, excess, levels=[0, *_SIGMAS], cmap=COLOURS, extend="max")
     panel.contour(x, y, excess, levels=_SIGMAS, colors="white", linewidths=0.7)
-    panel.figure.colorbar(drawn, ax=panel, label="the same (standard deviations)")
+    panel.figure.colorbar(drawn, ax=panel, label=_NAME)
     panel.contour(x, y, excess, levels=[np.sqrt(_CHI2_95)], colors=ORANGE, linewidths=2.0)
-    panel.plot([], [], color=ORANGE, linewidth=2.0, label="95 % by the cost")
+    panel.plot([], [], color=ORANGE, linewidth=2.0, label="95 % region by the cost")
     moved = scene.moved(lambda place: place - np.pad(centre[:2], (0, len(centre) - 2)))
     style.ellipses(panel, moved, PLAN, size, color=BLACK, linestyle="--", linewidth=1.4)
     panel.scatter(0.0, 0.0, marker="o", s=50, color=BLUE, edgecolors="white", zorder=4)
@@ -194,40 +197,39 @@ def _square(panel: Axes, scene: PictureScene, corners: Array, unit: str) -> None
     panel.set_ylim(*corners[:, 1])
 
 
-# Where iterations from many starts end, beside the fix that needs no start.
+# Convergence: results of iterations from many starts, compared with the fix, which needs no start.
 
 
 def plot_convergence(
     problem: Problem, fix: Fix, title: str = "", *, reach: float | None = None, starts: int | None = None
 ) -> Figure:
-    """Return a map of starts, coloured by where plain and damped iterations from there end, beside the fix.
+    """Return a map of starts, coloured by the result of plain and damped iterations from each start.
 
-    The fix is drawn with its lines of position, and what is around it.
-
-    Starts lie in the horizontal plane of the fix: the plain iteration is told the height.
+    A third panel shows the fix with its lines of position and its surroundings. Starts are in the horizontal plane of
+    the fix, so the plain iteration starts with the right height.
 
     Parameters
     ----------
     problem : Problem
-        A single problem with one target that stands for the run.
+        A single problem with one target that has one position in the whole run.
     fix : Fix
         Its fix, without a guess.
     title : str
         Title of the picture.
     reach : float, optional
-        Half the side of the square of starts, metres; by default it holds stations and fix three times.
+        Half the side of the square of starts, m. By default, the square is three times as wide as stations and fix.
     starts : int, optional
         Starts along each side of the square: 161, or fewer for long runs.
 
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.show.pictures.save`.
+        The picture; write it with `optloc.show.pictures.save`.
 
     Raises
     ------
     InvalidProblem
-        Where there are several fixes or targets, or no answer.
+        If there are several fixes or targets, or no fix.
     """
     flat, answer = single(problem, fix)
     scene = scene_of(flat, [answer])
@@ -242,7 +244,7 @@ def plot_convergence(
     unit, size = unit_of(corners)
     for panel, method in zip(panels, _NAMES, strict=False):
         found = basins(flat, answer, places.reshape(starts, starts, -1), method)
-        _ends(panel, found, x / size, y / size)
+        _draw_ends(panel, found, x / size, y / size)
         share = f"{100.0 * found.share(End.REACHED):.1f} % of {starts**2} starts"
         panel.set_title(f"{_NAMES[method]}:\n{share} reach the best fit")
     panels[2].set_title(f"optloc needs no start:\n{verdict(answer)}")
@@ -251,13 +253,13 @@ def plot_convergence(
         _marks(panel, scene, size, corners / size, unit, last=panel is panels[2])
     _legend(figure, panels[2])
     finish(figure, f"{title}: from which starts is the best fit found?" if title else "")
-    _inset(panels[2], scene)
+    _draw_inset(panels[2], scene)
     separate_notes(figure)
     return figure
 
 
-def _inset(panel: Axes, scene: PictureScene) -> None:
-    """Draw the surroundings of the fix in a corner: in the plan of all starts its ellipse is a dot."""
+def _draw_inset(panel: Axes, scene: PictureScene) -> None:
+    """Draw the surroundings of the fix in a corner, because its ellipse is only a dot in the plan of all starts."""
     centre, covariance = scene.fixes[0], scene.covariances[0]
     half = _AROUND * float(np.sqrt(np.diagonal(covariance)[:2].max()))
     if not (np.isfinite(half) and half > 0.0):
@@ -279,15 +281,15 @@ def _inset(panel: Axes, scene: PictureScene) -> None:
 
 
 def verdict(fix: Fix) -> str:
-    """Return the status of a flat fix of one, and what is listed or proven."""
+    """Return the status of a flat fix of one, with the number of positions or the extent of the proof."""
     code, proof = int(fix.code[0]), fix.certificates[0].proof
     if code == Status.AMBIGUOUS:
-        return f"ambiguous: {1 + int(np.isfinite(fix.alternatives.gap[0]).sum())} places listed"
+        return f"ambiguous: {1 + int(np.isfinite(fix.alternatives.gap[0]).sum())} positions listed"
     proven = {"global": ": proven best everywhere", "region": ": proven best in its region"}
     return f"status {Status(code).label}{proven.get(proof, '')}"
 
 
-def _ends(panel: Axes, found: Basins, x: Array, y: Array) -> None:
+def _draw_ends(panel: Axes, found: Basins, x: Array, y: Array) -> None:
     from matplotlib.colors import ListedColormap
 
     colours = ListedColormap([_COLOURS[end] for end in End])

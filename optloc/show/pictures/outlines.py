@@ -1,6 +1,7 @@
-"""What covers where an ellipse does not, as lines of a picture: an egg for a far fix, a banana or a ring as it is.
+"""Outlines of 95 % regions whose ellipse is not valid, in pictures and as GeoJSON on Earth.
 
-And such lines on the Earth as GeoJSON has them: cut at the antimeridian, closed around the poles.
+An ellipse is *valid* if it covers the true position with the stated probability. The region of a far fix is egg-shaped;
+other regions can be bananas or rings. GeoJSON lines are cut at the antimeridian and closed around the poles.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from optloc.problem.problem import Problem
 from optloc.uncertainty.contour import holds
 from optloc.uncertainty.outline import Outline, outline_of
 
-# Regions that are drawn as they are: in space each takes half a second.
+# Maximum number of regions whose outline is computed: in three dimensions each takes half a second.
 _MOST = 12
 
 
 def outlines_of(problem: Problem, fix: Fix, planes: Sequence[Array], level: float = 0.95) -> list[list[Outline]]:
-    """Return the regions of the fixes of a batch of one position where an ellipse does not cover.
+    """Return the 95 % regions of fixes whose ellipse is not valid, in each plane; each fix has one position.
 
     Parameters
     ----------
@@ -34,86 +35,95 @@ def outlines_of(problem: Problem, fix: Fix, planes: Sequence[Array], level: floa
     fix : Fix
         Their fixes.
     planes : sequence of array (2, d) or (n, 2, d)
-        Axes of planes through the fixes, of each fix or of all: those that pictures show.
+        Axes of planes through the fixes, the same for all fixes or one plane for each fix.
     level : float
-        Probability that a region contains what is seen of the target.
+        Probability that a region contains the projection of the target.
 
     Returns
     -------
     list of list of Outline
-        For each fix its region in each plane; empty where the ellipse covers, or nothing is known of what does.
+        For each fix, its region in each plane. The list is empty if the ellipse is valid or the region is unknown.
     """
     flat = fix if len(fix.shape) == 1 else fix.flat()
     if flat.chart is None:
         return [[] for _ in range(len(flat))]
     shaped = ((flat.chart.kind != CARTESIAN) | flat.chart.cut_off) & np.isfinite(flat.cov).all((-1, -2))
-    own = _one_each(problem, len(flat))
-    if own is None or shaped.sum() > _MOST:
+    problems = _problem_of_each_fix(problem, len(flat))
+    if problems is None or shaped.sum() > _MOST:
         return [[] for _ in range(len(flat))]
     found: list[list[Outline]] = []
     for i in range(len(flat)):
         made = []
         if shaped[i]:
-            one, fixed = own.take(np.array([i])), flat[i]
+            one, fixed = problems.take(np.array([i])), flat[i]
             made = [outline_of(one, fixed, plane if plane.ndim == 2 else plane[i], level) for plane in planes]
         found.append([] if any(one is None for one in made) else [one for one in made if one is not None])
     return found
 
 
 def level_planes(problem: Problem, position: Array) -> Array:
-    """Return east and north (n, 2, d) at positions (n, d) on Earth, metres; without one those at the stations."""
+    """Return the directions east and north (n, 2, d) at positions (n, d) on Earth, m.
+
+    A position that is NaN gets the directions at the centre of the stations.
+    """
     centre = problem.stations.places.reshape(-1, problem.dimension).mean(0)
     known = np.where(np.isfinite(position).all(-1, keepdims=True), position, centre)
     return np.stack([problem.frame.enu_axes(place)[:2] for place in known]).reshape(-1, 2, problem.dimension)
 
 
-def _one_each(problem: Problem, count: int) -> Problem | None:
-    """Return the problems of so many fixes as a flat batch: those of a batch, or of the epochs of a file."""
+def _problem_of_each_fix(problem: Problem, count: int) -> Problem | None:
+    """Return a flat batch with one problem for each of `count` fixes; None if the numbers do not match."""
     flat = problem.flat()
     if flat.batch_shape[0] != count and problem.batch_shape == () and separable(problem):
         flat = by_epoch(problem).flat()
     return flat if flat.batch_shape[0] == count else None
 
 
-# On the Earth, as GeoJSON: RFC 7946, sections 3.1.6 and 3.1.9.
+# GeoJSON on Earth: RFC 7946, sections 3.1.6 and 3.1.9.
 
-# Decimals of a degree: a tenth of a millimetre, so that the ellipse of a fix of centimetres is round; of metres.
+# Decimals of a degree (0.1 mm, so that an ellipse of centimetres is round) and of a height in metres (1 mm).
 _DIGITS, _MILLIMETRES = 9, 3
-# Longitudes of neighbours on a line differ by this many degrees at most, as lines of a map are straight in degrees.
+# Maximum difference in longitude between neighbours on a line, degrees: maps draw straight lines in degrees.
 _STEP = 5.0
-# Halvings by which that is sought, enough for a line that passes a pole at a thousandth of its length.
+# Maximum number of halvings of a line to meet that limit: enough if a line passes a pole at a thousandth of its length.
 _HALVINGS = 10
-# How far inside the antimeridian a point on it is taken to be, degrees: it is on one side, and crossings are crossings.
+# Distance from the antimeridian, degrees, to which points on it are moved. Each point is then on one side, so that
+# crossings are found.
 _INSIDE = 1e-9
-# The edge of the map counter-clockwise from its lower right corner: its length, degrees, and how far the corners are.
+# The edge of the map, counter-clockwise from its lower right corner: its length, degrees, and the corners by their
+# distance along the edge.
 _AROUND = 1080.0
 _EDGES = {180.0: (180.0, 90.0), 540.0: (-180.0, 90.0), 720.0: (-180.0, -90.0), 0.0: (180.0, -90.0)}
 
 
 def feature(geometry: dict[str, Any], properties: dict[str, Any]) -> dict[str, Any]:
-    """Return a feature of GeoJSON."""
+    """Return a GeoJSON feature."""
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
 def point_geometry(place: Array, digits: int = _DIGITS) -> dict[str, Any]:
-    """Return a point (2 or 3,) of longitude, latitude (degrees) and height (metres)."""
+    """Return a GeoJSON point from longitude, latitude (degrees) and an optional height (m): (2,) or (3,)."""
     return {"type": "Point", "coordinates": _rounded(_wrapped(place[None]), digits)[0]}
 
 
 def line_geometry(lines: Sequence[Array], digits: int = _DIGITS) -> dict[str, Any]:
-    """Return lines (n, 2 or 3) of longitude, latitude (degrees) and height (metres), cut at the antimeridian."""
+    """Return GeoJSON lines, cut at the antimeridian.
+
+    Each line is (n, 2) or (n, 3): longitude, latitude (degrees) and an optional height (m).
+    """
     parts = [_rounded(part, digits) for line in lines for part in _parts(_wrapped(line))]
     return {"type": "MultiLineString", "coordinates": [part for part in parts if len(part) > 1]}
 
 
 def polygon_geometry(polygons: Sequence[Sequence[Array]], digits: int = _DIGITS) -> dict[str, Any]:
-    """Return polygons on the Earth, cut at the antimeridian, and closed along the edge of the map around a pole.
+    """Return GeoJSON polygons, cut at the antimeridian and closed along the edge of the map around a pole.
 
     Parameters
     ----------
     polygons : sequence of sequence of array (n, 2 or 3)
-        Closed lines of longitude, latitude (degrees) and height (metres), the outer one counter-clockwise as seen from
-        above, then those around holes, clockwise: what is on the left of a line is inside.
+        Closed lines of longitude, latitude (degrees) and height (m). The outer line of each polygon is first and runs
+        counter-clockwise as seen from above; lines around holes run clockwise. So the interior is on the left of each
+        line.
     digits : int
         Decimals of a degree.
     """
@@ -126,7 +136,7 @@ def polygon_geometry(polygons: Sequence[Sequence[Array]], digits: int = _DIGITS)
 
 
 def earth_line(frame: Frame, line: Array) -> Array:
-    """Return a line (n, d) in metres as longitude, latitude (degrees) and height (metres) (m, 3), finer near a pole."""
+    """Return a line (n, d), m, as longitude, latitude (degrees), height (m) (k, 3), with extra points near a pole."""
     place = earth_points(frame, line)
     for _ in range(_HALVINGS):
         wide = np.abs((np.diff(place[:, 0]) + 180.0) % 360.0 - 180.0) > _STEP
@@ -139,20 +149,20 @@ def earth_line(frame: Frame, line: Array) -> Array:
 
 
 def earth_points(frame: Frame, position: Array) -> Array:
-    """Return positions (n, d) in metres as longitude, latitude (degrees) and height (metres) (n, 3)."""
+    """Return positions (n, d), m, as longitude, latitude (degrees) and height (m) (n, 3)."""
     lat, lon, height = frame.to_geodetic(position)
     return np.stack([np.degrees(lon), np.degrees(lat), height], axis=-1)
 
 
 def _wrapped(place: Array) -> Array:
-    """Return places with longitudes within ±180 degrees."""
+    """Return points with longitudes within ±180 degrees."""
     out = np.array(place, dtype=float)
     out[:, 0] = np.clip((out[:, 0] + 180.0) % 360.0 - 180.0, -180.0 + _INSIDE, 180.0 - _INSIDE)
     return out
 
 
 def _rounded(line: Array, digits: int) -> list[list[float]]:
-    """Return a line as JSON has it, without neighbours that are one place."""
+    """Return a line as lists of rounded numbers, without repeated points."""
     out = np.round(line, digits)
     out[:, 2:] = np.round(line[:, 2:], _MILLIMETRES)
     kept = np.append(True, (np.diff(out[:, :2], axis=0) != 0.0).any(-1))
@@ -160,10 +170,10 @@ def _rounded(line: Array, digits: int) -> list[list[float]]:
 
 
 def _parts(line: Array) -> list[Array]:
-    """Return a line cut where it crosses the antimeridian; each part begins and ends on it where it was cut."""
+    """Return the parts of a line between its crossings of the antimeridian; each cut adds a point on either side."""
     parts, part = [], [line[0]]
     for one, two in pairwise(line):
-        if abs(two[0] - one[0]) > 180.0:  # the shorter way
+        if abs(two[0] - one[0]) > 180.0:  # The shorter way between the points crosses the antimeridian.
             side = float(np.copysign(180.0, one[0]))
             before, after = side - one[0], two[0] + side
             middle = one + before / (before + after) * (two - one)
@@ -177,10 +187,10 @@ def _parts(line: Array) -> list[Array]:
 
 
 def _cut(rings: Sequence[Array]) -> list[list[Array]]:
-    """Return one polygon as polygons within the map: parts of its lines, joined along the edge of the map.
+    """Return a polygon as polygons within the map: the parts of its lines are joined along the edge of the map.
 
-    The interior is on the left of every line: from the end of a part it goes on along the edge, counter-clockwise, to
-    the next beginning; around a pole that way leads over the corners.
+    The interior is on the left of every line. From the end of a part, the outline continues along the edge,
+    counter-clockwise, to the next start of a part. Around a pole, this path passes the corners of the map.
     """
     whole: list[Array] = []
     parts: list[Array] = []
@@ -189,7 +199,7 @@ def _cut(rings: Sequence[Array]) -> list[list[Array]]:
         found = _parts(closed)
         if len(found) == 1:
             whole.append(closed)
-        else:  # where the line begins it is not cut
+        else:  # The start of the ring is no cut: join the last and the first part.
             parts += [np.concatenate([found[-1], found[0][1:]]), *found[1:-1]]
     if not parts:
         return [whole]
@@ -200,17 +210,17 @@ def _cut(rings: Sequence[Array]) -> list[list[Array]]:
 
 
 def _joined(parts: list[Array]) -> list[Array]:
-    """Return parts of lines that begin and end on the edge of the map as closed lines along it."""
+    """Return closed lines from parts that begin and end on the edge of the map, joined along the edge."""
     begins = [_along(part[0]) for part in parts]
-    left, found = set(range(len(parts))), []
-    while left:
-        first = here = min(left)
+    unused, found = set(range(len(parts))), []
+    while unused:
+        first = here = min(unused)
         line: list[Array] = []
         while here != first or not line:
-            left.discard(here)
+            unused.discard(here)
             line.append(parts[here])
             end = _along(parts[here][-1])
-            here = min({*left, first}, key=lambda i: (begins[i] - end) % _AROUND)
+            here = min({*unused, first}, key=lambda i: (begins[i] - end) % _AROUND)
             way = (begins[here] - end) % _AROUND
             for corner, place in sorted(_EDGES.items(), key=lambda each: (each[0] - end) % _AROUND):
                 if (corner - end) % _AROUND < way:
@@ -220,5 +230,5 @@ def _joined(parts: list[Array]) -> list[Array]:
 
 
 def _along(place: Array) -> float:
-    """Return how far along the edge of the map a place on its left or right side is."""
+    """Return the distance along the edge of the map, degrees, of a point on its left or right side."""
     return float(90.0 + place[1] if place[0] > 0.0 else 630.0 - place[1])

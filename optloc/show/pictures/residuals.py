@@ -1,4 +1,4 @@
-"""Residuals of fixes by station: what each measurement says against its fix."""
+"""Pictures of residuals by station: of fixes, and against the prediction of the other stations."""
 
 from __future__ import annotations
 
@@ -23,19 +23,21 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Stations or pairs of a panel, those with the largest residuals in sigmas; and residuals that are drawn one by one.
+# Maximum number of stations or pairs in a panel: those with the largest residuals in sigmas. Maximum number of
+# residuals drawn as single points.
 _SHOWN, _FEW = 40, 12
-# Residuals, in sigmas, beyond which they are marked.
+# Residuals beyond this many sigmas have another mark.
 _BEYOND = 3.0
 # Percentiles of a box and of its whiskers.
 _MIDDLE, _WHISKERS = (25.0, 75.0), (2.5, 97.5)
-# Standard deviation of a left-out residual, in that of the median, beyond which it says little of its station.
+# A left-out residual is not drawn if its standard deviation exceeds this many medians: it shows little about the
+# station.
 _VAGUE = 3.0
-# Bias, in whiskers of the others, beyond which a station is not drawn but named.
+# If a bias exceeds this many whiskers of the other stations, a text at the edge of the panel replaces its box.
 _FAR = 10.0
 
 Sets = dict[str, tuple[Array, float]]
-"""Residuals (n,) and the median standard deviation of a row, by the name of the stations."""
+"""Residuals (n,) and the median standard deviation of a row, by the names of the stations."""
 
 
 def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
@@ -43,14 +45,14 @@ def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
 
     Residuals of compass bearings are clockwise.
 
-    A bar reaches over twice the standard deviation of a row, the other way of its zero too. Of many residuals the box
-    holds the middle half. A fix follows its measurements, so that residuals are smaller than errors:
-    `optloc.station_health.health` compares each station with what the others say.
+    The grey bar covers plus and minus two standard deviations of a row. If a station has many residuals, a box holds
+    the middle half of them. A fix follows its measurements, so residuals are smaller than errors. To compare each
+    station with the prediction of the others, use `optloc.station_health.health`.
 
     Parameters
     ----------
     problem : Problem
-        Batch (...) of problems; give epochs that are fixed by themselves as `optloc.problem.by_epoch` makes them.
+        Batch (...) of problems. For epochs with separate fixes, use `optloc.problem.by_epoch`.
     fix : Fix
         Their fixes, with the same batch axes.
     title : str
@@ -59,12 +61,12 @@ def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.show.pictures.save`.
+        The picture; write it with `optloc.show.pictures.save`.
 
     Raises
     ------
     InvalidProblem
-        Where the batch axes differ, or nothing was fixed.
+        If the batch axes differ, or there is no fix.
     """
     flat, answers = problem.flat(), fix.flat()
     good = np.flatnonzero(np.isfinite(answers.x).all(-1))
@@ -72,7 +74,9 @@ def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
         what = f"{len(answers)} fixes do not belong to {flat.batch_shape[0]} problems"
         raise InvalidProblem(what, "plot", "give the problem that was fixed; see `optloc.problem.by_epoch`")
     if not len(good):
-        raise InvalidProblem("nothing was fixed, so there are no residuals", "plot", "see `optloc fix` for the reasons")
+        raise InvalidProblem(
+            "no epoch has a fix, so there are no residuals", "plot", "see `optloc fix` for the reasons"
+        )
     part, vectors = flat.take(good), answers.x[good]
     residual = differentiate(part, vectors)[0]
     sigma = np.broadcast_to(np.sqrt(variances(with_station_noise(part, vectors).noise, part.count)), residual.shape)
@@ -90,11 +94,11 @@ def _sets(problem: Problem, rows: Rows, residual: Array, sigma: Array, weight: A
     labels = [_label(names, a, b) for a, b in zip(rows.a, rows.b, strict=True)]
     found: Sets = {}
     for name in dict.fromkeys(labels):
-        own = np.array([label == name for label in labels])
-        present = weight[:, own] > 0.0
+        mask = np.array([label == name for label in labels])
+        present = weight[:, mask] > 0.0
         if present.any():
-            found[name] = (residual[:, own][present], float(np.median(sigma[:, own][present])))
-    # The largest residual in sigmas decides who is drawn; the order stays that of the file.
+            found[name] = (residual[:, mask][present], float(np.median(sigma[:, mask][present])))
+    # Keep the stations with the largest residuals in sigmas, in the order of the file.
     worst = sorted(found, key=lambda name: -float(np.abs(found[name][0]).max() / found[name][1]))[:_SHOWN]
     return {name: values for name, values in found.items() if name in worst}
 
@@ -111,7 +115,10 @@ def _draw(kinds: Sequence[str], sets: Sequence[Sets], title: str) -> Figure:
 
 
 def _rows_of_panels(counts: Sequence[int], width: float, line: float) -> tuple[Figure, Any]:
-    """Return a figure with a panel for each count of lines, one below the other, as tall as its lines (inches)."""
+    """Return a figure with one panel below the other, one for each entry of `counts`.
+
+    The height of a panel follows its number of lines; `width` and `line` are in inches.
+    """
     tall = [max(2, count) for count in counts]
     size = (width, 1.1 + sum(0.9 + line * n for n in tall))
     figure = figure_class()(figsize=size, layout="constrained")
@@ -120,38 +127,44 @@ def _rows_of_panels(counts: Sequence[int], width: float, line: float) -> tuple[F
 
 def _panel(panel: Axes, kind: str, sets: Sets) -> None:
     unit = SI_UNIT[MODELS[kind].quantity]  # type: ignore[index]  # the table holds known quantities only
-    # Milliradians: angles of residuals have too many zeros otherwise.
+    # Use milliradians: residuals in radians have too many zeros.
     factor, unit = (1e3, f"m{unit}") if unit == "rad" else (1.0, unit)
     for place, (values, sigma) in enumerate(sets.values()):
-        own, bar = factor * values, 2.0 * factor * sigma
-        panel.hlines(place, -bar, bar, color=GREY, linewidth=5.0, alpha=0.5, label=_once(place, "± 2 sigma of a row"))
-        if len(own) > _FEW:
+        scaled, bar = factor * values, 2.0 * factor * sigma
+        panel.hlines(
+            place, -bar, bar, color=GREY, linewidth=5.0, alpha=0.5, label=_label_of_first(place, "± 2 sigma of a row")
+        )
+        if len(scaled) > _FEW:
             low, left, middle, right, high = np.percentile(
-                own, (_WHISKERS[0], _MIDDLE[0], 50.0, _MIDDLE[1], _WHISKERS[1])
+                scaled, (_WHISKERS[0], _MIDDLE[0], 50.0, _MIDDLE[1], _WHISKERS[1])
             )
-            panel.hlines(place, low, high, color=BLUE, linewidth=1.2, zorder=3, label=_once(place, "95 % of residuals"))
+            panel.hlines(
+                place, low, high, color=BLUE, linewidth=1.2, zorder=3, label=_label_of_first(place, "95 % of residuals")
+            )
             style: dict[str, Any] = {"height": 0.5, "color": SKY, "edgecolor": BLUE, "zorder": 3}
-            panel.barh(place, right - left, left=left, label=_once(place, "middle half"), **style)
-            panel.scatter(middle, place, marker="|", s=70, color=BLACK, zorder=4, label=_once(place, "median"))
+            panel.barh(place, right - left, left=left, label=_label_of_first(place, "middle half"), **style)
+            panel.scatter(
+                middle, place, marker="|", s=70, color=BLACK, zorder=4, label=_label_of_first(place, "median")
+            )
             continue
-        far = np.abs(own) > _BEYOND * factor * sigma
+        far = np.abs(scaled) > _BEYOND * factor * sigma
         for chosen, colour, mark, name in (
             (~far, BLUE, "o", "residual"),
             (far, ORANGE, "X", "residual beyond 3 sigma"),
         ):
             if chosen.any():
                 panel.scatter(
-                    own[chosen], np.full(chosen.sum(), place), color=colour, marker=mark, zorder=4, label=name
+                    scaled[chosen], np.full(chosen.sum(), place), color=colour, marker=mark, zorder=4, label=name
                 )
     panel.axvline(0.0, color=BLACK, linewidth=0.8, zorder=1)
     panel.set_yticks(range(len(sets)), [literal(name) for name in sets])
     panel.set_ylim(len(sets) - 0.4, -0.6)
-    panel.set_xlabel(f"measured less modelled ({unit})" if unit != "1" else "measured less modelled")
+    panel.set_xlabel(f"measured minus modelled ({unit})" if unit != "1" else "measured minus modelled")
     panel.set_title(kind, fontsize=10)
     grid(panel)
 
 
-def _once(place: int, label: str) -> str:
+def _label_of_first(place: int, label: str) -> str:
     return "" if place else label
 
 
@@ -161,21 +174,22 @@ def _once(place: int, label: str) -> str:
 def plot_health(health: Health, *, title: str = "") -> Figure:
     """Return a picture of the left-out residuals of every station, one panel for each unit.
 
-    A box holds the middle half of a station's residuals and its whiskers 95 %; a mark with bars is the bias with two
-    standard errors. Residuals that the others predict much worse than most are not drawn, and of many stations those
-    with the most fixes are.
+    A left-out residual compares a measurement with the prediction of the other stations. A box holds the middle half of
+    the residuals of a station, and its whiskers 95 %. A mark with bars is the bias with two standard errors. Residuals
+    with a much larger prediction error than most are not drawn. If there are many stations, those with the most fixes
+    are drawn.
 
     Parameters
     ----------
     health : Health
-        Of `optloc.station_health.health`.
+        Result of `optloc.station_health.health`.
     title : str
         Title of the picture.
 
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.show.pictures.save`.
+        The picture; write it with `optloc.show.pictures.save`.
     """
     units = list(dict.fromkeys(health.units))
     chosen = [_choose(health, unit) for unit in units]
@@ -186,7 +200,7 @@ def plot_health(health: Health, *, title: str = "") -> Figure:
 
 
 def _choose(health: Health, unit: str) -> Array:
-    """Return the groups of a unit that are drawn, those with the smallest bias first."""
+    """Return the groups of a unit to draw: those with the most fixes, sorted by bias."""
     groups = np.flatnonzero(np.array(health.units) == unit)
     groups = groups[np.argsort(-health.count[groups], kind="stable")[:_SHOWN]]
     return groups[np.argsort(np.nan_to_num(health.bias[groups]), kind="stable")]
@@ -208,7 +222,8 @@ def _health_panel(panel: Axes, health: Health, unit: str, groups: Array) -> None
     _limit(panel, np.abs([low, high]).max(0), factor * health.bias[groups], shown)
     panel.axvline(0.0, color=BLACK, linewidth=0.8, zorder=0)
     panel.set_yticks(place, [literal(health.names[g]) for g in groups])
-    panel.set_xlabel(f"measured less predicted by the others ({shown})" if shown != "1" else "measured less predicted")
+    label = "measured minus predicted from other stations"
+    panel.set_xlabel(f"{label} ({shown})" if shown != "1" else label)
     panel.set_ylim(-0.7, len(groups) - 0.3)
     panel.grid(axis="x", color=GREY, alpha=0.3, linewidth=0.6)
     words = [f"{health.outliers[g]:.1%} of {health.count[g]}" for g in groups]
@@ -219,15 +234,15 @@ def _health_panel(panel: Axes, health: Health, unit: str, groups: Array) -> None
 
 
 def _well_checked(health: Health, group: int) -> Array:
-    """Return the residuals of a group but for those that the others predict several times worse than most."""
-    own = health.group == group
-    sigma = health.sigma[own]
-    return np.asarray(health.residual[own][sigma <= _VAGUE * np.median(sigma)])
+    """Return the residuals of a group, without residuals whose prediction error is much larger than the median."""
+    mask = health.group == group
+    sigma = health.sigma[mask]
+    return np.asarray(health.residual[mask][sigma <= _VAGUE * np.median(sigma)])
 
 
 def _limit(panel: Axes, whisker: Array, bias: Array, unit: str) -> None:
-    """Set the limits so that boxes can be told apart; of a station far beyond the others the edge tells the bias."""
-    # A fifth of the stations may be worse without squeezing the boxes of the others.
+    """Set the limits so that boxes differ visibly; if a bias is far beyond the limits, write its value at the edge."""
+    # Use the 80 % quantile of the whiskers: a fifth of the stations can be worse, and the other boxes stay large.
     most = np.quantile(whisker, 0.8)
     bias = np.nan_to_num(bias)
     far = np.abs(bias) > _FAR * most

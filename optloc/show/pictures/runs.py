@@ -1,4 +1,4 @@
-"""Curves: errors of methods over noise, the bound of a run and its estimates against time."""
+"""Pictures of curves: errors of methods against noise, and bounds and estimates of a run against time."""
 
 from __future__ import annotations
 
@@ -32,65 +32,66 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Each method has a colour and a mark, so that print in grey tells them apart.
+# Each method has a colour and a mark, so that methods differ in grey print.
 _LOOKS = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "D"), (PURPLE, "^"), (SKY, "v"), (YELLOW, "P"))
 _COURSE_COLOURS = (ORANGE, GREEN, PURPLE, SKY, YELLOW, GREY, BLACK)
 _WORDS = {"position": ("position", "m"), "velocity": ("velocity", "m/s"), "acceleration": ("acceleration", "m/s²")}
 _SPACE = {2: "the plane", 3: "space"}
-# Members of a family of biases that have a curve each; more are told by their root mean square.
+# Maximum number of members of a family of biases with one curve each; larger families have one curve, the root mean
+# square.
 _MANY = 10
 _BIAS_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, YELLOW)
 _DASHES = ("-", "--", "-.", ":")
-# Members that are drawn: as many as there are colours.
+# Maximum number of members that are drawn: one for each colour.
 _MOST = 6
-# Quantile of a standard normal variable that leaves 2.5 % above it.
+# 97.5 % quantile of a standard normal variable.
 _95 = 1.959963984540054
-# Half the height of a panel of estimates, in their standard deviation half way of the run: the first intervals, which
-# are far wider, are cut off.
+# Half the height of a panel of estimates, in standard deviations half way through the run. The first intervals are far
+# wider and are cut off.
 _RIM = 8.0
 
 
 def plot_accuracy(
     noise: Array, errors: Mapping[str, Array], bound: Array, title: str = "", *, unit: str = "m", what: str = "position"
 ) -> Figure:
-    """Return a picture of root mean square errors and the Cramer-Rao bound against noise, both axes logarithmic.
+    """Return a picture of root mean square errors and the Cramér-Rao bound against noise, both axes logarithmic.
 
     Parameters
     ----------
     noise : array (q,)
-        Standard deviations of a row, or factors on those of a problem where `unit` is empty.
+        Standard deviations of a row; if `unit` is empty, factors on the standard deviations of a problem.
     errors : mapping of str to array (q,)
-        Root mean square error of each method, metres; NaN where it has none.
+        Root mean square error of each method, m; NaN if unknown.
     bound : array (q,)
-        Root of the trace of the bound, metres.
+        Root of the trace of the bound, m.
     title : str
         Title of the picture.
     unit : str
-        Of the noise.
+        Unit of the noise.
     what : str
-        Of what the errors are.
+        Quantity of the errors, for the label.
 
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.show.pictures.save`.
+        The picture; write it with `optloc.show.pictures.save`.
 
     Raises
     ------
     InvalidProblem
-        Where numbers of points differ, or a noise is not positive.
+        If numbers of points differ, or a noise is not positive.
     """
     noise, bound = np.asarray(noise, dtype=float), np.asarray(bound, dtype=float)
     for name, values in {"the bound": bound, **errors}.items():
         if np.shape(values) != noise.shape:
             raise InvalidProblem(
-                f"{name} has {np.size(values)} values for {noise.size} noises", "plot", "give one each"
+                f"{name} has {np.size(values)} values for {noise.size} noises", "plot", "give one value for each noise"
             )
     if not (noise > 0.0).all():
-        raise InvalidProblem("a noise is not positive", "noise", "leave it out: the axis is logarithmic")
+        raise InvalidProblem("a noise is not positive", "noise", "omit it, because the axis is logarithmic")
     figure = figure_class()(figsize=(6.2, 4.4), layout="constrained")
     axes = figure.subplots()
-    # Wide and pale behind the methods: those that attain it lie on it.
+    # Draw the bound wide and pale behind the methods: curves of efficient methods are on top of it.
     axes.plot(noise, bound, color=BLACK, linewidth=4.0, alpha=0.3, label="Cramer-Rao bound", zorder=2)
     for i, (name, values) in enumerate(errors.items()):
         colour, mark = _LOOKS[i % len(_LOOKS)]
@@ -106,7 +107,7 @@ def plot_accuracy(
     return figure
 
 
-# The Cramer-Rao bound against time.
+# The Cramér-Rao bound against time.
 
 
 def plot_course(
@@ -117,18 +118,18 @@ def plot_course(
     Parameters
     ----------
     course : Course
-        The bound of everything that is unknown.
+        The bound of all unknowns.
     known : Course, optional
-        The same with biases known, drawn dashed.
+        The bound if the biases are known, drawn dashed.
     title : str
         Title of the picture.
     names : sequence of str, optional
-        Names of the unknowns that are drawn; all by default.
+        Names of the unknowns to draw; by default all.
 
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.show.pictures.save`.
+        The picture; write it with `optloc.show.pictures.save`.
     """
     slots = [slot for slot in course.layout.shared if names is None or slot.name in names]
     figure, panels = panels_for(len(slots), 3, 4.8, 4.2)
@@ -160,7 +161,7 @@ def _course_panel(panel: Axes, course: Course, known: Course | None, slot: Slot)
     panel.legend(frameon=False, fontsize=8)
 
 
-# Estimates of a run against time, with their intervals: biases, and whatever else its epochs share.
+# Estimates of a run against time, with their intervals: biases and other unknowns that the epochs share.
 
 
 def plot_biases(
@@ -171,23 +172,23 @@ def plot_biases(
     Parameters
     ----------
     found : GrowingRun
-        Estimates after the first epochs, of `optloc.solvers.running.growing`.
+        Estimates after the first epochs, from `optloc.solvers.running.growing`.
     title : str
         Title of the picture.
     names : sequence of str, optional
-        What is drawn; all families of biases by default.
+        Names of the unknowns to draw; by default all families of biases.
     truth : mapping of str to array, optional
         True values by name, drawn dotted.
 
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.show.pictures.save`.
+        The picture; write it with `optloc.show.pictures.save`.
 
     Raises
     ------
     InvalidProblem
-        Where there is nothing to draw.
+        If the run has nothing to draw.
     """
     slots = [slot for slot in found.layout.shared if (bool(slot.members) if names is None else slot.name in names)]
     if not slots:
@@ -214,13 +215,16 @@ def _bias_panel(panel: Axes, found: GrowingRun, slot: Slot, truth: Array | None)
     hidden = len(slot.entries) - _MOST
     panel.set_title(literal(slot.name) + (f" (first {_MOST} of {len(slot.entries)})" if hidden > 0 else ""))
     panel.set_xlabel("time (s)")
-    panel.set_ylabel(f"estimate and 95 % ({slot.unit})" if slot.unit else "estimate and 95 %")
+    panel.set_ylabel(f"estimate with 95 % interval ({slot.unit})" if slot.unit else "estimate with 95 % interval")
     panel.legend(frameon=False, fontsize=8, ncols=2)
     grid(panel)
 
 
 def _window(panel: Axes, values: Array, sigma: Array) -> None:
-    """Limit the vertical axis to the last estimates and what their intervals were half way."""
+    """Limit the vertical axis to the last estimates plus and minus a margin.
+
+    The margin is `_RIM` times the largest standard deviation half way through the run.
+    """
     known = np.flatnonzero(np.isfinite(values).all(-1))
     if not len(known):
         return

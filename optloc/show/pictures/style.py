@@ -1,4 +1,7 @@
-"""What all pictures share: colours, the figure, units of axes, names that keep apart, how it is written."""
+"""Common parts of all pictures: colours, units of axes, labels without overlap, the scene of a fix, and image files.
+
+An ellipse is *valid* if it covers the true position with the stated probability.
+"""
 
 from __future__ import annotations
 
@@ -28,36 +31,37 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.text import Annotation
 
-# Okabe and Ito: told apart with any colour vision, and in grey by lightness.
+# Palette of Okabe and Ito: distinct with any colour vision, and by lightness in grey print.
 BLACK, BLUE, ORANGE, GREY = "#000000", "#0072B2", "#D55E00", "#999999"
 GREEN, SKY, PURPLE, YELLOW = "#009E73", "#56B4E9", "#CC79A7", "#E69F00"
 
 View = tuple[int, int]
-"""Which two of the scene's axes a panel shows."""
+"""Indices of the two axes of the scene that a panel shows."""
 
 PLAN: View = (0, 1)
 HEIGHT: View = (0, 2)
-# Places of a note around its point, points of 1/72 inch, the usual one first; and where text ends on either side of it.
+# Positions of a note around its point, in points of 1/72 inch, the usual one first; and the alignment of its text.
 _PLACES = ((5, 5), (-5, 5), (5, -5), (-5, -5), (0, 8), (0, -8), (9, 0), (-9, 0), (14, 14), (-14, 14), (14, -14))
 _ASIDE: dict[int, Literal["left", "center", "right"]] = {-1: "right", 0: "center", 1: "left"}
 _ABOVE: dict[int, Literal["bottom", "center", "top"]] = {-1: "top", 0: "center", 1: "bottom"}
-# Half the side of a mark, pixels, that no note may cover; and marks of a panel that are heeded: beyond, all is covered.
+# Half the side of a mark in pixels, which notes avoid; and maximum number of marks of a panel that notes avoid, because
+# more marks cover the whole panel.
 _MARK, _MANY = 5.0, 200
-# Stations that are named: the names of more would hide each other.
+# Maximum number of stations with names: more names would overlap.
 _NAMED = 20
-# Fixes of which alternatives are drawn and marks are large, and those that have ellipses: beyond, dots are all one
-# sees.
+# Maximum number of fixes with alternatives and large marks, and of fixes with ellipses: with more fixes, only dots are
+# readable.
 _FEW_FIXES, _ELLIPSES = 12, 200
-# Cost gap below which two places explain the data equally well: "+0".
+# A cost gap below this is printed as "+0": both positions fit the data equally well.
 _NO_GAP = 1e-3
-# Points of a path or track that a picture needs, and corners of an ellipse: finer than its pixels.
+# Points of a path or track, and corners of an ellipse: finer than the pixels of a picture.
 _PATH, _CORNERS = 200, 181
-# Greatest coordinate from which a plan is in kilometres, metres.
+# A plan is in kilometres if its largest coordinate is at least this, m.
 _FAR = 5e3
 
 
 def figure_class() -> type[Figure]:
-    """Return matplotlib's figure; raise InvalidProblem where it is not installed."""
+    """Return the figure class of matplotlib; raise InvalidProblem if matplotlib is not installed."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -68,7 +72,7 @@ def figure_class() -> type[Figure]:
 
 
 def panels_for(count: int, most: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """Return a figure with a panel for each of some things, at most so many side by side, inches each."""
+    """Return a figure with `count` panels, at most `most` side by side; `width` and `height` of a panel in inches."""
     columns = min(count, most)
     rows = -(-count // columns)
     size = (0.6 + width * columns, 0.4 + height * rows)
@@ -79,12 +83,12 @@ def panels_for(count: int, most: int, width: float, height: float) -> tuple[Figu
     return figure, panels[:count]
 
 
-# Width of a letter of a legend, inches, and letters that its handle takes.
+# Width of a letter of a legend, inches, and the width of its handle in letters.
 _LETTER, _HANDLE = 0.07, 6
 
 
 def finish(figure: Figure, title: str, panels: Sequence[Axes] = (), ncols: int = 5, **style: Any) -> Figure:
-    """Give a figure its title, and below it the legend of some of its panels, each label once."""
+    """Return the figure after adding its title and a legend below the panels, with each label of `panels` once."""
     shown: dict[str, Any] = {}
     for panel in panels:
         handles, labels = panel.get_legend_handles_labels()
@@ -100,37 +104,37 @@ def finish(figure: Figure, title: str, panels: Sequence[Axes] = (), ncols: int =
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a picture; the ending of the name decides the type, without one it is PNG.
+    """Write a picture; the ending of the file name selects the type, and without an ending the type is PNG.
 
     Raises
     ------
     InvalidProblem
-        Where that type is unknown, or the file cannot be written.
+        If the type is unknown, or the file cannot be written.
     """
     known = sorted(figure.canvas.get_supported_filetypes())
     ending = path.suffix.lower().removeprefix(".") or "png"
     if ending not in known:
         raise InvalidProblem(f"pictures of type {path.suffix!r} are unknown", str(path), nearest(ending, known))
-    # Drawn before it is written: an error of the disk inside a library has many names.
+    # Draw into memory first: then only the write below can raise an error of the disk, and that error is handled.
     drawn = BytesIO()
     figure.savefig(drawn, dpi=120, format=ending)
     with written(path) as file:
         file.write_bytes(drawn.getvalue())
 
 
-# Letters of a title or a name that a picture has room for.
+# Maximum number of letters of a title or a name in a picture.
 _LETTERS = 120
 
 
 def literal(text: str) -> str:
-    """Return a text as matplotlib shows it letter by letter: dollars begin no formula, and `_` hides nothing."""
+    """Return a text that matplotlib prints literally: `$` starts no formula, and a leading `_` hides no label."""
     text = visible(" ".join(text.split()))
     text = text if len(text) <= _LETTERS else f"{text[: _LETTERS - 1]}…"
     return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
 def unit_of(points: Array) -> tuple[str, float]:
-    """Return the unit in which points (n, 2) of metres read best, and its size."""
+    """Return the unit for axes around points (n, 2), m, and the size of the unit, m."""
     reach = np.nanmax(np.abs(points), initial=1e-3)
     return ("km", 1e3) if reach >= _FAR else ("m", 1.0) if reach >= 1.0 else ("mm", 1e-3)
 
@@ -141,12 +145,12 @@ def grid(panel: Axes) -> None:
     panel.set_axisbelow(True)
 
 
-# Parts of a panel that a scale bar takes: a length that reads well, and the corner in which fewest marks are.
+# Largest length of a scale bar, and size of the corner in which marks are counted, as shares of a panel.
 _BAR, _CORNER = 0.25, 0.3
 
 
 def scale_bar(panel: Axes, unit: str) -> None:
-    """Draw the bar of a length in a corner of a plan whose limits are settled."""
+    """Draw a scale bar in the lower corner with fewer marks, in a plan with final limits."""
     from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
     (west, east), (south, north) = panel.get_xlim(), panel.get_ylim()
@@ -166,17 +170,18 @@ def scale_bar(panel: Axes, unit: str) -> None:
     panel.add_artist(bar)
 
 
-# Notes that keep apart.
+# Notes without overlap.
 
 
 def separate_notes(figure: Figure) -> None:
-    """Move the notes at points of a finished figure until none covers another or a mark, or leaves its panel.
+    """Move the notes of a finished figure until no note covers another note or a mark, or leaves its panel.
 
-    Each takes the first free place around its point; a note that finds none stands above it to the right.
+    Each note takes the first free position around its point. If no position is free, the note is above the point to the
+    right.
     """
     from matplotlib.text import Annotation
 
-    # Sizes of texts are known only once the figure was laid out.
+    # Sizes of texts are known only after the layout of the figure.
     figure.draw_without_rendering()
     for panel in figure.axes:
         notes = [text for text in panel.texts if isinstance(text, Annotation) and _movable(text)]
@@ -186,12 +191,12 @@ def separate_notes(figure: Figure) -> None:
         taken = [_box(x - _MARK, y - _MARK, x + _MARK, y + _MARK) for x, y in _marks(panel)]
         taken += [text.get_window_extent() for text in panel.texts if text not in notes and text.get_visible()]
         for note, (x, y) in zip(notes, spots, strict=True):
-            # The box of a mark that the note belongs to may be touched: it is drawn beside it.
+            # A note may touch the box of its mark, because it is drawn next to the mark.
             taken.append(_settle(note, panel, [box for box in taken if not box.contains(x, y)]))
 
 
 def _marks(panel: Axes) -> Array:
-    """Return the marks (n, 2) of a panel on the canvas."""
+    """Return the positions (n, 2) of the marks of a panel on the canvas, pixels."""
     from matplotlib.collections import PathCollection
 
     found = [np.ma.filled(c.get_offsets(), np.nan) for c in panel.collections if isinstance(c, PathCollection)]
@@ -210,13 +215,13 @@ def _box(*corners: float) -> Any:
 
 
 def _settle(note: Annotation, panel: Axes, taken: list[Any]) -> Any:
-    """Move a note to its first free place, and return the box it then has."""
+    """Move a note to its first free position, and return its box there."""
     inside = panel.get_window_extent()
     for place in _PLACES:
         _put(note, place)
         box = note.get_window_extent()
-        held = inside.x0 <= box.x0 and box.x1 <= inside.x1 and inside.y0 <= box.y0 and box.y1 <= inside.y1
-        if held and not any(box.overlaps(other) for other in taken):
+        fits = inside.x0 <= box.x0 and box.x1 <= inside.x1 and inside.y0 <= box.y0 and box.y1 <= inside.y1
+        if fits and not any(box.overlaps(other) for other in taken):
             return box
     _put(note, _PLACES[0])
     return note.get_window_extent()
@@ -228,45 +233,45 @@ def _put(note: Annotation, place: tuple[int, int]) -> None:
     note.set_verticalalignment(_ABOVE[int(np.sign(place[1]))])
 
 
-# What a picture of fixes shows: positions along its axes, covariances, alternatives, regions.
+# The scene of fixes: positions along the axes of the picture, covariances, alternatives and regions.
 
 
 @dataclass(frozen=True, slots=True)
 class PictureScene:
-    """What is drawn, metres along the picture's axes (east, north, up on Earth).
+    """The content of a picture of fixes, m, along the axes of the picture (east, north, up on Earth).
 
     Parameters
     ----------
     stations : array (s, d)
-        Positions.
+        Positions of the stations.
     names : tuple of s str
-        Their names.
+        Names of the stations.
     fixes : array (n, d)
-        Estimates; NaN where there is none.
+        Estimated positions; NaN if unknown.
     covariances : array (n, d, d)
-        Theirs; NaN where there is none.
+        Covariances of the estimates, m^2; NaN if unknown.
     clean : bool array (n,)
-        Where the status is ok.
+        Whether the status is `ok`.
     alternatives : array (q, d)
-        Other positions.
+        Positions of the alternatives.
     gaps : array (q,)
-        Their cost gaps.
+        Cost gaps of the alternatives.
     axes : tuple of d str
         Names of the axes.
     regions : tuple of array (v, 2)
-        Corners of the polygons and boxes of the plan.
+        Corners of the polygons and boxes of constraints.
     tracks : tuple of array (k, d)
-        Where moving stations are in the course of the run.
+        Tracks of the moving stations during the run.
     paths : tuple of array (k, d)
-        The same of moving targets, as they were fixed.
+        Estimated paths of the moving targets.
     other_paths : tuple of array (k, d)
-        The same as the alternatives have it.
+        Paths of the moving targets in the alternatives.
     known : tuple of array (k, d)
-        Places of known targets.
+        Positions of known targets.
     outlines : tuple of n dicts of View to Outline
-        The region of each fix that no ellipse covers, in the views of a picture; empty for the others.
+        95 % region of each fix without a valid ellipse, by view; empty for other fixes.
     local : bool array (n,), optional
-        Where an ellipse does not cover, and what does is not known.
+        Whether the ellipse of a fix is not valid while its region is unknown.
     """
 
     stations: Array
@@ -286,7 +291,7 @@ class PictureScene:
     local: Array | None = None
 
     def moved(self, change: Callable[[Array], Array]) -> PictureScene:
-        """Return the scene with all positions changed; regions, outlines about the fixes and covariances stay."""
+        """Return the scene with all positions changed; regions, covariances and outlines do not change."""
         return replace(
             self,
             stations=change(self.stations),
@@ -300,8 +305,11 @@ class PictureScene:
 
 
 def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) -> PictureScene:
-    """Return what is to be drawn of a problem and its fixes, and outlines of what no ellipse covers if asked for."""
-    # Of moving stations the first epoch, of a batch the first problem: tracks are drawn as lines.
+    """Return the scene of a problem and its fixes.
+
+    With `outlined`, the scene has the outlines of the 95 % regions of fixes without a valid ellipse.
+    """
+    # Use the first epoch of moving stations and the first problem of a batch; tracks are drawn as lines.
     stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
     parts = [part for fix in fixes for part in states_of(fix)]
     d = problem.dimension
@@ -311,7 +319,7 @@ def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) 
     others, gaps = _alternatives(fixes, d) if len(position) <= _FEW_FIXES else (np.zeros((0, d)), np.zeros(0))
     axes = ("east", "north", "up") if problem.frame.geodetic else ("x", "y", "z")
     reach = np.concatenate([stations, position[np.isfinite(position).all(-1)]])[:, :2]
-    # A box in ECEF is no shape of a plan.
+    # In ECEF, a box of x and y has no shape in the plan.
     regions = () if problem.frame.kind == "ecef" else _regions(problem, reach)
     paths, other = _paths(problem, fixes)
     known = tuple(m.known.reshape(-1, *m.known.shape[-2:])[:, 0] for m in problem.motions if m.known is not None)
@@ -329,7 +337,7 @@ def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) 
 
 
 def _outlines(problem: Problem, fixes: Sequence[Fix], count: int) -> tuple[dict[View, Outline], ...]:
-    """Return the regions of fixes in the plan and, in space, in the view of the height."""
+    """Return the 95 % regions of fixes in the plan and, in three dimensions, in the view of the height."""
     views = (PLAN, HEIGHT) if problem.dimension == 3 else (PLAN,)
     local = local_frame(problem)
     axes = np.eye(problem.dimension) if local is None else local.rotation_to_ecef().T
@@ -340,18 +348,20 @@ def _outlines(problem: Problem, fixes: Sequence[Fix], count: int) -> tuple[dict[
 def regions_of(
     problem: Problem, fixes: Sequence[Fix], count: int, planes: Sequence[Array]
 ) -> tuple[list[Outline], ...]:
-    """Return the regions of fixes of one position each in planes; none where there are others, or too many.
+    """Return the 95 % regions of fixes in planes.
+
+    The result is empty if there are too many fixes, or a fix has several positions.
 
     Parameters
     ----------
     problem : Problem
-        Of the fixes.
+        Problem of the fixes.
     fixes : sequence of Fix
         Single fixes or batches.
     count : int
-        How many positions they are.
+        Number of positions in the picture.
     planes : sequence of array (2, d) or (n, 2, d)
-        Axes of each plane, of all fixes or of each.
+        Axes of each plane, the same for all fixes or one plane for each fix.
     """
     if count > _ELLIPSES or count != sum(fix.code.size for fix in fixes):
         return ()
@@ -363,7 +373,10 @@ def regions_of(
 
 
 def is_local(fixes: Sequence[Fix], outlined: Sequence[bool], count: int) -> Array | None:
-    """Return where an ellipse does not cover and there is no outline (n,); None unless fixes are one position each."""
+    """Return, for each fix (n,), whether its ellipse is not valid and it has no outline.
+
+    If a fix has several positions, the result is None.
+    """
     if count != sum(fix.code.size for fix in fixes):
         return None
     kinds = [np.zeros(fix.code.size) if fix.chart is None else np.ravel(fix.chart.kind) for fix in fixes]
@@ -372,7 +385,7 @@ def is_local(fixes: Sequence[Fix], outlined: Sequence[bool], count: int) -> Arra
 
 
 def local_frame(problem: Problem) -> Frame | None:
-    """Return east, north and up at the centre of stations in ECEF, in which they are drawn; None in other frames."""
+    """Return the frame of pictures in ECEF: east, north and up at the centre of the stations; None for other frames."""
     if problem.frame.kind != "ecef":
         return None
     stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
@@ -381,7 +394,10 @@ def local_frame(problem: Problem) -> Frame | None:
 
 
 def placed_points(problem: Problem, points: Array) -> tuple[Array, Array]:
-    """Return points (n, d) along the picture's axes in the problem's frame, and the axes (d, d) in its rows."""
+    """Return points in the frame of the problem (n, d), m, and the axes of the picture (d, d) as rows in that frame.
+
+    The argument `points` (n, d) is along the axes of the picture.
+    """
     local = local_frame(problem)
     if local is None:
         return points, np.eye(problem.dimension)
@@ -389,7 +405,7 @@ def placed_points(problem: Problem, points: Array) -> tuple[Array, Array]:
 
 
 def _local(problem: Problem, scene: PictureScene) -> PictureScene:
-    """Return a scene in ECEF along east, north and up at the stations' centre."""
+    """Return a scene in ECEF along east, north and up at the centre of the stations."""
     local = local_frame(problem)
     assert local is not None
     turn = local.rotation_to_ecef().T
@@ -398,7 +414,7 @@ def _local(problem: Problem, scene: PictureScene) -> PictureScene:
 
 
 def _tracks(problem: Problem) -> tuple[Array, ...]:
-    """Return the tracks (k, d) of the stations of a single run that move."""
+    """Return the tracks (k, d), m, of the moving stations of a single run."""
     position = problem.stations.position
     if position.ndim > 3:
         return ()
@@ -407,12 +423,12 @@ def _tracks(problem: Problem) -> tuple[Array, ...]:
 
 
 def thinned(track: Array) -> Array:
-    """Return a track (k, d) with no more points than a picture needs, the first and the last among them."""
+    """Return a track (k, d) with at most `_PATH` points, including the first and the last point."""
     return np.asarray(track[np.unique(np.linspace(0, len(track) - 1, _PATH).astype(int))])
 
 
 def _paths(problem: Problem, fixes: Sequence[Fix]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Return the paths (k, d) of the moving targets of a run, as fixed and as its alternatives have them."""
+    """Return the paths (k, d), m, of the moving targets of a run: first of the fix, then of its alternatives."""
     if len(fixes) != 1 or fixes[0].shape or problem.epochs == 1:
         return (), ()
     others = fixes[0].alternatives
@@ -438,11 +454,11 @@ def _path(problem: Problem, fix: Fix, target: int, x: Array) -> Array:
 
 
 def _regions(problem: Problem, reach: Array) -> tuple[Array, ...]:
-    """Return the corners (v, 2) of polygons and boxes; an open box ends a little beyond the points (n, 2) to reach."""
+    """Return the corners (v, 2), m, of polygons and boxes; open boxes end a little beyond the points `reach` (n, 2)."""
     rim = 0.1 * np.ptp(reach, axis=0)
     sides: dict[int, tuple[Array, Array]] = {}
     for c in problem.constraints:
-        # A box is stored as bounds of single coordinates; other planes have no edges to be drawn.
+        # A box is stored as bounds of single coordinates; bounds along other directions have no edges to draw.
         if isinstance(c, Band) and c.kind == "plane" and np.ndim(c.lower) == np.ndim(c.upper) == 0:
             along = np.flatnonzero(c.coefficients)
             if len(along) == 1 and along[0] < 2 and c.coefficients[along[0]] == 1.0:
@@ -454,7 +470,7 @@ def _regions(problem: Problem, reach: Array) -> tuple[Array, ...]:
 
 
 def states_of(fix: Fix) -> list[tuple[Array, Array, Array]]:
-    """Return positions (n, d), covariances (n, d, d) and whether they are clean (n,) of every target."""
+    """Return positions (n, d), m, covariances (n, d, d), m^2, and whether the status is `ok` (n,), for each target."""
     flat = fix if len(fix.shape) == 1 else fix.flat()
     found = []
     for slots, shared in ((flat.layout.shared, True), (flat.layout.local, False)):
@@ -464,11 +480,12 @@ def states_of(fix: Fix) -> list[tuple[Array, Array, Array]]:
             values = flat.take(slot.name)
             d = values.shape[-1]
             position = values.reshape(-1, d)
-            # Positions of single epochs of a run have no covariance unless it was asked for.
+            # Positions of single epochs in a run have a covariance only if the solver was asked to compute it.
             covariance = np.full((len(position), d, d), np.nan)
-            if shared:  # an axis that is not determined has no ellipse, and the others keep theirs
-                wild = flat.undetermined(slot.name)
-                covariance = np.where(wild[:, :, None] | wild[:, None, :], np.nan, flat.covariance(slot.name))
+            if shared:  # NaN removes the undetermined axes only.
+                undetermined = flat.undetermined(slot.name)
+                hidden = undetermined[:, :, None] | undetermined[:, None, :]
+                covariance = np.where(hidden, np.nan, flat.covariance(slot.name))
             found.append((position, covariance, np.repeat(flat.code == Status.OK, len(position) // len(flat))))
     return found
 
@@ -485,16 +502,16 @@ def _alternatives(fixes: Sequence[Fix], d: int) -> tuple[Array, Array]:
     return np.concatenate(points or [np.zeros((0, d))]), np.concatenate(gaps or [np.zeros(0)])
 
 
-# What plans are made of: stations, fixes, alternatives, ellipses, axes with units.
+# Parts of plans: stations, fixes, alternatives, ellipses, axes with units.
 
 
 def xy(points: Array, view: View, size: float) -> tuple[Array, Array]:
-    """Return the two coordinates of points (n, d) that a panel shows, in its unit."""
+    """Return the two coordinates of points (n, d), m, that a panel shows, in the unit of the panel."""
     return points[:, view[0]] / size, points[:, view[1]] / size
 
 
 def stations(panel: Axes, scene: PictureScene, view: View, size: float, *, named: bool = True, **style: Any) -> None:
-    """Draw the stations, with their names where there are not too many."""
+    """Draw the stations; if they are few, write their names."""
     label = "station, first epoch" if scene.tracks else "station"
     look: dict[str, Any] = {"marker": "^", "s": 60, "color": BLACK, "label": label, "zorder": 3} | style
     panel.scatter(*xy(scene.stations, view, size), **look)
@@ -504,12 +521,12 @@ def stations(panel: Axes, scene: PictureScene, view: View, size: float, *, named
 
 
 def note(panel: Axes, text: str, x: float, y: float, colour: str = BLACK) -> None:
-    """Write a note beside a point, readable over lines and colours."""
+    """Write a note next to a point, readable over lines and colours."""
     from matplotlib.patheffects import withStroke
 
     style: dict[str, Any] = {"fontsize": 8, "color": colour, "zorder": 6, "annotation_clip": True}
     made = panel.annotate(literal(text), (x, y), xytext=(5, 5), textcoords="offset points", **style)
-    # A white rim: readable over lines and colours.
+    # A white outline keeps the text readable over lines and colours.
     made.set_path_effects([withStroke(linewidth=2.0, foreground="white")])
 
 
@@ -529,7 +546,7 @@ def points(panel: Axes, scene: PictureScene, view: View, size: float) -> None:
 
 
 def ellipses(panel: Axes, scene: PictureScene, view: View, size: float, **style: Any) -> None:
-    """Draw the 95 % ellipses of the fixes, and the outlines of the regions where ellipses do not cover."""
+    """Draw the 95 % ellipses of the fixes, or the outlines of the 95 % regions if ellipses are not valid."""
     if len(scene.fixes) > _ELLIPSES:
         return
     look: dict[str, Any] = {"color": BLUE, "linewidth": 1.5, "zorder": 2} | style
@@ -539,7 +556,7 @@ def ellipses(panel: Axes, scene: PictureScene, view: View, size: float, **style:
     for i, (centre, covariance, regions) in enumerate(zip(scene.fixes, scene.covariances, outlines, strict=True)):
         region, place = regions.get(view), centre[list(view)]
         around = [] if region is None else [np.append(place + line, [[np.nan] * 2], axis=0) for line in region.lines]
-        label = "local ellipse: it does not cover" if local[i] else "95 % ellipse"
+        label = "local ellipse: not valid as 95 % region" if local[i] else "95 % ellipse"
         if region is not None:
             label = "95 % region, cut off" if region.cut else "95 % region"
         dashes = {"linestyle": ":"} if local[i] else {}
@@ -550,16 +567,16 @@ def ellipses(panel: Axes, scene: PictureScene, view: View, size: float, **style:
 
 
 def ellipse_line(covariance: Array) -> Array:
-    """Return the 95 % ellipse of a covariance (2, 2) about the origin as a closed line; NaN where there is none."""
+    """Return the 95 % ellipse of a covariance (2, 2), m^2, about the origin as a closed line (p, 2), m; NaN for NaN."""
     angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
     semi_axes, directions = error_ellipse(covariance)
     return np.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=-1) * semi_axes @ directions.T)
 
 
 def name_axes(panel: Axes, scene: PictureScene, view: View, unit: str) -> None:
-    """Give both axes of a plan one scale, names and units."""
+    """Give both axes of a plan the same scale, names and units."""
     panel.margins(0.12)
-    # One scale on both axes, or an ellipse would have another shape.
+    # With different scales, an ellipse would have a wrong shape.
     panel.set_aspect("equal", adjustable="datalim")
     grid(panel)
     panel.set_xlabel(f"{scene.axes[view[0]]} ({unit})")

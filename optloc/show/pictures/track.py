@@ -1,4 +1,4 @@
-"""Tracks: where targets went, how sure that is, and whether the innovations agree."""
+"""Pictures of tracks: the plan, the height, the standard deviation and the innovations against time."""
 
 from __future__ import annotations
 
@@ -33,28 +33,28 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _CYCLE = (BLUE, GREEN, PURPLE, SKY, YELLOW)
-# Ellipses along a track: more would be a band.
+# Maximum number of ellipses along a track: more would merge to a band.
 _ELLIPSES = 25
-# Distance of a station, in the extent of the tracks, from which it is out of the picture: satellites.
+# A station is left out if its distance from the tracks is more than this many extents of the tracks, as for satellites.
 _OUT = 100.0
-# Share of scans whose NIS is below the line: one in a thousand above it is chance.
+# Share of scans whose NIS is below the line: by chance, one in a thousand is above.
 _ALLOWED = 0.999
-# Quantile of a standard normal variable that leaves 2.5 % above it.
+# 97.5 % quantile of a standard normal variable.
 _95 = 1.96
 
 
 @dataclass(frozen=True, slots=True)
 class PlottedTrack:
-    """One target's track.
+    """The track of one target.
 
     Parameters
     ----------
     name : str
-        Of the target.
+        Name of the target.
     problem : Problem
-        Its run: gives the stations and the frame.
+        Run of the target; gives the stations and the frame.
     entries : tuple of Entry
-        What became of its scans.
+        Result of each scan.
     """
 
     name: str
@@ -64,7 +64,10 @@ class PlottedTrack:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """A track as arrays over its k scans, along the picture's axes; `starts` and `bad` say which scans are such."""
+    """A track as arrays over its k scans, along the axes of the picture.
+
+    `starts` marks the scans at which the track started or restarted; `bad` marks the scans whose status is not ok.
+    """
 
     name: str
     times: Array
@@ -78,20 +81,20 @@ class _Line:
 
 
 def plot_tracks(drawn: Sequence[PlottedTrack], title: str = "") -> Figure:
-    """Return a picture of tracks: plan, in three dimensions the height, sigma of the position, and NIS against time.
+    """Return a picture of tracks: the plan, and against time the height (in 3-D), sigma of the position and the NIS.
 
     Parameters
     ----------
     drawn : sequence of PlottedTrack
-        At least one target; ECEF is drawn along east, north and up at the stations' centre, or at the first position
-        where the stations are further than that from the ground.
+        At least one track. If the frame is ECEF, the axes are east, north and up at the first position; if no position
+        is known, at the centre of the stations.
     title : str
         Title of the picture.
 
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.show.pictures.save`.
+        The picture; write it with `optloc.show.pictures.save`.
     """
     lines, stations, axes = _along(drawn)
     names = ["height", "sigma", "nis"][3 - stations.shape[-1] :]
@@ -109,7 +112,7 @@ def plot_tracks(drawn: Sequence[PlottedTrack], title: str = "") -> Figure:
 
 
 def _along(drawn: Sequence[PlottedTrack]) -> tuple[list[_Line], Array, tuple[str, ...]]:
-    """Return tracks and stations (s, d) of the first scan along the picture's axes, and the axes' names."""
+    """Return tracks and stations (s, d) of the first scan along the axes of the picture, and the names of the axes."""
     first = drawn[0].problem
     d = first.dimension
     stations = first.stations.position.reshape(-1, first.stations.count, d)[0]
@@ -118,7 +121,7 @@ def _along(drawn: Sequence[PlottedTrack]) -> tuple[list[_Line], Array, tuple[str
     if first.frame.kind != "ecef":
         return lines, stations, axes[:d]
     known = [line.position[np.isfinite(line.position).all(-1)] for line in lines]
-    # Satellites are far above the ground: the plan is that at the first position.
+    # The origin is the first position, because stations can be satellites far above the ground.
     lat, lon, height = first.frame.to_geodetic(next((p[0] for p in known if len(p)), stations.mean(0)))
     local = Frame("enu", (float(lat), float(lon), float(height)))
     turn = local.rotation_to_ecef().T
@@ -175,7 +178,7 @@ def _plan(panel: Axes, lines: Sequence[_Line], stations: Array, axes: Sequence[s
 
 
 def _near(stations: Array, known: Array) -> Array:
-    """Return the stations (s,) that a picture of positions (n, 2) can hold: satellites are out of it."""
+    """Return whether each station (s,) is near enough to positions (n, 2) to be in the picture."""
     if not len(known):
         return np.ones(len(stations), dtype=bool)
     centre, extent = known.mean(0), max(float(np.ptp(known, axis=0).max()), 1.0)
@@ -197,7 +200,7 @@ def _heights(panel: Axes, lines: Sequence[_Line], name: str) -> None:
         band = (line.position[:, 2] - _95 * sigma, line.position[:, 2] + _95 * sigma)
         panel.fill_between(line.times, *band, color=colour, alpha=0.2, linewidth=0.0)
     panel.set_ylabel(f"{name} (m)")
-    panel.set_title("height, and 95 % of it")
+    panel.set_title("height, with 95 % interval")
 
 
 def _sigmas(panel: Axes, lines: Sequence[_Line]) -> None:
@@ -209,10 +212,10 @@ def _sigmas(panel: Axes, lines: Sequence[_Line]) -> None:
 
 
 def _innovations(panel: Axes, lines: Sequence[_Line]) -> None:
-    """Draw the NIS, and the 99.9 % that the chi-square of as many rows allows."""
+    """Draw the NIS, and the 99.9 % quantile of chi-square for the number of rows of each scan."""
     from scipy.special import gammaincinv
 
-    # NIS of m rows is chi-square with m degrees of freedom: the line follows the rows of each scan.
+    # The NIS of m rows is chi-square with m degrees of freedom, so the line depends on the number of rows of each scan.
     for i, (line, colour) in enumerate(_colour(lines)):
         tested = np.isfinite(line.nis) & (line.count > 0)
         panel.plot(line.times[tested], line.nis[tested], color=colour, linestyle="", marker=".", markersize=4)
@@ -226,14 +229,14 @@ def _innovations(panel: Axes, lines: Sequence[_Line]) -> None:
 
 
 def _decades(panel: Axes, values: Array) -> None:
-    """Make the vertical axis logarithmic, with plain numbers, where values span more than a decade."""
+    """Make the vertical axis logarithmic, with plain numbers, if the values span more than a decade."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     known = values[np.isfinite(values) & (values > 0.0)]
     if not len(known) or known.max() < 10.0 * known.min():
         return
     panel.set_yscale("log")
-    # Over many decades a tick each; over few, at 2 and 5 as well.
+    # Over more than three decades, put a tick at each decade; otherwise also at 2 and 5.
     wide = known.max() > 1e3 * known.min()
     panel.yaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
     panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -1,5 +1,5 @@
 "use strict";
-// The latest fixes of the server that this page comes from, asked once a second; marks as those of fixes on other maps.
+// Request the latest fixes from the server of this page once a second, and draw them like fixes on other maps.
 {
   const map = document.querySelector(".map"), data = JSON.parse(map.querySelector("script").textContent);
   const layer = map.querySelector('[data-layer="fixes"]'), note = document.querySelector("p.soft"), text = note.textContent;
@@ -20,7 +20,7 @@
       layer.replaceChildren(...found.features.filter(one => one.geometry).map(mark));
       note.textContent = text;
     } catch {
-      note.textContent = "The server does not answer.";
+      note.textContent = "The server does not answer. The page tries again every second.";
     }
     setTimeout(ask, 1000);
   };

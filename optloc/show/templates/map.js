@@ -1,5 +1,6 @@
 "use strict";
-// Maps: drag, wheel, pinch and buttons move them; a pointer or a tap tells a mark, or the bound or the place.
+// Maps: dragging, the wheel, pinching and buttons move a map. A pointer or a tap shows the text of a mark, else the bound or
+// the position.
 for (const map of document.querySelectorAll(".map")) {
   const svg = map.querySelector("svg"), out = map.querySelector("output"), help = out.textContent;
   const data = JSON.parse(map.querySelector("script").textContent);
@@ -10,13 +11,13 @@ for (const map of document.querySelectorAll(".map")) {
     return Math.max(view[2] / Math.max(width, 1), view[3] / Math.max(height, 1));
   };
   const bar = map.querySelector(".scale");
-  // The longest of 1, 2, 5, 10 ... metres that is no longer than 120 pixels; a degree of latitude has 111.2 km.
+  // The longest length of 1, 2, 5, 10, ... metres that fits in 120 pixels; a degree of latitude is 111.2 km long.
   const measure = () => {
     const metres = unit() * 111195 / Math.abs(data.scale[1]), most = 120 * metres;
     const power = 10 ** Math.floor(Math.log10(most)), length = power * [5, 2, 1].find(n => n * power <= most);
     bar.style.width = `${length / metres}px`;
     bar.textContent = length >= 1000 ? `${length / 1000} km` : length >= 1 ? `${length} m` : `${+(length * 100).toFixed(2)} cm`;
-    // Shores are off by kilometres: of a city they say little, and look it.
+    // Shores are inaccurate by kilometres. On a map of a city, the style shows that they are only approximate.
     svg.classList.toggle("near", metres < 20);
   };
   const show = () => {
@@ -41,7 +42,7 @@ for (const map of document.querySelectorAll(".map")) {
     const text = `${Math.abs(lat).toFixed(digits)}° ${lat < 0 ? "S" : "N"}, ${Math.abs(turned).toFixed(digits)}° ${turned < 0 ? "W" : "E"}`;
     return [lon, lat, text];
   };
-  // What stands at a pixel or a little beside it: marks are small, and fingers are not.
+  // The text of the mark at a pixel or 6 pixels from it: marks are smaller than fingers.
   const marked = event => {
     for (const [dx, dy] of [[0, 0], [6, 0], [-6, 0], [0, 6], [0, -6]]) {
       const mark = document.elementFromPoint(event.clientX + dx, event.clientY + dy)?.closest?.("[data-tell]");

@@ -1,5 +1,5 @@
 "use strict";
-// A press on a method of the legend makes its lines stand out in every figure.
+// A click on a method in the legend highlights its lines in every figure.
 (() => {
   const picked = new Set();
   for (const button of document.querySelectorAll(".legend button")) {

@@ -112,7 +112,7 @@ def test_what_does_not_cover_has_no_ellipse_anywhere(status, chart):
     results = on_earth(status, chart)
     root = ET.fromstring(kml(results))
     assert root.find(f".//{KML}Polygon") is None
-    assert "no ellipse covers" in root.find(f".//{KML}Placemark/{KML}description").text
+    assert "no valid ellipse" in root.find(f".//{KML}Placemark/{KML}description").text
     assert (status == "ok") != (f": {status}" in root.find(f".//{KML}Placemark/{KML}name").text)
     point = ET.fromstring(cot(results)).find("point")
     assert float(point.get("ce")) == float(point.get("le")) == 9999999.0
@@ -144,7 +144,7 @@ def test_alternatives_are_shown(tmp_path):
     assert roles.count("alternative") == count
     assert "ellipse95" not in roles
     assert (tmp_path / "out.nmea").read_text().split(",")[6] == "0"
-    assert (tmp_path / "out.g2o").read_text().count("# or ") == count
+    assert (tmp_path / "out.g2o").read_text().count("# alternative at ") == count
     assert list(yaml.safe_load_all((tmp_path / "out.yaml").read_text())) == []
 
 

@@ -31,13 +31,13 @@ def test_a_mark_is_level_on_earth():
     assert found.place == pytest.approx([8.0, 47.0, 400.0])
     assert found.level == pytest.approx(np.diag([1.0, 4.0, 9.0]), abs=1e-9)
     assert found.velocity == pytest.approx([0.0, 5.0, 0.0], abs=1e-12)
-    assert "long axis at 0 deg" in found.words or "long axis at 180 deg" in found.words
+    assert "long axis 0 deg" in found.words or "long axis 180 deg" in found.words
 
 
 def test_what_is_not_ok_has_a_position_without_a_covariance():
     found = mark("ambiguous")
     assert (found.known, found.sure, found.covers) == (True, False, False)
-    assert "no ellipse covers" in found.words
+    assert "no valid ellipse" in found.words
 
 
 def test_large_times_are_dates():

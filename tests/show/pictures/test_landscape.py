@@ -36,5 +36,5 @@ def test_the_excess_is_the_root_of_the_cost_above_the_fix():
 def test_a_batch_and_a_missing_answer_have_no_landscape():
     problem, fix = ranged()
     lost = replace(fix.flat(), x=np.full((1, 2), np.nan))
-    with pytest.raises(InvalidProblem, match="no fix to draw around"):
+    with pytest.raises(InvalidProblem, match="the problem has no fix"):
         single(problem, lost)
