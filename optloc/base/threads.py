@@ -27,7 +27,7 @@ _Result = TypeVar("_Result")
 def thread_count() -> int:
     """Return the number of threads for a batch: the variable OPTLOC_THREADS, or the number of available processors.
 
-    Inside `flow`, whose parts run in parallel, it is the share of the current part.
+    Inside `map_in_order`, whose parts run in parallel, it is the share of the current part.
 
     Returns
     -------
@@ -129,14 +129,14 @@ def map_on_threads(
 def map_in_order(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
     """Yield the results of a function for all items in their order, with several running in parallel.
 
-    It is for large parts of a batch. Unlike `mapped` it suits work in which Python takes as long as machine code: the
+    It is for large parts of a batch. Unlike `map_on_threads` it suits work in which Python takes as long as machine code: the
     Python code of one part runs while the machine code of another runs. Results can be freed after each step: at most
     one more than the number of threads is stored.
 
     Parameters
     ----------
     function : callable
-        Function of one item, as for `mapped`. Its own calls of `thread_count` return its share of the threads.
+        Function of one item, as for `map_on_threads`. Its own calls of `thread_count` return its share of the threads.
     items : sequence
         The parts.
     """

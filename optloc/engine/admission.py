@@ -136,7 +136,7 @@ def evaluate(model: EngineModel, rows: Any, room: EngineWorkspace, shift: int) -
     """Write information, right side and cost at row X, or at TRIAL if `shift` is 1.
 
     On exact surfaces, the information across the surface is enlarged to the size of the information along it. The steps
-    that `hold` leaves do not depend on this term. The matrix becomes regular if the rows leave a direction
+    that `project_step` leaves do not depend on this term. The matrix becomes regular if the rows leave a direction
     undetermined.
     """
     equations(rows, room, shift)

@@ -1,6 +1,6 @@
 """The refined mirror image of a fix in the best plane of the stations: the second minimum of flat networks.
 
-A refinement ends early if it cannot lead to a rival of the fix, see `watch`. Names in capitals, such as X or GOOD, are
+A refinement ends early if it cannot lead to a rival of the fix, see `stop_hopeless`. Names in capitals, such as X or GOOD, are
 rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
@@ -154,7 +154,7 @@ def refine_images(
     fewest : int
         Least number of active lanes to continue.
     every : bool
-        As for `watch`.
+        As for `stop_hopeless`.
     """
     nearest = room.scalar[SHARE]
     evaluate(model, rows, room, 0)

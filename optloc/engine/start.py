@@ -202,7 +202,7 @@ def square_ranges(
     reference : int
         Station whose range is t; -1 if all ranges are determined.
     place, spread : array (s, d, W), (W,)
-        Results of `stand`.
+        Results of `load_stations`.
     scale : array (W,)
         Written: unit of length, metres.
     rows : array (s, d + 2, W)
@@ -250,7 +250,7 @@ def weigh_rows(
     Parameters
     ----------
     rows, place, scale : array (s, d + 2, W), (s, d, W), (W,)
-        Results of `square` and `stand`.
+        Results of `square_ranges` and `load_stations`.
     y : array (d + 1, W)
         Point at which the ranges are computed, scaled.
     white : array (s, s)

@@ -298,7 +298,7 @@ _CONVENTION_TEXT = {
 def azimuths_of(written: ProblemFile, read: ProblemFile) -> str:
     """Return a text with the convention of azimuths and the setting that changes it; empty without azimuths.
 
-    `written` are the settings of the file; `read` are the settings that `in_our_words` returns.
+    `written` are the settings of the file; `read` are the settings that `with_standard_names` returns.
     """
     said: dict[str, None] = {}
     for before, after in zip(written.measurements, read.measurements, strict=True):

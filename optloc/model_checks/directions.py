@@ -478,7 +478,7 @@ def _with_range(view: DirectionCost, cone: Direction, minima: DirectionMinima, l
 
 
 def has_directions(problem: Problem) -> bool:
-    """Return whether problems have one static position, no constraints and no medium, as `View` requires."""
+    """Return whether problems have one static position, no constraints and no medium, as `DirectionCost` requires."""
     still = one_position(problem) and problem.motions[0].order == 0 and problem.layout.shares("position")
     return still and not problem.constraints and problem.medium is None
 

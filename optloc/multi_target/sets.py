@@ -339,7 +339,7 @@ def values_in_balls(scan: Problem, centre: Array, radius: Array) -> tuple[Array,
     Parameters
     ----------
     scan : Problem
-        Rows of the kinds of `served`, with the position as the only unknown.
+        Rows of the kinds of `bounded_kinds`, with the position as the only unknown.
     centre : array (q, d)
         Centres, metres.
     radius : array (q,)
@@ -373,9 +373,9 @@ def value_changes(scan: Problem, slope: Array, remainder: Array, half: Array) ->
     Parameters
     ----------
     scan : Problem
-        The scan of `around`.
+        The scan of `values_in_balls`.
     slope, remainder : array (q, m, d) and (q, m)
-        Results of `around` for the balls around the boxes.
+        Results of `values_in_balls` for the balls around the boxes.
     half : array (q, d)
         Half-widths of the boxes.
     """

@@ -255,7 +255,7 @@ def contract_to_minima(
     Parameters
     ----------
     A, half, nodes, curves, sums : arrays
-        As in `convex`.
+        As in `is_convex_over_box`.
     cut : array (6,)
         Lower and upper ends of the box relative to its centre; contracted in place.
     solve : array (3, 3)
@@ -303,7 +303,7 @@ def _clip_along(a: float, d: float, f: float, plane: bool, sums: Array, ball: fl
     """Contract each coordinate to where the same component of the gradient may vanish; return whether any part remains.
 
     If the Hessian is nearly singular, its inverse gives no bound, but a steep coordinate still gives one. Arguments
-    are as in `clip_newton`. a, d and f are the diagonal of the Hessian, and `ball` is multiplied by half of the
+    are as in `contract_newton`. a, d and f are the diagonal of the Hessian, and `ball` is multiplied by half of the
     diagonal of the box.
     """
     for _ in range(_SWEEPS):

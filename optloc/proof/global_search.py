@@ -217,7 +217,7 @@ def excludes_infimum(cost: Cost, atlas: Atlas, box: Box, touching: bool, floor: 
 
 @inlined
 def _clips_away(cost: Cost, atlas: Atlas, box: Box, touching: bool, noise: float) -> bool:
-    """Return the result of `leaves` for the part between the ends of ``box.cut``, which is contracted."""
+    """Return the result of `excludes_infimum` for the part between the ends of ``box.cut``, which is contracted."""
     curve_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
     sum_up(cost.K, cost.w, cost.weight, noise, box.nodes, box.curves, box.sums)
     ball = spread_of(cost.A, box.half, box.nodes, box.curves, box.sums)
@@ -353,7 +353,7 @@ def prove_atlas(
     rivals: Array,
     found: Array,
 ) -> tuple[int, int, float, float, int]:
-    """Prove the same as `prove_everywhere` with the atlas alone; `optloc.proof.box.reaches_infinity` must hold."""
+    """Prove the same as `prove_globally` with the atlas alone; `optloc.proof.box.reaches_infinity` must hold."""
     chart, _ = chart_at(cost, x, box)
     least, corners, nowhere = cost_at(cost.K, cost.w, box.nodes), np.empty((2, 3)), np.full(x.shape[0], nan)
     noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
@@ -394,7 +394,7 @@ def prove_atlas(
 def verdict_of(
     outcome: int, boxes: int, bound: float, shown: int, met: int, gaps: Array, least: float
 ) -> tuple[int, int, float, float, int]:
-    """Return the results of `prove_everywhere` for the outcome of a search; `least` is the lowest level."""
+    """Return the results of `prove_globally` for the outcome of a search; `least` is the lowest level."""
     if outcome == CLEAR:
         return UNIQUE if gaps[shown] > 0.0 else VALUE, boxes, bound, gaps[shown], met
     if outcome == CHEAPER:

@@ -374,7 +374,7 @@ def noting_place(place: str) -> Iterator[None]:
 
 
 def _cause(error: Exception) -> str:
-    """Return the message of a numerical failure, after the place that `where` added."""
+    """Return the message of a numerical failure, after the place that `noting_place` added."""
     return ": ".join([*getattr(error, "__notes__", ()), str(error) or type(error).__name__])
 
 

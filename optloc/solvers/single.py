@@ -139,7 +139,7 @@ class _SingleWorkspace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedFix:
-    """One problem without batch axes, prepared to fix new measurements on the short path; see `single`.
+    """One problem without batch axes, prepared to fix new measurements on the short path; see `prepare_fix`.
 
     Parameters
     ----------
@@ -482,7 +482,7 @@ def prepare_fix(problem: Problem, method: Method, *, often: bool = True) -> Prep
     method : Method
         The fixes equal those of this method.
     often : bool
-        As of `Single`.
+        As of `PreparedFix`.
     """
     proves = _WORDS.get(method.words)
     if proves is None or (method.then is not None and not proves) or separable(problem):
@@ -545,7 +545,7 @@ def at_once(problem: Problem, method: Method) -> Fix | None:
     A cache stores the prepared problem for later problems of the same structure.
     """
     shape, place = problem.batch_shape, problem.stations.position
-    # a problem without batch axes shares everything, and `single` tests the other conditions once
+    # a problem without batch axes shares everything, and `prepare_fix` tests the other conditions once
     few = is_few(shape) and problem.count <= MOST and place.size == prod(place.shape[-3:])
     if not few or (shape and not is_planned(problem)):
         return None
@@ -558,7 +558,7 @@ def at_once(problem: Problem, method: Method) -> Fix | None:
 
 
 def _own_numbers(problem: Problem) -> tuple[Any, ...]:
-    """Return the numbers that `Single` stores and the key of a plan omits: stations and levels, without measurements.
+    """Return the numbers that `PreparedFix` stores and the key of a plan omits: stations and levels, without measurements.
 
     They are bytes, as parts of a cache key.
     """

@@ -384,7 +384,7 @@ def range_hessian(
 
 @inlined
 def largest_entries(matrix: Symmetric, h: Triple) -> Triple:
-    """Return the greatest sizes over a box of the entries of ``matrix s``, see `row_reach`."""
+    """Return the greatest sizes over a box of the entries of ``matrix s``, see `largest_row_value`."""
     m00, m01, m02, m11, m12, m22 = matrix
     b, c, e = abs(m01), abs(m02), abs(m12)
     return (

@@ -46,7 +46,7 @@ from optloc.proof.nodes.node import (
 )
 from optloc.proof.nodes.ratio import quotient_hessian, quotient_remainder
 
-# Second derivatives of a range over a box, see `range_bend`.
+# Second derivatives of a range over a box, see `range_hessian`.
 RangeBend = tuple[Symmetric, Triple, float, float]
 
 

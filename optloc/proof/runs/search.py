@@ -132,7 +132,7 @@ def search_run(
     Returns
     -------
     outcome, boxes, bound
-        As in `optloc.proof.global_search.search_globally`.
+        As in `optloc.proof.global_search.search_everywhere`.
     """
     look, small, d, boxes, looks, lows = run.look, tables.small, found.shape[0], 0, 0, 0
     floors = floor_of(space, look), floor_of(space, run.cost)

@@ -174,12 +174,12 @@ def prove_scaled(
     scaled : Scaled
         The cost.
     x, others, gaps, eps, budget, rivals, found
-        As in `prove_everywhere`; others (P, D) are the known minima.
+        As in `prove_globally`; others (P, D) are the known minima.
 
     Returns
     -------
     verdict, boxes, bound, gap, met
-        As in `prove_everywhere`.
+        As in `prove_globally`.
     """
     cost, tables, D, rest = scaled.cost, tables_of(scaled), x.shape[0], rest_of(scaled)
     far, endless = stays_finite(scaled), scaled.free and not scaled.lift.any()

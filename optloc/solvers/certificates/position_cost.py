@@ -151,7 +151,7 @@ def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Ar
 
     For a target at rest without a given region the search covers all positions: NaN. A moving target could be anywhere
     at any speed, so its claim needs a region. If constraints limit the position and the speed, they are the requested
-    region. Otherwise the region is the box of `around`; see `unlimited`.
+    region. Otherwise the region is the box of `boxes_around`; see `why_unlimited`.
 
     Parameters
     ----------

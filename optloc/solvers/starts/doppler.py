@@ -41,7 +41,7 @@ def doppler_starts(problem: Problem) -> Array:
     Parameters
     ----------
     problem : Problem
-        N problems, see `dopplered`.
+        N problems, see `has_doppler_of_rest`.
 
     Returns
     -------

@@ -78,7 +78,7 @@ def candidates(problem: Problem, found: Ranges | None, pick: Pick) -> Array:
     found : Ranges, optional
         Its least-squares ranges.
     pick : callable
-        Selects points of a squared-range problem: `minimum`, `every`, `shor` or `hull`.
+        Selects points of a squared-range problem: `minimum`, `stationary_points`, `shor` or `hull`.
 
     References
     ----------

@@ -1,6 +1,6 @@
 """Search for suspects over sets of groups: leave each set out and fix the remaining rows again, without a first guess.
 
-If the sets are few, all of them are tried, so that one error cannot mask another. If they are many, `grow` leaves out
+If the sets are few, all of them are tried, so that one error cannot mask another. If they are many, `grow_explanation` leaves out
 one group at a time.
 """
 
@@ -144,7 +144,7 @@ class SameRows:
 
 @dataclass(frozen=True, slots=True)
 class _Request:
-    """Sets of groups (C,) to leave out of some problems of an `Alike`, and the least scores so far."""
+    """Sets of groups (C,) to leave out of some problems of an `SameRows`, and the least scores so far."""
 
     alike: SameRows
     items: Array
@@ -296,7 +296,7 @@ def _try_requests(asked: dict[int, list[_Request]]) -> dict[int, list[list[_Trie
 
 
 class _Pair(NamedTuple):
-    """One problem of an `Alike`, a set to leave out of it, and the record that receives the result."""
+    """One problem of an `SameRows`, a set to leave out of it, and the record that receives the result."""
 
     alike: SameRows
     item: int
@@ -459,7 +459,7 @@ def explain_from_beginnings(outcomes: Sequence[Outcome], groups: Sequence[Group]
 
 
 def begin_without(problem: Problem, groups: Sequence[Group], rows: Array, x: Array) -> RemainingFix:
-    """Return the rest of one problem without some rows (m,), refined from a vector (size,): a start for `grow`."""
+    """Return the rest of one problem without some rows (m,), refined from a vector (size,): a start for `grow_explanation`."""
     left = tuple(i for i, group in enumerate(groups) if len(group.rows) == 1 and rows[group.rows[0]])
     return remaining_fix_of(groups, left, fix_without(problem, groups, left, x))
 

@@ -174,7 +174,7 @@ def test_the_cost_of_a_minimizer_is_the_one_that_judges_it_and_has_its_gradient(
     for drawn in problems(tmp_path):
         x = drawn.truth[0] + 10.0
         quick, judge = cost_of(drawn.problem)(x), float(equations_at(drawn.problem, x[None]).cost[0])
-        monkeypatch.setattr("optloc.lab.study.minimizers.usable", lambda *_: False)
+        monkeypatch.setattr("optloc.lab.study.minimizers.may_use_code", lambda *_: False)
         cost = cost_of(drawn.problem)
         value, slope = cost(x)
         monkeypatch.undo()
