@@ -558,9 +558,9 @@ def at_once(problem: Problem, method: Method) -> Fix | None:
 
 
 def _own_numbers(problem: Problem) -> tuple[Any, ...]:
-    """Return the numbers that `PreparedFix` stores and the key of a plan omits: stations and levels, without measurements.
+    """Return the numbers that `PreparedFix` stores and the key of a plan omits.
 
-    They are bytes, as parts of a cache key.
+    These are stations and levels, without measurements. They are bytes, as parts of a cache key.
     """
     rates, bands = problem.stations.velocity, problem.constraints
     levels = tuple((b.lower.tobytes(), b.upper.tobytes()) for b in bands if isinstance(b, Band))

@@ -1,6 +1,6 @@
 """Multi-start search for a network, until three starts agree on the least cost.
 
-Each round makes starts (`restarts`) and then moves single stations or pulses (`blocks`) of the cheapest
+Each round makes starts (`rounds`) and then moves single stations or pulses (`blocks`) of the cheapest
 networks.
 """
 

@@ -1,7 +1,7 @@
 """Search for suspects over sets of groups: leave each set out and fix the remaining rows again, without a first guess.
 
-If the sets are few, all of them are tried, so that one error cannot mask another. If they are many, `grow_explanation` leaves out
-one group at a time.
+If the sets are few, all of them are tried, so that one error cannot mask another. If they are many, `grow_explanation`
+leaves out one group at a time.
 """
 
 from __future__ import annotations
@@ -459,7 +459,10 @@ def explain_from_beginnings(outcomes: Sequence[Outcome], groups: Sequence[Group]
 
 
 def begin_without(problem: Problem, groups: Sequence[Group], rows: Array, x: Array) -> RemainingFix:
-    """Return the rest of one problem without some rows (m,), refined from a vector (size,): a start for `grow_explanation`."""
+    """Return the rest of one problem without some rows (m,), refined from a vector (size,).
+
+    The rest is a start for `grow_explanation`.
+    """
     left = tuple(i for i, group in enumerate(groups) if len(group.rows) == 1 and rows[group.rows[0]])
     return remaining_fix_of(groups, left, fix_without(problem, groups, left, x))
 
