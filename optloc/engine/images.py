@@ -1,7 +1,7 @@
 """The refined mirror image of a fix in the best plane of the stations: the second minimum of flat networks.
 
-A refinement ends early if it cannot lead to a rival of the fix, see `stop_hopeless`. Names in capitals, such as X or GOOD,
-are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+A refinement ends early if it cannot lead to a rival of the fix, see `stop_hopeless`. Names in capitals, such as X or
+GOOD, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations

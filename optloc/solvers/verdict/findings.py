@@ -1,7 +1,7 @@
 """Findings against finished answers. They define the status `ok` for every method.
 
-A finding is a test and a sentence. `finding_marks` applies all tests to a batch of settled pools. `examine` computes the
-numbers that the tests read, and `explain` writes the sentences.
+A finding is a test and a sentence. `finding_marks` applies all tests to a batch of settled pools. `examine` computes
+the numbers that the tests read, and `explain` writes the sentences.
 """
 
 from __future__ import annotations
