@@ -85,7 +85,7 @@ def test_nothing_is_proven_of_rates_with_unsure_velocities():
     problem, x = problem_of("noise", epochs=1)
     fix = solve(simulate(problem, x, 1))
     assert fix.status is not optloc.Status.OK
-    assert "velocities enter range_rate rows" in fix.certificate.reason
+    assert "velocities change range_rate rows" in fix.certificate.reason
 
 
 def test_rows_without_rates_do_not_feel_them():
@@ -150,7 +150,7 @@ def test_a_file_states_them(tmp_path, keys, column, sigma):
     ("keys", "column", "words"),
     [
         ('velocity_sigma = "5 m"', "", "velocity_sigma"),
-        ("velocity_sigma = -1.0", "", "leave velocity_sigma out"),
+        ("velocity_sigma = -1.0", "", "remove velocity_sigma"),
         ("", ", velocity_sigma = 0", "not positive"),
     ],
 )

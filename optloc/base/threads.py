@@ -130,15 +130,8 @@ def map_in_order(function: Callable[[_Item], _Result], items: Sequence[_Item]) -
     """Yield the results of a function for all items in their order, with several running in parallel.
 
     It is for large parts of a batch. Unlike `map_on_threads` it suits work in which Python takes as long as machine
-    code: the Python code of one part runs while the machine code of another runs. Results can be freed after each step: at
-    most one more than the number of threads is stored.
-
-    Parameters
-    ----------
-    function : callable
-        Function of one item, as for `map_on_threads`. Its own calls of `thread_count` return its share of the threads.
-    items : sequence
-        The parts.
+    code: the Python code of one part runs while the machine code of another runs. Results can be freed after each
+    step: at most one more than the number of threads is stored.
     """
     threads = thread_count()
     count = min(threads, len(items))

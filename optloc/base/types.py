@@ -359,41 +359,45 @@ class Status(IntEnum):
 
 # Each sentence states first what happened, then what helps. Users read it without any code.
 _SENTENCES: dict[Status, str] = {
-    Status.OK: "The data do not reject the model, no other position explains them about as well, and the covariance "
-    "covers as it promises.",
-    Status.AMBIGUOUS: "Several positions explain the data about equally well; see the alternatives, or add a row, a "
-    "station or a known height that tells them apart.",
-    Status.SEARCHED: "No safe start is known for this mixture of rows: this is the best of a seeded search, and "
-    "nothing proves that no other position explains the data as well.",
-    Status.MAX_ITERATIONS: "The iterations ended before they converged; check the units, the signs and the "
-    "places of the stations with 'optloc check'.",
-    Status.STALLED: "The refinement could not lower the cost any more although its gradient is not zero.",
-    Status.SINGULAR_GEOMETRY: "The rows leave a direction of the answer undetermined; add a station off it.",
-    Status.TOO_FEW_ROWS: "There are fewer measurements than unknowns; add rows or fix an unknown.",
-    Status.INFEASIBLE: "No position meets the constraints.",
-    Status.UNBOUNDED: "Positions ever farther away explain the data about as well: they say a direction and a least "
-    "range; add a station farther off, a bearing or a known height.",
+    Status.OK: "Use it: the residuals fit the stated noise, no other position fits, and the error ellipse is valid.",
+    Status.AMBIGUOUS: "Several positions fit the data about equally well; see the alternatives, and add a station, a "
+    "measurement or a known height that decides.",
+    Status.SEARCHED: "No safe start is known for these kinds of measurements; this is the best position of a seeded "
+    "search, and a better one is not excluded.",
+    Status.MAX_ITERATIONS: "The iterations did not converge; check units, signs and station positions with "
+    "'optloc check'.",
+    Status.STALLED: "The refinement stopped before the minimum: its steps no longer lower chi-square, but the gradient "
+    "is not zero; check units and noise with 'optloc check'.",
+    Status.SINGULAR_GEOMETRY: "The measurements leave one direction of the answer undetermined; add a station in "
+    "another direction.",
+    Status.TOO_FEW_ROWS: "There are fewer measurements than unknowns; add measurements or fix an unknown.",
+    Status.INFEASIBLE: "No position meets the constraints; check their limits.",
+    Status.UNBOUNDED: "The target is too far for these stations: the data give a direction and a minimum range; add a "
+    "distant station, a bearing or a known height.",
     Status.NUMERICAL: "A solver failed, and the reason names it; check the scale and the units of the input, or choose "
     "another solver.",
     Status.REJECTED: "A measurement is not a finite number; remove the row or give it weight zero.",
-    Status.UNAVAILABLE: "The method gives no start for these rows; the reason says why, and 'auto' takes all kinds.",
-    Status.DISCONNECTED: "The station pairs fall into groups without a common station: no closed form starts from "
-    "them; take 'auto', which searches, or add a pair that links them.",
-    Status.CONTRADICTORY: "The measurements contradict each other, and leaving few of them out does not help, or they "
-    "contradict the constraints; check the stations' places and clocks, the noise levels and the bounds.",
-    Status.MISFIT: "The residuals are larger than the stated noise allows, so position and covariance are refuted; see "
-    "'optloc check', look for a wrong row with the method 'robust', or state the noise as it is.",
-    Status.UNPROVEN: "Refined, but nothing proves that no other position explains the data about as well; the method "
-    "'auto' tries to, the certificate says what is missing, and whoever can do without allows this status.",
-    Status.CURVED: "Right, but the covariance in metres does not cover: use the fix's chart, its interval, or "
-    "optloc.uncertainty.likelihood_region.",
-    Status.UNREFINED: "The estimate of a start, neither refined nor judged: put '+lsr+certify' behind the method.",
-    Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a row, a station or what is known.",
-    Status.TAILS: "The 95 % figures hold, as repeats of the measurement show; the 99.9 % region does not.",
-    Status.ROBUST: "The rows that keep their weight prove the position; a search, not a proof, found no other rows to "
-    "reject that explain the data.",
-    Status.RESCALED: "The fixes of the batch show that the noise is larger than stated; cost and covariance use the "
-    "larger noise.",
+    Status.UNAVAILABLE: "The method has no start for these measurements; see the reason, or use 'auto', which accepts "
+    "all kinds.",
+    Status.DISCONNECTED: "The station pairs form groups without a common station, so no closed form gives a start; use "
+    "'auto', which searches, or add a pair that links the groups.",
+    Status.CONTRADICTORY: "The measurements contradict each other or the constraints, even without a few of them; "
+    "check station positions, clocks, noise levels and bounds.",
+    Status.MISFIT: "Do not use it: the residuals are larger than the stated noise allows; run 'optloc check', find the "
+    "wrong row with the method 'robust', or correct the noise.",
+    Status.UNPROVEN: "The position is refined, but another position is not excluded, as the certificate explains; try "
+    "the method 'auto', or accept this status with 'allow'.",
+    Status.CURVED: "The position is right, but the error ellipse in metres is not valid; use the fix's chart, its "
+    "interval, or optloc.uncertainty.likelihood_region.",
+    Status.UNREFINED: "This is the estimate of a start, without refinement and verdict; append '+lsr+certify' to the "
+    "method.",
+    Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a station, a measurement or a "
+    "known height.",
+    Status.TAILS: "Repeats of the measurement confirm the 95 % figures, but not the 99.9 % region.",
+    Status.ROBUST: "The rows that keep their weight prove the position; that no other choice of rejected rows explains "
+    "the data is searched, not proven.",
+    Status.RESCALED: "The fixes of the batch show larger noise than stated; chi-square and covariance use the larger "
+    "noise.",
 }
 
 PRECEDENCE = (

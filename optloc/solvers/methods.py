@@ -117,7 +117,7 @@ def compare_bounds(problem: Problem, pool: Pool | None) -> Pool:
 
 def _claim(cost: float, bound: float, tight: bool, name: str) -> Claims:
     """Return the claim from a lower bound of a relaxation; a tight bound is a global proof of the value."""
-    reason = "no position costs less" if tight else f"a lower bound leaves a gap of {cost - bound:.2g}"
+    reason = "no position has a lower chi-square" if tight else f"a lower bound leaves a gap of {cost - bound:.2g}"
     text = f"{reason}; other minima were searched for, not excluded"
     proof = "global" if tight else "local"
     return claim(Certificate(proof, text, f"{name.removesuffix('s')} relaxation", bound, cost - bound))
@@ -156,7 +156,7 @@ _STAGES: dict[str, SolverEntry] = {
     "nlp": _refinement(_nlp, "the maximum-likelihood cost by IPOPT from every candidate"),
     "certify": _refinement(
         certified,
-        "branch and bound: proves that no position costs less, and that no other minimum comes near",
+        "branch and bound: proves that no position has a lower chi-square, and that no other minimum comes near",
         batched=True,
     ),
     "value": _refinement(

@@ -18,7 +18,7 @@ SIGMA = 5.0
 @pytest.fixture
 def filtered(monkeypatch):
     """Return what filters a scan of ranges by the kernel, run as plain Python."""
-    monkeypatch.setattr(scan_rows, "at_hand", lambda kernel: True)
+    monkeypatch.setattr(scan_rows, "is_available", lambda kernel: True)
     monkeypatch.setattr(scan_rows, "_KEPT", type(scan_rows._KEPT)(256))
 
     def run(z, how, weight=1.0):

@@ -37,7 +37,7 @@ def _repeatedly(value: float, times: int) -> float:
 @pytest.fixture(autouse=True)
 def nothing_is_kept(monkeypatch):
     """Machine code on disk would leave nothing to compile."""
-    monkeypatch.setattr(jit, "kept", lambda kernel, *, callee: None)
+    monkeypatch.setattr(jit, "code_cache_of", lambda kernel, *, callee: None)
     for kernel in (_scaled, _repeated, _mixed, _repeatedly):
         kernel.renew()
 

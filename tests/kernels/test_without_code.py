@@ -26,7 +26,7 @@ from optloc import assemble, measured, prepare, simulate, solve
 from optloc.kernels import jit
 
 begun, callers = [], []
-jit.begin_child = lambda: begun.append(1)
+jit.start_background_compiler = lambda: begun.append(1)
 original = jit._Kernel._prepare
 jit._Kernel._prepare = lambda self, args: (callers.append(self.name), original(self, args))
 count, sigma = int(sys.argv[1]), float(sys.argv[2])

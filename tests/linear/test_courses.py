@@ -280,9 +280,9 @@ def test_files_hold_heights_along_courses(loaded):
         (
             'kind = "height"\nexactly = [1.0, 2.0, 3.0, 4.0, 5.0]\nalong = false\n',
             "constant_velocity",
-            "leave out along",
+            "remove along",
         ),
-        ('kind = "height"\nmin = 3.0\nwithin = "1 m"\n', "constant_velocity", "'within' has nothing"),
+        ('kind = "height"\nmin = 3.0\nwithin = "1 m"\n', "constant_velocity", "'within' needs"),
         ('kind = "height"\nexactly = 3.0\nwithin = "-1 m"\n', "constant_velocity", "negative width"),
         ('kind = "height"\nmin = 0.0\nalong = true\n', "constant_acceleration", "constant acceleration"),
         ('kind = "speed"\nmax = 3.0\nalong = true\n', "constant_velocity", "no key 'along'"),

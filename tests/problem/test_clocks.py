@@ -254,7 +254,7 @@ def test_what_cannot_be_meant_is_refused(change, words):
 
 def test_what_adds_up_epochs_refuses_walks():
     problem, _ = drawn(walking(12, density=0.04), 5)
-    with pytest.raises(InvalidProblem, match="ties each epoch to the next"):
+    with pytest.raises(InvalidProblem, match="links each epoch to the next"):
         optloc.solvers.Running.begin(problem, optloc.solve(problem, "roots+lsr"))
     one = optloc.assemble(np.eye(3), optloc.measured("range", a=[0, 1, 2], sigma=1.0))
     with pytest.raises(InvalidProblem, match="needs several epochs"):

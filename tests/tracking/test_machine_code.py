@@ -36,7 +36,7 @@ SIGMA = {"tdoa": 5.0, "range": 5.0, "fdoa": 0.5}
 @pytest.fixture
 def at_hand(monkeypatch):
     """Take machine code, which is made where it is not kept."""
-    monkeypatch.setattr(scan_rows, "at_hand", lambda kernel: True)
+    monkeypatch.setattr(scan_rows, "is_available", lambda kernel: True)
 
 
 def run(*kinds, d=3, moving=False, **more):
@@ -229,7 +229,7 @@ def test_a_track_is_the_same_either_way(name, rule, monkeypatch):
     problem, entries, tracks = problem.with_rows(z=wild), [], []
     start = State(-1.0, np.r_[TRUTH - SPEED + 30.0, SPEED], predictions(6, 3)["good"])
     for hand in (False, True):
-        monkeypatch.setattr(scan_rows, "at_hand", lambda kernel, hand=hand: hand)
+        monkeypatch.setattr(scan_rows, "is_available", lambda kernel, hand=hand: hand)
         tracks.append(followed(problem, start, polynomial(1, 0.5), gated(rule)))
         entries.append(list(tracked(problem, polynomial(1, 0.5), rule, start=start, rules=Rules(gate=4.0))))
     for one, two in (tracks, [collected(own, 3) for own in entries]):

@@ -110,22 +110,24 @@ def state_claims(
 _SPACE = 3
 
 
-@lru_cache(maxsize=256)  # fixes solved together share few sentences, and Python formats numbers slowly
+@lru_cache(maxsize=256)  # the fixes of a call have few different margins, and formatting numbers is slow
 def claim_sentence(margin: float, listed: int, region: tuple[Corner, Corner] | None) -> str:
-    """Return the claim about a proven fix as a sentence: over all positions, or over a region; see `state_claims`."""
-    where = "no position" if region is None else _where(*region)
-    beside = "" if not listed else f", except the {'one' if listed == 1 else listed} listed,"
-    if margin > 0.0:
-        rest = f"every other local minimum{beside} costs at least {margin:g} more"
-    else:
-        rest = "other minima were searched for, not excluded"
-    return f"{where} costs less; {rest}"
+    """Return the claim about a proven fix, over all positions or over a region, in words.
+
+    Another position means another local minimum: chi-square rises continuously around the fix. See `state_claims`.
+    """
+    where = "" if region is None else f" {_where(*region)}"
+    if margin <= 0.0:
+        return f"no position{where} has a lower chi-square; other minima were searched for, not excluded"
+    except_listed = "" if not listed else f" except the {'one' if listed == 1 else listed} listed"
+    there = " there" if where else ""
+    return f"proven best{where}; any other position{there}{except_listed} raises chi-square by at least {margin:g}"
 
 
 def _where(lower: Corner, upper: Corner) -> str:
-    """Return the sentence part for a region of positions, or of positions and velocities."""
+    """Return a region in words: positions in m, and velocities in m/s where the corners have them."""
     d = len(lower) // 2 if len(lower) > _SPACE else len(lower)
-    words = f"no position from {_text(lower[:d])} to {_text(upper[:d])} m"
+    words = f"from {_text(lower[:d])} to {_text(upper[:d])} m"
     return words if d == len(lower) else f"{words} at a velocity from {_text(lower[d:])} to {_text(upper[d:])} m/s"
 
 

@@ -60,14 +60,14 @@ def test_those_that_raise_or_never_end_are_not_listed():
         assert faults[name]
         with pytest.raises(InvalidProblem, match=f"the solver '{name}' does not work here: ") as error:
             backend_kind(name, "solver")
-        assert "take CLARABEL" in str(error.value)
+        assert "use one of CLARABEL" in str(error.value)
 
 
 def test_what_was_tried_once_is_kept(monkeypatch):
     kinds = {name: entry.kind for name, entry in installed().items() if entry.kind != "least squares"}
     known = faults_of(kinds)
     module._faults.cache_clear()
-    monkeypatch.setattr(module, "try_apart", lambda names: pytest.fail("tried again"))
+    monkeypatch.setattr(module, "try_in_process", lambda names: pytest.fail("tried again"))
     if module.folder() is not None:
         assert faults_of(kinds) == known
 

@@ -201,7 +201,7 @@ def test_the_command_draws(what, file, tmp_path):
         (["landscape", "nowhere.toml"], "no such file"),
         (["landscape", "run", "--epoch", "x"], "there is no epoch 'x'"),
         (["biases", "demo"], "does not grow with the epochs"),
-        (["accuracy", "demo"], "those of a study"),
+        (["accuracy", "demo"], "needs a study"),
         (["fix", "demo", "--out", "no/such/folder.png"], "cannot be written"),
     ],
 )

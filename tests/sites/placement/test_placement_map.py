@@ -25,7 +25,7 @@ def maps(side):
 
 @pytest.fixture
 def drawn(monkeypatch):
-    monkeypatch.setattr(placement_map, "apart", lambda figure: None)  # which lays the figure out
+    monkeypatch.setattr(placement_map, "separate_notes", lambda figure: None)  # which lays the figure out
     return draw
 
 

@@ -69,7 +69,7 @@ def test_coarse_bearings_are_ok_at_95_percent_and_say_so() -> None:
     fix = next(one for seed in range(20) if (one := solve(simulate(problem, target, seed))).has(Status.TAILS))
     assert fix.status is Status.OK
     assert fix.findings == (Status.TAILS,)
-    assert "99.9 % region does not" in str(fix)
+    assert "the 99.9 % region is not" in str(fix)
     assert fix.to_dataframe()["tails"].all()
     assert fix.require() is fix
     assert bool(fix.covers(fix.position))
