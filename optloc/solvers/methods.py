@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -146,7 +147,9 @@ _STAGES: dict[str, SolverEntry] = {
     "minimax": _start(
         stages.start_with("minimax"), "smallest maximal angle by second-order cones (Clarabel); bounded errors"
     ),
-    "widen": _refinement(stages.add_candidates, "more candidates for a fix: mirror image, sub-arrays", batched=True),
+    "add_candidates": _refinement(
+        stages.add_candidates, "more candidates for a fix: mirror image, sub-arrays", batched=True
+    ),
     "search": _refinement(
         stages.search,
         "a search for problems without an answer: over boxes if a proof bounds them, or from many positions",
@@ -199,11 +202,14 @@ SHORTCUTS: Mapping[tuple[str, ...], PlannedStages] = {("gtrs", "lsr"): PlannedSt
 
 # The method after "|" runs for problems that are not fully proven by then.
 METHODS = {
-    "auto": "gtrs+lsr+certify|roots+lsr+widen+lsr+search+certify",
-    "searched": "roots+lsr+widen+lsr+search",
-    "proven": "roots+lsr+widen+lsr+search+certify+bound",
-    "robust": "roots+lsr+widen+lsr+search+suspects+certify",
+    "auto": "gtrs+lsr+certify|roots+lsr+add_candidates+lsr+search+certify",
+    "searched": "roots+lsr+add_candidates+lsr+search",
+    "proven": "roots+lsr+add_candidates+lsr+search+certify+bound",
+    "robust": "roots+lsr+add_candidates+lsr+search+suspects+certify",
 }
+
+# Names of stages in version 0.1 before its release: they work with a warning, so that scripts and studies still run.
+_FORMER = {"widen": "add_candidates"}
 
 # Endings of back ends that a sentence names: a longer list does not help.
 _SHOWN = 3
@@ -231,7 +237,7 @@ class Method:
     def parse(cls, text: str) -> Method:
         """Return a method such as "auto" or "gtrs+lsr"; raise InvalidProblem naming an unknown word."""
         first, _, rest = METHODS.get(text, text).partition("|")
-        words = tuple(first.split("+"))
+        words = tuple(_present_name(word) for word in first.split("+"))
         for word in words:
             if word not in SOLVERS:
                 raise InvalidProblem(f"unknown method {word!r}", "method", nearest(word, [*METHODS, *SOLVERS]))
@@ -274,6 +280,16 @@ class Method:
         for branch in branches[1:]:
             pool = _take_over(branch, problem, pool)
         return pool
+
+
+def _present_name(word: str) -> str:
+    """Return the present name of a stage, with a warning if it was renamed."""
+    if word in _FORMER:
+        new = _FORMER[word]
+        warnings.warn(
+            f"the stage {word} is {new} now; version 0.2 removes the old name", DeprecationWarning, stacklevel=4
+        )
+    return _FORMER.get(word, word)
 
 
 def _stage(word: str) -> Solver:

@@ -169,7 +169,7 @@ def fix_by(problem: Problem, start: Callable[[Problem], Pool]) -> Fix:
 def add_candidates(problem: Problem, pool: Pool | None) -> Pool:
     """Return a refined pool with mirror images as starts, and starts of sub-arrays if the verdict has findings."""
     if pool is None:
-        raise InvalidProblem("widen needs a fix", "method", "put it after a refinement, as in 'gtrs+lsr+widen'")
+        raise InvalidProblem("add_candidates needs a fix", "method", "put it after a refinement, as lsr+add_candidates")
     if is_registration_run(problem):
         began, fix = perf_counter(), judge(problem, pool)
         around = step_beside(problem, fix.x, fix.covariance())
@@ -203,7 +203,8 @@ def _widen(problem: Problem, pool: Pool) -> Pool:
 
 def _beside(problem: Problem, pool: Pool, fix: Fix, x: Array, began: float) -> Pool:
     """Return the candidates of fixes together with more starts x (N, q, size)."""
-    return offer(problem, pack(np.concatenate([surviving_candidates(pool, fix), x], axis=1)), pool, "widen", began)
+    candidates = pack(np.concatenate([surviving_candidates(pool, fix), x], axis=1))
+    return offer(problem, candidates, pool, "add_candidates", began)
 
 
 def _subarrays(problem: Problem, fix: Fix) -> Array:

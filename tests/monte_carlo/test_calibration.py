@@ -1,4 +1,4 @@
-"""Networks from nothing, counted: at the optimum, ok, wrong though ok, and what the covariance covers."""
+"""Networks from nothing, counted: at the optimum, ok, wrong but ok, and what the covariance covers."""
 
 import json
 import os
@@ -44,7 +44,7 @@ HEADER = (
     "of 10 random starts",
     "ok",
     "curved, ambiguous, unproven, searched",
-    "wrong though ok",
+    "wrong but ok",
     "distances of ok within 95 / 99.9 %",
     "NEES of ok",
     "errors of all / bound",
@@ -152,7 +152,7 @@ GROSS_HEADER = (
     "counted",
     "same rows left out as from the truth",
     "distances as good as from the truth",
-    "wrong though ok",
+    "wrong but ok",
     "unproven, curved, misfit",
     "median s",
 )

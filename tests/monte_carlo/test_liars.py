@@ -1,4 +1,4 @@
-"""What `robust` says where stations lie: counted over kinds, stations, liars and sizes, and what is wrong though ok."""
+"""What `robust` says where stations lie: counted over kinds, stations, liars and sizes, and what is wrong but ok."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Cell:
         return spoilt(self.kind, trials, self.stations, seed=20261122, **given)
 
 
-# What is promised of a cell: shares of wrong though ok, and of ok, of 2 000 trials.
+# What is promised of a cell: shares of wrong but ok, and of ok, of 2 000 trials.
 WRONG = {
     **{Cell("toa", 3, 6, 2, size): 0.004 for size in (100, 1000, 10_000)},
     **{Cell("toa", 3, 8, 1, size): 0.002 for size in (30, 100, 10_000)},
@@ -54,7 +54,7 @@ RIGHT = {
     **{Cell(kind, 3, 8, 1, size): 0.95 for kind in ("toa", "range") for size in (100, 10_000)},
     **{Cell(kind, d, 8, 2, size): 0.95 for kind, d in (("toa", 2), ("range", 3)) for size in (100, 10_000)},
 }
-# Of these the definition of `ok` was tried on first, with these shares of wrong though ok among 100.
+# Of these the definition of `ok` was tried on first, with these shares of wrong but ok among 100.
 TRIED = {
     Cell("toa", 3, 6, 1, 30): 0.03,
     Cell("toa", 3, 7, 1, 30): 0.01,

@@ -8,7 +8,7 @@ import optloc
 from optloc import Status, assemble, measured
 from optloc.base.frames import geodetic_to_ecef
 from optloc.solvers import given
-from optloc.solvers.methods import FORMULATIONS, SOLVERS, Choice, using
+from optloc.solvers.methods import FORMULATIONS, SOLVERS, Choice, Method, using
 
 STATIONS = 1e3 * np.array([[0, 0, 0], [10, 0, 6], [0, 10, 3], [10, 10, 0], [5, 5, 6], [2, 7, 1.0]])
 TRUTH = np.array([22e3, 14e3, 3e3])
@@ -178,3 +178,9 @@ def test_every_start_of_a_formulation_is_a_word_of_this_table():
     assert found <= set(WORDS)
     unrefined = {name for name, entry in SOLVERS.items() if entry.role == "start"} - set(optloc.problem.LOSSES)
     assert unrefined == set(WORDS)
+
+
+def test_the_former_name_of_a_stage_works_with_a_warning():
+    with pytest.warns(DeprecationWarning, match="widen is add_candidates now"):
+        method = Method.parse("roots+lsr+widen+lsr")
+    assert method.words == ("roots", "lsr", "add_candidates", "lsr")

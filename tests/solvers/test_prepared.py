@@ -346,7 +346,7 @@ def test_errors_are_those_that_the_covariance_says():
     assert abs(fix.cost.mean() - fix.dof[0]) < 5.0 * np.sqrt(2.0 * fix.dof[0] / count)
 
 
-@pytest.mark.parametrize("method", ["gtrs+lsr", "roots+lsr", "roots+lsr+widen+lsr+search"])
+@pytest.mark.parametrize("method", ["gtrs+lsr", "roots+lsr", "roots+lsr+add_candidates+lsr+search"])
 def test_parts_make_the_whole(method):
     """A large batch is worked on in parts: the same fixes, whatever slots of alternatives each part needs."""
     near_plane = STATIONS[3] * np.array([1.0, 1.0, 0.01])

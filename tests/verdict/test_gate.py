@@ -20,7 +20,7 @@ from optloc.problem import LOSSES
 SCENES, FEW = 24, 2
 IN_FULL = {"auto": 1000}  # scenes a seed, of ten; 100 of every other method
 # Others than `auto`; those of a loss can never be `ok`, and only that is looked at.
-METHODS = ("gtrs+lsr", "roots+lsr", "searched", "proven", "robust", "roots+lsr+widen+lsr+value", *LOSSES)
+METHODS = ("gtrs+lsr", "roots+lsr", "searched", "proven", "robust", "roots+lsr+add_candidates+lsr+value", *LOSSES)
 LEVELS = (0.68, 0.95, 0.999)
 # Truths that lie where one in ten thousand does.
 BEYOND = 0.9999

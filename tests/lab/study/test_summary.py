@@ -38,7 +38,7 @@ def test_counts_by_status_say_where_a_better_point_is_known(frame):
         ["b", "ok", 3, 2, 1, 1],
         ["b", "ambiguous", 1, 0, 1, 0],  # a better point is known, and the status says that there may be one
     ]
-    # all fixes are counted once, and what was wrong though ok is that of the other tables
+    # all fixes are counted once, and what was wrong but ok is that of the other tables
     made = frame.assign(status=np.where(frame["status"] == "ok", "unproven", frame["status"]))
     table = by_status(judged(made.drop(columns=["above", "right", "wrong", "false", "case"])))
     assert table["trials"].sum() == len(frame)
