@@ -66,7 +66,7 @@ ITERATIONS = {"taylor": False, "lsr": True}
 
 
 class End(IntEnum):
-    """The way in which an iteration ended."""
+    """The way in which an iteration ended: at the fix, at another minimum, or at no minimum."""
 
     REACHED = 0
     ELSEWHERE = 1
@@ -82,7 +82,7 @@ class Basins:
     method : str
         A key of `ITERATIONS`.
     ends : int array (...)
-        `End` of each start: at the fix, at another stationary point, or at no point. The latter means that the
+        `End` of each start: at the fix, at another stationary point, or at no point. "No point" means that the
         iteration ran to infinity, circled, or stopped at a singular geometry.
     """
 
