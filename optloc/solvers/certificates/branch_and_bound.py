@@ -531,8 +531,8 @@ def certified_freely(
 ) -> Pool:
     """Return the pools of a flat batch with certificates over all positions; inequalities are ignored.
 
-    `pool` has the refined candidates of N problems. `region` (2, d) is as of `admitted.certify`, `margin` the gap of cost
-    to prove, and `effort` the factor of the boxes that a proof may use.
+    `pool` has the refined candidates of N problems. `region` (2, d) is as of `admitted.certify`, `margin` the gap of
+    cost to prove, and `effort` the factor of the boxes that a proof may use.
     """
     if pool is None:
         raise InvalidProblem("certify needs a fix", "method", "put it after a refinement, as in 'gtrs+lsr+certify'")
