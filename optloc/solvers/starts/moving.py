@@ -58,7 +58,10 @@ def problem_at_rest(problem: Problem) -> Problem:
 
 
 def moving_starts(problem: Problem) -> Array:
-    """Return the cheapest positions (N, q, d) that a best-first search of a flat batch finds; NaN after the last.
+    """Return the cheapest positions (N, q, d), metres, that a search over boxes of all space finds; NaN after the last.
+
+    Each problem has at most q = 24 positions, far from each other, in ascending order of cost. The cost of a position
+    is the cost with the best velocity. The refinement starts from all of them.
 
     Parameters
     ----------
@@ -74,9 +77,9 @@ def moving_starts(problem: Problem) -> Array:
 
 
 def _search(costs: PositionCosts, d: int) -> Array:
-    """Return the cheapest centres (q, d) of boxes that are far apart, metres; q is 0 if the search is not possible.
+    """Return the cheapest centres (q, d) of boxes that are far apart, metres; `costs` is the cost of one problem.
 
-    `costs` is the position cost of one problem.
+    q is 0 if the cost grows without limit towards infinity: the atlas of all positions does not apply.
     """
     kinds, data, K, w = costs.kinds, costs.data[0], costs.K[0], costs.w[0]
     with plain():

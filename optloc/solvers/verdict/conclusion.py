@@ -129,7 +129,10 @@ def _name_rivals(explanations: Sequence[Explanation]) -> str:
 
 
 def _either(explanations: Sequence[Explanation]) -> str:
-    """Return explanations by the names of their suspects, as a part of a sentence: "A or B and C"."""
+    """Return explanations by the names of their suspects, as a part of a sentence: "A or B and C".
+
+    Most `_SHOWN` explanations are named, and the others are counted.
+    """
     shown = [" and ".join(one.names) or "no station" for one in explanations[:_SHOWN]]
     more = f" or {len(explanations) - _SHOWN} others" if len(explanations) > _SHOWN else ""
     return " or ".join(shown) + more

@@ -77,7 +77,7 @@ class Evidence(NamedTuple):
     blind : bool
         Whether a search for suspects was requested, and the redundancy is too low to notice or to name one.
     held : bool
-        Whether the 95 % ellipses of repeated measurements cover.
+        Whether the 95 % ellipses of repeated measurements contain the truth often enough.
     robust : bool
         Whether the minima of a robust loss were searched, and the rows with weight prove the position.
     """
@@ -166,7 +166,7 @@ def finding_marks(problem: Problem, pool: Pool, gap: Array) -> Array:
             improbable,
             np.nan if pool.infinity is None else pool.infinity - cost,
             quantile(REGION_LEVEL, problem.dimension),
-            _apart(pool, gap).min(1, initial=np.inf),
+            _gaps_of_rivals(pool, gap).min(1, initial=np.inf),
             np.nan if kappa is None else kappa[:, 0],
             _is_unique(pool),
             False if pool.searched is None else pool.searched,
@@ -178,15 +178,18 @@ def finding_marks(problem: Problem, pool: Pool, gap: Array) -> Array:
 
 
 def marks_of(*numbers: Any) -> Any:
-    """Return the marks of all findings against one answer, or against N; `numbers` are the fields of `Evidence`."""
+    """Return the marks of all findings against one answer, or against N: one bit for each status.
+
+    `numbers` are the fields of `Evidence`, in their order.
+    """
     evidence, marks = Evidence(*numbers), 0
     for status_mark, test in _TESTS:
         marks = marks | test(evidence) * status_mark
     return marks
 
 
-def _apart(pool: Pool, gap: Array) -> Array:
-    """Return the gaps (N, r); infinite for the mirror image of the best within the same likelihood region."""
+def _gaps_of_rivals(pool: Pool, gap: Array) -> Array:
+    """Return the gaps (N, r) of other minima; infinite for the mirror image of the best in one likelihood region."""
     if pool.pair is None or not gap.shape[1]:
         return gap
     first, second = pool.pair[:, :1], pool.pair[:, 1:]
@@ -222,11 +225,11 @@ def _is_unique(pool: Pool) -> Array:
 def is_proof_of_one(claims: Claims, infinity: Array) -> Array:
     """Return flags (...) of claims that every unlisted minimum costs more than `AMBIGUOUS_GAP` above the best.
 
-    If infinity costs less than the gap (`infinity` is this difference), a proof up to infinity is enough: the finding
-    `unbounded` covers the rest.
+    `infinity` is the cost at infinity minus the cost of the best. If it is positive and less than the gap, a proof up
+    to infinity is enough: the finding `unbounded` covers the rest.
     """
-    wide = (claims.margin >= AMBIGUOUS_GAP) | ((infinity > 0.0) & (infinity < AMBIGUOUS_GAP))
-    return np.asarray(claims.unique & ((claims.proof == GLOBAL) | claims.asked) & wide)
+    enough = (claims.margin >= AMBIGUOUS_GAP) | ((infinity > 0.0) & (infinity < AMBIGUOUS_GAP))
+    return np.asarray(claims.unique & ((claims.proof == GLOBAL) | claims.asked) & enough)
 
 
 def examine(problem: Problem, pool: Pool) -> Pool:
@@ -260,7 +263,10 @@ def examine(problem: Problem, pool: Pool) -> Pool:
 
 
 def _with_repeats(problem: Problem, pool: Pool, good: Array) -> Pool:
-    """Return a pool with repeats of the fixes whose only finding is `curved`."""
+    """Return a pool with the results of simulated repeats of the fixes whose only finding is `curved`.
+
+    `good` (N,) flags the fixes that may be repeated.
+    """
     assert pool.curvature is not None
     cost = pool.cost[:, 0]
     with np.errstate(invalid="ignore"):
@@ -276,14 +282,17 @@ def _with_repeats(problem: Problem, pool: Pool, good: Array) -> Pool:
 
 
 def repeats_hold(curvature: Curvature | None) -> Any:
-    """Return flags (N,) of fixes whose repeats were computed and cover; False if no repeats were computed."""
+    """Return flags (N,) of fixes whose simulated repeats cover the truth often enough; False without repeats."""
     if curvature is None or curvature.repeats is None:
         return False
     return holds(curvature.repeats)
 
 
 def _departure(problem: Problem, pool: Pool) -> Array:
-    """Return the departures of the cost from a Gaussian's, (N, 2): in metres and in inverse range."""
+    """Return the departures (N, 2) of the cost from a Gaussian's at three sigma: in metres and in inverse range.
+
+    The departures along the inner side of active bounds count too.
+    """
     assert pool.curvature is not None
     if pool.loss:
         problem = problem.with_rows(weight=pool.weights)
@@ -300,14 +309,17 @@ def _departure(problem: Problem, pool: Pool) -> Array:
 
 
 def _departure_inwards(problem: Problem, pool: Pool) -> Array:
-    """Return the departure (N,) of the cost from a Gaussian's, on the inner side of the bounds that hold fixes."""
+    """Return the departure (N,) of the cost from a Gaussian's, on the inner side of active bounds.
+
+    It is infinite if the truncated law of a fix is not valid.
+    """
     law = law_at(problem, pool)
     if law is None:
         return np.full(len(pool), np.inf)
     assert pool.curvature is not None
     assert pool.curvature.free is not None
-    held = np.isfinite(pool.curvature.free).all((-1, -2)) & law.sound & law.truncated.cuts
-    items, out = np.flatnonzero(held), np.full(len(pool), np.inf)
+    usable = np.isfinite(pool.curvature.free).all((-1, -2)) & law.sound & law.truncated.cuts
+    items, out = np.flatnonzero(usable), np.full(len(pool), np.inf)
     if len(items):
         free, one = pool.curvature.free[items], take(law.truncated, items)
         out[items] = departure_inwards(problem.take(items), pool.x[items, 0], free, one)
@@ -322,9 +334,9 @@ def law_at(problem: Problem, pool: Pool) -> Law | None:
         return None
     covariance, shift = curvature.covariance, np.zeros((len(pool), problem.layout.n_shared))
     if curvature.free is not None and curvature.shift is not None:
-        held = pool.face[:, 0] > 0
-        covariance = np.where(held[:, None, None], curvature.free, covariance)
-        shift = np.where(held[:, None], curvature.shift, shift)
+        on_bound = pool.face[:, 0] > 0
+        covariance = np.where(on_bound[:, None, None], curvature.free, covariance)
+        shift = np.where(on_bound[:, None], curvature.shift, shift)
     return law_of(problem, pool.x[:, 0], covariance, shift)
 
 
@@ -340,7 +352,11 @@ def _is_bent(pool: Pool) -> Array:
 
 
 def _infinity(problem: Problem, pool: Pool, wanted: Array, unseen: Array) -> Array:
-    """Return the least costs (N,) at infinity: from runs to infinity, and from all directions for wanted fixes."""
+    """Return the least known costs (N,) at infinity; NaN if unknown.
+
+    Runs of the refinement to infinity give some of the costs. For fixes flagged in `wanted` (N,) all directions are
+    tried, unless their shape was known before: `unseen` (N,) flags shapes that were not.
+    """
     known = np.full(len(pool), np.nan) if pool.infinity is None else np.array(pool.infinity)
     # A run to infinity tries one direction, so its cost need not be the least. If the shape is already known, all
     # directions were tried before.
@@ -453,7 +469,7 @@ def explain(finished: Finished, code: Array, reason: Array) -> None:
 
 
 def _name_residuals(finished: Finished, items: Array) -> Any:
-    """Return a sentence on the residuals for each item, with the p-value; empty where the residuals fit the noise."""
+    """Return a sentence on the residuals for each item, with the p-value; "" if the residuals fit the noise."""
     pool = finished.pool
     improbable = is_improbable(pool.cost[items, 0], pool.dof[items], P_SUSPECT)
     p_values = tail_probability(pool.cost[items, 0], pool.dof[items])
@@ -471,7 +487,7 @@ def _name_infinity(finished: Finished, items: Array) -> Any:
 
 def _name_rivals(finished: Finished, items: Array) -> Any:
     """Return the sentences of `ambiguous`: the gap of the nearest rival."""
-    gaps = _apart(finished.pool, finished.gap)[items].min(1).tolist()
+    gaps = _gaps_of_rivals(finished.pool, finished.gap)[items].min(1).tolist()
     return np.array([ambiguity(finished.problem, gap) for gap in gaps], dtype=object)
 
 
