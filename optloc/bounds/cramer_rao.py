@@ -88,7 +88,7 @@ class Course:
     layout: Layout
 
     def sigma(self, name: str) -> Array:
-        """Return the bound (q, size) of the standard deviations of a named unknown."""
+        """Return the bound (q, size) of the standard deviations of a named unknown, in its SI unit."""
         slot, _ = self.layout.find(name)
         variance = np.diagonal(self.covariance, axis1=-2, axis2=-1)[:, slot.start : slot.start + slot.size]
         return np.asarray(np.sqrt(variance))
@@ -179,7 +179,10 @@ def _totals(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
 
 
 def _totals_of_walks(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
-    """Return the result of `_totals` for epochs that do not add up; time grows with each count."""
+    """Return the result of `_totals` for a run with biases that walk; time grows with each count.
+
+    Walks link the epochs, so the information of the epochs does not add up.
+    """
     n, length = problem.layout.n_shared, problem.layout.n_local
     total, size = np.zeros((len(counts), n, n)), np.zeros((len(counts), n))
     for i, count in enumerate(counts.tolist()):

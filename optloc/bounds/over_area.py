@@ -178,7 +178,7 @@ def _places(frame: Frame, x: Array, y: Array, height: float, dimension: int, ear
 
 
 def map_coordinates(frame: Frame, position: Array, earth: bool) -> Array:
-    """Return positions (n, d) as longitude, latitude (deg) and height (m) on Earth, else unchanged."""
+    """Return positions (n, d) as longitude, latitude (deg) and height (m) if `earth` is True, else unchanged."""
     if not earth:
         return position
     lat, lon, height = frame.to_geodetic(position)

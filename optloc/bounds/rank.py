@@ -167,7 +167,7 @@ def _split_information(information: Array, size: Array, basis: Array) -> _Inform
 
 
 def _open_sentences(layout: Layout, parts: _InformationParts) -> Iterator[str]:
-    """Yield sentences on undetermined combinations: common changes of all members of a bias first, then others."""
+    """Yield sentences on the undetermined combinations in `parts`, common changes of a bias first."""
     common = np.array([_entries(layout, slot) for slot in layout.shared if slot.members]).reshape(-1, layout.n_shared)
     found = [row for row in common / parts.reach if _inside(row, parts.open)]
     for row in found:
@@ -187,7 +187,7 @@ def _entries(layout: Layout, slot: Slot) -> Array:
 
 
 def _inside(row: Array, basis: Array) -> bool:
-    """Return whether a vector (n,) is in the span of a basis (q, n)."""
+    """Return whether a vector `row` (n,) is in the span of a basis (q, n)."""
     away = row - np.linalg.lstsq(basis.T, row, rcond=None)[0] @ basis
     return float(np.linalg.norm(away)) < _NOTHING * float(np.linalg.norm(row))
 
@@ -219,7 +219,7 @@ def _reduce(rows: Array) -> Array:
 
 
 def _open_sentence(layout: Layout, direction: Array) -> str:
-    """Return the sentence on a combination (n,) of unknowns that no measurement determines."""
+    """Return the sentence on a combination `direction` (n,) of unknowns that no measurement determines."""
     labels, names, amounts = layout.labels(), [], []
     for slot in layout.shared:
         unit = "" if slot.unit == "1" else slot.unit
@@ -241,7 +241,7 @@ def _open_sentence(layout: Layout, direction: Array) -> str:
 
 
 def _tied_sentences(layout: Layout, correlation: Array) -> list[str]:
-    """Return a sentence for each group of unknowns that are strongly correlated and include a bias."""
+    """Return a sentence for each group of unknowns with correlations (n, n) above `TIED` that includes a bias."""
     from scipy.sparse.csgraph import connected_components
 
     labels, found = layout.labels(), []

@@ -205,7 +205,10 @@ def _is_joined(found: _FoundSides, sides: _Sides) -> Array:
 
 
 def _as_pool(problem: Problem, across: Across, own: Pool, found: _FoundSides, sides: _Sides) -> Pool:
-    """Return minima on both sides of the plane as a settled pool, together with minima on constraints."""
+    """Return minima on both sides of the plane as a settled pool, together with minima on constraints.
+
+    `own` is the pool before, with the minima on constraints.
+    """
     x, cost = sides.x, sides.cost
     joined = _is_joined(found, sides)
     pair = np.where(joined[:, None, None], x[:, :2], np.nan)

@@ -217,9 +217,9 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
 
     A target that the Earth hides from a station with a row of it is not feasible either.
 
-    A face is a set of inequalities that can hold with equality together. The cost is minimised on each face from the
-    cheapest candidates, and the feasible results compete. The cheapest one meets the conditions of Karush, Kuhn and
-    Tucker.
+    A face is a set of inequalities that can be satisfied with equality together. The cost is minimised on each face
+    from the cheapest candidates, and the feasible results compete. The cheapest one meets the conditions of Karush,
+    Kuhn and Tucker.
 
     Parameters
     ----------
@@ -302,7 +302,7 @@ def _keep_misfits(problem: Problem, before: Pool, broken: Array, pool: Pool) -> 
 
 
 def _fits(pool: Pool, cost: Array) -> Array:
-    """Return flags (N, q) of costs that noise explains; all True for a robust loss, which has no chi-square test."""
+    """Return flags (N, q) of costs (N, q) that noise explains; all True for a robust loss, which has no such test."""
     if pool.loss:
         return np.ones(cost.shape, dtype=bool)
     return ~(tail_probability(cost, pool.dof[:, None]) < P_MISFIT)
@@ -452,7 +452,10 @@ def _first_sentence(one: Array | None, other: Array | None) -> Array | None:
 
 
 def _describe(problem: Problem, x: Array, cost: Array, item: int) -> str:
-    """Return a sentence about the minima (q, size) of problem `item` behind the Earth: costs, positions, stations."""
+    """Return a sentence about minima behind the Earth: costs, positions, and stations that they are hidden from.
+
+    `x` (q, size) and `cost` (q,) are the minima of problem number `item`.
+    """
     names = {motion: state_names(motion, len(problem.motions), 0)[0] for motion in range(len(problem.motions))}
     slots = [slot for slot in problem.layout.shared if slot.name in names.values()]
     kept: list[int] = []

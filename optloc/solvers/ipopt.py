@@ -188,7 +188,7 @@ def _program(problem: Problem, data: int, rows: int) -> Program:
 
 
 def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compiled: bool) -> Program:
-    """Return a new program for a structure, see `_program`."""
+    """Return a new program for a structure: `choice` is the solver, and `compiled` requests a C compiler."""
     n = problem.layout.size
 
     def scaled_residual(y: Any, p: Any, z: Any) -> list[Any]:
@@ -262,7 +262,10 @@ def _add_walks(problem: Problem, mean: Array, information: Array) -> None:
 
 
 def _prior(problem: Problem, unit: Array, centre: Array) -> tuple[Array, Array]:
-    """Return the prior mean (size,) and the prior information (size, size) in scaled units."""
+    """Return the prior mean (size,) and the prior information (size, size) in scaled units.
+
+    `unit` and `centre` (size,) are the unit and the origin of each scaled unknown.
+    """
     layout = problem.layout
     mean, information = np.zeros(layout.size), np.zeros((layout.size, layout.size))
     for name, value, precision in prior_parts(problem):

@@ -90,7 +90,7 @@ def _holds_depth(problem: Problem, level: Level) -> bool:
 
 
 def in_every_layer(strata: Strata, x: Array) -> Array:
-    """Return starts x (N, q, size), followed by the first starts of each problem moved into each layer."""
+    """Return starts x (N, q, size), followed by the first starts of each problem moved into each layer of `strata`."""
     first, count = x[:, :_TRIED], len(strata.low)
     more = np.repeat(first[:, :, None], count, axis=2)
     more[..., strata.column] = strata.inside(more[..., strata.column], np.arange(count))

@@ -285,7 +285,7 @@ def _stage(word: str) -> Solver:
 
 
 def _named(name: str, solver: Solver) -> Solver:
-    """Return a stage whose numerical failures report the name of the stage."""
+    """Return a stage that runs `solver`; its numerical failures report the name of the stage."""
 
     def stage(problem: Problem, pool: Pool | None) -> Pool:
         with noting_place(name), recording() as endings:

@@ -211,7 +211,7 @@ _STARTED = Stage("gtrs", "1 candidates at most", 0.0)
 
 
 def planned_stages(count: int, steps: int, seconds: float) -> tuple[Stage, ...]:
-    """Return the stages of `count` fixes from a plan, with the largest number of steps."""
+    """Return the stages of `count` fixes from a plan, with the largest number of steps and the time in seconds."""
     return _STARTED, Stage("lsr", f"{count} candidates, {steps} steps at most", seconds)
 
 

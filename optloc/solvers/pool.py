@@ -127,7 +127,8 @@ class Pool:
     code : int array (N, q)
         `Status` of their refinement.
     face : int array (N, q)
-        Number of the face of `optloc.linear.constraints.faces` on which each was refined; 0 without inequalities.
+        Number of the face of `optloc.linear.constraints.faces` on which each candidate was refined; 0 without
+        inequalities.
     weights : array (N, m)
         Row weights that were used.
     dof : int array (N,)
@@ -163,7 +164,7 @@ class Pool:
     hidden : object array (N,), optional
         Sentence on a minimum behind the Earth; "" without one.
     missing : NoStart, optional
-        Why there is no candidate; used only for problems without a candidate.
+        Reason why there is no candidate; used only for problems without a candidate.
     asked : bool
         Whether a search for suspects ran.
     conclusion : object array (N,), optional
@@ -217,7 +218,7 @@ class Pool:
         return np.asarray(~found.any(1))
 
     def without(self, items: Array, reason: str, status: Status) -> Pool:
-        """Return the pool with a reason why problems `items` have no candidate; earlier reasons are kept."""
+        """Return the pool with a reason and a status for problems `items`; earlier reasons are kept."""
         blank = np.full(len(self), "", dtype=object)
         known = self.missing or NoStart(blank, np.full(len(self), int(Status.UNAVAILABLE), dtype=np.int8))
         reasons, code = known.reason.copy(), known.code.copy()

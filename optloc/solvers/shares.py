@@ -64,7 +64,7 @@ def status_shares(
     """Return the share of each status among fixes of simulated measurements at given positions.
 
     The simulation draws noise, biases from their priors, and prior means of states about the truth. The figures of `ok`
-    hold over all measurements; this function returns the share of measurements that are `ok`.
+    apply to all measurements; this function returns the share of measurements that are `ok`.
 
     Parameters
     ----------
@@ -114,8 +114,8 @@ def _solve_trials(
 ) -> tuple[Fix, Array]:
     """Return the fixes (q trials,) of measurements at q positions, and the true vectors (q trials, size).
 
-    `places` (q, size) are the true vectors at the positions, and `numbers` (q,) the numbers of the positions: together
-    with `seed` they determine the draws.
+    `single` is the problem, without measurements. `places` (q, size) are the true vectors at the positions, and
+    `numbers` (q,) the numbers of the positions: together with `seed` they determine the draws.
     """
     drawn, true = [], []
     for number, place in zip(numbers.tolist(), places, strict=True):

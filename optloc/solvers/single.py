@@ -332,7 +332,11 @@ class PreparedFix:
         stages: tuple[Stage, ...],
         workspace: _SingleWorkspace,
     ) -> Fix | None:
-        """Return the fixes with their verdicts, or None if the reason of one of them needs the long path."""
+        """Return the fixes with their verdicts, or None if the reason of one of them needs the long path.
+
+        `shape` are the batch axes of the fixes, `answer` the arrays of the plan, and `found` the scalar results of each
+        fix.
+        """
         marks, kinds, gaps = [], [], []
         for one in found:
             excess, gap = one.infinity - one.cost, one.rival_cost - one.cost
@@ -378,7 +382,10 @@ class PreparedFix:
         )
 
     def _inflations(self, answer: Any, marks: list[int], workspace: _SingleWorkspace) -> dict[int, float]:
-        """Return the inflations, by item number, of curved fixes whose 95 % ellipses cover simulated repeats."""
+        """Return the inflations of curved fixes whose 95 % ellipses cover simulated repeats, by item number.
+
+        `marks` are the bit masks of the findings. An inflation is a factor of the covariance.
+        """
         items = [i for i, mark in enumerate(marks) if mark == Status.CURVED.mark]
         if not items or not self.repeatable:
             return {}
@@ -560,7 +567,7 @@ _KEPT = Cache["PreparedFix | None"](64)
 def at_once(problem: Problem, method: Method) -> Fix | None:
     """Return the fixes of one problem, or of a few that differ in measurements only; None if the stages have to run.
 
-    A cache stores the prepared problem for later problems of the same structure.
+    A cache stores the prepared problem for later problems of the same structure, with the same method.
     """
     shape, place = problem.batch_shape, problem.stations.position
     # a problem without batch axes shares everything, and `prepare_fix` tests the other conditions once

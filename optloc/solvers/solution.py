@@ -82,7 +82,7 @@ _FINISH = Method(("lsr", "certify"))
 
 
 def _broadcast_start(problem: Problem, start: Any) -> Array:
-    """Return a starting vector for every problem, (..., size)."""
+    """Return the vector `start` for every problem, (..., size); raise InvalidProblem if it has a wrong shape."""
     vector, wanted = np.asarray(start, dtype=float), (*problem.batch_shape, problem.layout.size)
     try:
         return np.broadcast_to(vector, wanted)

@@ -216,7 +216,7 @@ def _lift_ranges(
 
 
 def _centre(m: Array, block: Rows) -> Array:
-    """Return arrival times m (N, m rows) minus the median of their epoch, in the same unit.
+    """Return arrival times m (N, rows) of one kind minus the median of their epoch, in the same unit.
 
     The median sets the origin of time, because one gross error must not set it.
     """

@@ -149,7 +149,7 @@ def _without_halted(problem: Problem, pool: Pool) -> Pool:
     """Return a settled pool without rivals from which an undamped step would move on; such a point is no minimum."""
     item, slot = pool.occupied
     item, slot = item[slot > 0], slot[slot > 0]
-    # constraints and interfaces hold points that free steps would leave
+    # free steps would leave minima on constraints and interfaces
     if not len(item) or problem.constraints or strata_of(problem) is not None:
         return pool
     equations, x = equations_at(problem.take(item), pool.x[item, slot]), np.array(pool.x)
@@ -283,8 +283,8 @@ def _search_unanswered(
 ) -> Pool:
     """Return a pool whose unanswered problems start again; problems without a better result keep their old pool.
 
-    `starts` maps the unanswered problems to starts (n, q, size). `says` maps the earlier reasons of their fixes to
-    fields of the new pool.
+    `starts` maps the unanswered problems to starts (n, q, size). `fields_from` maps the earlier reasons of their fixes
+    to fields of the new pool.
     """
     fix = judge(problem, pool)
     # if the Earth hides all known minima, another minimum may be visible

@@ -201,7 +201,11 @@ def trace_from(surface: RegionSurface) -> Arc:
 
 @dataclass(frozen=True, slots=True)
 class _Node:
-    """A point of the curve: coordinates, cost, direction (d,), and standard deviations across it (d, d - 1)."""
+    """A point of the curve.
+
+    `z` (d,) are its coordinates, `cost` its cost, and `along` (d,) the unit direction of the curve. `across` (d, d - 1)
+    are standard deviations across the curve, in columns.
+    """
 
     z: Array
     cost: float

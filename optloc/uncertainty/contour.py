@@ -124,7 +124,10 @@ def _parts(cells: Array) -> list[Array]:
 
 
 def _nodes_in_rectangles(first: Array, last: Array, shape: tuple[int, int]) -> Array:
-    """Return flags of the nodes of a grid in rectangles from first to last nodes, both (m, 2)."""
+    """Return flags of the nodes of a grid that are in one of m rectangles, from first to last nodes, both (m, 2).
+
+    `shape` is the shape of the grid.
+    """
     count = np.zeros((shape[0] + 1, shape[1] + 1), dtype=int)
     (west, south), (east, north) = first.T, last.T + 1
     for x, y, sign in ((west, south, 1), (east, south, -1), (west, north, -1), (east, north, 1)):
@@ -230,7 +233,7 @@ Edge = tuple[int, int, int]
 
 
 def _polygons(value: Value, grid: _Grid, values: Array) -> list[Polygon]:
-    """Return the polygons of values on a grid, with corners at the zeros of the function."""
+    """Return the polygons of values (nx, ny) on a grid, with corners at the zeros of the function `value`."""
     loops = _loops(values)
     if not loops:
         return []
@@ -275,7 +278,10 @@ def _loops(values: Array) -> list[list[Edge]]:
 
 
 def _crossings(value: Value, grid: _Grid, values: Array, edges: Array) -> Array:
-    """Return the zeros (n, 2) of a function along edges (n, 3) of a grid."""
+    """Return the zeros (n, 2) of the function `value` along edges (n, 3) of a grid.
+
+    `values` (nx, ny) are the values at the nodes; an edge is as in `_loops`.
+    """
     begin, along = edges[:, :2].astype(float), np.eye(2)[edges[:, 2]]
     one, two = values[tuple(edges[:, :2].T)], values[tuple((edges[:, :2] + np.eye(2, dtype=int)[edges[:, 2]]).T)]
     # from the end inside to the end outside

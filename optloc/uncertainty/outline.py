@@ -25,7 +25,7 @@ from optloc.problem.problem import Problem
 from optloc.uncertainty.contour import Polygon, area, trace, trace_nodes
 from optloc.uncertainty.region import RegionSurface, likelihood_region, passes
 
-# Most cells that hold a region, by dimension; the contour is searched in them.
+# Most cells that contain a region, by dimension; the contour is searched in them.
 _CELLS = {2: 400, 3: 3000}
 # Distance, in distances of the fix, at which a picture cuts off a region that reaches to infinity.
 FAR = 3.0
@@ -36,7 +36,7 @@ _AT_EDGE = 0.995
 _STEPS, _BEYOND = {2: 24, 3: 14}, 1.4
 # Positions along the hidden coordinate, and steps from the best two of them: a cost with two minima there has both.
 _ALONG, _NEWTON = 9, 4
-# Nodes across the plane of the table that holds the reach of cells along the third coordinate.
+# Nodes across the plane of the table that contains the reach of cells along the third coordinate.
 _ACROSS = 160
 # Half the drawn width of a region that is a line, as a share of its length: visible, but not mistaken for an area.
 _WIDTH = 2e-3
@@ -203,7 +203,7 @@ def _far_cells(chart: Chart, level: float) -> Array:
     return chart.to_position(in_chart)
 
 
-# A region that equalities hold: part of a surface, or of a line.
+# A region on equalities: part of a surface, or of a line.
 
 
 def _outline_on_equalities(problem: Problem, fix: Fix, plane: Array, level: float) -> Outline | None:
@@ -236,7 +236,7 @@ def _counter_clockwise(polygon: Polygon) -> Polygon:
 def _strips(along_line: EqualityCost, plane: Array, position: Array) -> tuple[Polygon, ...]:
     """Return thin strips around a region along a line, in the plane: without a width it would be invisible.
 
-    `position` (d,) is the fix, metres.
+    `along_line` is the cost along the line, `plane` (2, d) has the axes of the picture, and `position` (d,) is the fix.
     """
     nodes, step = along_line.flooded()
     order = np.sort(nodes[:, 0])
@@ -314,7 +314,7 @@ class EqualityCost:
         return np.asarray(np.sqrt(((self.place(steps) - self.x[0, self.own]) ** 2).sum(-1)) / self.reach)
 
     def value(self, steps: Array) -> Array:
-        """Return numbers (n,) that are negative inside the region and zero on its edge."""
+        """Return numbers (n,) at coordinates (n, k) that are negative inside the region and zero on its edge."""
         points = self._vectors(steps)
         cost = profile(self.problem, points[:, None], self.x, passes(self.problem))[0][:, 0]
         beyond = np.sqrt(((points[:, self.own] - self.x[0, self.own]) ** 2).sum(-1)) / self.reach - 1.0
@@ -343,7 +343,7 @@ def cost_along(problem: Problem, fix: Fix, level: float, reach: float) -> Equali
     Parameters
     ----------
     problem : Problem
-        The problem of the fix: one static position, held by equalities.
+        The problem of the fix: one static position with equalities.
     fix : Fix
         A single fix.
     level : float

@@ -147,7 +147,10 @@ def samples(
 
 
 def around(surface: RegionSurface, n: int, seed: int, prior: str = "jeffreys", within: float | None = None) -> Samples:
-    """Return samples of a fix that is Gaussian in metres or in the inverse-range chart; arguments as of `samples`."""
+    """Return samples of a fix that is Gaussian in metres or in the inverse-range chart; arguments as of `samples`.
+
+    `surface` is the cost around the fix.
+    """
     chart, inverse = surface.chart, surface.kind == INVERSE_RANGE
     if chart.truncated is not None and chart.cut_off:
         return _within_bounds(surface, chart.truncated, n, seed, prior, within)

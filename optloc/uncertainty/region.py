@@ -107,7 +107,7 @@ class Region:
         directions between them, in the coordinates in which the fix is Gaussian. In the plane they are in order around
         the fix. NaN for a ray that never leaves the region.
     cells : Cells, optional
-        Cells that hold the region, of any shape and with any number of parts; bounds of the proof certify them.
+        Cells that contain the region, of any shape and with any number of parts; bounds of the proof certify them.
     open : bool
         Whether the region has no end: infinity is as likely. Then only a direction (`cone`) and a least range are
         known.
@@ -192,7 +192,7 @@ def likelihood_region(problem: Problem, fix: Fix, level: float = 0.95, *, boxes:
     level : float
         Probability that the region contains the target.
     boxes : int, optional
-        Most cells that may hold the region; more are finer. By default 1 000 in the plane and 8 000 in space.
+        Most cells that may contain the region; more are finer. By default 1 000 in the plane and 8 000 in space.
 
     Notes
     -----

@@ -6,7 +6,8 @@ inequalities. Minima that violate another constraint do not count. Minima from w
 count either.
 
 Letters: n problems, q slots for minima of a problem, d coordinates, `size` numbers of a parameter vector. Costs are
-chi-square values. A *margin* is a difference of costs: other minimum minus fix.
+chi-square values. `margin` is the difference of costs to prove: other minimum minus fix. `effort` multiplies the
+number of boxes that a proof may use.
 """
 
 from __future__ import annotations
@@ -342,7 +343,7 @@ def _costs(problem: Problem, costs: Costs, x: Array) -> Array:
 
 
 def _request(on: Problem, limits: Array, costs: Costs, x: Array, difference: Array, effort: float) -> ProofRequest:
-    """Return the request to prove that no position of a face costs less than vector x by more than `less` (n,).
+    """Return the request to prove that no position of a face costs less than vector x by more than a difference (n,).
 
     `on` has the n problems with the face as equalities. `limits` (2, d) are the least and greatest coordinates. x has
     shape (n, size).

@@ -2,9 +2,9 @@
 
 A proof may find a better or another minimum. The minimum is then refined and added to the candidates.
 
-Letters: N problems of a batch, n of them in a round, d coordinates of the state (position, and velocity if the target
-moves), q gaps, P points for each problem, `size` numbers of a parameter vector. Costs, gaps and margins are
-chi-square values. `items` (n,) are numbers of problems in the batch.
+Letters: N problems of a batch, n problems of a round, q gaps, P points of a problem. d is the number of coordinates of
+the state: position, and velocity if the target moves. Costs, gaps and margins are chi-square values. `items` (n,) are
+numbers of problems in the batch, and `work` is the state of all proofs, which functions change.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def claim_sentence(margin: float, listed: int, region: tuple[Corner, Corner] | N
 
 
 def _where(lower: Corner, upper: Corner) -> str:
-    """Return the part of a claim that names the region: corners in m, and in m/s for velocities."""
+    """Return the part of a claim that names the region: lower and upper corner in m, and in m/s for velocities."""
     d = len(lower) // 2 if len(lower) > _SPACE else len(lower)
     words = f"no position from {_text(lower[:d])} to {_text(upper[:d])} m"
     return words if d == len(lower) else f"{words} at a velocity from {_text(lower[d:])} to {_text(upper[d:])} m/s"
@@ -300,7 +300,7 @@ def _run_round(work: BoundWorkspace, items: Array) -> None:
     free = is_free(work.problem, work.fix, items)
     _give_up(work, items[~free], HELD)
     asked, costs = _requests(work, items), work.costs.take(items)
-    # Above `costs.level`, wrapping may change a residual by a whole turn, and the bounds of the proof do not hold.
+    # Above `costs.level`, wrapping may change a residual by a whole turn, and the bounds of the proof are not valid.
     turning = free & (costs.level < work.fix.cost[items] + asked.gaps[:, 0])
     _lower_margin(work, items[turning], TURNS)
     good = np.flatnonzero(free & ~turning)
@@ -581,7 +581,7 @@ def fixes_to_prove(pool: Pool, fix: Fix) -> tuple[Array, Array]:
 
 
 def _is_still_valid(before: TriedBefore | None, fix: Fix) -> Array:
-    """Return flags (N,) of earlier claims that are about the same minima as the fixes, so that they are still valid.
+    """Return flags (N,) of earlier claims, in `before`, about the same minima as the fixes: they are still valid.
 
     Known minima stay candidates. So an equal number of minima and an equal least cost mean the same minima.
     """

@@ -125,8 +125,8 @@ def _planes(problem: Problem, bands: list[Band], size: int) -> Array:
 def _surface(problem: Problem, bands: list[Band], position: Array) -> Array:
     """Return the w numbers (N, w) that describe the surface of a height constraint; w is 0 without a height.
 
-    The order of the numbers is in `optloc.proof.surface`. The upward axis is the normal of the ellipsoid at the
-    positions.
+    `bands` are the equalities of the problem. The order of the numbers is in `optloc.proof.surface`. The upward axis is
+    the normal of the ellipsoid at the positions.
     """
     levels = [band.lower for band in bands if band.kind == "height"]
     if not levels:

@@ -147,9 +147,10 @@ def residuals(problem: Problem, x: Array) -> Array:
 
 
 def fold_signs(loss: Loss, u: Array, sided: Array) -> Array:
-    """Return residuals (N, m) for a loss: unchanged for a loss of both signs or `sided` rows (m,), else absolute.
+    """Return residuals u (N, m), in sigma, as arguments of a loss: absolute, or signed for `sided` rows (m,).
 
-    A one-sided loss limits late signals only. Rows that are not sided may have gross errors of either sign.
+    A one-sided loss limits late signals only. Rows that are not sided may have gross errors of either sign, so their
+    absolute residuals count. For a loss of both signs all residuals are returned unchanged.
     """
     return np.where(sided, u, np.abs(u)) if loss.one_sided else u
 
@@ -212,7 +213,7 @@ def reweight(
         A step shorter than this many standard deviations ends the iteration, once the weights have converged too. The
         weights may change by the tolerance if it exceeds the least change that shows in a fix.
     face : Face
-        Constraints that hold with equality.
+        Constraints that are satisfied with equality.
     """
     # more than fifty updates mean slow progress along a flat valley, and the status shows it
     x, weight = np.array(start), np.ones(doubt.base.shape)
@@ -230,7 +231,7 @@ def reweight(
             new_weight = weigh_by(loss, part, part_doubt, here, old_weight)
             step = _step(part.with_rows(weight=part_doubt.row_weight(new_weight)), here, last[active], face, tolerance)
             moved = _backtrack(loss, part, part_doubt, here, step.x, new_weight) if must_check else step.x
-            # extrapolation leaves a face that constraints hold, so there only plain steps are taken
+            # extrapolation leaves a face of constraints, so there only plain steps are taken
             if iteration >= _PATIENCE and iteration % _OFTEN == 0 and not face:
                 moved = _extrapolate(loss, part, part_doubt, step, new_weight)
             x[active], weight[active], last[active] = moved, new_weight, step.x - here
@@ -314,7 +315,7 @@ def _backtrack(loss: Loss, problem: Problem, doubt: Doubt, here: Array, there: A
 def _extrapolate(loss: Loss, problem: Problem, doubt: Doubt, step: _Step, weight: Array) -> Array:
     """Return the limits (M, size) of the steps if each shrinks by the same ratio (Aitken 1926).
 
-    If the limit does not cost less, the end point of the step is returned.
+    If the limit does not cost less, the end point of the step is returned. `weight` (M, m) are the weights of the loss.
     """
     cost = []
     for x in (step.x, step.tried):
@@ -335,7 +336,7 @@ def weigh_by(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Array
     weight : array (N, m)
         Current weights, used for the partners of correlated rows.
     scale : array (N, 1) or float
-        Above 1 fewer rows are doubted.
+        Above 1 fewer rows get a reduced weight.
     """
     u = fold_signs(loss, doubt.residual(problem, x, weight) / scale, doubt.sided)
     return np.where(np.isfinite(u), loss.weight(u), 0.0)
@@ -352,8 +353,9 @@ def robust_cost(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Ar
 def robust_equations(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Array) -> Normal:
     """Return normal equations of N estimates x (N, size), whose inverse is the covariance of the estimates.
 
-    They are the weighted normal matrix of the rows over ``loss.spread``, plus the priors. The right-hand side is not
-    scaled: it is half the downhill gradient of the robust cost, from which the multipliers follow.
+    `weight` (N, m) are the weights of the loss. The equations are the weighted normal matrix of the rows over
+    ``loss.spread``, plus the priors. The right-hand side is not scaled: it is half the downhill gradient of the robust
+    cost, from which the multipliers follow.
     """
     rows = summed(problem.with_rows(weight=doubt.row_weight(weight)), x)
     information = {name: getattr(rows, name) / loss.spread for name in ("shared", "local", "cross")}

@@ -136,7 +136,10 @@ class Robust:
 
 
 def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[Stage, ...]) -> Pool:
-    """Return the settled minima of a loss, from given starts (N, q, size) or from robust starts."""
+    """Return the settled minima of a loss, from starts `start` (N, q, size), or from robust starts if it is None.
+
+    `stages` are the stages that ran before.
+    """
     began = perf_counter()
     pool = _minima(problem, loss, robust_starts(problem, loss) if start is None else start)
     # A flat loss has a minimum for almost every set of rows. So start from a rising loss, and try sets next to the best
@@ -158,7 +161,10 @@ def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[S
 
 
 def _on_face(loss: Loss, problem: Problem, start: Array, item: Array, face: Face) -> tuple[Array, Array, Array]:
-    """Return x (M, size), cost (M,) and status (M,) of the minima of a loss on a face of the constraints."""
+    """Return x (M, size), cost (M,) and status (M,) of the minima of a loss on a face of the constraints.
+
+    `start` (M, size) are the starts, and `item` (M,) is the problem of each start.
+    """
     part = problem.take(item)
     done = reweight(part, start, loss, Doubt.of(part, start), face=face)
     return done.x, done.cost, done.status

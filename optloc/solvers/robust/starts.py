@@ -93,8 +93,8 @@ def subsets(problem: Problem, clean: Array) -> tuple[Array, Array]:
 def _unite(members_of: Array, touched: Array, size: int) -> tuple[Array, Array, Array]:
     """Return the unions of the rows of up to `size` members: problems (S,), rows (S, m), sizes (S,).
 
-    A member is a station or a row, g in total. `own` (N, g) flags the members of each problem, and `touched` (g, m) the
-    rows of each member.
+    A member is a station or a row, g in total. `members_of` (N, g) flags the members of each problem, and `touched` (g,
+    m) the rows of each member.
     """
     count = members_of.sum(1)
     most = int(count.max(initial=0))

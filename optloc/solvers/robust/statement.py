@@ -193,7 +193,7 @@ def _squared_position(problem: Problem, fix: Fix, step: Array) -> Array:
 def _repeat(problem: Problem, loss: Loss, fix: Fix, doubted: Array) -> Array:
     """Return two shares of repeats of the loss whose ellipses contain the truth, and an inflation, (N, 3).
 
-    See `Curvature.repeats`. The rejected rows keep their residuals in all repeats.
+    See `Curvature.repeats`. The rows flagged in `doubted` (N, m) keep their residuals in all repeats.
     """
     z = np.where(doubted, problem.observed - predict(problem, fix.x), 0.0)
     return repeated(problem, fix.x, fix.cov, lambda many, truth: _refit(many, loss, truth), z)

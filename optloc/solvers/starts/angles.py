@@ -197,7 +197,7 @@ def _at_height(problem: Problem, plan: Array) -> Array:
 
 
 def by_directions(seen: Bearings) -> Array:
-    """Return the fixes (N, 1, d) of the unit-direction relaxation, over threads; NaN without elevations."""
+    """Return the fixes (N, 1, d), metres, of the unit-direction relaxation, over threads; NaN without elevations."""
     from formulations.direction_sdp import directions
 
     out = np.full((len(seen.station), 1, seen.station.shape[-1]), np.nan)

@@ -137,7 +137,7 @@ def _reference(problem: Problem, reference: float | None) -> float:
 
 
 def _rise_at(times: Array, rise: Array | None, middle: Array) -> Array | None:
-    """Return the known shape of a height (..., b, 2) at the middles of b blocks; None without a known shape.
+    """Return the known shape of a height (..., b, 2) at the middles (b,) of b blocks; None without a known shape.
 
     The shape `rise` (..., k, 2) at the times (k,) of the epochs is interpolated linearly.
     """

@@ -145,7 +145,8 @@ class _MovingRows:
     def bound(self, atlas: Atlas, nodes: Array, half: Array, d: int) -> tuple[float, float, int]:
         """Return the cost at the centre, a lower bound of the residual norm over the box, and the side to halve.
 
-        `nodes` has values, slopes and remainder bounds of all nodes in the box. `half` are the half-widths of the box.
+        `atlas` is set to the centre of the box. `nodes` has values, slopes and remainder bounds of all nodes in the
+        box. `half` are the half-widths of the box.
         """
         lines, slants = self._lines(atlas, d)
         length = np.linalg.norm(lines, axis=1)

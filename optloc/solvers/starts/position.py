@@ -229,8 +229,9 @@ def _subsets(place: Array, found: Ranges, mask: Array, count: int) -> list[Array
 def _relax(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:
     """Return the points (N, 1, 3) of the reduced relaxation, in Earth radii: nearest to the point below the stations.
 
-    `nodes` (N, 3) are the numbers of the stations of each problem, `surface` is the ellipsoid of the height, and `mask`
-    (N,) flags the problems to solve. NaN for all other problems.
+    `place` (N, s, 3) are the stations with ranges, in Earth radii. `nodes` (N, 3) are the numbers of the stations to
+    use. `surface` is the ellipsoid of the height. `mask` (N,) flags the problems to solve, and NaN is the result for
+    others.
     """
     from formulations.range_height_conic import lift
 

@@ -438,7 +438,7 @@ def closed_form(problem: Problem) -> Array | None:
 
 
 def place_states(problem: Problem, run: RegistrationRun, state: Array, bias: Array) -> Array:
-    """Return vectors (N, C, size) from states (N, C, order + 1, d) and biases (N, C, q) in the units of a run."""
+    """Return vectors (N, C, size) from states (N, C, order + 1, d) and biases (N, C, q), both in the units of a run."""
     state = state * (run.length / run.duration ** np.arange(state.shape[2])[:, None])
     state[:, :, 0] += run.origin
     x = np.repeat(vectors(problem, None)[:, None], state.shape[1], axis=1)

@@ -64,7 +64,7 @@ def _isolate(problem: Problem, target: int) -> Problem:
     problem = without_biases(problem)
     problem = _take_rows(problem, target) if len(problem.motions) > 1 else problem
     motion = problem.motions[target]
-    # A constraint at the reference time may not hold at other times, but a known height is a good start.
+    # A constraint at the reference time may not apply at other times, but a known height is a good start.
     constraints = tuple(
         replace(c, target=0)
         for c in problem.constraints

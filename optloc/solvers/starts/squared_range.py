@@ -1,10 +1,11 @@
 """From rows of any kind to squared-range rows: linear in (x, t) on a cone, or in (x, |x|^2) on a paraboloid.
 
 If all ranges share an unknown, t is the range to the reference station, and ``t = |x|`` is a cone. If ranges are known,
-the last unknown is |x|^2.
+the last unknown is |x|^2. Both surfaces are quadrics.
 
 Letters: N problems, m rows, s stations with ranges, n = d + 1 unknowns y, d coordinates, q points of a problem. The
-range of station i is r_i = c_i + sign_i t.
+range of station i is r_i = c_i + sign_i t. A squared-range problem is ``rows . y = right`` in least squares, with y on
+the quadric: rows (N, m, n), right (N, m).
 """
 
 from __future__ import annotations
@@ -393,7 +394,10 @@ def _point(problem: Problem, rows: Rows, index: Array, to: Coordinates) -> Point
 
 
 def _stays_unknown(entry: LiftEntry, known: tuple[KnownLift, KnownLift]) -> bool:
-    """Return whether a row contains a range that is unknown even up to t: it then has no linear form."""
+    """Return whether a row contains a range that is unknown even up to t: it then has no linear form.
+
+    `entry` is the linear form of the rows, and `known` has the ranges at their two stations.
+    """
     lost = np.isnan(known[0].sign) | np.isnan(known[1].sign)
     return bool((np.isnan(entry.last) & lost).any())
 

@@ -106,7 +106,7 @@ def suspects(
         Kinds of groups that may be wrong: all rows of a station, one measurement, a prior, or all lengths of a kind by
         one offset.
     together : bool
-        Whether one statement of the noise holds for the whole batch and all epochs. If so, the noise is a suspect too
+        Whether one statement of the noise applies to the whole batch and all epochs. If so, the noise is a suspect too
         when many fixes contradict themselves. False for unrelated problems.
 
     Returns

@@ -176,7 +176,7 @@ def explain(alike: Sequence[SameRows]) -> list[list[Outcome]]:
 
 
 def _search(alike: SameRows) -> Generator[list[_Request], list[list[_Tried]], list[Outcome]]:
-    """Yield requests for the sets to try, size by size, and return the outcomes (N,)."""
+    """Yield requests for the sets to try, size by size; receive their results, and return the outcomes (N,)."""
     groups, whole, count = alike.groups, alike.whole, alike.batch.count
     prices = np.cumsum(np.sort([group.price for group in groups]))
     rests = [[remaining_fix_of(groups, (), whole[i])] if ok else [] for i, ok in enumerate(passes_noise_test(whole))]
@@ -236,7 +236,7 @@ def within_gap(rests: Sequence[RemainingFix], groups: Sequence[Group]) -> tuple[
 
 
 def _adds_nothing(rest: RemainingFix, size: int, other: RemainingFix, fewer: int) -> bool:
-    """Return whether the further rows of a rest lower the cost by no more than chance."""
+    """Return whether the `size` rows of a rest lower the cost no more than chance, beyond the `fewer` of `other`."""
     if size == fewer:  # the same rows under other names: their costs differ by rounding
         return True
     return float(other.fix.cost - rest.fix.cost) <= (ROW_PRICE - AMBIGUOUS_GAP) * (size - fewer)
@@ -250,7 +250,7 @@ def _parts(groups: Sequence[Group], left: Sequence[int]) -> frozenset[tuple[int,
 
 @dataclass(slots=True)
 class _Tried:
-    """Collected results of the sets of one size for one problem."""
+    """Results of the sets of one size for a problem: `best` is the least score, `cheapest` the cost of `closest`."""
 
     rests: list[RemainingFix]
     p_value: dict[tuple[int, ...], float]

@@ -101,7 +101,7 @@ def _contradictory(conclusion: Conclusion) -> Fix:
 
 
 def list_names(parts: Sequence[str]) -> str:
-    """Return names as a part of a sentence: "a, b and c"."""
+    """Return names as a part of a sentence: "a, b and c". At most four names are listed, and the others counted."""
     if len(parts) > _SHOWN:
         parts = [*parts[:_SHOWN], f"{len(parts) - _SHOWN} more"]
     return parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]

@@ -135,7 +135,10 @@ class Finding:
 
 
 def objections(table: Sequence[Finding], evidence: Any) -> list[tuple[Status, str]]:
-    """Return status and sentence of all findings against one answer, in the order of `PRECEDENCE`."""
+    """Return status and sentence of all findings of a table against one answer, in the order of `PRECEDENCE`.
+
+    `evidence` has the numbers that the tests of the table read.
+    """
     found = [(one.status, words) for one in table if one.test(evidence) for words in one.sentence(evidence)]
     return sorted(found, key=lambda one: PRECEDENCE.index(one[0]))
 
@@ -202,7 +205,10 @@ def _gaps_of_rivals(pool: Pool, gap: Array) -> Array:
 
 
 def is_improbable(cost: Array, dof: Array, probability: float) -> Array:
-    """Return flags (N,) of costs (N,) that noise exceeds with less than the given probability."""
+    """Return flags (N,) of costs (N,) that noise exceeds with less than the given probability.
+
+    `dof` (N,) are the degrees of freedom. Without any, the flag is False.
+    """
     # often all N share one number of degrees of freedom: a view without strides
     if dof.strides == (0,):
         return np.asarray(cost > largest(int(dof[0]) if len(dof) else 0, probability))
@@ -214,7 +220,7 @@ def is_improbable(cost: Array, dof: Array, probability: float) -> Array:
 
 def _is_unique(pool: Pool) -> Array:
     """Return flags (N,) of answers with a proof that every unlisted minimum costs more than the gap."""
-    if pool.loss:  # a proof for squares does not hold for a robust loss
+    if pool.loss:  # a proof for squares does not apply to a robust loss
         return np.zeros(len(pool), dtype=bool) if pool.robust is None else pool.robust
     if pool.proven is None:
         return np.zeros(len(pool), dtype=bool)
@@ -388,7 +394,7 @@ def reach_of(problem: Problem, x: Array) -> Array:
     """
     centre, spread = centre_and_spread(problem.stations.places)
     reach = np.broadcast_to(spread, (len(x),))
-    if problem.layout.shares("position"):  # a shared position has a chart, and the chart holds its distance
+    if problem.layout.shares("position"):  # a shared position has a chart, which contains its distance
         return reach
     slots = (*problem.layout.shared, *problem.layout.local)
     for name in (slot.name for slot in slots if slot.name.partition("[")[0] == "position"):
@@ -435,7 +441,8 @@ def chart_of(
 def chart_kind(metres: Any, inverse: Any) -> Any:
     """Return the kind of chart of one fix, or of N fixes, from the two numbers of `Curvature.kappa`.
 
-    It is the first kind whose number is at most `BENT`. NaN counts as larger.
+    `metres` and `inverse` are the departures from a Gaussian in metres and in inverse range. The result is the first
+    kind whose number is at most `BENT`. NaN counts as larger.
     """
     assert (CARTESIAN, INVERSE_RANGE, CURVED) == (0, 1, 2)  # each number above the limit moves to the next kind
     bent = (metres <= BENT) ^ True
@@ -497,7 +504,7 @@ def _name_search(finished: Finished, items: Array) -> Any:
 
 
 def _name_proof(finished: Finished, items: Array) -> Any:
-    """Return the sentences of `unproven`: why there is no proof of uniqueness."""
+    """Return the sentences of `unproven`: the reasons why there is no proof of uniqueness."""
     pool = finished.pool
     if pool.loss and pool.robust is not None and pool.remark is not None:
         return np.where(pool.remark[items] == "", NOT_TRIED, pool.remark[items])
@@ -517,7 +524,7 @@ def _name_shape(finished: Finished, items: Array) -> Any:
 
 
 def _is_unsafe(evidence: Evidence) -> Any:
-    """Return flags of answers whose start was not safe and that have no proof of uniqueness."""
+    """Return flags of answers whose start was not safe and that have no proof of uniqueness; see `Evidence`."""
     return evidence.searched & (evidence.unique ^ True)
 
 

@@ -129,8 +129,8 @@ def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
 
 
 def _is_broken(problem: Problem, count: int) -> Array:
-    """Return flags (N,) of problems that have a measurement which is not a finite number."""
-    # an absent row may hold any value
+    """Return flags (N,) of problems that have a measurement which is not a finite number; `count` is N."""
+    # an absent row may contain any value
     return ~np.broadcast_to((np.isfinite(problem.z) | (problem.weight == 0.0)).all(-1), (count,))
 
 
@@ -251,7 +251,7 @@ def _has_hidden(pool: Pool) -> Array:
 
 
 def _hidden_or(pool: Pool, item: int, otherwise: str) -> str:
-    """Return the sentence on a minimum behind the Earth of one problem, or another sentence if it has none."""
+    """Return the sentence on a minimum behind the Earth of one problem, or the sentence `otherwise` if it has none."""
     return otherwise if pool.hidden is None else pool.hidden[item] or otherwise
 
 

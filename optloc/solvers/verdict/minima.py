@@ -357,9 +357,9 @@ def _take_slots(values: Array, slots: Array, empty: float) -> Array:
 
 
 def _is_same_place(x: Array, y: Array, curvature: Curvature) -> Array:
-    """Return flags (N,) of point pairs that are equal, or closer than 0.1 standard deviations in all directions."""
+    """Return flags (N,) of points x and y (N, n) that are equal, or closer than 0.1 standard deviations."""
     difference = x - y
-    with np.errstate(all="ignore"):  # a point that constraints hold has no spread
+    with np.errstate(all="ignore"):  # a point that constraints determine has no spread
         squared = (difference[:, None, :] @ curvature.information @ difference[..., None])[:, 0, 0]
         spread = np.trace(curvature.covariance, axis1=-2, axis2=-1)  # constraints leave directions without information
         squared = np.maximum(squared, (difference**2).sum(-1) / spread)

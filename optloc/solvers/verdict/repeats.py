@@ -87,7 +87,10 @@ def repeat(problem: Problem, x: Array, covariance: Array) -> Array:
 
 
 class Repeats(NamedTuple):
-    """Fixes of M repeated measurements: vectors (M, size), covariances (M, n, n), and flags (M,) of finished ones."""
+    """Fixes of M repeated measurements: vectors x (M, size), covariances `spread` (M, n, n), and flags `good` (M,).
+
+    The flag of a finished fix is True.
+    """
 
     x: Array
     spread: Array
