@@ -3,8 +3,8 @@
 The data separate mirror images only if the cost on the plane between them is clearly higher. Otherwise both belong to
 one region.
 
-Letters: N problems, r minima of a problem, q slots of a pool, `size` numbers of a parameter vector, w the distance from
-the plane in metres. The minima are found in the coordinates of `Across`: position in the plane, and w^2.
+Letters: N problems, r minima of a problem, q slots of a pool, `size` numbers of a parameter vector. w is the distance
+from the plane in metres. The minima are found in the coordinates of `Across`: position in the plane, and w^2.
 """
 
 from __future__ import annotations

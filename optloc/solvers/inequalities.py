@@ -444,7 +444,7 @@ def _name_hidden(problem: Problem, x: Array, cost: Array) -> Array | None:
 
 
 def _first_sentence(one: Array | None, other: Array | None) -> Array | None:
-    """Return sentences (N,): those of `one`, or of `other` for problems with an empty sentence in `one`.
+    """Return the sentences (N,) of `one`; if a sentence is empty, the sentence of `other`.
 
     If either of the two is None, the result is `one`.
     """

@@ -197,7 +197,7 @@ SOLVERS: Registry[SolverEntry] = Registry(
     "optloc.solvers", lambda value: isinstance(value, SolverEntry), _STAGES, _derive
 )
 
-# First stages of methods that one combined stage replaces, with the same result.
+# First stages of methods that a combined stage replaces, with the same result.
 SHORTCUTS: Mapping[tuple[str, ...], PlannedStages] = {("gtrs", "lsr"): PlannedStages()}
 
 # The method after "|" runs for problems that are not fully proven by then.

@@ -227,7 +227,7 @@ class Pool:
         return replace(self, missing=NoStart(reasons, code))
 
     def merge(self, items: Array, other: Pool, stage: Stage | None = None) -> Pool:
-        """Return the pool with problems `items` replaced by those of another pool, and with one more stage."""
+        """Return the pool with problems `items` replaced by the problems of another pool, and one more stage."""
         stages = self.stages if stage is None else (*self.stages, stage)
         return replace(overwrite(self, items, other), stages=stages)
 
@@ -345,7 +345,7 @@ def _contained(
     work: Callable[[Problem, slice], Answer],
     failed: Callable[[Problem, str], Answer] | None,
 ) -> Iterator[Answer]:
-    """Yield the answers of a part, or of its halves if it fails numerically; the arguments are those of `in_parts`.
+    """Yield the answers of a part, or of its halves if it fails numerically; the arguments are as in `in_parts`.
 
     `part` is the slice of the problems in the batch. A single problem that fails gets the answer of `failed`.
     """

@@ -113,13 +113,13 @@ class _SingleWorkspace:
         Centre of the charts, metres.
     claims : Claims
         Claims of the fixes, without the bounds and boxes of proofs.
-    nothing : object array (...)
+    no_active : object array (...)
         Empty tuples: no constraint is active at a fix.
-    alone : Alternatives
+    no_alternatives : Alternatives
         Empty: no other minimum.
-    beside : ReachWorkspace, optional
+    reach : ReachWorkspace, optional
         Workspace of the proofs that bounds are out of reach.
-    kept : dict
+    constants : dict
         Fields of a fix that are the same for all measurements, as read-only arrays.
     checked : bool
         Whether the position cost of a first fix was compared with the cost of the problem.
@@ -132,10 +132,10 @@ class _SingleWorkspace:
     answered: ProofResult
     centre: Array
     claims: Claims
-    nothing: Array
-    alone: Alternatives
-    beside: ReachWorkspace | None
-    kept: dict[str, Any]
+    no_active: Array
+    no_alternatives: Alternatives
+    reach: ReachWorkspace | None
+    constants: dict[str, Any]
     checked: bool = False
 
 
@@ -176,7 +176,7 @@ class PreparedFix:
         Whether repeats of the measurement can be simulated for a curved fix.
     limits : array (k, 2), optional
         Bounds that may truncate the law of the position; None without bounds.
-    own : threading.local
+    thread : threading.local
         Workspaces of each thread.
     """
 
@@ -198,7 +198,7 @@ class PreparedFix:
     often: bool
     repeatable: bool
     limits: Array | None
-    own: local = field(default_factory=local)
+    thread: local = field(default_factory=local)
 
     def __call__(self, z: Array) -> Fix | None:
         """Return the fix of measurements (m,), or the fixes (n,) of measurements (n, m).
@@ -311,13 +311,13 @@ class PreparedFix:
 
     def _is_inside(self, edges: Edges, answer: Answer, workspace: _SingleWorkspace) -> bool:
         """Return whether every point on a bound costs more than the levels of the proofs; else bounds matter."""
-        assert workspace.beside is not None
+        assert workspace.reach is not None
         if (answer.rival_cost < np.inf).any():  # low costs around a rival may reach a bound elsewhere
             return False
         d = self.load.place.shape[-1]
         x, cov = answer.x[:, :d], answer.covariance[:, :d, :d]
         numbers = (x, cov, answer.cost, answer.quantity, answer.normal)
-        return are_out_of_reach(edges, workspace.beside, workspace.costs, *numbers)
+        return are_out_of_reach(edges, workspace.reach, workspace.costs, *numbers)
 
     def _agrees(self, fix: Fix, workspace: _SingleWorkspace) -> bool:
         """Return whether the position costs equal the costs of the problem, at the fixes and near them."""
@@ -376,9 +376,9 @@ class PreparedFix:
             marks=notes.marks,
             chart=Chart(notes.kind, x[..., :d], covariance[..., :d, :d], workspace.centre, inflation=inflations),
             infinity=answer.infinity.reshape(shape) - cost,
-            alternatives=workspace.alone if alone else _rivals(answer, shape),
-            active=workspace.nothing if held is None else held.reshape(shape),
-            **workspace.kept,
+            alternatives=workspace.no_alternatives if alone else _rivals(answer, shape),
+            active=workspace.no_active if held is None else held.reshape(shape),
+            **workspace.constants,
         )
 
     def _inflations(self, answer: Any, marks: list[int], workspace: _SingleWorkspace) -> dict[int, float]:
@@ -395,9 +395,9 @@ class PreparedFix:
 
     def _workspace(self, shape: tuple[int, ...]) -> _SingleWorkspace:
         """Return the workspace of this thread for a batch shape."""
-        workspaces: dict[tuple[int, ...], _SingleWorkspace] | None = getattr(self.own, "workspaces", None)
+        workspaces: dict[tuple[int, ...], _SingleWorkspace] | None = getattr(self.thread, "workspaces", None)
         if workspaces is None:
-            workspaces = self.own.workspaces = {}
+            workspaces = self.thread.workspaces = {}
         if shape not in workspaces:
             if len(workspaces) == _WORKSPACES:
                 workspaces.clear()

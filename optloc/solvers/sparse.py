@@ -1,7 +1,7 @@
 """The stage "sparse": starts and suspected rows from a convex program that allows gross errors in a few rows.
 
-Letters: N problems, m rows, n unknowns y, d coordinates, q stations b (second stations of pairs), r_a and r_b the
-ranges to the stations a and b, x a position, s a station, t an emission time as a distance.
+Letters: N problems, m rows, n unknowns y, d coordinates, x a position, s a station, t an emission time as a distance.
+q stations b are the second stations of pairs; r_a and r_b are the ranges to the stations a and b.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ def _lift_ranges(
 ) -> _SparsePart | None:
     """Return the linear rows of range measurements of one kind, or None for other kinds.
 
-    `start` is the number of the first row of the kind. `origin` and `scale` are those of `RowWise`. `pairs` are the
+    `start` is the number of the first row of the kind. `origin` and `scale` are as in `RowWise`. `pairs` are the
     stations b, and `first` is the column of y of their first range.
     """
     model, form = MODELS[block.kind], MODELS[block.kind].ranges

@@ -30,7 +30,7 @@ _COARSE = 200
 _FIRST, _INSIDE, _MOST = 4000, 600, 40_000
 # Factor of the nodes inside at which several parts are accepted: fewer may be one ridge that is thinner than a step.
 _APART_AT = 10
-# Most grids: each has half the step of the one before.
+# Most grids: each has half the step of the grid before.
 _PASSES = 8
 # Values below which a node is near the set, the widest first: at a ridge of half width w the value is 3 at distance 2
 # w.

@@ -209,7 +209,7 @@ def _far_cells(chart: Chart, level: float) -> Array:
 def _outline_on_equalities(problem: Problem, fix: Fix, plane: Array, level: float) -> Outline | None:
     """Return the outline of a region on the surface of equalities, or a strip around a region on a line.
 
-    None if no node of the grid is in the region. The arguments are those of `outline_of`.
+    None if no node of the grid is in the region. The arguments are as in `outline_of`.
     """
     assert fix.chart is not None
     on_equalities = cost_along(problem, fix, level, FAR * float(fix.chart.distance))
@@ -281,7 +281,7 @@ class EqualityCost:
         The equalities.
     x : array (1, size)
         All unknowns of the fix.
-    own : slice
+    columns : slice
         Slice of the position in the unknowns.
     axes : array (d, k)
         One standard deviation along each axis, metres.
@@ -298,7 +298,7 @@ class EqualityCost:
     problem: Problem
     face: Face
     x: Array
-    own: slice
+    columns: slice
     axes: Array
     least: float
     quantile: float
@@ -307,17 +307,17 @@ class EqualityCost:
 
     def place(self, steps: Array) -> Array:
         """Return the positions (n, d), metres, of coordinates (n, k)."""
-        return np.asarray(self._vectors(steps)[:, self.own])
+        return np.asarray(self._vectors(steps)[:, self.columns])
 
     def away(self, steps: Array) -> Array:
         """Return the distances (n,) of coordinates (n, k) from the fix, as shares of the reach."""
-        return np.asarray(np.sqrt(((self.place(steps) - self.x[0, self.own]) ** 2).sum(-1)) / self.reach)
+        return np.asarray(np.sqrt(((self.place(steps) - self.x[0, self.columns]) ** 2).sum(-1)) / self.reach)
 
     def value(self, steps: Array) -> Array:
         """Return numbers (n,) at coordinates (n, k) that are negative inside the region and zero on its edge."""
         points = self._vectors(steps)
         cost = profile(self.problem, points[:, None], self.x, passes(self.problem))[0][:, 0]
-        beyond = np.sqrt(((points[:, self.own] - self.x[0, self.own]) ** 2).sum(-1)) / self.reach - 1.0
+        beyond = np.sqrt(((points[:, self.columns] - self.x[0, self.columns]) ** 2).sum(-1)) / self.reach - 1.0
         return np.asarray(np.maximum((cost - self.least) / self.quantile - 1.0, beyond))
 
     def flooded(self) -> tuple[Array, float]:
@@ -333,7 +333,7 @@ class EqualityCost:
     def _vectors(self, steps: Array) -> Array:
         """Return vectors (n, size) of coordinates (n, k), moved onto the equalities."""
         points = np.repeat(self.x, len(steps), axis=0)
-        points[:, self.own] += steps @ self.axes.T
+        points[:, self.columns] += steps @ self.axes.T
         return restore(self.problem, self.face, points)
 
 

@@ -177,7 +177,7 @@ def _within_bounds(
 ) -> Samples:
     """Return samples of a fix with a truncated law: drawn from the law, weighted by the cost.
 
-    The other arguments are those of `samples`.
+    The other arguments are as in `samples`.
     """
     away, excess = law.draw(n, seed)
     position, centre = surface.position + away, surface.chart.centre
@@ -314,7 +314,7 @@ def mixture(problem: Problem, fix: Fix, k: int = _SLICES, seed: int = 0) -> Mixt
 
 
 def _slices(surface: RegionSurface, k: int, seed: int) -> Mixture:
-    """Return the Gaussians of one minimum; their weights sum to one. `k` and `seed` are those of `mixture`."""
+    """Return the Gaussians of one minimum; their weights sum to one. `k` and `seed` are as in `mixture`."""
     chart = surface.chart
     if surface.kind == CARTESIAN:
         law = chart.truncated if chart.cut_off else None

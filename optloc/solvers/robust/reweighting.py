@@ -1,7 +1,8 @@
 """Iteratively reweighted least squares: the minima of a robust cost next to given starts, for a batch.
 
-Letters: N or M problems, m rows, r residuals, sigma their standard deviations, u residuals in sigma, R the covariance
-of the noise, rho the cost of a residual under the loss. A *weight of the loss* is a factor from 0 to 1 for a row.
+Letters: N or M problems, m rows, r residuals, sigma their standard deviations, u residuals in sigma. R is the
+covariance of the noise, and rho the cost of a residual under the loss. A *weight of the loss* is a factor from 0 to 1
+for a row.
 """
 
 from __future__ import annotations
@@ -211,7 +212,7 @@ def reweight(
         Most updates of the weights.
     tolerance : float
         A step shorter than this many standard deviations ends the iteration, once the weights have converged too. The
-        weights may change by the tolerance if it exceeds the least change that shows in a fix.
+        weights have converged if they change by less than the tolerance or 1e-4, the larger of the two.
     face : Face
         Constraints that are satisfied with equality.
     """

@@ -239,7 +239,8 @@ def _anneal(problem: Problem, x: Array, loss: Loss, halvings: int) -> tuple[Arra
     """Return vectors (M, size) after annealing, their costs (M,) and residuals (M, m).
 
     Annealing means steps under the Cauchy loss with a falling scale. The scale is halved `halvings` times. With 0
-    halvings the vectors do not move. Residuals are in sigma. Costs are those of `loss`, infinite for invalid vectors.
+    halvings the vectors do not move. Residuals are in sigma. Costs are the costs under `loss`, infinite for invalid
+    vectors.
     """
     doubt, cauchy, face = Doubt.of(problem, x), LOSSES["cauchy"], exact(problem)
     weight = np.ones(doubt.base.shape)

@@ -95,7 +95,7 @@ def _examine(problem: Problem, loss: Loss, x: Array, doubted: Array) -> tuple[Ar
     """Return flags (N,) of fixes that pass, reasons (N,) of the others, and results of repeats (N, 3).
 
     `x` (N, size) are the minima of the loss, and `doubted` (N, m) flags the rejected rows. The numbers of the repeats
-    are those of `Curvature.repeats`; NaN if a fix failed before.
+    are as in `Curvature.repeats`; NaN if a fix failed before.
     """
     rest = problem.with_rows(weight=np.where(doubted, 0.0, problem.weight))
     fix = verdict(rest, certified(rest, lsr(rest, begin(rest, x))))

@@ -160,7 +160,7 @@ def _means(rows: Rows, when: _Blocks, present: Array, start: int, taken: int) ->
     order = np.lexsort(key[::-1])
     key, order = key[:, order], inside[order]
     new = np.ones(len(order), dtype=bool)
-    # an entry that differs from the one before begins a new row
+    # an entry that differs from the entry before begins a new row
     new[1:] = (key[:, 1:] != key[:, :-1]).any(0)
     head, row = np.flatnonzero(new), np.cumsum(new) - 1
     since = when.since[rows.epoch[order]]

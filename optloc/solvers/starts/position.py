@@ -257,7 +257,7 @@ def _relax(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: 
 def _intersect(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:
     """Return the intersections of the ellipsoid with the ranges of some stations, (N, 4, 3) in Earth radii.
 
-    The arguments are those of `_relax`, with two known ranges or three ranges with a common unknown. NaN in empty
+    The arguments are as in `_relax`, with two known ranges or three ranges with a common unknown. NaN in empty
     slots.
     """
     items = np.flatnonzero(mask)

@@ -136,7 +136,7 @@ def suspects(
 def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS, *, together: bool = True) -> Pool:
     """Return the pool of a flat batch with the conclusions of a search for suspects: the stage behind `suspects`.
 
-    `by` and `together` are those of `suspects`.
+    `by` and `together` are as in `suspects`.
     """
     if pool is None:
         raise InvalidProblem("suspects needs a fix", "method", "put it after a refinement, as in 'gtrs+lsr+suspects'")

@@ -89,8 +89,8 @@ def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     few = (pool.dof < 0) & ~broken
     missing = ~np.isfinite(cost) & ~broken & ~few
     answered = ~(broken | few | missing)
-    # Missing data, missing rows and missing candidates are tested in this order. Other problems have an answer, perhaps
-    # a bad one.
+    # Missing data, missing rows and missing candidates are tested in this order. Other problems have an answer,
+    # perhaps a bad answer.
     weak = answered & ~_is_determined(curvature)
     distance = distance_of(problem, _position(problem, pool))
     with np.errstate(invalid="ignore"):

@@ -46,7 +46,7 @@ _AWAY, _MOST = 1.3, 0.5
 def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array) -> Curvature:
     """Return the curvature of the cost at vectors x (N, size) on faces `face` (N,) of the constraints.
 
-    The faces are those of `optloc.linear.constraints.faces`, and face 0 has no inequalities.
+    `optloc.linear.constraints.faces` lists the faces; face 0 has no inequalities.
     """
     information, vector, ok = marginal(equations)
     covariance, regular = linalg.inverse(information)
@@ -137,7 +137,7 @@ def smallest_pivot(information: Array) -> Array:
 def weak_direction(problem: Problem, information: Array) -> str:
     """Return a sentence that names the combination of unknowns that the data do not determine.
 
-    `information` (n, n) is that of one problem.
+    `information` (n, n) belongs to one problem.
     """
     diagonal = np.diagonal(information)
     if not np.isfinite(information).all():
