@@ -1,4 +1,7 @@
-"""Maps of the Cramer-Rao bound: the best possible accuracy of a fix, as a function of the target's position."""
+"""Maps of the Cramer-Rao bound: the best possible accuracy of a fix, as a function of the target's position.
+
+Letters: nx and ny columns and rows of the grid, n positions, d coordinates, s stations.
+"""
 
 from __future__ import annotations
 

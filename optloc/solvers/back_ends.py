@@ -164,7 +164,7 @@ def faults_of(kinds: Mapping[str, str]) -> dict[str, str]:
 
 
 def _key(kinds: tuple[tuple[str, str], ...]) -> str:
-    """Return a digest of everything that the results depend on: names, versions, and the programs of the trial."""
+    """Return a digest of everything that the results depend on: `kinds`, versions, and the programs of the trial."""
     here = Path(__file__).parent
     programs = [path.read_text(encoding="utf-8") for path in sorted((here.parents[1] / "formulations").glob("*.py"))]
     libraries = [version_of(name) for name in ("casadi", "cvxpy", "numpy")]

@@ -224,7 +224,7 @@ def _slot_units(slots: Any, size: float) -> Array:
 
 
 def _independent(problem: Problem) -> bool:
-    """Return whether all rows have independent errors."""
+    """Return whether all rows have independent errors, so that a diagonal of weights replaces the whitening matrix."""
     return all(block.row.shape[1] == 1 for block in problem.noise.blocks)
 
 

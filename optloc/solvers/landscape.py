@@ -1,4 +1,7 @@
-"""The cost of a problem as a function of the position, and the basins of attraction of iterations."""
+"""The cost of a problem as a function of the position, and the basins of attraction of iterations.
+
+A basin is the set of starts from which an iteration reaches the fix. Pictures show both.
+"""
 
 from __future__ import annotations
 
@@ -90,7 +93,7 @@ class Basins:
     ends: Array
 
     def share(self, end: End) -> float:
-        """Return the share of starts with a given end."""
+        """Return the share of starts, 0 to 1, with a given end."""
         return float((self.ends == end).mean())
 
 

@@ -82,7 +82,7 @@ def strata_of(problem: Problem, face: Face = ()) -> Strata | None:
 
 
 def _holds_depth(problem: Problem, level: Level) -> bool:
-    """Return whether a constraint determines the third coordinate: a height, or a plane that is not vertical."""
+    """Return whether the constraint of a level determines the third coordinate: a height, or a plane not vertical."""
     band = problem.constraints[level.constraint]
     if not isinstance(band, Band):
         return False

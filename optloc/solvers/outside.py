@@ -34,7 +34,7 @@ def adapt(solver: FixSolver) -> Solver:
 
 
 def given(problem: Problem, start: Any) -> Fix:
-    """Return given starts (N, size) or (N, q, size) of a flat batch as unrefined fixes."""
+    """Return the fixes, not refined, of given starts (N, size) or (N, q, size) of a flat batch."""
     return judge(problem, begin(problem, np.asarray(start, dtype=float)))
 
 

@@ -241,7 +241,7 @@ def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = N
 
 
 def _space_counts(epochs: int) -> Array:
-    """Return at most sixty numbers of epochs, denser at the start."""
+    """Return at most sixty numbers of epochs, from 1 to `epochs`, denser at the start."""
     if epochs <= _POINTS:
         return np.arange(1, epochs + 1)
     # geometric spacing: an estimate changes most while its epochs are few

@@ -1,4 +1,7 @@
-"""The probability of each status at given positions, from many simulated measurements."""
+"""The probability of each status at given positions, from many simulated measurements.
+
+Letters: q positions, s statuses, `size` numbers of a parameter vector. A trial is one simulated measurement.
+"""
 
 from __future__ import annotations
 

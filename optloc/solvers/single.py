@@ -394,7 +394,7 @@ class PreparedFix:
         return {i: float(one[2]) for i, one, good in zip(items, found, holds(found), strict=True) if good}
 
     def _workspace(self, shape: tuple[int, ...]) -> _SingleWorkspace:
-        """Return the workspace of this thread for a batch shape."""
+        """Return the workspace of this thread for a batch shape; a few shapes are stored."""
         workspaces: dict[tuple[int, ...], _SingleWorkspace] | None = getattr(self.thread, "workspaces", None)
         if workspaces is None:
             workspaces = self.thread.workspaces = {}

@@ -5,7 +5,7 @@ a line is then moved along its edge of the grid to the zero of the function. So 
 corners, but not the course of a line.
 
 A *node* is a point of the grid, given by two indices. An *edge* joins two neighbouring nodes. A *polygon* is a closed
-line and the lines around its holes.
+line and the lines around its holes. Letters: m cells of v corners, a grid of (nx, ny) nodes, r points of a line.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def trace_nodes(value: Value, nodes: Array, step: float) -> list[Polygon]:
 
 
 def _parts(cells: Array) -> list[Array]:
-    """Return the cells (m, v, 2) in groups that do not touch each other."""
+    """Return the cells (m, v, 2) in groups that do not touch each other; each group gets a separate grid."""
     from scipy.ndimage import label
 
     low, high = cells.min((0, 1)), cells.max((0, 1))

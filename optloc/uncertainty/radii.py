@@ -113,12 +113,14 @@ def _first_guess(variance: Array, level: Array) -> Array:
 def probability(variance: Array, square: Array) -> tuple[Array, Array, Array]:
     """Return the probability (...) that independent normal numbers are in a ball, its slope and its curvature.
 
+    Slope and curvature, also (...), are the first and second derivative to the logarithm of the squared radius.
+
     Parameters
     ----------
     variance : array (..., d)
         Variances of the numbers.
     square : array (...)
-        Squared radius of the ball, positive; slope and curvature are derivatives to its logarithm.
+        Squared radius of the ball, positive.
 
     Notes
     -----

@@ -1,7 +1,7 @@
 """The likelihood region of a fix: all positions whose cost exceeds the cost of the fix by at most a quantile.
 
 A region may have any shape, several parts, and no end. Convex cells enclose it; bounds of the cost, as in a proof,
-certify that no part is outside. Costs are chi-square values.
+certify that no part is outside. Costs are chi-square values. Letters: n cells, k rays, d coordinates, q points.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Cells:
         return np.asarray(signs @ self.edges)
 
     def _finite(self, corners: Array) -> Array:
-        """Return homogeneous corners as positions, metres; infinite where the last coordinate is zero."""
+        """Return homogeneous corners (..., 1 + d) as positions (..., d), m; infinite if the last coordinate is zero."""
         scale = corners[..., -1:]
         with np.errstate(divide="ignore", invalid="ignore"):
             apart = np.where(corners[..., :-1] == 0.0, 0.0, corners[..., :-1] / np.maximum(scale, 0.0))

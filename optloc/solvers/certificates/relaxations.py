@@ -153,7 +153,10 @@ def _beyond_directions(problem: Problem) -> str:
 
 
 def _nothing(problem: Problem, method: str, why: str) -> Reference:
-    """Return a reference without bounds: NaN for all fixes, with the reason `why`."""
+    """Return a reference without bounds for all fixes: bounds and points are NaN, and `why` is the reason.
+
+    `method` is the name of the relaxation.
+    """
     size = problem.batch_shape[0]
     scope, reason = np.full(size, "", dtype=object), np.full(size, why, dtype=object)
     return Reference(method, np.full(size, np.nan), scope, reason, np.full((size, problem.dimension), np.nan))

@@ -182,7 +182,7 @@ def _changes(present: Array, doubted: Array) -> tuple[Array, Array, Array]:
 
 
 def _squared_position(problem: Problem, fix: Fix, step: Array) -> Array:
-    """Return squared lengths (N,) of position steps, from steps (N, size), in standard deviations of fixes."""
+    """Return squared lengths (N,) of position steps, in standard deviations of fixes, from steps (N, size)."""
     slot, _ = problem.layout.find("position")
     where = slice(slot.start, slot.start + slot.size)
     with np.errstate(all="ignore"):

@@ -1,4 +1,7 @@
-"""Starts for every mixture of kinds that a proof can bound: minima that a best-first search of boxes finds."""
+"""Starts for every mixture of kinds that a proof can bound: minima that a best-first search of boxes finds.
+
+The search splits the box with the lowest bound of the cost first. Letters: N problems, q minima, d coordinates, metres.
+"""
 
 from __future__ import annotations
 

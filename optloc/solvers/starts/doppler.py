@@ -99,7 +99,7 @@ class _DopplerRows:
 
 
 def _gather(problem: Problem) -> _DopplerRows:
-    """Return the rows in the relaxation, with groups and coefficients."""
+    """Return the rows of all problems that the relaxation can use, with groups and coefficients."""
     shared, parts = problem.layout.n_shared, list(_parts(problem))
     row, epoch, a, b, kind, rates, ranges = (np.concatenate(values) for values in zip(*parts, strict=True))
     design = np.zeros((problem.count, shared))
@@ -113,9 +113,10 @@ def _gather(problem: Problem) -> _DopplerRows:
 
 
 def _parts(problem: Problem) -> Iterator[tuple[Array, ...]]:
-    """Yield, for each kind: number, epoch, stations a and b, number of the kind, coefficients of rates and of ranges.
+    """Yield seven arrays for each kind: number, epoch, stations a and b, number of the kind, and coefficients.
 
-    Kinds that the relaxation does not use yield empty arrays.
+    The last two arrays (m, 2) are the coefficients of the rates and of the ranges. Kinds that the relaxation does not
+    use yield empty arrays.
     """
     for i, (rows, start) in enumerate(zip(problem.rows, problem.starts, strict=True)):
         rates, ranges = _rates(rows), _ranges(rows)

@@ -106,7 +106,11 @@ def _search(costs: PositionCosts, d: int) -> Array:
 
 
 def _whole(piece: int, d: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return centre and half-widths of the box that covers a whole piece of an atlas."""
+    """Return centre and half-widths, three numbers each, of the box that covers a whole piece of an atlas.
+
+    With d = 2 the third numbers are zero. The first 2 d pieces reach to infinity: their last coordinate in use is from
+    0 to 1.
+    """
     at, half = [0.0] * 3, [1.0] * d + [0.0] * (3 - d)
     if piece < 2 * d:
         at[d - 1] = half[d - 1] = 0.5

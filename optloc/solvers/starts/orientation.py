@@ -46,13 +46,13 @@ class Headings:
     Parameters
     ----------
     names : tuple of str
-        Biases with such an offset.
+        Names of the biases with offsets of this kind.
     column : int array (n,)
         Column of each offset in the vector of unknowns; all members of these biases.
     touch : array (n, m)
         Factor with which each offset enters each row: 1, -1 or 0.
     mean : array (n,)
-        Prior mean, or zero.
+        Prior mean, or zero, radians.
     known : bool array (n,)
         Whether the prior is narrow and no target of known position is measured: then the prior mean is the start.
     free : bool array (n,)

@@ -60,7 +60,7 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
 
 
 def _isolate(problem: Problem, target: int) -> Problem:
-    """Return the problem of one target: its rows, without other unknowns."""
+    """Return the problem of one target: its rows and its constraints that help a start, without other unknowns."""
     problem = without_biases(problem)
     problem = _take_rows(problem, target) if len(problem.motions) > 1 else problem
     motion = problem.motions[target]
@@ -161,7 +161,10 @@ def _can_merge_epochs(problem: Problem) -> bool:
 
 
 def _merge_epochs(problem: Problem) -> Problem:
-    """Return the problem of a target at rest as one epoch: every position of a station becomes a station."""
+    """Return the problem of a target at rest as one epoch: every position of a station becomes a station.
+
+    Then one fix uses the rows of all epochs.
+    """
     s = problem.stations
     nodes = [np.where(rows.a < 0, -1, rows.epoch * s.count + rows.a) for rows in problem.rows]
     used = np.unique(np.concatenate(nodes))

@@ -243,7 +243,7 @@ def _adds_nothing(rest: RemainingFix, size: int, other: RemainingFix, fewer: int
 
 
 def _parts(groups: Sequence[Group], left: Sequence[int]) -> frozenset[tuple[int, int]]:
-    """Return the numbers that a set of groups leaves out: rows, and the components of groups without rows."""
+    """Return the parts that a set of groups leaves out: pairs (-1, row), or (group without rows, component)."""
     rows = {(-1, row) for i in left for row in groups[i].rows}
     return frozenset(rows | {(i, j) for i in left if not groups[i].rows for j in range(groups[i].size)})
 

@@ -2,6 +2,9 @@
 
 A finding is a test and a sentence. `finding_marks` applies all tests to a batch of settled pools. `examine` computes
 the numbers that the tests read, and `explain` writes the sentences.
+
+Letters: N problems, n of them in a sentence, r other minima, d coordinates, `size` numbers of a parameter vector. A
+*mark* is a bit mask with one bit for each status. Costs and gaps are chi-square values.
 """
 
 from __future__ import annotations
@@ -485,7 +488,7 @@ def _name_residuals(finished: Finished, items: Array) -> Any:
 
 
 def _name_infinity(finished: Finished, items: Array) -> Any:
-    """Return the sentences of `unbounded`: the rise of chi-square at infinity."""
+    """Return the sentences of `unbounded` for items (n,): the rise of chi-square at infinity."""
     assert finished.pool.infinity is not None
     more = finished.pool.infinity[items] - finished.pool.cost[items, 0]
     rises = [f"only {rise:.2g}" if rise > _NONE else "nothing" for rise in more.tolist()]
@@ -493,18 +496,18 @@ def _name_infinity(finished: Finished, items: Array) -> Any:
 
 
 def _name_rivals(finished: Finished, items: Array) -> Any:
-    """Return the sentences of `ambiguous`: the gap of the nearest rival."""
+    """Return the sentences of `ambiguous` for items (n,): the gap of the nearest rival."""
     gaps = _gaps_of_rivals(finished.pool, finished.gap)[items].min(1).tolist()
     return np.array([ambiguity(finished.problem, gap) for gap in gaps], dtype=object)
 
 
 def _name_search(finished: Finished, items: Array) -> Any:
-    """Return the sentences of `searched`: the remark of the search."""
+    """Return the sentences of `searched` for items (n,): the remark of the search."""
     return "" if finished.pool.remark is None else finished.pool.remark[items]
 
 
 def _name_proof(finished: Finished, items: Array) -> Any:
-    """Return the sentences of `unproven`: the reasons why there is no proof of uniqueness."""
+    """Return the sentences of `unproven` for items (n,): the reasons why there is no proof of uniqueness."""
     pool = finished.pool
     if pool.loss and pool.robust is not None and pool.remark is not None:
         return np.where(pool.remark[items] == "", NOT_TRIED, pool.remark[items])
@@ -513,7 +516,7 @@ def _name_proof(finished: Finished, items: Array) -> Any:
 
 
 def _name_shape(finished: Finished, items: Array) -> Any:
-    """Return the sentences of `curved`: the coordinates in which the fix is Gaussian, if any."""
+    """Return the sentences of `curved` for items (n,): the coordinates in which a fix is Gaussian, if there are any."""
     curvature = finished.pool.curvature
     assert curvature is not None
     assert curvature.kappa is not None

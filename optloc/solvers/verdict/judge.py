@@ -1,6 +1,9 @@
 """The verdict: from a pool of candidates to a fix with a status.
 
 Only this module sets the status of a fix, by one set of rules. So a status has the same meaning for every method.
+
+Letters: N problems, q candidates, r other minima, n shared unknowns, `size` numbers of a parameter vector. Marks are
+bit masks with one bit for each status.
 """
 
 from __future__ import annotations
