@@ -228,7 +228,10 @@ def _inverse(information: Array, size: Array, basis: Array) -> Array:
 
 
 def with_local_priors(problem: Problem, equations: Normal) -> Normal:
-    """Return equations of the data plus the priors of local unknowns, such as station errors of one epoch."""
+    """Return equations of the data plus the priors of local unknowns, such as station errors of one epoch.
+
+    They count with the measurements, since local unknowns are eliminated.
+    """
     local = equations.local.copy()
     for name, _, precision in prior_parts(problem):
         slot, shared = problem.layout.find(name)

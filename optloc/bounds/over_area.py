@@ -61,7 +61,7 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Return the numbers of rows and columns of the grid."""
+        """Return the shape (ny, nx) of the grid."""
         return len(self.y), len(self.x)
 
 

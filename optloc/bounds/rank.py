@@ -126,7 +126,7 @@ def observability(problem: Problem, x: Array) -> Observability:
 
 
 def open_sentences(layout: Layout, information: Array) -> tuple[str, ...]:
-    """Return sentences that name the combinations of shared unknowns without information in a matrix (n, n)."""
+    """Return sentences on the combinations of shared unknowns about which a matrix (n, n) has no information."""
     return tuple(_open_sentences(layout, _split_information(information, information, np.eye(layout.n_shared))))
 
 

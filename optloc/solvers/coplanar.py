@@ -73,7 +73,10 @@ def join_sides(problem: Problem, pool: Pool) -> Pool:
 
 
 def _is_near(problem: Problem, pool: Pool) -> Array:
-    """Return flags (N,) of fixes that are near the plane, within `APART` standard deviations, or not finished."""
+    """Return flags (N,) of fixes near the plane, within `APART` standard deviations, or not finished.
+
+    Only for these fixes may both sides of the plane be one region.
+    """
     assert pool.curvature is not None
     across = Across.of(problem)
     place, normal = pool.x[:, 0, across.part], across.axes[..., -1]
@@ -103,7 +106,7 @@ class _FoundSides:
     on_plane: Array
 
     def take(self, items: Array) -> _FoundSides:
-        """Return the entries of some problems."""
+        """Return the entries of problems `items`."""
         return _FoundSides(self.x[items], self.cost[items], self.on_plane[items])
 
 
@@ -165,7 +168,7 @@ class _Sides:
     on_plane: Array
 
     def take(self, items: Array) -> _Sides:
-        """Return the entries of some problems."""
+        """Return the entries of problems `items`."""
         return _Sides(self.x[items], self.cost[items], self.on_plane[items])
 
 
@@ -198,7 +201,8 @@ def _sides(problem: Problem, across: Across, found: _FoundSides) -> _Sides:
 def _is_joined(found: _FoundSides, sides: _Sides) -> Array:
     """Return flags (N,) of problems in which both sides of the plane are one region.
 
-    The region is one if the cost on the plane is at most `JOINED` above the least cost.
+    The region is one if constraints admit both sides, and the cost on the plane is at most `JOINED` above the least
+    cost.
     """
     both = np.isfinite(sides.cost[:, :2]).all(1) | sides.on_plane
     return np.asarray(both & (found.on_plane - found.cost[:, 0] <= JOINED))

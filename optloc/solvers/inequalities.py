@@ -309,7 +309,7 @@ def _fits(pool: Pool, cost: Array) -> Array:
 
 
 def without_broken(problem: Problem, pool: Pool) -> Pool:
-    """Return a pool in which candidates that break a constraint, or are hidden, have infinite cost."""
+    """Return a pool in which candidates that break a constraint, or are hidden, are infeasible: infinite cost."""
     return _mark_infeasible(pool, _breaks(problem, pool))
 
 

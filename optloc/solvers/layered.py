@@ -82,7 +82,7 @@ def strata_of(problem: Problem, face: Face = ()) -> Strata | None:
 
 
 def _holds_depth(problem: Problem, level: Level) -> bool:
-    """Return whether the constraint of a level determines the third coordinate: a height, or a plane not vertical."""
+    """Return whether the constraint of a level determines the third coordinate: a height, or a plane with a z term."""
     band = problem.constraints[level.constraint]
     if not isinstance(band, Band):
         return False
@@ -164,7 +164,10 @@ def _along_border(
 
 
 def _with_depth(problem: Problem, z: Array, face: Face) -> tuple[Problem, Face]:
-    """Return M problems with known third coordinates z (M,), and the face extended by this constraint."""
+    """Return M problems with known third coordinates z (M,), metres, and the face extended by this constraint.
+
+    A refinement on this face moves along a border between layers.
+    """
     known = Band("plane", z, z, np.eye(3)[2], "interface")
     return replace(problem, constraints=(*problem.constraints, known)), (
         *face,

@@ -250,7 +250,7 @@ class Method:
 
     @property
     def entries(self) -> list[SolverEntry]:
-        """Return the table entries of its words, from all branches."""
+        """Return the table entries of the words of the method, from all branches."""
         return [SOLVERS[word] for branch in self.branches for word in branch.words]
 
     def runs(self, count: int) -> list[Solver]:
@@ -358,7 +358,7 @@ def is_unproven(fix: Fix) -> Array:
 
 
 def shortcut(method: Method) -> bool:
-    """Return whether one combined stage performs the whole method, so that a plan can replace it."""
+    """Return whether one combined stage performs the whole method, so that a plan can replace the method."""
     return method.then is None and method.words in SHORTCUTS
 
 

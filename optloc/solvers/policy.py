@@ -45,5 +45,8 @@ _EQUAL = 1e-6
 
 
 def equal_cost(cost: Any) -> Any:
-    """Return the largest difference at which another cost counts as equal to a cost, or to each of many costs."""
+    """Return the largest difference at which another cost counts as equal to a cost, or to each of many costs.
+
+    Smaller differences come from rounding.
+    """
     return _EQUAL * (1.0 + cost)

@@ -285,7 +285,7 @@ def begin(problem: Problem, start: Array) -> Pool:
 
 
 def pack(points: Array) -> Array:
-    """Return points (N, q, n) with the finite points of each problem first, and without unused slots."""
+    """Return points (N, q, n) with the finite points of each problem first, and without slots that no problem uses."""
     if points.shape[1] <= 1:
         return points
     finite = np.isfinite(points).all(-1)
@@ -296,7 +296,7 @@ def pack(points: Array) -> Array:
 
 
 def chunk_size(problem: Problem) -> int:
-    """Return the number of problems per part if each problem has dozens of candidates."""
+    """Return the number of problems per part, for problems with dozens of candidates each: it limits the memory."""
     return max(1, _ROWS // max(problem.count, 1))
 
 
@@ -397,7 +397,10 @@ def _joined(answers: Iterable[Answer], count: int) -> Answer:
 
 
 def _sum_stages(parts: list[tuple[Stage, ...]]) -> tuple[Stage, ...]:
-    """Return the stages of the part with the most stages, with the total seconds of all parts."""
+    """Return the stages of the part with the most stages, with the total seconds of all parts.
+
+    `parts` are the stages of each part of a batch.
+    """
     longest = max(parts, key=len)
     seconds = dict.fromkeys(range(len(longest)), 0.0)
     for stages in parts:

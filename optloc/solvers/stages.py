@@ -432,5 +432,8 @@ def taylor(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def _offer_positions(problem: Problem, position: Array, pool: Pool | None, name: str, began: float) -> Pool:
-    """Return positions (N, q, d), metres, as starts of the stage `name`; other unknowns get their best values."""
+    """Return positions (N, q, d), metres, as starts of the stage `name`.
+
+    Emission times fit the positions, and other unknowns are at their prior means or zero.
+    """
     return offer(problem, vectors(problem, pack(position)), pool, name, began)

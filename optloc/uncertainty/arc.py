@@ -146,7 +146,7 @@ class Arc:
         return np.asarray(np.sqrt((np.diff(self.node, axis=0) ** 2).sum(-1)))
 
     def _log_width(self) -> Array:
-        """Return the logarithm of the volume (m,) of one standard deviation across the curve."""
+        """Return the logarithms (m,) of the volumes that one standard deviation across the curve spans at each node."""
         gram = np.swapaxes(self.across, -1, -2) @ self.across
         return np.asarray(0.5 * np.linalg.slogdet(gram)[1])
 
@@ -240,7 +240,10 @@ class _Valley:
         return node, size * vectors[:, 0]
 
     def walk(self, start: _Node, first: Array) -> tuple[list[_Node], bool]:
-        """Return the nodes in the direction of the first step (d,), and whether the curve has returned to the fix."""
+        """Return the nodes in the direction of the first step (d,), and whether the curve has returned to the fix.
+
+        The first node is the fix, `start`.
+        """
         size = least = float(np.sqrt((first**2).sum()))
         least *= _TINY
         nodes, along = [start], first / size

@@ -321,7 +321,10 @@ class EqualityCost:
         return np.asarray(np.maximum((cost - self.least) / self.quantile - 1.0, beyond))
 
     def flooded(self) -> tuple[Array, float]:
-        """Return the connected nodes (n, k) of a grid in the region, and the step; empty if there are too many."""
+        """Return the connected nodes (n, k) of a grid in the region, and the step of the grid in standard deviations.
+
+        If a fine grid has too many nodes, the step is doubled. The array is empty if all grids have too many.
+        """
         step = float(np.sqrt(self.quantile)) / _FINE
         for _ in range(_DOUBLINGS):
             found = _connected_nodes(lambda steps: self.value(steps) <= 0.0, self.starts, step)

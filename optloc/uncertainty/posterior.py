@@ -64,13 +64,13 @@ class Samples:
 
     @property
     def mean(self) -> Array:
-        """Return the mean (d,), metres; if infinity has density, it needs `within`."""
+        """Return the mean (d,), metres; raise InvalidProblem if infinity has density and no ball limits the samples."""
         self._demand("mean")
         return np.asarray(self.weight @ self.position)
 
     @property
     def covariance(self) -> Array:
-        """Return the covariance (d, d), square metres; if infinity has density, it needs `within`."""
+        """Return the covariance (d, d), square metres; raise InvalidProblem in the same case as `mean`."""
         self._demand("covariance")
         return moments(self.position, self.weight)[1]
 
@@ -263,7 +263,7 @@ class Mixture:
     covariance: Array
 
     def log_density(self, points: Array) -> Array:
-        """Return the logarithm of the density (...), per metre to the dimension, at points (..., d), metres."""
+        """Return the natural logarithm of the density (...), per m^d, at points (..., d), metres."""
         from scipy.special import logsumexp
 
         apart = np.asarray(points)[..., None, :] - self.mean

@@ -345,7 +345,7 @@ class RegionSurface:
 
     @classmethod
     def of(cls, problem: Problem, fix: Fix) -> RegionSurface:
-        """Return the surface of a single fix of one static position; raise InvalidProblem for others."""
+        """Return the surface of a single fix of one static position; raise InvalidProblem for other fixes."""
         _check(problem, fix)
         if not np.isfinite(fix.position).all() or not np.isfinite(fix.covariance()).all():
             raise InvalidProblem("the fix has no position with a covariance", "fix", "see fix.status for the reason")

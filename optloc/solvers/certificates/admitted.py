@@ -150,7 +150,10 @@ def _prove_freely(
 
 
 def _is_new(fix: Fix, other: Fix) -> Array:
-    """Return flags (n,) of other fixes that replace the fixes: lower cost, more alternatives, or no answer."""
+    """Return flags (n,) of other fixes that replace the fixes: lower cost, more alternatives, or no answer.
+
+    A replaced fix needs a new proof.
+    """
     with np.errstate(invalid="ignore"):
         lower = other.cost < fix.cost - equal_cost(fix.cost)
     more = np.isfinite(other.alternatives.gap).sum(1) > np.isfinite(fix.alternatives.gap).sum(1)

@@ -51,7 +51,7 @@ class Edges:
 
     @property
     def constraint(self) -> Array:
-        """Return the number of the constraint of each edge, (e,)."""
+        """Return the number, in the problem, of the constraint of each edge, (e,)."""
         return np.array([level.constraint for level in self.levels], dtype=np.int64)
 
 

@@ -40,7 +40,10 @@ Costs = PositionCosts | ScaledCosts | Runs | CourseCosts
 
 
 def eliminate_nuisance(problem: Problem) -> Costs:
-    """Return the costs of a flat batch over the state of the target, minimised over all other unknowns."""
+    """Return the costs of a flat batch over the state of the target, minimised over all other unknowns.
+
+    Proofs split boxes of states only, so the other unknowns must be eliminated first.
+    """
     if has_one_epoch_velocity(problem):
         return velocity_costs(problem)
     if problem.motions[0].order > 0:
@@ -51,7 +54,7 @@ def eliminate_nuisance(problem: Problem) -> Costs:
 
 
 def prove(costs: Costs, asked: ProofRequest) -> ProofResult:
-    """Return the results of the proofs of n fixes from the costs of their problems."""
+    """Return the results of the proofs of n fixes, from the costs of their problems and the n requests `asked`."""
     if isinstance(costs, CourseCosts):
         return prove_courses(costs, asked)
     if isinstance(costs, ScaledCosts):

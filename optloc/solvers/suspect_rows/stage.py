@@ -349,7 +349,7 @@ def _with_group_by_group(alike: SameRows, doubted: _RejectedRows, outcomes: list
 def _conclude(problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: Sequence[Outcome]) -> Array:
     """Return the conclusions (N,) for problems with the same rows; None if the fix of all data is kept.
 
-    `fix` are the fixes of all data, and `outcomes` the results of the search.
+    `fix` has the fixes of all data, and `outcomes` the results of the search.
     """
     arrivals, out = as_arrivals(problem), filled_objects(len(outcomes), None)
     cases: list[SuspectCase] = []

@@ -336,7 +336,10 @@ def _departure_inwards(problem: Problem, pool: Pool) -> Array:
 
 
 def law_at(problem: Problem, pool: Pool) -> Law | None:
-    """Return the truncated normal laws of the best candidates, or None if no bound is near a candidate."""
+    """Return the truncated normal laws of the best candidates, or None if no bound is near a candidate.
+
+    If bounds cut off a law, its covariance and its regions differ from a Gaussian's.
+    """
     curvature = pool.curvature
     # the covariance under a robust loss is no quadratic model beyond a bound
     if curvature is None or pool.loss or not has_law(problem):
@@ -376,7 +379,7 @@ def _infinity(problem: Problem, pool: Pool, wanted: Array, unseen: Array) -> Arr
 
 
 def centre_of(problem: Problem) -> Array:
-    """Return the mean (N or 1, d) of the stations that have rows with weight, metres."""
+    """Return the mean (N or 1, d) of the stations that have rows with weight, metres: the centre of the charts."""
     places = problem.stations.places
     measured = (problem.weight > 0.0).astype(float) @ rows_of_stations(problem).T.astype(float) > 0.0
     # a moving station counts with its positions at all epochs

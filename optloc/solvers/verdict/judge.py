@@ -387,7 +387,10 @@ def _concluded(problem: Problem, item: int, conclusion: Conclusion | Fix) -> Fix
 
 
 def surviving_candidates(pool: Pool, fix: Fix) -> Array:
-    """Return the candidates (N, q, size) of a pool; NaN for a best candidate whose verdict shows no position."""
+    """Return the candidates (N, q, size) of a pool; NaN for a best candidate whose verdict shows no position.
+
+    The next stage starts from these candidates.
+    """
     if pool.curvature is None:
         return pool.x
     best = np.where(np.isnan(fix.x).all(-1, keepdims=True), np.nan, pool.x[:, 0])
@@ -534,7 +537,7 @@ def failed_fixes(problem: Problem, cause: str) -> Fix:
 
 
 def hide_open_epochs(fix: Fix) -> Fix:
-    """Return fixes of runs with NaN for the states of undetermined epochs; the reason names these epochs."""
+    """Return fixes of runs with NaN for the states of undetermined epochs; their reasons name these epochs."""
     if fix.local is None or not fix.answered.any():
         return fix
     size = fix.local.shape[-1]

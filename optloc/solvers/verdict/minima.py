@@ -260,7 +260,10 @@ def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = eq
 
 
 def _without_runs_to_infinity(problem: Problem, pool: Pool) -> tuple[Pool, Array]:
-    """Return the pool without runs to infinity that a finite minimum rivals, and the least cost (N,) of these runs."""
+    """Return the pool without runs to infinity that a finite minimum rivals, and the least cost (N,) of all such runs.
+
+    The cost is NaN without a run to infinity. A rival costs at most `AMBIGUOUS_GAP` more than the run.
+    """
     none = np.full(len(pool), np.nan)
     if not problem.layout.shares("position"):
         return pool, none
