@@ -93,7 +93,7 @@ def diagnose(problem: Problem, fix: Fix) -> Diagnosis:
 
 
 def _advice(problem: Problem, fix: Fix) -> Iterator[Advice]:
-    """Yield the advice on each fix that is not ok, without repetitions."""
+    """Yield the advice on each fix that is not `ok`, without repetitions; in a batch, on the first twenty of them."""
     if not problem.batch_shape:
         yield from advise(problem, fix)
         return

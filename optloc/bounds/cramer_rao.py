@@ -1,4 +1,8 @@
-"""The Cramer-Rao bound: the least covariance of an unbiased estimate."""
+"""The Cramer-Rao bound: the least covariance of an unbiased estimate.
+
+Letters: n shared unknowns, k epochs, q counts of epochs, p free directions, `size` numbers of a parameter vector. The
+information of an unknown has one over its squared SI unit.
+"""
 
 from __future__ import annotations
 
@@ -51,13 +55,13 @@ def crlb(problem: Problem, truth: Array) -> Array:
     S. M. Kay, "Fundamentals of Statistical Signal Processing: Estimation Theory" (1993), eq. 3.31.
     J. D. Gorman and A. O. Hero, "Lower bounds for parametric estimation with constraints" (1990), theorem 1.
     """
-    x, held = np.asarray(truth, dtype=float), exact(problem)
+    x, equalities = np.asarray(truth, dtype=float), exact(problem)
     equations = equations_at(problem, x)
-    if not held:
+    if not equalities:
         return covariance(equations)[0]
     information, _, ok = marginal(equations)
     vectors = np.broadcast_to(x, (*ok.shape, x.shape[-1])).reshape(-1, x.shape[-1])
-    along = tangent_at(problem.flat(), held, vectors)
+    along = tangent_at(problem.flat(), equalities, vectors)
     bound, good = linalg.inverse_within(information.reshape(-1, *information.shape[-2:]), along)
     return np.where((ok.ravel() & good)[:, None, None], bound, np.nan).reshape(information.shape)
 
@@ -84,7 +88,7 @@ class Course:
     layout: Layout
 
     def sigma(self, name: str) -> Array:
-        """Return the bound (q, size) of the standard deviations of a named unknown."""
+        """Return the bound (q, size) of the standard deviations of a named unknown, in its SI unit."""
         slot, _ = self.layout.find(name)
         variance = np.diagonal(self.covariance, axis1=-2, axis2=-1)[:, slot.start : slot.start + slot.size]
         return np.asarray(np.sqrt(variance))
@@ -140,22 +144,28 @@ def crlb_course(
 
 
 def free_directions(problem: Problem, x: Array, known: Sequence[str] = ()) -> Array:
-    """Return a basis (n, p) of the directions that equalities, at a vector (size,), and known names leave free."""
-    layout, held = problem.layout, exact(problem)
+    """Return a basis (n, p) of the directions of the shared unknowns that nothing fixes.
+
+    Equalities, linearised at a vector x (size,), and unknowns with names in `known` fix the other directions.
+    """
+    layout, equalities = problem.layout, exact(problem)
     fixed = np.zeros(layout.n_shared, dtype=bool)
     for slot in (layout.find(name)[0] for name in known):
         fixed[slot.start : slot.start + slot.size] = True
     eye = np.eye(layout.n_shared)
-    if not held:
+    if not equalities:
         return eye[:, ~fixed]
     # known names are equalities too: the tangent space of both
-    gradients = levels(problem.flat(), held, x[None])[1]
+    gradients = levels(problem.flat(), equalities, x[None])[1]
     across = np.concatenate([gradients, eye[None, fixed]], axis=1)
     return np.asarray(linalg.tangent(across, np.ones((1, len(eye)))).along[0])
 
 
 def _totals(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
-    """Return the information of the first epochs (q, n, n), and its diagonal (q, n) before elimination."""
+    """Return the information of the first epochs (q, n, n), and its diagonal (q, n) before elimination.
+
+    `counts` (q,) are the numbers of epochs, and x (size,) is the point of linearisation. Local unknowns are eliminated.
+    """
     n = problem.layout.n_shared
     total, size = np.zeros((len(counts), n, n)), np.zeros((len(counts), n))
     so_far, size_so_far = np.zeros((n, n)), np.zeros(n)
@@ -169,18 +179,21 @@ def _totals(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
 
 
 def _totals_of_walks(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
-    """Return the result of `_totals` for epochs that do not add up; time grows with each count."""
+    """Return the result of `_totals` for a run with biases that walk; time grows with each count.
+
+    Walks link the epochs, so the information of the epochs does not add up.
+    """
     n, length = problem.layout.n_shared, problem.layout.n_local
     total, size = np.zeros((len(counts), n, n)), np.zeros((len(counts), n))
     for i, count in enumerate(counts.tolist()):
-        part, own = cut(problem, 0, count), x[: n + count * length]
-        equations = with_priors(part, own, summed(part, own), shared=False)
+        part, x_part = cut(problem, 0, count), x[: n + count * length]
+        equations = with_priors(part, x_part, summed(part, x_part), shared=False)
         total[i], size[i] = marginal(equations)[0], np.diagonal(equations.shared)
     return total, size
 
 
 def _each_epoch(problem: Problem, x: Array) -> Iterator[tuple[int, Array, Array]]:
-    """Yield the first epoch of a part, the information (k, n, n) of its epochs, and the size of this information.
+    """Yield for each part of a run: its first epoch, the information (k, n, n) of its k epochs, and its size.
 
     The information is about the shared unknowns. The size is its diagonal (k, n) before elimination.
     """
@@ -189,18 +202,18 @@ def _each_epoch(problem: Problem, x: Array) -> Iterator[tuple[int, Array, Array]
         linear = linearise(part, x)
         # all unknowns count as local to each epoch, so that the local blocks are the information of the epochs
         both = np.concatenate([linear.shared, linear.local], axis=-1)
-        own = Linear(linear.residual, linear.shared[..., :0], both, linear.epoch - first, linear.noise)
-        gram = normal(own, last - first).local
-        none, here = np.zeros(len(gram)), gram[:, None]
+        as_local = Linear(linear.residual, linear.shared[..., :0], both, linear.epoch - first, linear.noise)
+        gram = normal(as_local, last - first).local
+        zeros, grams = np.zeros(len(gram)), gram[:, None]
         equations = Normal(
-            gram[:, :n, :n], here[..., n:, n:], here[..., :n, n:], none[:, None], none[:, None, None], none
+            gram[:, :n, :n], grams[..., n:, n:], grams[..., :n, n:], zeros[:, None], zeros[:, None, None], zeros
         )
         yield first, shared_information(with_local_priors(problem, equations)), np.diagonal(gram[:, :n, :n], 0, -2, -1)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # an overflow becomes NaN
 def _inverse(information: Array, size: Array, basis: Array) -> Array:
-    """Return inverses (q, n, n) on a basis (n, p), NaN for an undetermined combination.
+    """Return inverses (q, n, n) of information (q, n, n) on a basis (n, p); NaN if a combination is undetermined.
 
     `size` (q, n), the diagonal before elimination, sets the rounding error of zero.
     """
@@ -215,7 +228,10 @@ def _inverse(information: Array, size: Array, basis: Array) -> Array:
 
 
 def with_local_priors(problem: Problem, equations: Normal) -> Normal:
-    """Return equations of the data plus the priors of local unknowns, such as station errors."""
+    """Return equations of the data plus the priors of local unknowns, such as station errors of one epoch.
+
+    They count with the measurements, since local unknowns are eliminated.
+    """
     local = equations.local.copy()
     for name, _, precision in prior_parts(problem):
         slot, shared = problem.layout.find(name)
@@ -238,11 +254,12 @@ def shared_priors(problem: Problem) -> Array:
 
 
 def shared_information(equations: Normal) -> Array:
-    """Return the information (..., n, n) of the shared unknowns; an epoch with undetermined local unknowns counts too.
+    """Return the information (..., n, n) of the shared unknowns, after elimination of the local unknowns.
 
-    If all local blocks are regular, it equals the information of `optloc.linear.normal.marginal`.
+    An epoch with undetermined local unknowns counts too. If all local blocks are regular, the result equals the
+    information of `optloc.linear.normal.marginal`.
     """
     # root of the pseudo-inverse: directions of local unknowns that no row measures remove no information
     root, _ = linalg.root(equations.local)
-    seen = equations.cross @ root
-    return np.asarray(equations.shared - (seen @ np.swapaxes(seen, -1, -2)).sum(-3))
+    projected = equations.cross @ root
+    return np.asarray(equations.shared - (projected @ np.swapaxes(projected, -1, -2)).sum(-3))

@@ -1,4 +1,7 @@
-"""Maps of the Cramer-Rao bound: the best possible accuracy of a fix, as a function of the target's position."""
+"""Maps of the Cramer-Rao bound: the best possible accuracy of a fix, as a function of the target's position.
+
+Letters: nx and ny columns and rows of the grid, n positions, d coordinates, s stations.
+"""
 
 from __future__ import annotations
 
@@ -38,9 +41,9 @@ class Grid:
     places : array (ny nx, d)
         Positions in the frame, metres; x varies fastest.
     slot : slice
-        Slice of the position in the shared unknowns.
+        Columns of the position in the shared unknowns.
     stations : array (s, 2)
-        Stations in the units of x and y.
+        Positions of the s stations in the units of x and y.
     names : tuple of s str
         Names of the stations.
     geodetic : bool
@@ -58,7 +61,7 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Return the numbers of rows and columns of the grid."""
+        """Return the shape (ny, nx) of the grid."""
         return len(self.y), len(self.x)
 
 
@@ -136,21 +139,24 @@ def bound_map(
 
 
 def grid_of(problem: Problem, x: Array, y: Array, height: float, geodetic: bool | None = None) -> Grid:
-    """Return the grid of a map; arguments and exceptions as of `bound_map`."""
+    """Return the grid of a map, with its positions and stations; arguments and exceptions as of `bound_map`."""
     slot = _slot(problem)
     earth = problem.frame.geodetic and problem.dimension == 3 if geodetic is None else geodetic
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     east, north = np.meshgrid(x, y)
     places = _places(problem.frame, east.ravel(), north.ravel(), height, problem.dimension, earth)
     stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
-    marks = map_coordinates(problem.frame, stations, earth)[:, :2]
+    places_of_stations = map_coordinates(problem.frame, stations, earth)[:, :2]
     if earth:  # a map across the date line has longitudes beyond 180 degrees, so its stations need them too
-        marks[:, 0] = (marks[:, 0] - np.mean(x) + 180.0) % 360.0 - 180.0 + np.mean(x)
-    return Grid(x, y, float(height), places, slot, marks, problem.stations.names, earth)
+        places_of_stations[:, 0] = (places_of_stations[:, 0] - np.mean(x) + 180.0) % 360.0 - 180.0 + np.mean(x)
+    return Grid(x, y, float(height), places, slot, places_of_stations, problem.stations.names, earth)
 
 
 def _slot(problem: Problem) -> slice:
-    """Return the slice of the position of the unknown target in the shared unknowns."""
+    """Return the columns of the position of the unknown target in the shared unknowns.
+
+    Raise InvalidProblem without exactly one unknown target, or if every epoch has a separate position.
+    """
     sought = [i for i, motion in enumerate(problem.motions) if motion.known is None]
     advice = "use a file with one unknown target"
     if len(sought) != 1:
@@ -165,14 +171,17 @@ def _slot(problem: Problem) -> slice:
 
 
 def _places(frame: Frame, x: Array, y: Array, height: float, dimension: int, earth: bool) -> Array:
-    """Return grid points as positions (n, d) in the frame, metres."""
+    """Return grid points as positions (n, d) in the frame, metres.
+
+    x and y (n,) are degrees if `earth` is True, else metres. `height` is in metres.
+    """
     if earth:
         return frame.from_geodetic(np.radians(y), np.radians((x + 180.0) % 360.0 - 180.0), np.full(len(x), height))
     return np.stack([x, y, np.full(len(x), height)][:dimension], axis=-1)
 
 
 def map_coordinates(frame: Frame, position: Array, earth: bool) -> Array:
-    """Return positions (n, d) as longitude, latitude (deg) and height (m) on Earth, else unchanged."""
+    """Return positions (n, d) as longitude, latitude (deg) and height (m) if `earth` is True, else unchanged."""
     if not earth:
         return position
     lat, lon, height = frame.to_geodetic(position)
@@ -187,9 +196,10 @@ def _deviation(problem: Problem) -> float:
 
 
 def extent(problem: Problem, places: Array | None = None, *, widen: float = 0.5) -> tuple[float, float, float, float]:
-    """Return x and y limits around stations and positions (n, d), widened on every side by a share of the larger side.
+    """Return x and y limits around stations and positions (n, d): least and greatest x, least and greatest y.
 
-    Degrees in three-dimensional frames of the Earth, else metres.
+    Every side is widened by a share of the larger side. Limits are degrees in three-dimensional frames of the Earth,
+    else metres.
     """
     earth = problem.frame.geodetic and problem.dimension == 3
     stations = problem.stations.position.reshape(-1, problem.dimension)

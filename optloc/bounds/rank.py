@@ -1,4 +1,8 @@
-"""Observability: the information of data and priors about each unknown, and the combinations that stay undetermined."""
+"""Observability: the information of data and priors about each unknown, and the combinations that stay undetermined.
+
+Letters: n shared unknowns, p free directions of a basis, q undetermined combinations. A *slot* is the entries of one
+named unknown.
+"""
 
 from __future__ import annotations
 
@@ -66,8 +70,8 @@ class Observability:
         a prior, NaN for an undetermined unknown.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
-            left = np.where(np.isinf(self.prior), 0.0, (self.posterior / self.prior) ** 2)
-        return np.where(np.isinf(self.posterior), np.nan, np.clip(1.0 - left, 0.0, 1.0))
+            share_of_variance = np.where(np.isinf(self.prior), 0.0, (self.posterior / self.prior) ** 2)
+        return np.where(np.isinf(self.posterior), np.nan, np.clip(1.0 - share_of_variance, 0.0, 1.0))
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -106,14 +110,14 @@ def observability(problem: Problem, x: Array) -> Observability:
     information, size = shared_information(equations), equations.shared
     basis = free_directions(problem, x)
     precision = shared_priors(problem)
-    data = _take_apart(information, size, basis)
-    both = _take_apart(information + precision, size + precision, basis)
+    data = _split_information(information, size, basis)
+    both = _split_information(information + precision, size + precision, basis)
     shown = np.isfinite(data.sigma)  # undetermined unknowns have sentences of another kind
     return Observability(
         layout.labels(),
         tuple(slot.unit for slot in layout.shared for _ in range(slot.size)),
         data.sigma,
-        _take_apart(precision, precision, np.eye(layout.n_shared)).sigma,
+        _split_information(precision, precision, np.eye(layout.n_shared)).sigma,
         both.sigma,
         basis.shape[1] - len(data.open),
         tuple(_open_sentences(layout, data)),
@@ -122,13 +126,17 @@ def observability(problem: Problem, x: Array) -> Observability:
 
 
 def open_sentences(layout: Layout, information: Array) -> tuple[str, ...]:
-    """Return sentences that name the combinations of shared unknowns without information in a matrix (n, n)."""
-    return tuple(_open_sentences(layout, _take_apart(information, information, np.eye(layout.n_shared))))
+    """Return sentences on the combinations of shared unknowns about which a matrix (n, n) has no information."""
+    return tuple(_open_sentences(layout, _split_information(information, information, np.eye(layout.n_shared))))
 
 
 @dataclass(frozen=True, slots=True)
 class _InformationParts:
-    """Standard deviations (n,), correlations (n, n), and an undetermined basis (q, n) over `reach` (n,)."""
+    """Determined and undetermined combinations of n unknowns.
+
+    `sigma` (n,) are standard deviations, infinite if undetermined, and `correlation` (n, n) the correlations. `open`
+    (q, n) is a basis of the undetermined combinations, divided by the scale `reach` (n,) of each unknown.
+    """
 
     sigma: Array
     correlation: Array
@@ -136,10 +144,10 @@ class _InformationParts:
     reach: Array
 
 
-def _take_apart(information: Array, size: Array, basis: Array) -> _InformationParts:
+def _split_information(information: Array, size: Array, basis: Array) -> _InformationParts:
     """Return the parts of information (n, n) on a basis (n, p): determined and undetermined combinations.
 
-    `size` is the information before elimination; its rounding errors decide what counts as zero.
+    `size` (n, n) is the information before elimination; its rounding errors decide what counts as zero.
     """
     # columns are scaled to unit information, so that metres and seconds are comparable
     weight = np.sqrt(np.einsum("ip,ij,jp->p", basis, size, basis).clip(0.0))
@@ -148,23 +156,23 @@ def _take_apart(information: Array, size: Array, basis: Array) -> _InformationPa
     directions = basis @ vectors
     reach = np.linalg.norm(directions, axis=-1, keepdims=True)
     reach = np.where(reach > 0.0, reach, 1.0)
-    shut = values > OPEN
-    known, null = directions[:, shut] / np.sqrt(values[shut]), directions[:, ~shut] / reach
+    determined = values > OPEN
+    known, null = directions[:, determined] / np.sqrt(values[determined]), directions[:, ~determined] / reach
     sigma = np.linalg.norm(known, axis=-1)
     # an unknown in an undetermined combination is undetermined
-    loose = (np.abs(null) > _NOTHING).any(-1)
+    undetermined = (np.abs(null) > _NOTHING).any(-1)
     unit = known / np.where(sigma > 0.0, sigma, 1.0)[:, None]
-    correlation = np.where(loose[:, None] | loose, 0.0, unit @ unit.T)
-    return _InformationParts(np.where(loose, np.inf, sigma), correlation, null.T, reach[:, 0])
+    correlation = np.where(undetermined[:, None] | undetermined, 0.0, unit @ unit.T)
+    return _InformationParts(np.where(undetermined, np.inf, sigma), correlation, null.T, reach[:, 0])
 
 
 def _open_sentences(layout: Layout, parts: _InformationParts) -> Iterator[str]:
-    """Yield sentences on undetermined combinations: common changes of all members of a bias first, then others."""
+    """Yield sentences on the undetermined combinations in `parts`, common changes of a bias first."""
     common = np.array([_entries(layout, slot) for slot in layout.shared if slot.members]).reshape(-1, layout.n_shared)
     found = [row for row in common / parts.reach if _inside(row, parts.open)]
     for row in found:
         yield _open_sentence(layout, row * parts.reach)
-    rest = _reduce(_without(parts.open, found))
+    rest = _reduce(_orthogonal_rest(parts.open, found))
     if len(rest) <= _FEW:
         yield from (_open_sentence(layout, row * parts.reach) for row in rest)
     else:
@@ -173,19 +181,22 @@ def _open_sentences(layout: Layout, parts: _InformationParts) -> Iterator[str]:
 
 
 def _entries(layout: Layout, slot: Slot) -> Array:
-    """Return the change (n,) of all entries of a slot by one."""
+    """Return the vector (n,) that changes all entries of a slot by one."""
     place = np.arange(layout.n_shared) - slot.start
     return ((place >= 0) & (place < slot.size)).astype(float)
 
 
 def _inside(row: Array, basis: Array) -> bool:
-    """Return whether a vector (n,) is in the span of a basis (q, n)."""
+    """Return whether a vector `row` (n,) is in the span of a basis (q, n)."""
     away = row - np.linalg.lstsq(basis.T, row, rcond=None)[0] @ basis
     return float(np.linalg.norm(away)) < _NOTHING * float(np.linalg.norm(row))
 
 
-def _without(basis: Array, found: list[Array]) -> Array:
-    """Return a basis (q - f, n) of the span of a basis (q, n), orthogonal to f vectors in this span."""
+def _orthogonal_rest(basis: Array, found: list[Array]) -> Array:
+    """Return a basis (q - f, n) of the part of a space that is orthogonal to f vectors.
+
+    `basis` (q, n) spans the space, and `found` are f vectors in it.
+    """
     if not found:
         return basis
     taken, _ = np.linalg.qr(np.array(found).T)
@@ -195,12 +206,12 @@ def _without(basis: Array, found: list[Array]) -> Array:
 
 
 def _reduce(rows: Array) -> Array:
-    """Return a basis (q, n) of the same space in which each row has an entry of one that no other row has."""
+    """Return a basis (q, n) of the same space: each row has an entry 1 where all other rows have 0."""
     rows = rows.copy()
     for i in range(len(rows)):
         # Gauss-Jordan with full pivoting: the largest remaining entry becomes one, and the only one of its column
-        at, pivot = divmod(int(np.argmax(np.abs(rows[i:]))), rows.shape[1])
-        rows[[i, i + at]] = rows[[i + at, i]]
+        offset, pivot = divmod(int(np.argmax(np.abs(rows[i:]))), rows.shape[1])
+        rows[[i, i + offset]] = rows[[i + offset, i]]
         rows[i] /= rows[i, pivot]
         others = np.arange(len(rows)) != i
         rows[others] -= rows[others, pivot, None] * rows[i]
@@ -208,7 +219,7 @@ def _reduce(rows: Array) -> Array:
 
 
 def _open_sentence(layout: Layout, direction: Array) -> str:
-    """Return the sentence on a combination (n,) of unknowns that no measurement determines."""
+    """Return the sentence on a combination `direction` (n,) of unknowns that no measurement determines."""
     labels, names, amounts = layout.labels(), [], []
     for slot in layout.shared:
         unit = "" if slot.unit == "1" else slot.unit
@@ -230,7 +241,7 @@ def _open_sentence(layout: Layout, direction: Array) -> str:
 
 
 def _tied_sentences(layout: Layout, correlation: Array) -> list[str]:
-    """Return a sentence for each group of unknowns with biases in it that are strongly correlated."""
+    """Return a sentence for each group of unknowns with correlations (n, n) above `TIED` that includes a bias."""
     from scipy.sparse.csgraph import connected_components
 
     labels, found = layout.labels(), []

@@ -77,7 +77,7 @@ def version_of(package: str) -> str:
 
 @cache
 def installed() -> dict[str, Backend]:
-    """Return every back end that its library lists here, working or not, by the name in study files."""
+    """Return every back end that its library lists, working or not; the key is the name in study files."""
     import casadi
     import cvxpy
     from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC
@@ -111,7 +111,10 @@ def kind_of(name: str) -> Literal["conic", "nonlinear"]:
 
 
 def backend_kind(name: str, where: str) -> Literal["conic", "nonlinear"]:
-    """Return the kind of programs that a back end solves; raise InvalidProblem if it is unknown, missing or broken."""
+    """Return the kind of programs that a back end solves; raise InvalidProblem if it is unknown, missing or broken.
+
+    `where` is the place of the name in the input, for the message of the error.
+    """
     here = {key: entry.kind for key, entry in installed().items() if entry.kind != "least squares"}
     working = [key for key in backends() if key in here]
     if name not in here:
@@ -135,30 +138,33 @@ def backend_kind(name: str, where: str) -> Literal["conic", "nonlinear"]:
 
 @cache
 def _faults(kinds: tuple[tuple[str, str], ...]) -> dict[str, str]:
-    """Return the fault of each back end; "" for one that works."""
-    place = folder()
-    file = None if place is None else place / f"backends-{_key(kinds)}.json"
+    """Return the fault of each back end, a sentence; "" for a back end that works.
+
+    `kinds` has pairs (name, kind). A file in the cache folder stores the faults, if there is such a folder.
+    """
+    cache_folder = folder()
+    file = None if cache_folder is None else cache_folder / f"backends-{_key(kinds)}.json"
     if file is not None:
         with suppress(OSError, ValueError):
-            kept = json.loads(file.read_text(encoding="utf-8"))
-            if isinstance(kept, dict) and set(kept) == {name for name, _ in kinds}:
-                return {str(name): str(fault) for name, fault in kept.items()}
-    found = try_in_process(dict(kinds))
+            stored = json.loads(file.read_text(encoding="utf-8"))
+            if isinstance(stored, dict) and set(stored) == {name for name, _ in kinds}:
+                return {str(name): str(fault) for name, fault in stored.items()}
+    faults = try_in_process(dict(kinds))
     if file is not None:
         with suppress(OSError):
-            own = file.with_suffix(f".{os.getpid()}")
-            own.write_text(json.dumps(found), encoding="utf-8")
-            own.replace(file)  # an atomic replacement: another process never reads a partial file
-    return found
+            temporary = file.with_suffix(f".{os.getpid()}")
+            temporary.write_text(json.dumps(faults), encoding="utf-8")
+            temporary.replace(file)  # an atomic replacement: another process never reads a partial file
+    return faults
 
 
 def faults_of(kinds: Mapping[str, str]) -> dict[str, str]:
-    """Return the fault of each back end, given by name and kind; "" for one that works."""
+    """Return the fault of each back end, a sentence; "" for a back end that works. `kinds` maps names to kinds."""
     return dict(_faults(tuple(sorted(kinds.items()))))
 
 
 def _key(kinds: tuple[tuple[str, str], ...]) -> str:
-    """Return a digest of everything that the results depend on: names, versions, and the programs of the trial."""
+    """Return a digest of everything that the results depend on: `kinds`, versions, and the programs of the trial."""
     here = Path(__file__).parent
     programs = [path.read_text(encoding="utf-8") for path in sorted((here.parents[1] / "formulations").glob("*.py"))]
     libraries = [version_of(name) for name in ("casadi", "cvxpy", "numpy")]
@@ -168,23 +174,26 @@ def _key(kinds: tuple[tuple[str, str], ...]) -> str:
 
 
 def try_in_process(kinds: dict[str, str]) -> dict[str, str]:
-    """Return the faults of back ends, given by name and kind, from a trial in a separate process.
+    """Return the faults of back ends from a trial in a separate process; `kinds` maps names to kinds.
 
-    If a solver ends the process, a new process tries the remaining solvers.
+    If a solver ends the process, a new process tries the remaining solvers. The fault "" means that the solver works.
     """
-    left, found = dict(kinds), dict[str, str]()
-    while left:
-        done = _one_process(left)
-        found |= done
-        left = {name: kind for name, kind in left.items() if name not in found}
-        if left and not done:  # no solver was reached, so the fault is not in a solver
-            found |= dict.fromkeys(left, "the trial did not run")
+    untried, faults = dict(kinds), dict[str, str]()
+    while untried:
+        tried = _one_process(untried)
+        faults |= tried
+        untried = {name: kind for name, kind in untried.items() if name not in faults}
+        if untried and not tried:  # no solver was reached, so the fault is not in a solver
+            faults |= dict.fromkeys(untried, "the trial did not run")
             break
-    return found
+    return faults
 
 
 def _one_process(kinds: dict[str, str]) -> dict[str, str]:
-    """Return the faults of the back ends that one process reaches, including the one that ends the process."""
+    """Return the faults of the back ends that one process reaches, including the back end that ends the process.
+
+    `kinds` maps names to kinds. Back ends that the process does not reach are missing from the result.
+    """
     root = str(Path(__file__).resolve().parents[2])
     path = os.pathsep.join([root, *(place for place in sys.path if place)])
     process = subprocess.Popen(  # noqa: S603  (this interpreter, and a module of this package)
@@ -199,13 +208,13 @@ def _one_process(kinds: dict[str, str]) -> dict[str, str]:
     except subprocess.TimeoutExpired:
         process.kill()
         output, _ = process.communicate()
-    found: dict[str, str] = {}
+    faults: dict[str, str] = {}
     for line in output.decode(errors="replace").splitlines():
         word, _, rest = line.partition(" ")
         name, _, fault = rest.partition(" ")
         if word in _SAID and name in kinds:
-            found[name] = fault
-    ended = next((name for name in kinds if name not in found), None)
+            faults[name] = fault
+    ended = next((name for name in kinds if name not in faults), None)
     if ended is not None and process.returncode:
-        found[ended] = f"it ends the process (exit code {process.returncode})"
-    return found
+        faults[ended] = f"it ends the process (exit code {process.returncode})"
+    return faults

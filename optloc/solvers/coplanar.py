@@ -2,6 +2,9 @@
 
 The data separate mirror images only if the cost on the plane between them is clearly higher. Otherwise both belong to
 one region.
+
+Letters: N problems, r minima of a problem, q slots of a pool, `size` numbers of a parameter vector. w is the distance
+from the plane in metres. The minima are found in the coordinates of `Across`: position in the plane, and w^2.
 """
 
 from __future__ import annotations
@@ -32,7 +35,7 @@ from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.verdict.minima import measure_curvature, smallest_pivot
 
 APART = 20.0
-"""Standard deviations of the distance w from the plane beyond which no region reaches across: ten of q = w^2."""
+"""Standard deviations of the distance w from the plane beyond which no region reaches across: ten of w^2."""
 
 
 def join_sides(problem: Problem, pool: Pool) -> Pool:
@@ -70,7 +73,10 @@ def join_sides(problem: Problem, pool: Pool) -> Pool:
 
 
 def _is_near(problem: Problem, pool: Pool) -> Array:
-    """Return a mask (N,): the fix is within some standard deviations of the plane, or not finished."""
+    """Return flags (N,) of fixes near the plane, within `APART` standard deviations, or not finished.
+
+    Only for these fixes may both sides of the plane be one region.
+    """
     assert pool.curvature is not None
     across = Across.of(problem)
     place, normal = pool.x[:, 0, across.part], across.axes[..., -1]
@@ -83,7 +89,7 @@ def _is_near(problem: Problem, pool: Pool) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _FoundSides:
-    """Minima of N problems over the position in the plane and q, the squared distance from it; the cheapest first.
+    """Minima of N problems over the position in the plane and w^2, the squared distance from it; the cheapest first.
 
     Parameters
     ----------
@@ -100,12 +106,12 @@ class _FoundSides:
     on_plane: Array
 
     def take(self, items: Array) -> _FoundSides:
-        """Return the entries of some problems."""
+        """Return the entries of problems `items`."""
         return _FoundSides(self.x[items], self.cost[items], self.on_plane[items])
 
 
 def _minima(across: Across, pool: Pool) -> _FoundSides:
-    """Return the minima that steps in q reach from all candidates of a pool."""
+    """Return the minima that steps in the coordinates of `Across` reach from all candidates of a pool."""
     item, slot = pool.occupied
     each, shape = across.take(item), pool.x.shape[:2]
     start = each.to_plane(pool.x[item, slot])
@@ -124,7 +130,10 @@ def _minima(across: Across, pool: Pool) -> _FoundSides:
 
 
 def _distinct(across: Across, x: Array, cost: Array) -> Array:
-    """Return a mask (N, r) of distinct minima within the listed gap; minima are in ascending order of cost."""
+    """Return flags (N, r) of distinct minima within the listed gap of cost.
+
+    The minima x (N, r, size) are in ascending order of cost (N, r). Of equal minima the first one is kept.
+    """
     n = across.problem.layout.n_shared
     information, _ = information_in_square(across, np.where(np.isfinite(x[:, 0]), x[:, 0], 0.0))
     folded = np.array(x[..., :n])
@@ -159,27 +168,30 @@ class _Sides:
     on_plane: Array
 
     def take(self, items: Array) -> _Sides:
-        """Return the entries of some problems."""
+        """Return the entries of problems `items`."""
         return _Sides(self.x[items], self.cost[items], self.on_plane[items])
 
 
 def _sides(problem: Problem, across: Across, found: _FoundSides) -> _Sides:
-    """Return the minima that constraints admit, in space."""
+    """Return the minima on both sides of the plane, in space; the cost of a minimum that is not admitted is infinite.
+
+    A minimum in the plane has one slot only.
+    """
     count, slots, size = found.x.shape
     x, cost = np.full((count, 2 * slots, size), np.nan), np.full((count, 2 * slots), np.inf)
     off = found.x[..., across.part.stop - 1] > across.least[:, None]
     # the upper side first, as in the verdict
     upward = np.where(across.axes[:, -1, -1] < 0.0, -1.0, 1.0)
     for slot in range(slots):
-        flat = np.array(found.x[:, slot])
-        flat[~off[:, slot], across.part.stop - 1] = 0.0
+        minimum = np.array(found.x[:, slot])
+        minimum[~off[:, slot], across.part.stop - 1] = 0.0
         for side, sense in ((0, upward), (1, -upward)):
-            at = across.to_space(flat, sense)
-            there = np.isfinite(found.cost[:, slot]) & (off[:, slot] | (side == 0))
-            if there.any():
-                known = np.where(there[:, None], at, 0.0)
-                there &= (violation(problem, known) <= TOLERANCE) & ~is_hidden(problem, known)
-            x[there, 2 * slot + side], cost[there, 2 * slot + side] = at[there], found.cost[there, slot]
+            in_space = across.to_space(minimum, sense)
+            exists = np.isfinite(found.cost[:, slot]) & (off[:, slot] | (side == 0))
+            if exists.any():
+                known = np.where(exists[:, None], in_space, 0.0)
+                exists &= (violation(problem, known) <= TOLERANCE) & ~is_hidden(problem, known)
+            x[exists, 2 * slot + side], cost[exists, 2 * slot + side] = in_space[exists], found.cost[exists, slot]
     # if constraints admit only the second side, it becomes the first
     swap = ~np.isfinite(cost[:, 0]) & np.isfinite(cost[:, 1])
     x[swap, :2], cost[swap, :2] = x[swap, 1::-1], cost[swap, 1::-1]
@@ -187,23 +199,30 @@ def _sides(problem: Problem, across: Across, found: _FoundSides) -> _Sides:
 
 
 def _is_joined(found: _FoundSides, sides: _Sides) -> Array:
-    """Return a mask (N,): both sides of the plane are one region."""
+    """Return flags (N,) of problems in which both sides of the plane are one region.
+
+    The region is one if constraints admit both sides, and the cost on the plane is at most `JOINED` above the least
+    cost.
+    """
     both = np.isfinite(sides.cost[:, :2]).all(1) | sides.on_plane
     return np.asarray(both & (found.on_plane - found.cost[:, 0] <= JOINED))
 
 
 def _as_pool(problem: Problem, across: Across, own: Pool, found: _FoundSides, sides: _Sides) -> Pool:
-    """Return minima on both sides of the plane as a settled pool, together with minima on constraints."""
+    """Return minima on both sides of the plane as a settled pool, together with minima on constraints.
+
+    `own` is the pool before, with the minima on constraints.
+    """
     x, cost = sides.x, sides.cost
     joined = _is_joined(found, sides)
     pair = np.where(joined[:, None, None], x[:, :2], np.nan)
     curvature = _curvature(problem, across, found, x[:, 0], joined)
     face = np.zeros(cost.shape, dtype=int)
     if problem.constraints:
-        held = _held(across, own, cost[:, 0])
-        x = np.concatenate([x, np.where(held[..., None], own.x, np.nan)], axis=1)
-        cost = np.concatenate([cost, np.where(held, own.cost, np.inf)], axis=1)
-        face = np.concatenate([face, np.where(held, own.face, 0)], axis=1)
+        constrained = _has_active_constraint(across, own, cost[:, 0])
+        x = np.concatenate([x, np.where(constrained[..., None], own.x, np.nan)], axis=1)
+        cost = np.concatenate([cost, np.where(constrained, own.cost, np.inf)], axis=1)
+        face = np.concatenate([face, np.where(constrained, own.face, 0)], axis=1)
     order = np.argsort(~np.isfinite(cost), axis=1, kind="stable")[:, : int(np.isfinite(cost).sum(1).max())]
     x = np.take_along_axis(x, order[..., None], axis=1)
     cost, face = np.take_along_axis(cost, order, axis=1), np.take_along_axis(face, order, axis=1)
@@ -212,8 +231,11 @@ def _as_pool(problem: Problem, across: Across, own: Pool, found: _FoundSides, si
     return replace(own, x=x, cost=cost, code=code, face=face, pair=pair, curvature=curvature, plain=plain)
 
 
-def _held(across: Across, own: Pool, least: Array) -> Array:
-    """Return a mask (N, q) of minima that a constraint holds off the plane, with costs within the listed gap."""
+def _has_active_constraint(across: Across, own: Pool, least: Array) -> Array:
+    """Return flags (N, q) of minima with an active constraint, off the plane, with costs within the listed gap.
+
+    `least` (N,) is the least cost of each problem.
+    """
     away = own.x[..., across.part] - across.centre[:, None]
     w = np.abs((away * across.axes[:, None, :, -1]).sum(-1))
     with np.errstate(invalid="ignore"):
@@ -222,27 +244,37 @@ def _held(across: Across, own: Pool, least: Array) -> Array:
 
 
 def _curvature(problem: Problem, across: Across, found: _FoundSides, x: Array, joined: Array) -> Curvature:
-    """Return the curvature at minima x (N, size); for a joined region with the second moment of both sides about x."""
+    """Return the curvature at minima x (N, size).
+
+    `joined` (N,) flags regions with both sides of the plane: their covariance is the second moment of both sides about
+    x.
+    """
     with np.errstate(all="ignore"):
-        at = measure_curvature(problem, equations_at(problem, x), x, np.zeros(len(x), dtype=int))
-    covariance, kappa = at.covariance.copy(), np.full((len(x), 2), np.nan)
+        curvature = measure_curvature(problem, equations_at(problem, x), x, np.zeros(len(x), dtype=int))
+    covariance, kappa = curvature.covariance.copy(), np.full((len(x), 2), np.nan)
     items = np.flatnonzero(joined)
     if not len(items):
-        return replace(at, kappa=kappa)
+        return replace(curvature, kappa=kappa)
     across, best = across.take(items), found.x[items, 0]
     information, ok = information_in_square(across, best)
     square, regular = linalg.inverse(information)
-    own = across.part.stop - 1
-    _, end = interval_across(across, best, found.cost[items, 0])
+    axis = across.part.stop - 1
+    _, upper = interval_across(across, best, found.cost[items, 0])
     # both sides are symmetric, so the distance from the plane is not correlated with other unknowns
-    square[:, own], square[:, :, own] = 0.0, 0.0
-    square[:, own, own] = (end / np.sqrt(JOINED)) ** 2 + best[:, own] ** 2
-    turn = np.broadcast_to(np.eye(information.shape[-1]), information.shape).copy()
-    turn[:, across.part, across.part] = across.axes
-    covariance[items] = turn @ square @ np.swapaxes(turn, -1, -2)
+    square[:, axis], square[:, :, axis] = 0.0, 0.0
+    square[:, axis, axis] = (upper / np.sqrt(JOINED)) ** 2 + best[:, axis] ** 2
+    rotation = np.broadcast_to(np.eye(information.shape[-1]), information.shape).copy()
+    rotation[:, across.part, across.part] = across.axes
+    covariance[items] = rotation @ square @ np.swapaxes(rotation, -1, -2)
     kappa[items] = np.inf
-    known, weakest, of_all = np.array(at.regular), np.array(at.weakest), np.array(at.information)
-    known[items] = ok & regular
+    regular_now, weakest, of_all = (
+        np.array(curvature.regular),
+        np.array(curvature.weakest),
+        np.array(curvature.information),
+    )
+    regular_now[items] = ok & regular
     weakest[items] = smallest_pivot(information)
     of_all[items], _ = linalg.inverse(covariance[items])
-    return replace(at, covariance=covariance, information=of_all, regular=known, weakest=weakest, kappa=kappa)
+    return replace(
+        curvature, covariance=covariance, information=of_all, regular=regular_now, weakest=weakest, kappa=kappa
+    )

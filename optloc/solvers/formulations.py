@@ -66,7 +66,7 @@ class Formulation:
 
 
 def _from_bearings(locate: Callable[[Bearings], Array]) -> Callable[[Problem], Array]:
-    """Return a start from the bearings of a problem."""
+    """Return a start for problems from a function of their bearings; the start is NaN without azimuths."""
 
     def start(problem: Problem) -> Array:
         # NaN without azimuths: other formulations may start the rows
@@ -78,13 +78,13 @@ def _from_bearings(locate: Callable[[Bearings], Array]) -> Callable[[Problem], A
 
 
 def _needs_sight(problem: Problem) -> str:
-    """Return the missing input, as of `Formulation.needs`, if no azimuth is measured."""
+    """Return the missing input, as of `Formulation.needs`, if no azimuth is measured; else ""."""
     kinds = dict.fromkeys(rows.kind for rows in problem.rows)
     return "" if "azimuth" in kinds else f"starts from azimuths, and these rows are {' and '.join(kinds)}"
 
 
 def _needs_bearings(problem: Problem) -> str:
-    """Return the missing input, as of `Formulation.needs`, if fewer than two stations measure complete bearings."""
+    """Return the missing input, as of `Formulation.needs`, without complete bearings of two stations; else ""."""
     wanted = ("azimuth", "elevation")[: problem.dimension - 1]
     seen = [
         {
@@ -102,7 +102,7 @@ def _needs_bearings(problem: Problem) -> str:
 
 
 def _needs_directions(problem: Problem) -> str:
-    """Return the missing input, as of `Formulation.needs`, if directions are in a plane or bearings are incomplete."""
+    """Return the missing input, as of `Formulation.needs`, for a problem in a plane or incomplete bearings; else ""."""
     plane = problem.dimension == 2
     return (
         "relaxes directions in three dimensions, and these rows are in a plane" if plane else _needs_bearings(problem)

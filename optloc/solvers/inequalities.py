@@ -1,6 +1,10 @@
 """Conditions that an answer must meet: inequalities, and lines of sight that the Earth does not block.
 
-If the best candidate breaks an inequality, the cost is minimised along every face of the inequalities.
+If the best candidate breaks an inequality, the cost is minimised along every face of the inequalities. A *face* is a
+set of inequalities that are satisfied with equality.
+
+Letters: N problems, q slots for candidates, k stations, M starts or points of several problems, `size` numbers of a
+parameter vector. Costs are chi-square values.
 """
 
 from __future__ import annotations
@@ -60,13 +64,13 @@ class Sight:
     frame : Frame
         Frame of the vectors.
     part : slice
-        Slice of a vector that holds the position of the target.
+        Columns of the position of the target in a parameter vector.
     station : int array (k,)
         Numbers of the stations.
     place : array (N, k, 3)
         Earth-centred positions of the stations, scaled so that the ellipsoid is the unit sphere.
     present, angular : bool array (N, k)
-        Whether they have a row in a problem, and whether they have an angle.
+        True if the station has a row in a problem, and if one of its rows is an angle.
     """
 
     frame: Frame
@@ -77,7 +81,10 @@ class Sight:
     angular: Array
 
     def blocked(self, x: Array, reach: float = 0.0) -> Array:
-        """Return flags (N, k) of stations that the Earth hides from vectors x (N, size), see `is_hidden`."""
+        """Return flags (N, k) of stations that the Earth hides from targets at x (N, size).
+
+        `reach` is the radius, metres, of a ball around the target that must be hidden as a whole; see `is_hidden`.
+        """
         point = self.frame.to_ecef(x[:, self.part]) * _STRETCH
         return _is_blocked(point[:, None], self.place, self.present, self.angular, reach * float(_STRETCH.max()))
 
@@ -103,33 +110,36 @@ def sights(problem: Problem) -> list[Sight]:
 
 
 def _measured_by(problem: Problem, target: int) -> tuple[Array, Array, Array, Array]:
-    """Return the epochs and stations (k,) that measure a target, with flags (N, k) for any row and for an angle.
+    """Return the k pairs of epoch and station that measure a target: epochs (k,), stations (k,), and two flags (N, k).
+
+    The first flag is True if the pair has a row in a problem, and the second if it has an angle. If no station moves,
+    all epochs count as epoch 0.
 
     Parameters
     ----------
     problem : Problem
         Flat batch of N problems.
     target : int
-        The target.
+        Number of the target.
     """
     moving = problem.stations.position.shape[-3] > 1
     weight = np.broadcast_to(problem.weight, (problem.batch_shape[0], problem.count))
-    none = np.zeros(len(weight), dtype=bool)
+    no_rows = np.zeros(len(weight), dtype=bool)
     found: dict[tuple[int, int], Array] = {}
     sighted: dict[tuple[int, int], Array] = {}
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         present, model = weight[:, start : start + rows.count] > 0.0, MODELS[rows.kind]
-        mine = np.flatnonzero(rows.target == target).tolist()
+        rows_of_target = np.flatnonzero(rows.target == target).tolist()
         for index in (rows.a, rows.b)[: model.stations]:
-            for i in mine:
+            for i in rows_of_target:
                 key = (int(rows.epoch[i]) if moving else 0, int(index[i]))
-                found[key] = found.get(key, none) | present[:, i]
+                found[key] = found.get(key, no_rows) | present[:, i]
                 if model.quantity == "angle":
-                    sighted[key] = sighted.get(key, none) | present[:, i]
+                    sighted[key] = sighted.get(key, no_rows) | present[:, i]
     epoch, station = np.array(list(found), dtype=int).reshape(-1, 2).T
     measured, angular = (np.empty((len(weight), len(found)), dtype=bool) for _ in range(2))
     for k, key in enumerate(found):
-        measured[:, k], angular[:, k] = found[key], sighted.get(key, none)
+        measured[:, k], angular[:, k] = found[key], sighted.get(key, no_rows)
     return epoch, station, measured, angular
 
 
@@ -139,11 +149,11 @@ def _is_blocked(point: Array, station: Array, present: Array, angular: Array, re
     Parameters
     ----------
     point, station : array (..., 3)
-        Ends of the line.
+        Ends of the line; the ellipsoid is the unit sphere.
     present, angular : bool array (...)
-        Whether the station has a row, and whether it has an angle.
+        True if the station has a row, and if one of its rows is an angle.
     reach : float
-        Further depth that a line must reach to count.
+        Further depth that a line must reach to count, in the same unit.
     """
     satellite = (station**2).sum(-1) > SATELLITE**2
     limit = np.where(satellite, GRAZE, GROUND)
@@ -157,9 +167,9 @@ def _is_blocked(point: Array, station: Array, present: Array, angular: Array, re
 
 
 def lowest_sight(problem: Problem, x: Array) -> Array:
-    """Return the sine (N,) of the lowest elevation of a satellite with rows, as seen from targets x (N, size).
+    """Return the sine (N,) of the elevation of the lowest satellite with rows, as seen from targets x (N, size).
 
-    Zero in plain Cartesian frames and without satellites. It ranks positions that fit equally well.
+    It is zero in plain Cartesian frames and without satellites. It ranks positions that fit equally well.
     """
     worst = np.full(len(x), np.inf)
     if not problem.frame.geodetic or problem.dimension != 3:
@@ -207,9 +217,9 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
 
     A target that the Earth hides from a station with a row of it is not feasible either.
 
-    A face is a set of inequalities that can hold with equality together. The cost is minimised on each face from the
-    cheapest candidates, and the feasible results compete. The cheapest one meets the conditions of Karush, Kuhn and
-    Tucker.
+    A face is a set of inequalities that can be satisfied with equality together. The cost is minimised on each face
+    from the cheapest candidates, and the feasible results compete. The cheapest one meets the conditions of Karush,
+    Kuhn and Tucker.
 
     Parameters
     ----------
@@ -233,34 +243,39 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
 
 
 def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Pool:
-    """Return the pool of `bound_pool` for candidates of which `broken` (N, q) break a constraint."""
+    """Return the pool of `bound_pool`: flagged candidates are infeasible, and minima on faces are added.
+
+    `broken` (N, q) flags the candidates that break a constraint or are hidden. `descend` minimises the cost on a face.
+    """
     sides = faces(problem)
     first = np.argmin(np.where(np.isfinite(pool.cost), pool.cost, np.inf), axis=1)
-    needy = np.flatnonzero(broken[np.arange(len(first)), first])
+    unanswered = np.flatnonzero(broken[np.arange(len(first)), first])
     refused = np.where(broken & (pool.code == Status.OK) & _fits(pool, pool.cost), pool.cost, np.inf)
-    kept = replace(_without(pool, broken), hidden=_first_told(_name_hidden(problem, pool.x, refused), pool.hidden))
+    kept = replace(
+        _mark_infeasible(pool, broken), hidden=_first_sentence(_name_hidden(problem, pool.x, refused), pool.hidden)
+    )
     # a feasible cheapest candidate is the answer, and without inequalities there is no other face
-    if not len(needy) or sides == [exact(problem)]:
+    if not len(unanswered) or sides == [exact(problem)]:
         return kept
-    starts, strata = _cheapest(pool, needy), strata_of(problem)
+    starts, strata = _cheapest(pool, unanswered), strata_of(problem)
     starts = starts if strata is None else in_every_layer(strata, starts)
     # face 0 has no inequality, and its minima are in the pool already
-    on_faces = [_on_face(problem, sides, number, needy, starts, descend) for number in range(1, len(sides))]
+    on_faces = [_on_face(problem, sides, number, unanswered, starts, descend) for number in range(1, len(sides))]
     size, width = len(pool.x), starts.shape[1] * len(on_faces)
     x = np.full((size, width, pool.x.shape[-1]), np.nan)
     cost, code = np.full((size, width), np.inf), np.full((size, width), int(Status.INFEASIBLE), dtype=np.int8)
     face = np.zeros((size, width), dtype=int)
-    beyond = np.full((size, width), np.inf)
-    for array, place in ((x, 0), (cost, 1), (code, 2), (face, 3), (beyond, 4)):
-        array[needy] = np.concatenate([found[place] for found in on_faces], axis=1)
-    beyond = np.where(_fits(pool, beyond), beyond, np.inf)
+    refused_on_faces = np.full((size, width), np.inf)
+    for array, place in ((x, 0), (cost, 1), (code, 2), (face, 3), (refused_on_faces, 4)):
+        array[unanswered] = np.concatenate([found[place] for found in on_faces], axis=1)
+    refused_on_faces = np.where(_fits(pool, refused_on_faces), refused_on_faces, np.inf)
     if not pool.loss:
         inside = np.where(kept.code == Status.OK, kept.cost, np.inf).min(1)
         falling = _falls(problem, sides, inside, x, cost, face)
         cost, code = np.where(falling, np.inf, cost), np.where(falling, np.int8(Status.INFEASIBLE), code)
     return replace(
         kept,
-        hidden=_first_told(kept.hidden, _name_hidden(problem, x, beyond)),
+        hidden=_first_sentence(kept.hidden, _name_hidden(problem, x, refused_on_faces)),
         x=np.concatenate([kept.x, x], axis=1),
         cost=np.concatenate([kept.cost, cost], axis=1),
         code=np.concatenate([kept.code, code], axis=1),
@@ -272,11 +287,11 @@ def _keep_misfits(problem: Problem, before: Pool, broken: Array, pool: Pool) -> 
     """Return a pool that keeps misfits behind the Earth for problems without a visible minimum.
 
     A wrong row may move the best minimum of a good network behind the Earth. Then the reason is the misfit, not the
-    horizon.
+    horizon. `before` is the pool before the candidates `broken` (N, q) lost their costs.
     """
     unseen = ~((pool.code == Status.OK) & np.isfinite(pool.cost)).any(1)
-    back = broken & unseen[:, None] & (before.code == Status.OK) & ~_fits(before, before.cost)
-    item, slot = np.nonzero(back & np.isfinite(before.x).all(-1))
+    restored = broken & unseen[:, None] & (before.code == Status.OK) & ~_fits(before, before.cost)
+    item, slot = np.nonzero(restored & np.isfinite(before.x).all(-1))
     if not len(item):
         return pool
     inside = violation(problem.take(item), before.x[item, slot]) <= TOLERANCE
@@ -287,15 +302,15 @@ def _keep_misfits(problem: Problem, before: Pool, broken: Array, pool: Pool) -> 
 
 
 def _fits(pool: Pool, cost: Array) -> Array:
-    """Return flags (N, q) of costs that noise explains; all True for a robust loss, which has no chi-square test."""
+    """Return flags (N, q) of costs (N, q) that noise explains; all True for a robust loss, which has no such test."""
     if pool.loss:
         return np.ones(cost.shape, dtype=bool)
     return ~(tail_probability(cost, pool.dof[:, None]) < P_MISFIT)
 
 
 def without_broken(problem: Problem, pool: Pool) -> Pool:
-    """Return a pool in which candidates that break a constraint, or are hidden, have infinite cost."""
-    return _without(pool, _breaks(problem, pool))
+    """Return a pool in which candidates that break a constraint, or are hidden, are infeasible: infinite cost."""
+    return _mark_infeasible(pool, _breaks(problem, pool))
 
 
 def _breaks(problem: Problem, pool: Pool) -> Array:
@@ -308,14 +323,14 @@ def _breaks(problem: Problem, pool: Pool) -> Array:
     return broken
 
 
-def _without(pool: Pool, broken: Array) -> Pool:
+def _mark_infeasible(pool: Pool, broken: Array) -> Pool:
     """Return a pool in which the candidates `broken` (N, q) are infeasible, with infinite cost."""
     cost = np.where(broken, np.inf, pool.cost)
     return replace(pool, cost=cost, code=np.where(broken, np.int8(Status.INFEASIBLE), pool.code))
 
 
 def _cheapest(pool: Pool, items: Array) -> Array:
-    """Return the cheapest candidates (items, q, size) of some problems; NaN in empty slots."""
+    """Return the cheapest candidates (n, q, size) of problems `items` (n,), q at most `_STARTS`; NaN in empty slots."""
     order = np.argsort(pool.cost[items], axis=1, kind="stable")[:, :_STARTS]
     x = np.take_along_axis(pool.x[items], order[..., None], axis=1)
     good = np.isfinite(np.take_along_axis(pool.cost[items], order, axis=1))
@@ -325,7 +340,11 @@ def _cheapest(pool: Pool, items: Array) -> Array:
 def _on_face(
     problem: Problem, sides: list[Face], number: int, items: Array, starts: Array, descend: Descend
 ) -> tuple[Array, ...]:
-    """Return x, cost, code and face (items, q) of the minima on one face, and the costs of infeasible minima."""
+    """Return x, cost, code and face (n, q) of the minima on one face, and the costs (n, q) of infeasible minima.
+
+    `number` is the index of the face in `sides`, the list of all faces. `items` (n,) are the numbers of the problems,
+    and `starts` (n, q, size) their starts. Costs are infinite in all other slots.
+    """
     shape = starts.shape[:2]
     cost, code = np.full(shape, np.inf), np.full(shape, int(Status.INFEASIBLE), dtype=np.int8)
     x = np.array(starts)
@@ -355,11 +374,14 @@ def is_minimum(problem: Problem, face: Face, x: Array) -> Array:
 
 
 # Share of the spread of the stations by which a point is moved off a face.
-_BESIDE = 1e-6
+_INSIDE = 1e-6
 
 
 def _inwards(problem: Problem, face: Face, x: Array) -> Array:
-    """Return points (N, size) slightly inside a face: on a plane of symmetry a saddle has no slope."""
+    """Return points (N, size) slightly inside a face, from points x (N, size) on it.
+
+    The slope of the cost is taken there: on a plane of symmetry a saddle has no slope.
+    """
     gradients = levels(problem, face, x)[1]
     sense = np.array([outwards(problem, level) for level in face])
     away = (sense[:, None] * gradients).sum(1)
@@ -369,7 +391,7 @@ def _inwards(problem: Problem, face: Face, x: Array) -> Array:
     _, spread = centre_and_spread(problem.stations.places)
     out = np.array(x)
     with np.errstate(invalid="ignore", divide="ignore"):
-        step = _BESIDE * np.reshape(spread, (-1, 1)) * away[:, part] / length
+        step = _INSIDE * np.reshape(spread, (-1, 1)) * away[:, part] / length
     out[:, part] -= np.where(np.isfinite(step), step, 0.0)
     return out
 
@@ -377,15 +399,16 @@ def _inwards(problem: Problem, face: Face, x: Array) -> Array:
 def _falls(problem: Problem, sides: list[Face], inside: Array, x: Array, cost: Array, face: Array) -> Array:
     """Return flags (N, q) of minima on faces from which the cost falls inwards, except for the cheapest minimum.
 
-    `inside` (N,) is the least cost of a minimum on no face. The cheapest of all minima is always a minimum of the
-    admitted positions. If a descent missed it, the best minimum found is kept.
+    `inside` (N,) is the least cost of a minimum on no face. `sides` is the list of all faces, and `face` (N, q) the
+    index of the face of each minimum. The cheapest of all minima is always a minimum of the admitted positions. If a
+    descent missed it, the best minimum found is kept.
     """
-    held = np.zeros(cost.shape, dtype=bool)
+    minimal = np.zeros(cost.shape, dtype=bool)
     for number in range(1, len(sides)):
         item, slot = np.nonzero(np.isfinite(cost) & (face == number))
-        held[item, slot] = is_minimum(problem.take(item), sides[number], x[item, slot])
-    least = np.minimum(np.where(held, cost, np.inf).min(1), inside)
-    return np.asarray(~held & (cost >= least[:, None]))
+        minimal[item, slot] = is_minimum(problem.take(item), sides[number], x[item, slot])
+    least = np.minimum(np.where(minimal, cost, np.inf).min(1), inside)
+    return np.asarray(~minimal & (cost >= least[:, None]))
 
 
 # Sentences about hidden minima.
@@ -415,18 +438,24 @@ def _name_hidden(problem: Problem, x: Array, cost: Array) -> Array | None:
     part, points = problem.take(item), x[item, slot]
     behind = is_hidden(part, points) & (violation(part, points) <= TOLERANCE)
     for i in np.unique(item[behind]):
-        own = np.flatnonzero(behind & (item == i))
-        out[i] = _describe(problem, points[own], cost[i, slot[own]], int(i))
+        slots_of_item = np.flatnonzero(behind & (item == i))
+        out[i] = _describe(problem, points[slots_of_item], cost[i, slot[slots_of_item]], int(i))
     return out
 
 
-def _first_told(one: Array | None, other: Array | None) -> Array | None:
-    """Return the sentences (N,) of `one`, and of `other` where `one` is empty."""
+def _first_sentence(one: Array | None, other: Array | None) -> Array | None:
+    """Return the sentences (N,) of `one`; if a sentence is empty, the sentence of `other`.
+
+    If either of the two is None, the result is `one`.
+    """
     return one if one is None or other is None else np.where(one != "", one, other)
 
 
 def _describe(problem: Problem, x: Array, cost: Array, item: int) -> str:
-    """Return a sentence about the minima (q, size) of problem `item` behind the Earth: costs, positions, stations."""
+    """Return a sentence about minima behind the Earth: costs, positions, and stations that they are hidden from.
+
+    `x` (q, size) and `cost` (q,) are the minima of problem number `item`.
+    """
     names = {motion: state_names(motion, len(problem.motions), 0)[0] for motion in range(len(problem.motions))}
     slots = [slot for slot in problem.layout.shared if slot.name in names.values()]
     kept: list[int] = []
@@ -449,7 +478,10 @@ def _describe(problem: Problem, x: Array, cost: Array, item: int) -> str:
 
 
 def _below(problem: Problem, x: Array, item: int) -> str:
-    """Return the names of the stations that the Earth hides from a target at a vector (size,) of one problem."""
+    """Return the names of the stations that the Earth hides from a target, three at most and a count of the others.
+
+    The target is at the vector x (size,) of problem number `item`.
+    """
     lines = sights(problem.take(np.array([item])))
     found = sorted({int(one) for sight in lines for one in sight.station[sight.blocked(x[None])[0]]})
     names = [problem.stations.names[station] for station in found]

@@ -1,6 +1,7 @@
 """The stage "nlp": the maximum-likelihood problem as a nonlinear program for IPOPT, one problem at a time.
 
-It checks the refinement by an independent solver.
+It checks the refinement by an independent solver. In a program, lengths are relative to the centre of the stations and
+in units of their spread; y is the scaled vector, p the data of the program, z the measurements.
 """
 
 from __future__ import annotations
@@ -84,7 +85,11 @@ def nlp(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def _of_blocks(problem: Problem, x: Array) -> Array:
-    """Return the answers (N, C, size) for the block averages of runs, started from candidates x (N, C, size)."""
+    """Return the answers (N, q, size) for the block averages of runs, started from candidates x (N, q, size).
+
+    A run of many epochs is averaged to `BLOCKS` epochs, since a program with thousands of rows is slow. NaN in empty
+    slots.
+    """
     n, out = problem.layout.n_shared, np.full(x.shape, np.nan)
     for items in group_alike(problem):
         blocks = average_blocks(problem.take(items), BLOCKS)
@@ -96,7 +101,11 @@ def _of_blocks(problem: Problem, x: Array) -> Array:
 
 
 def _stationary(problem: Problem, x: Array, code: Array, face: Array) -> Array:
-    """Return codes with `ok` where the next Gauss-Newton step is shorter than 1e-5 sigma, for every report of IPOPT."""
+    """Return status codes (M,) of points x (M, size): `ok` if the next Gauss-Newton step is shorter than 1e-5 sigma.
+
+    `code` (M,) has the codes from the reports of IPOPT, which stay otherwise. `face` (M,) is the index of the face of
+    each point.
+    """
     sides, out = faces(problem) if problem.constraints else [()], np.array(code)
     for number in np.unique(face):
         items = np.flatnonzero(face == number)
@@ -162,7 +171,10 @@ _STATIONARY = 1e-10
 
 
 def _program(problem: Problem, data: int, rows: int) -> Program:
-    """Return the program of a structure with `data` parameters, of which `rows` belong to the rows."""
+    """Return the program of the structure of a problem, from a cache.
+
+    `data` is the number of parameters of the program, of which `rows` belong to the measurements.
+    """
     choice, compiled = choice_for("nonlinear"), os.environ.get(_COMPILE, "") == "1"
     s = problem.stations
     shapes = tuple(None if a is None else a.shape[-3:] for a in (s.position, s.velocity, s.axes))
@@ -176,7 +188,7 @@ def _program(problem: Problem, data: int, rows: int) -> Program:
 
 
 def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compiled: bool) -> Program:
-    """Return a new program for a structure, see `_program`."""
+    """Return a new program for a structure: `choice` is the solver, and `compiled` requests a C compiler."""
     n = problem.layout.size
 
     def scaled_residual(y: Any, p: Any, z: Any) -> list[Any]:
@@ -202,19 +214,22 @@ def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compil
 
 
 def _slot_units(slots: Any, size: float) -> Array:
-    """Return the unit of each entry of slots: `size` metres for lengths and their rates, else 1."""
+    """Return the units of all entries of slots, one array: `size` for lengths and their rates, else 1.
+
+    `size` is the spread of the stations, metres.
+    """
     # a unit that begins with m is metres, or metres per something
     units = [np.full(slot.size, size if slot.unit.startswith("m") else 1.0) for slot in slots]
     return np.concatenate([*units, np.zeros(0)])
 
 
 def _independent(problem: Problem) -> bool:
-    """Return whether all rows have independent errors."""
+    """Return whether all rows have independent errors, so that a diagonal of weights replaces the whitening matrix."""
     return all(block.row.shape[1] == 1 for block in problem.noise.blocks)
 
 
 def _whitening(problem: Problem) -> Array:
-    """Return the whitening matrix, or the weights alone if errors are independent."""
+    """Return the whitening matrix (m, m) of m rows, or the weights (m,) alone if errors are independent."""
     rows = problem.count
     matrix = np.zeros(rows if _independent(problem) else (rows, rows))
     for whitener in whiten(problem.noise, problem.weight):
@@ -228,14 +243,17 @@ def _whitening(problem: Problem) -> Array:
 
 
 def _add_walks(problem: Problem, mean: Array, information: Array) -> None:
-    """Add the walks of biases to prior means and information: the steps of a walk are zero on average."""
+    """Add the walks of biases to prior means (size,) and information (size, size): steps of a walk are zero on average.
+
+    Both arrays are written.
+    """
     layout = problem.layout
-    walked = chain_at(problem, np.zeros((1, layout.size)))
+    chain = chain_at(problem, np.zeros((1, layout.size)))
     starts = layout.n_shared + layout.n_local * np.arange(layout.epochs)
-    own = starts[:, None] + np.arange(layout.n_local)
-    information[own[:, :, None], own[:, None, :]] += walked.block
-    information[own[:-1, :, None], own[1:, None, :]] += walked.link
-    information[own[1:, :, None], own[:-1, None, :]] += walked.link.mT
+    columns_of_epoch = starts[:, None] + np.arange(layout.n_local)
+    information[columns_of_epoch[:, :, None], columns_of_epoch[:, None, :]] += chain.block
+    information[columns_of_epoch[:-1, :, None], columns_of_epoch[1:, None, :]] += chain.link
+    information[columns_of_epoch[1:, :, None], columns_of_epoch[:-1, None, :]] += chain.link.mT
     for bias in walks(problem):
         # a walk that stays at its prior mean costs nothing
         if bias.sigma is not None:
@@ -244,7 +262,10 @@ def _add_walks(problem: Problem, mean: Array, information: Array) -> None:
 
 
 def _prior(problem: Problem, unit: Array, centre: Array) -> tuple[Array, Array]:
-    """Return the prior mean (size,) and the prior information (size, size) in scaled units."""
+    """Return the prior mean (size,) and the prior information (size, size) in scaled units.
+
+    `unit` and `centre` (size,) are the unit and the origin of each scaled unknown.
+    """
     layout = problem.layout
     mean, information = np.zeros(layout.size), np.zeros((layout.size, layout.size))
     for name, value, precision in prior_parts(problem):

@@ -1,4 +1,7 @@
-"""The cost of a problem as a function of the position, and the basins of attraction of iterations."""
+"""The cost of a problem as a function of the position, and the basins of attraction of iterations.
+
+A basin is the set of starts from which an iteration reaches the fix. Pictures show both.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +69,7 @@ ITERATIONS = {"taylor": False, "lsr": True}
 
 
 class End(IntEnum):
-    """The way in which an iteration ended."""
+    """The way in which an iteration ended: at the fix, at another minimum, or at no minimum."""
 
     REACHED = 0
     ELSEWHERE = 1
@@ -82,7 +85,7 @@ class Basins:
     method : str
         A key of `ITERATIONS`.
     ends : int array (...)
-        `End` of each start: at the fix, at another stationary point, or at no point. The latter means that the
+        `End` of each start: at the fix, at another stationary point, or at no point. "No point" means that the
         iteration ran to infinity, circled, or stopped at a singular geometry.
     """
 
@@ -90,7 +93,7 @@ class Basins:
     ends: Array
 
     def share(self, end: End) -> float:
-        """Return the share of starts with a given end."""
+        """Return the share of starts, 0 to 1, with a given end."""
         return float((self.ends == end).mean())
 
 

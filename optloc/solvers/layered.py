@@ -3,6 +3,9 @@
 Travel times have a kink, or a jump, at an interface. So each layer is a separate problem. Steps end at its borders, and
 along a border the depth is fixed. A point on an interface is a minimum if the cost grows into both layers, or if the
 other side costs more. The first case is the condition of Karush, Kuhn and Tucker on each side.
+
+Letters: L layers, M starts or points, N problems, q starts of a problem, `size` numbers of a parameter vector, z the
+third coordinate (upward), metres. A *side* is the end of a layer that a point has reached: 1 upper, -1 lower, 0 none.
 """
 
 from __future__ import annotations
@@ -50,11 +53,14 @@ class Strata:
     high: Array
 
     def layer(self, z: Array) -> Array:
-        """Return the number of the layer (...) that holds third coordinates (...)."""
+        """Return the number of the layer (...) that contains third coordinates z (...), metres."""
         return np.asarray(np.clip(np.searchsorted(-self.low, -z), 0, len(self.low) - 1))
 
     def inside(self, z: Array, layer: Array) -> Array:
-        """Return third coordinates (...) moved into given layers (...), off their ends by a quarter of the height."""
+        """Return third coordinates z (...), metres, moved into given layers (...).
+
+        Their distance from the ends of the layer is at least a quarter of its height.
+        """
         low, high = self.low[layer], self.high[layer]
         # the last layer is taken to be as high as all others together
         deep = np.maximum(self.high[0] - self.high[-1], 1.0)
@@ -63,7 +69,7 @@ class Strata:
 
 
 def strata_of(problem: Problem, face: Face = ()) -> Strata | None:
-    """Return the layers of a problem of one position, or None where no interface divides it or its depth is fixed."""
+    """Return the layers for a problem of one position; None without interfaces, or if `face` fixes the depth."""
     medium = problem.medium
     if not isinstance(medium, Layers) or medium.between != "constant" or len(medium.depth) == 1:
         return None
@@ -76,7 +82,7 @@ def strata_of(problem: Problem, face: Face = ()) -> Strata | None:
 
 
 def _holds_depth(problem: Problem, level: Level) -> bool:
-    """Return whether a constraint determines the third coordinate of the target."""
+    """Return whether the constraint of a level determines the third coordinate: a height, or a plane with a z term."""
     band = problem.constraints[level.constraint]
     if not isinstance(band, Band):
         return False
@@ -84,7 +90,7 @@ def _holds_depth(problem: Problem, level: Level) -> bool:
 
 
 def in_every_layer(strata: Strata, x: Array) -> Array:
-    """Return starts (N, q, size), and the first starts of each problem moved into each layer."""
+    """Return starts x (N, q, size), followed by the first starts of each problem moved into each layer of `strata`."""
     first, count = x[:, :_TRIED], len(strata.low)
     more = np.repeat(first[:, :, None], count, axis=2)
     more[..., strata.column] = strata.inside(more[..., strata.column], np.arange(count))
@@ -96,7 +102,7 @@ def refine_in_layers(
 ) -> Refined:
     """Return the minima in the layers of starts (M, size), or on the borders of these layers.
 
-    A point on a border is no minimum of the whole where the cost falls on the other side. Its cost is then infinite,
+    If the cost falls on the other side of a border, a point on the border is not a minimum. Its cost is then infinite,
     and its status `unavailable`.
 
     Parameters
@@ -110,9 +116,9 @@ def refine_in_layers(
     item : int array (M,)
         Problem of each start.
     face : Face
-        Constraints that hold with equality.
+        Constraints that are satisfied with equality.
     limit : int
-        Steps of each refinement.
+        Most steps of each refinement.
     cross : bool
         Whether a point from which the cost falls is moved to the other side, as unfinished, for a further refinement.
     """
@@ -120,21 +126,21 @@ def refine_in_layers(
     limits = Limits(column, strata.low[layer], strata.high[layer])
     x, steps = start.copy(), np.zeros(len(start), dtype=np.int32)
     cost, status = np.full(len(x), np.inf), np.full(len(x), int(Status.MAX_ITERATIONS), dtype=np.int8)
-    left = np.arange(len(x))
+    active = np.arange(len(x))
     for _ in range(_ROUNDS):
-        done = refine(problem, x[left], item=item[left], limit=limit, face=face, limits=limits.take(left))
-        x[left], cost[left], status[left] = done.x, done.cost, done.status
-        steps[left] += done.iterations
-        ended = left[limits.take(left).reached(x[left], _REACHED) != 0]
+        done = refine(problem, x[active], item=item[active], limit=limit, face=face, limits=limits.take(active))
+        x[active], cost[active], status[active] = done.x, done.cost, done.status
+        steps[active] += done.iterations
+        ended = active[limits.take(active).reached(x[active], _REACHED) != 0]
         if not len(ended):
             break
         end, inwards = _along_border(problem, limits.take(ended), x[ended], item[ended], face, limit)
         x[ended], cost[ended], status[ended] = end
-        left = ended[inwards]
-        if not len(left):
+        active = ended[inwards]
+        if not len(active):
             break
     else:
-        status[left] = Status.STALLED
+        status[active] = Status.STALLED
     _leave_falling(problem, strata, (x, cost, status), item, cross)
     return Refined(x, cost, status, steps, lambda: equations_at(problem.take(item), x))
 
@@ -142,18 +148,26 @@ def refine_in_layers(
 def _along_border(
     problem: Problem, limits: Limits, x: Array, item: Array, face: Face, limit: int
 ) -> tuple[tuple[Array, Array, Array], Array]:
-    """Return the minima along the borders next to x (M, size), and a flag where the cost falls inwards (M,)."""
+    """Return the minima along the borders next to x (M, size), and flags (M,): the cost falls inwards.
+
+    A minimum has a vector, a cost and a status.
+
+    `limits` are the ends of the layers of the points, and `limit` is the largest number of steps.
+    """
     side = limits.reached(x, _REACHED)
     z = np.where(side < 0, limits.low, limits.high)
     part = problem.take(item)
-    held, border = _with_depth(part, z, face)
-    done = refine(held, x, limit=limit, face=border)
-    pull = _pull(held, border, done.x)
+    fixed, border = _with_depth(part, z, face)
+    done = refine(fixed, x, limit=limit, face=border)
+    pull = _pull(fixed, border, done.x)
     return (done.x, done.cost, done.status), np.asarray((done.status == Status.OK) & (pull * side < 0.0))
 
 
 def _with_depth(problem: Problem, z: Array, face: Face) -> tuple[Problem, Face]:
-    """Return M problems with known third coordinates z (M,), and their face with this constraint."""
+    """Return M problems with known third coordinates z (M,), metres, and the face extended by this constraint.
+
+    A refinement on this face moves along a border between layers.
+    """
     known = Band("plane", z, z, np.eye(3)[2], "interface")
     return replace(problem, constraints=(*problem.constraints, known)), (
         *face,
@@ -162,7 +176,10 @@ def _with_depth(problem: Problem, z: Array, face: Face) -> tuple[Problem, Face]:
 
 
 def _pull(problem: Problem, face: Face, x: Array) -> Array:
-    """Return the upward force of the cost (M,), minus half its slope, at minima along a face whose last level is z."""
+    """Return the upward force of the cost (M,): minus half its slope in z, per metre, at minima x (M, size).
+
+    The last level of the face must be the constraint on z. The sign says to which side the cost falls.
+    """
     gradients = levels(problem, face, x)[1]
     force = marginal(equations_at(problem, x))[1]
     return np.asarray((np.linalg.pinv(np.swapaxes(gradients, -1, -2)) @ force[..., None])[:, -1, 0])
@@ -192,24 +209,24 @@ def _leave_falling(
     x, cost, status = found
     layer = strata.layer(x[:, strata.column])
     side = Limits(strata.column, strata.low[layer], strata.high[layer]).reached(x, _REACHED)
-    beside = layer - side
+    neighbour = layer - side
     # the uppermost and the last layer end where no other begins
-    rows = np.flatnonzero((side != 0) & (status == Status.OK) & (beside >= 0) & (beside < len(strata.low)))
+    rows = np.flatnonzero((side != 0) & (status == Status.OK) & (neighbour >= 0) & (neighbour < len(strata.low)))
     if not len(rows):
         return
     other, part, side = x[rows].copy(), problem.take(item[rows]), side[rows]
-    other[:, strata.column] = np.where(side > 0, strata.low[beside[rows]], strata.high[beside[rows]])
-    there, here = equations_at(part, other), equations_at(part, x[rows])
-    force, near = marginal(there)[1][:, strata.column], equal_cost(cost[rows])
-    falls = (there.cost < cost[rows] - near) | ((there.cost < cost[rows] + near) & (force * side > 0.0))
-    cost[rows[falls]] = there.cost[falls] if cross else np.inf
+    other[:, strata.column] = np.where(side > 0, strata.low[neighbour[rows]], strata.high[neighbour[rows]])
+    over, on = equations_at(part, other), equations_at(part, x[rows])
+    force, tolerance = marginal(over)[1][:, strata.column], equal_cost(cost[rows])
+    falls = (over.cost < cost[rows] - tolerance) | ((over.cost < cost[rows] + tolerance) & (force * side > 0.0))
+    cost[rows[falls]] = over.cost[falls] if cross else np.inf
     status[rows[falls]] = Status.MAX_ITERATIONS if cross else Status.UNAVAILABLE
     spreads = []
-    for equations in (here, there):
+    for equations in (on, over):
         covariance, ok = linalg.inverse(marginal(equations)[0])
         variance = covariance[:, strata.column, strata.column]
         spreads.append(np.where(ok & np.isfinite(variance), variance, 0.0))
-    moved = ~falls & (np.abs(there.cost - cost[rows]) <= near) & (spreads[1] > spreads[0])
+    moved = ~falls & (np.abs(over.cost - cost[rows]) <= tolerance) & (spreads[1] > spreads[0])
     moved |= falls & cross
     x[rows[moved]] = other[moved]
 
@@ -246,13 +263,16 @@ def equations_in_layers(problem: Problem, x: Array) -> Normal:
 
 
 def _rise_of_one(problem: Problem, limits: Limits, x: Array, cost: Array, face: Face) -> Array:
-    """Return the distance (M,) from a border to the depth at which the least cost is larger by one, in the layer."""
+    """Return the distance (M,), metres, from a border to the depth at which the least cost is larger by one.
+
+    `cost` (M,) is the cost at x (M, size). The search ends at the other border of the layer.
+    """
     z, side = x[:, limits.column], limits.reached(x, _REACHED)
-    most = np.where(side > 0, z - limits.low, limits.high - z)
-    apart, found, before = np.minimum(_FIRST, most), np.zeros(len(x), dtype=bool), np.zeros(len(x))
+    longest = np.where(side > 0, z - limits.low, limits.high - z)
+    apart, found, before = np.minimum(_FIRST, longest), np.zeros(len(x), dtype=bool), np.zeros(len(x))
     for _ in range(_DOUBLINGS):
-        held, border = _with_depth(problem, z - side * apart, face)
-        done = refine(held, x, face=border)
+        fixed, border = _with_depth(problem, z - side * apart, face)
+        done = refine(fixed, x, face=border)
         x, rise = done.x, np.maximum(done.cost - cost, 0.0)
         reached = ~found & (rise >= 1.0)
         # between two distances the rise is a power of the distance, the second or more
@@ -260,8 +280,8 @@ def _rise_of_one(problem: Problem, limits: Limits, x: Array, cost: Array, face: 
             power = np.maximum(np.log2(np.maximum(rise, 1.0) / before), 2.0)
         apart = np.where(reached, apart * np.maximum(rise, 1.0) ** (-1.0 / power), apart)
         before = rise
-        found |= reached | (apart >= most)
+        found |= reached | (apart >= longest)
         if found.all():
             break
-        apart = np.where(found, apart, np.minimum(2.0 * apart, most))
+        apart = np.where(found, apart, np.minimum(2.0 * apart, longest))
     return apart

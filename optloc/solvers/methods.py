@@ -57,7 +57,7 @@ class SolverEntry:
     Parameters
     ----------
     solver : callable
-        ``(problem, fix or None) -> fix`` of a flat batch of problems.
+        ``(problem, fix or None) -> fix`` of a flat batch of problems; None for optloc's own stages.
     summary : str
         One line for listings.
     role : "start" or "refinement"
@@ -77,7 +77,7 @@ class SolverEntry:
 
     @property
     def run(self) -> Solver:
-        """Return the stage."""
+        """Return the stage as a function of pools; a solver of fixes gets an adapter."""
         if self.stage is not None:
             return self.stage
         assert self.solver is not None
@@ -117,7 +117,10 @@ def compare_bounds(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def _claim(cost: float, bound: float, tight: bool, name: str) -> Claims:
-    """Return the claim from a lower bound of a relaxation; a tight bound is a global proof of the value."""
+    """Return the claim from a lower bound of a relaxation; a tight bound is a global proof of the value.
+
+    `name` is the name of the relaxation.
+    """
     reason = "no position has a lower chi-square" if tight else f"a lower bound leaves a gap of {cost - bound:.2g}"
     text = f"{reason}; other minima were searched for, not excluded"
     proof = "global" if tight else "local"
@@ -185,7 +188,7 @@ class _Derived(dict[str, SolverEntry]):
 
 
 def _derive() -> Mapping[str, SolverEntry]:
-    """Return the stages that follow from other tables: one per loss, and one per start of a formulation."""
+    """Return the stages that follow from other tables: one for each loss, and one for each start of a formulation."""
     out = _Derived({name: _start(Robust(loss, states=True), loss.summary) for name, loss in LOSSES.items()})
     for formulation in FORMULATIONS.values():
         for word in formulation.starts:
@@ -197,7 +200,7 @@ SOLVERS: Registry[SolverEntry] = Registry(
     "optloc.solvers", lambda value: isinstance(value, SolverEntry), _STAGES, _derive
 )
 
-# First stages of methods that one combined stage replaces, with the same result.
+# First stages of methods that a combined stage replaces, with the same result.
 SHORTCUTS: Mapping[tuple[str, ...], PlannedStages] = {("gtrs", "lsr"): PlannedStages()}
 
 # The method after "|" runs for problems that are not fully proven by then.
@@ -253,11 +256,11 @@ class Method:
 
     @property
     def entries(self) -> list[SolverEntry]:
-        """Return the table entries of its words, from all branches."""
+        """Return the table entries of the words of the method, from all branches."""
         return [SOLVERS[word] for branch in self.branches for word in branch.words]
 
     def runs(self, count: int) -> list[Solver]:
-        """Return the stages for `count` problems, with combined stages where available."""
+        """Return the stages of the first branch for `count` problems, with combined stages where available."""
         for words, short in SHORTCUTS.items():
             name = "+".join(words)
             if shortcut(self):
@@ -293,12 +296,12 @@ def _present_name(word: str) -> str:
 
 
 def _stage(word: str) -> Solver:
-    """Return the stage of a word, with its name in numerical failures."""
+    """Return the stage of a word; numerical failures report this word."""
     return _named(word, SOLVERS[word].run)
 
 
 def _named(name: str, solver: Solver) -> Solver:
-    """Return a stage whose numerical failures report the name of the stage."""
+    """Return a stage that runs `solver`; its numerical failures report the name of the stage."""
 
     def stage(problem: Problem, pool: Pool | None) -> Pool:
         with noting_place(name), recording() as endings:
@@ -310,7 +313,10 @@ def _named(name: str, solver: Solver) -> Solver:
 
 
 def _note_failures(pool: Pool, name: str, failed: list[Ending], solves: int) -> Pool:
-    """Return the pool of a stage with the number of failed back-end runs, and their reports."""
+    """Return the pool of a stage with the number of failed back-end runs, and their reports.
+
+    `failed` has the failed runs, and `solves` is the number of all runs. Problems without a candidate get this reason.
+    """
     reports = "; ".join(str(ending) for ending in list(dict.fromkeys(failed))[:_SHOWN])
     count = f"{len(failed)} of {solves} solve{'' if solves == 1 else 's'} without an answer"
     pool = pool.without(np.flatnonzero(pool.empty), f"{name}: {count} ({reports})", Status.NUMERICAL)
@@ -321,20 +327,23 @@ def _note_failures(pool: Pool, name: str, failed: list[Ending], solves: int) -> 
 
 
 def _run_through(method: Method, problem: Problem, given: Pool | None) -> Pool:
-    """Return the pool after all stages of one branch; given candidates compete with its starts."""
+    """Return the pool after all stages of one branch; `given` candidates, or None, compete with its starts."""
     # a shortcut takes no starts
     first, *others = method.runs(problem.batch_shape[0]) if given is None else map(_stage, method.words)
     pool = first(problem, given)
     if given is not None and pool.curvature is None:
         # the given candidates compete with the starts of the stage
-        pool = _beside(problem, pool, given.x)
+        pool = _with_starts(problem, pool, given.x)
     for stage in others:
         pool = stage(problem, pool)
     return pool
 
 
 def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
-    """Return a pool whose unproven problems went through a method, together with the candidates found before."""
+    """Return a pool whose unproven problems went through a further method.
+
+    Candidates that were found before stay, so the answer cannot become worse.
+    """
     fix = judge(problem, pool)
     items = np.flatnonzero(is_unproven(fix))
     if not len(items):
@@ -343,7 +352,7 @@ def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
     start = first(part, None)
     # earlier candidates compete, so that a branch never gives a worse answer than the branch before
     new, before = (
-        _beside(part, start, surviving_candidates(take(pool, items), fix[items])),
+        _with_starts(part, start, surviving_candidates(take(pool, items), fix[items])),
         tried_before(pool, fix, items),
     )
     for stage in others:
@@ -352,24 +361,24 @@ def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
     return replace(pool.merge(items, replace(new, tried_before=None)), stages=(*pool.stages, *new.stages))
 
 
-def _beside(problem: Problem, start: Pool, x: Array) -> Pool:
-    """Return a pool of starts with additional starts (N, q, size)."""
+def _with_starts(problem: Problem, start: Pool, x: Array) -> Pool:
+    """Return a pool of starts with additional starts x (N, q, size)."""
     both = pack(np.concatenate([start.x, x], axis=1))
     return replace(offer(problem, both, None, "", perf_counter()), stages=start.stages, missing=start.missing)
 
 
 def is_unproven(fix: Fix) -> Array:
-    """Return flags (N,) of fixes that could still change: no proof that all minima within the listed gap are known."""
-    sure = (fix.claims.proof == GLOBAL) & (fix.claims.margin >= LISTED_GAP)
-    return np.asarray(~sure & ~np.isin(fix.code, _SETTLED))
+    """Return flags (N,) of fixes that could still change: not every minimum within the listed gap of cost is known."""
+    proven = (fix.claims.proof == GLOBAL) & (fix.claims.margin >= LISTED_GAP)
+    return np.asarray(~proven & ~np.isin(fix.code, _SETTLED))
 
 
 def shortcut(method: Method) -> bool:
-    """Return whether one combined stage does the whole method, so that it can be prepared."""
+    """Return whether one combined stage performs the whole method, so that a plan can replace the method."""
     return method.then is None and method.words in SHORTCUTS
 
 
 def is_quick(problem: Problem, method: str) -> bool:
-    """Return whether a method begins with stages that a plan replaces; most fixes then take microseconds."""
+    """Return whether the first stages of a method have a plan; most fixes then take microseconds."""
     words = Method.parse(method).words
-    return any(words[: len(own)] == own for own in SHORTCUTS) and plan_of(problem) is not None
+    return any(words[: len(planned)] == planned for planned in SHORTCUTS) and plan_of(problem) is not None

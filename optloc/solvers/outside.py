@@ -24,7 +24,7 @@ FixSolver = Callable[[Problem, Fix | None], Fix]
 
 
 def adapt(solver: FixSolver) -> Solver:
-    """Return an external solver as a stage."""
+    """Return the stage of an external solver: judge the pool, call the solver, and convert the fixes to a pool."""
 
     def stage(problem: Problem, pool: Pool | None) -> Pool:
         fix = solver(problem, None if pool is None else judge(problem, pool))
@@ -34,7 +34,7 @@ def adapt(solver: FixSolver) -> Solver:
 
 
 def given(problem: Problem, start: Any) -> Fix:
-    """Return given starts (N, size) or (N, q, size) of a flat batch as unrefined fixes."""
+    """Return the fixes, not refined, of given starts (N, size) or (N, q, size) of a flat batch."""
     return judge(problem, begin(problem, np.asarray(start, dtype=float)))
 
 
@@ -65,7 +65,7 @@ def accept(problem: Problem, fix: Fix) -> Pool:
     """Return a pool from fixes of a flat batch; the verdict on this pool is the fixes again.
 
     Starts stay starts. Some contents of a fix do not follow from its numbers, such as the cause of a missing answer or
-    the rows left out. The pool holds these fixes unchanged.
+    the rows left out. The pool stores these fixes unchanged.
     """
     x = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
     shape = x.shape[:2]
@@ -83,8 +83,11 @@ def accept(problem: Problem, fix: Fix) -> Pool:
     covariance = np.where(known[:, None, None], fix.cov, np.eye(fix.cov.shape[-1]))
     information, regular = linalg.inverse(covariance)
     if fix.active is not None:  # zero variance here comes from a constraint, not from missing rows
-        held = np.flatnonzero(_lengths(fix.active) > 0)
-        information[held], regular[held] = np.linalg.pinv(covariance[held], _HELD, hermitian=True), True
+        constrained = np.flatnonzero(_lengths(fix.active) > 0)
+        information[constrained], regular[constrained] = (
+            np.linalg.pinv(covariance[constrained], _HELD, hermitian=True),
+            True,
+        )
     marks = np.zeros(len(fix.code), dtype=int) if fix.marks is None else fix.marks
     searched = (fix.code == Status.SEARCHED) | (marks & Status.SEARCHED.mark != 0)
     robust = marks & Status.ROBUST.mark != 0
@@ -118,12 +121,12 @@ _HELD = 1e-12
 
 
 def _lengths(explanations: Array) -> Array:
-    """Return the lengths (N,) of the tuples in an object array."""
+    """Return the lengths (N,) of the tuples in an object array (N,)."""
     return np.array([len(found) for found in explanations], dtype=int)
 
 
 def _claims(claims: Claims) -> Claims:
-    """Return the claims, with empty claims marked as not tried."""
+    """Return the claims (N,); claims without a proof or an answer are marked as not tried."""
     nothing = (claims.reason == NO_PROOF.reason) | (claims.reason == NO_ANSWER.reason)
     return merged_claims(nothing, empty_claims(len(nothing)), claims)
 

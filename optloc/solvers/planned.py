@@ -1,4 +1,10 @@
-"""Fixes by plans of the engine. Fixes with a complication take the stages of the method."""
+"""Fixes by plans of the engine. Fixes with a complication take the stages of the method.
+
+A *plan* is everything of a problem that does not depend on its measurements, for compiled code. Complications are, for
+instance, several minima, or an iteration that does not converge.
+
+Letters: N problems, m rows of a problem, k epochs, r rows of an epoch, `size` numbers of a parameter vector.
+"""
 
 from __future__ import annotations
 
@@ -80,9 +86,9 @@ def settle_by_plan(
     plan : Plan
         Plan of the problems.
     load : Load
-        Arguments of the plan.
+        Numbers of the problems that the plan takes as arguments.
     z : array (N, m)
-        Measurements.
+        Measurements, SI units and radians.
     problems_at : callable
         Maps the numbers of problems whose answer has a complication to the problems.
     refinement : callable
@@ -92,26 +98,33 @@ def settle_by_plan(
     """
     began = perf_counter()
     answer, steps = plan.run(load, z, threads)
-    left = np.flatnonzero(~answer.settled)
-    if not len(left):
+    unsettled = np.flatnonzero(~answer.settled)
+    if not len(unsettled):
         return _with_sides(_pool(plan, _preferred(answer, problems_at), steps, began), problems_at)
     # most of these problems only need another start, which the eigenvalues of the pencil give
-    some = problems_at(left)
-    start = in_parts(some, lambda part, _: gtrs(part, None))
-    alone = np.isfinite(start.x).all(-1).sum(1) == 1  # if there are several starts, all of them compete
-    more, again = plan.run(load.take(left), z[left], threads, np.where(alone[:, None], start.x[:, 0], np.nan))
-    for whole, part in zip(answer, more, strict=True):
-        whole[left] = part
+    rest = problems_at(unsettled)
+    start = in_parts(rest, lambda part, _: gtrs(part, None))
+    single = np.isfinite(start.x).all(-1).sum(1) == 1  # if there are several starts, all of them compete
+    second, again = plan.run(
+        load.take(unsettled), z[unsettled], threads, np.where(single[:, None], start.x[:, 0], np.nan)
+    )
+    for whole, part in zip(answer, second, strict=True):
+        whole[unsettled] = part
     pool = _with_sides(_pool(plan, _preferred(answer, problems_at), max(steps, again), began), problems_at)
-    lost = np.flatnonzero(~more.settled)
-    if not len(lost):
+    failed = np.flatnonzero(~second.settled)
+    if not len(failed):
         return pool
-    start = take(start, lost)
-    return pool.merge(left[lost], in_parts(some.take(lost), lambda part, which: refinement(part, take(start, which))))
+    start = take(start, failed)
+    return pool.merge(
+        unsettled[failed], in_parts(rest.take(failed), lambda part, which: refinement(part, take(start, which)))
+    )
 
 
 def _preferred(answer: Answer, problems_at: Callable[[Array], Problem]) -> Answer:
-    """Return the answer in which the likelier position comes first if two minima cost the same, as in the verdict."""
+    """Return the answer in which the likelier position comes first if two minima cost the same, as in the verdict.
+
+    `problems_at` maps numbers of problems to the problems.
+    """
     tied = np.flatnonzero(answer.settled & (np.abs(answer.rival_cost - answer.cost) <= equal_cost(answer.cost)))
     if not len(tied):
         return answer
@@ -124,14 +137,19 @@ def _preferred(answer: Answer, problems_at: Callable[[Array], Problem]) -> Answe
     x, rival, number, covariance = map(np.array, (answer.x, answer.rival, answer.number, answer.covariance))
     x[items], rival[items] = rival[items], x[items]
     number[items, COST_OF_FIX], number[items, COST_OF_RIVAL] = answer.rival_cost[items], answer.cost[items]
-    at = x[items]
-    covariance[items] = measure_curvature(some, equations_at(some, at), at, np.zeros(len(at), dtype=int)).covariance
+    position = x[items]
+    covariance[items] = measure_curvature(
+        some, equations_at(some, position), position, np.zeros(len(position), dtype=int)
+    ).covariance
     number[items, KAPPA:] = np.nan  # the verdict computes the shape
     return answer._replace(x=x, rival=rival, number=number, covariance=covariance)
 
 
 def _pool(plan: Plan, answer: Answer, steps: int, began: float) -> Pool:
-    """Return the pool of fixes from a plan, with a second slot if some fixes have a rival."""
+    """Return the pool of fixes from a plan, with a second slot if some fixes have a rival, another minimum.
+
+    `steps` is the largest number of steps. `began` is a time of `time.perf_counter`.
+    """
     count, seconds = len(answer.cost), perf_counter() - began
     rivalled = np.isfinite(answer.rival_cost) & answer.settled
     x, cost = answer.x[:, None], answer.cost[:, None]
@@ -160,7 +178,10 @@ def _pool(plan: Plan, answer: Answer, steps: int, began: float) -> Pool:
 
 
 def _with_sides(pool: Pool, problems_at: Callable[[Array], Problem]) -> Pool:
-    """Return a settled pool in which both sides of the plane of the stations are one region, if the data allow both."""
+    """Return a settled pool in which both sides of the plane of the stations are one region, if the data allow both.
+
+    Only fixes with a rival or with a curved cost are examined. `problems_at` maps their numbers to the problems.
+    """
     assert pool.curvature is not None
     assert pool.curvature.kappa is not None
     assert pool.plain is not None
@@ -168,18 +189,21 @@ def _with_sides(pool: Pool, problems_at: Callable[[Array], Problem]) -> Pool:
         items = np.flatnonzero(~pool.plain | ~(pool.curvature.kappa[:, 0] <= BENT))
     if not len(items):
         return pool
-    some, own = problems_at(items), take(pool, items)
-    joined = join_sides(some, own)
-    return pool if joined is own else pool.merge(items, joined, joined.stages[-1])
+    some, part = problems_at(items), take(pool, items)
+    joined = join_sides(some, part)
+    return pool if joined is part else pool.merge(items, joined, joined.stages[-1])
 
 
 def active_of(plan: Plan, multiplier: Array) -> Array | None:
-    """Return the constraints (N,) that hold fixes, with their multipliers (N, k); None if no constraint does."""
+    """Return the active constraints (N,) of fixes, tuples of `Active`; None if the plan has no constraint.
+
+    `multiplier` (N, k) has the Lagrange multipliers of the k constraints.
+    """
     if not plan.held:
         return None
     out = np.empty(len(multiplier), dtype=object)
-    for i, own in enumerate(multiplier.tolist()):
-        out[i] = tuple(map(Active, plan.held, own[: len(plan.held)]))
+    for i, multipliers in enumerate(multiplier.tolist()):
+        out[i] = tuple(map(Active, plan.held, multipliers[: len(plan.held)]))
     return out
 
 
@@ -187,7 +211,7 @@ _STARTED = Stage("gtrs", "1 candidates at most", 0.0)
 
 
 def planned_stages(count: int, steps: int, seconds: float) -> tuple[Stage, ...]:
-    """Return the stages of `count` fixes from a plan, with the largest number of steps."""
+    """Return the stages of `count` fixes from a plan, with the largest number of steps and the time in seconds."""
     return _STARTED, Stage("lsr", f"{count} candidates, {steps} steps at most", seconds)
 
 
@@ -201,7 +225,7 @@ class RunPlan:
     Parameters
     ----------
     rows : int array (k, r)
-        Rows of each epoch.
+        Numbers of the rows of each epoch.
     epoch : Plan
         Plan of an epoch without biases.
     load : Load
@@ -209,7 +233,7 @@ class RunPlan:
     added, gain : array (r,)
         Known biases plus corrections of the rows of an epoch, and known scales.
     columns : int array (l,)
-        Entry of the fix of an epoch for each unknown of an epoch; -1 without an entry.
+        For each of the l unknowns of an epoch its entry in the fix of the epoch; -1 without an entry.
     x : array (size,)
         Start of all other unknowns.
     runs : PackedRuns
@@ -239,9 +263,9 @@ class RunPlan:
         z = np.broadcast_to(problem.z, (count, problem.count))[:, self.rows].reshape(-1, self.rows.shape[1])
         answer, _ = self.epoch.run(self.load, (z - self.added) / self.gain)
         start, n = np.tile(self.x, (count, 1)), problem.layout.n_shared
-        own = start[:, n:].reshape(len(z), len(self.columns))
-        own[:, self.columns >= 0] = answer.x[:, self.columns[self.columns >= 0]]
-        start[:, n:] = own.reshape(count, -1)
+        local = start[:, n:].reshape(len(z), len(self.columns))
+        local[:, self.columns >= 0] = answer.x[:, self.columns[self.columns >= 0]]
+        start[:, n:] = local.reshape(count, -1)
         packed, item = self.runs.packed, np.arange(count)
         observed = packed.numbers._replace(observed=np.require(z - self.correction, requirements=["C", "W"]))
         runs = self.runs._replace(packed=packed._replace(numbers=observed))
@@ -262,15 +286,15 @@ class RunPlan:
             curvature=curvature,
             plain=plain,
         )
-        lost = np.flatnonzero(~plain)
-        return pool.merge(lost, otherwise(problem.take(lost))) if len(lost) else pool
+        failed = np.flatnonzero(~plain)
+        return pool.merge(failed, otherwise(problem.take(failed))) if len(failed) else pool
 
 
 _RUNS = Cache["RunPlan | None"](64)
 
 
 def run_plan_of(problem: Problem) -> RunPlan | None:
-    """Return the plan of runs of one target that is free at each epoch, or None without a plan.
+    """Return the plan of runs of one target that is free at each epoch, from a cache; None without a plan.
 
     The stations must be at rest, and a batch may differ in measurements only.
     """

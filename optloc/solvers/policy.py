@@ -19,8 +19,8 @@ P_MISFIT = 1e-4
 P_OUTLIER = 0.01
 """Probability at which a search for suspects notices an error.
 
-It holds for all groups of a long list together. It also holds at redundancy one, where an error can be noticed but its
-row cannot be named.
+It applies to all groups of a long list together. It also applies at redundancy one, where an error can be noticed
+but its row cannot be named.
 """
 
 REGION_LEVEL = 0.95
@@ -45,5 +45,8 @@ _EQUAL = 1e-6
 
 
 def equal_cost(cost: Any) -> Any:
-    """Return the largest difference at which another cost counts as equal to a cost, or to each of many costs."""
+    """Return the largest difference at which another cost counts as equal to a cost, or to each of many costs.
+
+    Smaller differences come from rounding.
+    """
     return _EQUAL * (1.0 + cost)

@@ -1,6 +1,6 @@
 """The pool: the candidates of a batch of problems, with costs, weights and proofs, which stages pass on.
 
-Only the verdict turns a pool into fixes.
+Only the verdict turns a pool into fixes. Costs are chi-square values.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Curvature:
     Parameters
     ----------
     covariance : array (N, n, n)
-        Inverse of the information on the tangent space of the constraints that hold with equality.
+        Inverse of the information of the n shared unknowns, along the constraints that are satisfied with equality.
     information : array (N, n, n), optional
         Information of the shared unknowns; local unknowns are eliminated.
     regular : bool array (N,), optional
@@ -51,15 +51,15 @@ class Curvature:
     active : object array (N,), optional
         Tuples of `Active` constraints.
     local : array (N, k, p, p), optional
-        Covariance of the states of targets at each epoch of a run.
+        Covariance of the p numbers of the states of targets at each of the k epochs of a run.
     kappa : array (N, 2), optional
         Departure of the cost from a Gaussian's at three sigma, in metres and in inverse range
         (`optloc.model_checks.shape`); NaN if not computed.
     repeats : array (N, 3), optional
-        Shares of repeated measurements whose ellipses contain the truth, and the inflation with which 95 % would
+        Two shares of repeated measurements whose ellipses contain the truth, and the inflation for a share of 95 %
         (`optloc.solvers.verdict.repeats`); NaN if not tried.
     free : array (N, n, n), optional
-        Covariance without the inequalities that hold fixes; NaN if no inequality does, or if it does not exist.
+        Covariance without the active inequalities; NaN if no inequality is active, or if it does not exist.
     shift : array (N, n), optional
         Mean without these inequalities in the quadratic model, minus the fix; NaN in the same cases.
     """
@@ -97,7 +97,7 @@ class TriedBefore:
 
 @dataclass(frozen=True, slots=True)
 class NoStart:
-    """Why N problems have no candidate, if a stage reports it.
+    """The reason why N problems have no candidate, if a stage reports it.
 
     Parameters
     ----------
@@ -127,7 +127,8 @@ class Pool:
     code : int array (N, q)
         `Status` of their refinement.
     face : int array (N, q)
-        Number of the face of `optloc.linear.constraints.faces` on which each was refined; 0 without inequalities.
+        Number of the face of `optloc.linear.constraints.faces` on which each candidate was refined; 0 without
+        inequalities.
     weights : array (N, m)
         Row weights that were used.
     dof : int array (N,)
@@ -163,7 +164,7 @@ class Pool:
     hidden : object array (N,), optional
         Sentence on a minimum behind the Earth; "" without one.
     missing : NoStart, optional
-        Why there is no candidate; used only for problems without a candidate.
+        Reason why there is no candidate; used only for problems without a candidate.
     asked : bool
         Whether a search for suspects ran.
     conclusion : object array (N,), optional
@@ -201,7 +202,7 @@ class Pool:
 
     @property
     def occupied(self) -> tuple[Array, Array]:
-        """Return item and slot of every candidate."""
+        """Return the problem numbers and the slots of all candidates, two arrays of equal length."""
         item, slot = np.nonzero(np.isfinite(self.x).all(-1))
         return item, slot
 
@@ -217,7 +218,7 @@ class Pool:
         return np.asarray(~found.any(1))
 
     def without(self, items: Array, reason: str, status: Status) -> Pool:
-        """Return the pool with a reason why some problems have no candidate; earlier reasons are kept."""
+        """Return the pool with a reason and a status for problems `items`; earlier reasons are kept."""
         blank = np.full(len(self), "", dtype=object)
         known = self.missing or NoStart(blank, np.full(len(self), int(Status.UNAVAILABLE), dtype=np.int8))
         reasons, code = known.reason.copy(), known.code.copy()
@@ -226,7 +227,7 @@ class Pool:
         return replace(self, missing=NoStart(reasons, code))
 
     def merge(self, items: Array, other: Pool, stage: Stage | None = None) -> Pool:
-        """Return the pool with some problems replaced by the problems of another pool, and one more stage."""
+        """Return the pool with problems `items` replaced by the problems of another pool, and one more stage."""
         stages = self.stages if stage is None else (*self.stages, stage)
         return replace(overwrite(self, items, other), stages=stages)
 
@@ -243,7 +244,7 @@ def offer(problem: Problem, x: Array, before: Pool | None, name: str, began: flo
     before : Pool, optional
         Earlier pool; its candidates are dropped.
     name : str
-        Stage that makes the starts.
+        Name of the stage that makes the starts.
     began : float
         Start time of the stage, by `time.perf_counter`.
     """
@@ -284,7 +285,7 @@ def begin(problem: Problem, start: Array) -> Pool:
 
 
 def pack(points: Array) -> Array:
-    """Return points (N, q, n) with the finite points of each problem first, and without unused slots."""
+    """Return points (N, q, n) with the finite points of each problem first, and without slots that no problem uses."""
     if points.shape[1] <= 1:
         return points
     finite = np.isfinite(points).all(-1)
@@ -295,7 +296,7 @@ def pack(points: Array) -> Array:
 
 
 def chunk_size(problem: Problem) -> int:
-    """Return the number of problems per part if each problem has dozens of candidates."""
+    """Return the number of problems per part, for problems with dozens of candidates each: it limits the memory."""
     return max(1, _ROWS // max(problem.count, 1))
 
 
@@ -326,8 +327,8 @@ def in_parts(
     if failed is not None and not count:
         return failed(problem, "")
     if count <= most:
-        found = list(_contained(problem, slice(0, count), work, failed))
-        return found[0] if len(found) == 1 else _joined(found, count)
+        answers = list(_contained(problem, slice(0, count), work, failed))
+        return answers[0] if len(answers) == 1 else _joined(answers, count)
 
     def answer(part: slice) -> list[Answer]:
         return list(_contained(problem.take(np.arange(part.start, part.stop)), part, work, failed))
@@ -344,7 +345,10 @@ def _contained(
     work: Callable[[Problem, slice], Answer],
     failed: Callable[[Problem, str], Answer] | None,
 ) -> Iterator[Answer]:
-    """Yield the answer of a part, or the answers of its halves if it fails numerically."""
+    """Yield the answers of a part, or of its halves if it fails numerically; the arguments are as in `in_parts`.
+
+    `part` is the slice of the problems in the batch. A single problem that fails gets the answer of `failed`.
+    """
     try:
         answer = work(problem, part)
     except NUMERICAL as error:
@@ -356,8 +360,8 @@ def _contained(
             return
         half = count // 2
         for first, last in ((0, half), (half, count)):
-            own = slice(part.start + first, part.start + last)
-            yield from _contained(problem.take(np.arange(first, last)), own, work, failed)
+            half_part = slice(part.start + first, part.start + last)
+            yield from _contained(problem.take(np.arange(first, last)), half_part, work, failed)
     else:
         yield answer
 
@@ -379,21 +383,24 @@ def _cause(error: Exception) -> str:
 
 
 def _joined(answers: Iterable[Answer], count: int) -> Answer:
-    """Return the joined answers of `count` problems."""
+    """Return the joined answers of `count` problems, from the answers of their parts in order."""
     stages: list[tuple[Stage, ...]] = []
 
-    def told() -> Iterator[Answer]:
+    def collected() -> Iterator[Answer]:
         for answer in answers:
             # parts may have different stages: one part may need a stage that others do not
             stages.append(answer.stages)
             yield answer
 
-    whole: Answer = join(told(), count)
+    whole: Answer = join(collected(), count)
     return replace(whole, stages=_sum_stages(stages))
 
 
 def _sum_stages(parts: list[tuple[Stage, ...]]) -> tuple[Stage, ...]:
-    """Return the stages of the part with the most stages, with the total seconds of all parts."""
+    """Return the stages of the part with the most stages, with the total seconds of all parts.
+
+    `parts` are the stages of each part of a batch.
+    """
     longest = max(parts, key=len)
     seconds = dict.fromkeys(range(len(longest)), 0.0)
     for stages in parts:

@@ -38,8 +38,8 @@ class Prepared:
     shape : tuple of int
         Batch axes of the problem without its measurements.
     count : int
-        Rows.
-    short : Single, optional
+        Number of rows.
+    short : PreparedFix, optional
         Fixes a few sets of measurements on the short path; None if the path is not available.
     """
 
@@ -98,14 +98,14 @@ class Prepared:
         return fix if len(shape) == 1 else fix.reshape(shape)
 
     def _flat(self, z: Array, shape: tuple[int, ...]) -> Problem:
-        """Return a flat batch of problems with the measurements z (..., m)."""
+        """Return a flat batch of problems with measurements z (..., m); the answer has the batch axes `shape`."""
         # A problem without batch axes takes the axes of its measurements, so only the measurements are reshaped.
         if not self.shape:
             return self.problem.with_rows(z=np.broadcast_to(z, (*shape, z.shape[-1])).reshape(-1, z.shape[-1]))
         return self.problem.with_rows(z=np.broadcast_to(z, (*shape, z.shape[-1]))).flat()
 
     def _batch(self, z: Array) -> tuple[int, ...]:
-        """Return the batch axes of the answer."""
+        """Return the batch axes of the answer for measurements z; raise InvalidProblem if z does not fit the rows."""
         count = self.count
         if z.shape == (count,):
             return self.shape

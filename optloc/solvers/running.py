@@ -1,6 +1,8 @@
 """A solution that grows with its run: new epochs are added to sums.
 
-Old epochs are linearised again only if the estimate has moved too far.
+Old epochs are linearised again only if the estimate has moved too far. The sums are normal equations.
+
+Letters: N runs, n shared unknowns, k epochs, q numbers of epochs.
 """
 
 from __future__ import annotations
@@ -85,8 +87,10 @@ class Running:
         if any(motion.span == "epoch" and motion.known is None for motion in problem.motions):
             raise InvalidProblem("targets that are free at each epoch share no unknown", "begin", "solve their epochs")
         if walks(problem):
-            what = f"the walk {walks(problem)[0].name!r} links each epoch to the next, so that epochs cannot be added"
-            raise InvalidProblem(what, "begin", "solve the whole run")
+            message = (
+                f"the walk {walks(problem)[0].name!r} links each epoch to the next, so that epochs cannot be added"
+            )
+            raise InvalidProblem(message, "begin", "solve the whole run")
         if not np.isfinite(fix.x).all():
             raise InvalidProblem("the fix has no answer to start from", "fix", "wait for more epochs; see fix.status")
         flat = problem.flat()
@@ -128,14 +132,20 @@ class Running:
 
 
 def _linearise(problem: Problem, at: Array, before: int, tolerance: float) -> Running:
-    """Return the running solution after a linearisation of all epochs at vectors (N, n)."""
+    """Return the running solution after a linearisation of all epochs at vectors `at` (N, n).
+
+    `before` is the number of earlier linearisations, and `tolerance` the length of a step in standard deviations.
+    """
     sums = _information(problem, at)
     x, cov, _ = _step(problem, sums, at)
     return Running(problem, x, cov, at, sums, before + 1, tolerance)
 
 
 def _information(problem: Problem, at: Array) -> Normal:
-    """Return the information of the measurements about the shared unknowns, linearised at vectors (N, n)."""
+    """Return the information of the measurements about the shared unknowns, linearised at vectors `at` (N, n).
+
+    Unknowns of single epochs are eliminated, with their priors. Priors of shared unknowns are not included.
+    """
     x = complete(problem, at[:, None])[:, 0]
     # Priors of local unknowns are added here and eliminated. Priors of shared unknowns would count again with every
     # update.
@@ -143,7 +153,11 @@ def _information(problem: Problem, at: Array) -> Normal:
 
 
 def _step(problem: Problem, sums: Normal, at: Array) -> tuple[Array, Array, Array]:
-    """Return estimates (N, n), their covariance, and the length (N,) of the step in standard deviations."""
+    """Return estimates (N, n), their covariance (N, n, n), and the length (N,) of the step in standard deviations.
+
+    `at` (N, n) is the point of linearisation of `sums`. If the sums are singular, the estimate is NaN and the length
+    infinite.
+    """
     x = np.zeros((len(at), problem.layout.size))
     x[:, : at.shape[1]] = at
     total = with_priors(problem, x, sums, local=False)
@@ -182,7 +196,7 @@ class GrowingRun:
     layout: Layout
 
     def take(self, name: str) -> tuple[Array, Array]:
-        """Return estimates (q, size) and standard deviations (q, size) of a named unknown."""
+        """Return estimates and standard deviations, both (q, size), of a named unknown, in its unit."""
         slot, _ = self.layout.find(name)
         part = slice(slot.start, slot.start + slot.size)
         return self.x[:, part], np.sqrt(np.diagonal(self.cov, axis1=-2, axis2=-1)[:, part])
@@ -227,7 +241,7 @@ def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = N
 
 
 def _space_counts(epochs: int) -> Array:
-    """Return at most sixty numbers of epochs, denser at the start."""
+    """Return at most sixty numbers of epochs, from 1 to `epochs`, denser at the start."""
     if epochs <= _POINTS:
         return np.arange(1, epochs + 1)
     # geometric spacing: an estimate changes most while its epochs are few

@@ -1,4 +1,7 @@
-"""The probability of each status at given positions, from many simulated measurements."""
+"""The probability of each status at given positions, from many simulated measurements.
+
+Letters: q positions, s statuses, `size` numbers of a parameter vector. A trial is one simulated measurement.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +67,7 @@ def status_shares(
     """Return the share of each status among fixes of simulated measurements at given positions.
 
     The simulation draws noise, biases from their priors, and prior means of states about the truth. The figures of `ok`
-    hold over all measurements; this function returns the share of measurements that are `ok`.
+    apply to all measurements; this function returns the share of measurements that are `ok`.
 
     Parameters
     ----------
@@ -103,7 +106,7 @@ def status_shares(
 
 
 def _parts(count: int, trials: int) -> Iterator[Array]:
-    """Yield the numbers of positions whose trials fit in one part."""
+    """Yield arrays with the numbers of the positions whose trials are solved together; `count` positions exist."""
     size = max(1, _PART // trials)
     for first in range(0, count, size):
         yield np.arange(first, min(first + size, count))
@@ -112,7 +115,11 @@ def _parts(count: int, trials: int) -> Iterator[Array]:
 def _solve_trials(
     single: Problem, places: Array, numbers: Array, trials: int, seed: int, method: str
 ) -> tuple[Fix, Array]:
-    """Return the fixes (q trials,) of measurements at q positions, and the true vectors (q trials, size)."""
+    """Return the fixes (q trials,) of measurements at q positions, and the true vectors (q trials, size).
+
+    `single` is the problem, without measurements. `places` (q, size) are the true vectors at the positions, and
+    `numbers` (q,) the numbers of the positions: together with `seed` they determine the draws.
+    """
     drawn, true = [], []
     for number, place in zip(numbers.tolist(), places, strict=True):
         at_truth, at_noise = np.random.SeedSequence((seed, number)).spawn(2)
@@ -129,7 +136,11 @@ def _solve_trials(
 
 
 def _with_drawn_priors(problem: Problem, place: Array, trials: int, rng: np.random.Generator) -> tuple[Problem, Array]:
-    """Return a problem with prior means of states drawn about a true vector (size,), and the true vectors of trials."""
+    """Return `trials` problems with drawn prior means, and their true vectors (trials, size).
+
+    Prior means of states are drawn about the true vector `place` (size,). Biases and other unknowns are drawn from
+    their priors.
+    """
     layout, n = problem.layout, problem.layout.n_shared
     x, means = np.tile(place, (trials, 1)), dict[str, Array]()
     local = x[:, n:].reshape(trials, problem.epochs, -1)
@@ -150,7 +161,10 @@ def _with_drawn_priors(problem: Problem, place: Array, trials: int, rng: np.rand
 
 
 def _hold(fix: Fix, true: Array) -> Array:
-    """Return 1 for each `ok` fix whose 95 % region contains the truth, 0 if it does not, and NaN for other fixes."""
+    """Return 1 for each `ok` fix whose 95 % region contains the truth, 0 if it does not, and NaN for other fixes; (N,).
+
+    Fixes with a curved region count as other fixes.
+    """
     out = np.full(len(true), np.nan)
     if fix.chart is None:
         return out
@@ -161,7 +175,10 @@ def _hold(fix: Fix, true: Array) -> Array:
 
 
 def _shares(code: Array, holds: Array, shape: tuple[int, ...]) -> StatusShares:
-    """Return the shares of codes (q, trials) at positions of a given shape."""
+    """Return the shares of statuses from codes (q, trials) at q positions, which form an array of a given shape.
+
+    `holds` (q, trials) has the results of `_hold`.
+    """
     statuses = tuple(one for one in PRECEDENCE if (code == one).any())
     share = np.stack([(code == one).mean(-1) for one in statuses], axis=-1)
     known = np.isfinite(holds).sum(-1)
@@ -179,7 +196,7 @@ class StatusMap:
     grid : Grid
         The positions.
     shares : StatusShares
-        At the positions (ny, nx).
+        Shares at the positions (ny, nx).
     """
 
     grid: Grid

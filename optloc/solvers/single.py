@@ -3,6 +3,8 @@
 Everything that does not depend on the measurements is stored: the linear maps of the fix, the terms of the proof, and
 the constant columns of the verdict. For a fix with a complication, such as a rival minimum, a doubtful cost or an
 unfinished proof, the result is None. The caller then runs the stages of the method: the long path.
+
+Letters: n fixes, m rows, d coordinates, e planes of equalities, k constraints, `size` numbers of a parameter vector.
 """
 
 from __future__ import annotations
@@ -111,13 +113,13 @@ class _SingleWorkspace:
         Centre of the charts, metres.
     claims : Claims
         Claims of the fixes, without the bounds and boxes of proofs.
-    nothing : object array (...)
-        Empty tuples: no constraint holds a fix.
-    alone : Alternatives
+    no_active : object array (...)
+        Empty tuples: no constraint is active at a fix.
+    no_alternatives : Alternatives
         Empty: no other minimum.
-    beside : ReachWorkspace, optional
+    reach : ReachWorkspace, optional
         Workspace of the proofs that bounds are out of reach.
-    kept : dict
+    constants : dict
         Fields of a fix that are the same for all measurements, as read-only arrays.
     checked : bool
         Whether the position cost of a first fix was compared with the cost of the problem.
@@ -130,10 +132,10 @@ class _SingleWorkspace:
     answered: ProofResult
     centre: Array
     claims: Claims
-    nothing: Array
-    alone: Alternatives
-    beside: ReachWorkspace | None
-    kept: dict[str, Any]
+    no_active: Array
+    no_alternatives: Alternatives
+    reach: ReachWorkspace | None
+    constants: dict[str, Any]
     checked: bool = False
 
 
@@ -174,7 +176,7 @@ class PreparedFix:
         Whether repeats of the measurement can be simulated for a curved fix.
     limits : array (k, 2), optional
         Bounds that may truncate the law of the position; None without bounds.
-    own : threading.local
+    thread : threading.local
         Workspaces of each thread.
     """
 
@@ -196,7 +198,7 @@ class PreparedFix:
     often: bool
     repeatable: bool
     limits: Array | None
-    own: local = field(default_factory=local)
+    thread: local = field(default_factory=local)
 
     def __call__(self, z: Array) -> Fix | None:
         """Return the fix of measurements (m,), or the fixes (n,) of measurements (n, m).
@@ -238,21 +240,27 @@ class PreparedFix:
         return fix
 
     def _is_near_bound(self, limits: Array, answer: Answer) -> bool:
-        """Return whether a bound may truncate the law of a fix."""
+        """Return whether a bound may truncate the law of a fix; `limits` (k, 2) are the bounds."""
         d = self.load.place.shape[-1]
         # equalities come first
-        own = slice(answer.quantity.shape[1] - len(limits), None)
-        return are_near(limits, answer.quantity[:, own], answer.normal[:, own], answer.covariance[:, :d, :d])
+        columns = slice(answer.quantity.shape[1] - len(limits), None)
+        return are_near(limits, answer.quantity[:, columns], answer.normal[:, columns], answer.covariance[:, :d, :d])
 
     def _is_near_plane(self, normal: Array, answer: Answer) -> bool:
-        """Return whether a fix may be so near to the plane of the stations that one region includes both sides."""
+        """Return whether a fix may be so near to the plane of the stations that one region includes both sides.
+
+        `normal` (d,) is the unit normal of the plane.
+        """
         d = len(normal)
         w = np.abs((answer.x[:, :d] - self.centre) @ normal)
         variance = (answer.covariance[:, :d, :d] @ normal) @ normal
         return not bool((w * w > APART * APART * variance).all())
 
     def _proves(self, affine: Affine, answer: Answer, found: list[EngineResult], workspace: _SingleWorkspace) -> bool:
-        """Return whether every fix is proven over all positions; bounds and boxes are written to the workspace."""
+        """Return whether every fix is proven over all positions; bounds and boxes are written to the workspace.
+
+        `affine` maps measurements to position costs. `found` are the scalar results of the n fixes.
+        """
         asked, answered, d = workspace.asked, workspace.answered, self.load.place.shape[-1]
         asked.known.fill(0)
         for i, one in enumerate(found):
@@ -281,7 +289,10 @@ class PreparedFix:
         return True
 
     def _pass_hidden(self, workspace: _SingleWorkspace, x: Array, i: int) -> None:
-        """Prove fix number i at x (size,) again, without the minima behind the Earth that its proof found."""
+        """Repeat the proof of fix number i at x (size,), without the minima behind the Earth that its proof found.
+
+        The result is written to the workspace, with the boxes of all proofs.
+        """
         one, d = slice(i, i + 1), workspace.asked.x.shape[-1]
         costs, asked, answered = workspace.costs.take(one), workspace.asked.take(one), workspace.answered.take(one)
         asked.hidden[0] = 0
@@ -299,14 +310,14 @@ class PreparedFix:
         answered.boxes[0] += boxes
 
     def _is_inside(self, edges: Edges, answer: Answer, workspace: _SingleWorkspace) -> bool:
-        """Return whether no point on a bound costs as little as the levels of the proofs."""
-        assert workspace.beside is not None
+        """Return whether every point on a bound costs more than the levels of the proofs; else bounds matter."""
+        assert workspace.reach is not None
         if (answer.rival_cost < np.inf).any():  # low costs around a rival may reach a bound elsewhere
             return False
         d = self.load.place.shape[-1]
         x, cov = answer.x[:, :d], answer.covariance[:, :d, :d]
         numbers = (x, cov, answer.cost, answer.quantity, answer.normal)
-        return are_out_of_reach(edges, workspace.beside, workspace.costs, *numbers)
+        return are_out_of_reach(edges, workspace.reach, workspace.costs, *numbers)
 
     def _agrees(self, fix: Fix, workspace: _SingleWorkspace) -> bool:
         """Return whether the position costs equal the costs of the problem, at the fixes and near them."""
@@ -321,13 +332,17 @@ class PreparedFix:
         stages: tuple[Stage, ...],
         workspace: _SingleWorkspace,
     ) -> Fix | None:
-        """Return the fixes with their verdicts, or None if the reason of one of them needs the long path."""
+        """Return the fixes with their verdicts, or None if the reason of one of them needs the long path.
+
+        `shape` are the batch axes of the fixes, `answer` the arrays of the plan, and `found` the scalar results of each
+        fix.
+        """
         marks, kinds, gaps = [], [], []
         for one in found:
-            more, gap = one.infinity - one.cost, one.rival_cost - one.cost
-            if one.kappa > STRAIGHT and isnan(more):  # the cost at infinity was not computed
+            excess, gap = one.infinity - one.cost, one.rival_cost - one.cost
+            if one.kappa > STRAIGHT and isnan(excess):  # the cost at infinity was not computed
                 return None
-            marks.append(marks_of(one.cost > self.refuted, more, self.region, gap, one.kappa, self.map is not None))
+            marks.append(marks_of(one.cost > self.refuted, excess, self.region, gap, one.kappa, self.map is not None))
             kinds.append(chart_kind(one.kappa, one.kappa_far))
             gaps.append(ambiguity(self.problem, gap) if gap < AMBIGUOUS_GAP else "")
         inflation = self._inflations(answer, marks, workspace)
@@ -361,13 +376,16 @@ class PreparedFix:
             marks=notes.marks,
             chart=Chart(notes.kind, x[..., :d], covariance[..., :d, :d], workspace.centre, inflation=inflations),
             infinity=answer.infinity.reshape(shape) - cost,
-            alternatives=workspace.alone if alone else _rivals(answer, shape),
-            active=workspace.nothing if held is None else held.reshape(shape),
-            **workspace.kept,
+            alternatives=workspace.no_alternatives if alone else _rivals(answer, shape),
+            active=workspace.no_active if held is None else held.reshape(shape),
+            **workspace.constants,
         )
 
     def _inflations(self, answer: Any, marks: list[int], workspace: _SingleWorkspace) -> dict[int, float]:
-        """Return the inflations, by item number, of curved fixes whose 95 % ellipses cover simulated repeats."""
+        """Return the inflations of curved fixes whose 95 % ellipses cover simulated repeats, by item number.
+
+        `marks` are the bit masks of the findings. An inflation is a factor of the covariance.
+        """
         items = [i for i, mark in enumerate(marks) if mark == Status.CURVED.mark]
         if not items or not self.repeatable:
             return {}
@@ -376,10 +394,10 @@ class PreparedFix:
         return {i: float(one[2]) for i, one, good in zip(items, found, holds(found), strict=True) if good}
 
     def _workspace(self, shape: tuple[int, ...]) -> _SingleWorkspace:
-        """Return the workspace of this thread for a batch shape."""
-        workspaces: dict[tuple[int, ...], _SingleWorkspace] | None = getattr(self.own, "workspaces", None)
+        """Return the workspace of this thread for a batch shape; a few shapes are stored."""
+        workspaces: dict[tuple[int, ...], _SingleWorkspace] | None = getattr(self.thread, "workspaces", None)
         if workspaces is None:
-            workspaces = self.own.workspaces = {}
+            workspaces = self.thread.workspaces = {}
         if shape not in workspaces:
             if len(workspaces) == _WORKSPACES:
                 workspaces.clear()
@@ -426,17 +444,17 @@ class PreparedFix:
 
 
 def _reasons(listed: Array, shape: tuple[int, ...]) -> Array:
-    """Return the claims in words of proven fixes; `listed` (n,) flags those with another listed minimum."""
+    """Return the claims (n,) of proven fixes as sentences; `listed` (n,) flags fixes with another listed minimum."""
     out = np.empty(len(listed), dtype=object)
     out[:] = [claim_sentence(LISTED_GAP, int(one), None) for one in listed]
     return out.reshape(shape)
 
 
 def _rivals(answer: Answer, shape: tuple[int, ...]) -> Alternatives:
-    """Return the other minima of fixes, with an empty slot for a fix without one."""
-    there = answer.rival_cost < np.inf
-    x = np.where(there[:, None], answer.rival, np.nan)
-    gap = np.where(there, answer.rival_cost - answer.cost, np.inf)
+    """Return the other minima of fixes: one slot for each fix, which is empty for a fix without another minimum."""
+    exists = answer.rival_cost < np.inf
+    x = np.where(exists[:, None], answer.rival, np.nan)
+    gap = np.where(exists, answer.rival_cost - answer.cost, np.inf)
     return Alternatives(x.reshape(*shape, 1, -1), gap.reshape(*shape, 1))
 
 
@@ -453,7 +471,11 @@ class _SingleNotes(NamedTuple):
 def _notes_of(
     marks: tuple[int, ...], kinds: tuple[int, ...], gaps: tuple[str, ...], shape: tuple[int, ...]
 ) -> _SingleNotes | None:
-    """Return statuses and reasons from marks, chart kinds and texts on rivals; None for the long path."""
+    """Return statuses and reasons from marks, chart kinds and texts on rivals; None for the long path.
+
+    `marks` are bit masks of findings, and `gaps` the reasons of ambiguous fixes, "" for others. `shape` are the batch
+    axes of the fixes.
+    """
     code = [Status(int(one)) for one in first_status(np.array(marks))]
     curved = [kind if status == Status.CURVED else None for status, kind in zip(code, kinds, strict=True)]
     reasons = [
@@ -525,7 +547,10 @@ def prepare_fix(problem: Problem, method: Method, *, often: bool = True) -> Prep
 
 
 def _alone(problem: Problem) -> Problem:
-    """Return a problem without measurements, and without batch axes of length one of its stations."""
+    """Return a problem with zero measurements, and without batch axes of length one of its stations.
+
+    If the batch axes are longer, the problem keeps them.
+    """
     bare = problem.with_rows(z=np.zeros(problem.count))
     if not bare.batch_shape or prod(bare.batch_shape) > 1:
         return bare
@@ -542,7 +567,7 @@ _KEPT = Cache["PreparedFix | None"](64)
 def at_once(problem: Problem, method: Method) -> Fix | None:
     """Return the fixes of one problem, or of a few that differ in measurements only; None if the stages have to run.
 
-    A cache stores the prepared problem for later problems of the same structure.
+    A cache stores the prepared problem for later problems of the same structure, with the same method.
     """
     shape, place = problem.batch_shape, problem.stations.position
     # a problem without batch axes shares everything, and `prepare_fix` tests the other conditions once

@@ -82,7 +82,7 @@ _FINISH = Method(("lsr", "certify"))
 
 
 def _broadcast_start(problem: Problem, start: Any) -> Array:
-    """Return a starting vector for every problem, (..., size)."""
+    """Return the vector `start` for every problem, (..., size); raise InvalidProblem if it has a wrong shape."""
     vector, wanted = np.asarray(start, dtype=float), (*problem.batch_shape, problem.layout.size)
     try:
         return np.broadcast_to(vector, wanted)
@@ -97,13 +97,13 @@ _KEPT = 8
 
 
 def _with_sources(problem: Problem, fix: Fix) -> Fix:
-    """Return the fixes; those that are not `ok` keep their problems, if there are few."""
+    """Return the fixes; fixes that are not `ok` store their problems for later advice, if there are at most `_KEPT`."""
     if not fix.shape and int(fix.code) == Status.OK:
         return fix
     if not fix.shape and not problem.batch_shape:  # a copy of the problem would take as long as the fix
-        own = np.empty((), dtype=object)
-        own[()] = Source(problem)
-        return replace(fix, source=own)
+        source_of_one = np.empty((), dtype=object)
+        source_of_one[()] = Source(problem)
+        return replace(fix, source=source_of_one)
     items = np.flatnonzero(fix.code.ravel() != Status.OK)
     if not 0 < len(items) <= _KEPT:
         return fix

@@ -1,4 +1,8 @@
-"""The stage "sparse": starts and suspected rows from a convex program that allows gross errors in a few rows."""
+"""The stage "sparse": starts and suspected rows from a convex program that allows gross errors in a few rows.
+
+Letters: N problems, m rows, n unknowns y, d coordinates, x a position, s a station, t an emission time as a distance.
+q stations b are the second stations of pairs; r_a and r_b are the ranges to the stations a and b.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +75,7 @@ class RowWise:
     apex : array (N, q, d)
         Stations b, scaled.
     square : bool
-        Whether y holds ``|x|^2``, after x; the ranges to the q stations b are the last entries.
+        Whether y contains ``|x|^2``, after x; the ranges to the q stations b are the last entries.
     """
 
     origin: Array
@@ -83,7 +87,7 @@ class RowWise:
     square: bool
 
     def cones(self, item: int) -> list[tuple[int, Array]]:
-        """Return the cones of one problem, each with the entry of y that it bounds."""
+        """Return the cones of one problem: pairs of the entry of y that a cone bounds, and its matrix."""
         n, d, q = self.rows.shape[-1], self.apex.shape[-1], self.apex.shape[1]
         ranged = [(n - q + j, range_cone(self.apex[item, j], n, n - q + j)) for j in range(q)]
         return [(d, square_cone(d, n, d)), *ranged] if self.square else ranged
@@ -91,7 +95,19 @@ class RowWise:
 
 @dataclass(frozen=True, slots=True)
 class _SparsePart:
-    """Rows of one kind: coefficients of x, of |x|^2 and of other unknowns by column, right side, error at a point."""
+    """Linear rows of one kind: part of `RowWise`.
+
+    Parameters
+    ----------
+    x, square : array (N, m, d), array (N, m) or (m,)
+        Coefficients of x and of |x|^2.
+    others : tuple of (column, coefficient)
+        Column of y (m,) and coefficients of other unknowns.
+    right : array (N, m)
+        Right sides.
+    error : callable
+        Maps scaled points, or None, to the standard deviations of the right sides.
+    """
 
     x: Array
     square: Array
@@ -127,18 +143,18 @@ def row_wise(problem: Problem) -> RowWise:
         part = part or _lift_others(problem, block, start, Coordinates(origin, scale, False))
         if part is None:
             continue
-        own = slice(start, start + block.count)
-        rows[:, own, :d], rows[:, own, d], right[:, own] = part.x, part.square, part.right
+        columns_of = slice(start, start + block.count)
+        rows[:, columns_of, :d], rows[:, columns_of, d], right[:, columns_of] = part.x, part.square, part.right
         for column, value in part.others:
-            rows[:, np.arange(start, own.stop), column] += value
-        errors.append((own, part.error))
+            rows[:, np.arange(start, columns_of.stop), column] += value
+        errors.append((columns_of, part.error))
     usable = (problem.weight > 0.0) & np.isfinite(right) & np.isfinite(rows).all(-1)
     rows, right = np.where(usable[..., None], rows, 0.0), np.where(usable, right, 0.0)
 
     def error(point: Array | None) -> Array:
         out = np.ones(right.shape)
-        for own, each in errors:
-            out[:, own] = each(point)
+        for columns_of, each in errors:
+            out[:, columns_of] = each(point)
         return out
 
     apex = (np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))[:, 0, pairs]
@@ -147,13 +163,16 @@ def row_wise(problem: Problem) -> RowWise:
 
 
 def _references(problem: Problem) -> list[int]:
-    """Return the stations b of rows that combine two ranges."""
+    """Return the numbers of the stations b of rows that combine two ranges, in ascending order."""
     taken = [rows.b for rows in problem.rows if (form := MODELS[rows.kind].ranges) is not None and form[1] != 0]
     return sorted({int(b) for each in taken for b in each})
 
 
 def _block_sigma(problem: Problem, block: Rows, start: int) -> Array:
-    """Return the standard deviations (..., m) of the rows of one kind, with their weights."""
+    """Return the standard deviations (..., m) of the rows of one kind, with their weights.
+
+    `start` is the number of the first row of the kind in the problem.
+    """
     weight = np.where(block.weight > 0.0, block.weight, 1.0)
     return np.sqrt(variances(problem.noise, problem.count)[..., start : start + block.count] / weight)
 
@@ -161,7 +180,11 @@ def _block_sigma(problem: Problem, block: Rows, start: int) -> Array:
 def _lift_ranges(
     problem: Problem, block: Rows, start: int, origin: Array, scale: Array, pairs: list[int], first: int
 ) -> _SparsePart | None:
-    """Return the linear rows of range measurements of one kind, or None for other kinds."""
+    """Return the linear rows of range measurements of one kind, or None for other kinds.
+
+    `start` is the number of the first row of the kind. `origin` and `scale` are as in `RowWise`. `pairs` are the
+    stations b, and `first` is the column of y of their first range.
+    """
     model, form = MODELS[block.kind], MODELS[block.kind].ranges
     if form is None:
         return None
@@ -193,18 +216,24 @@ def _lift_ranges(
 
 
 def _centre(m: Array, block: Rows) -> Array:
-    """Return arrival times (N, m) minus the median of their epoch: one gross error must not set the origin of time."""
+    """Return arrival times m (N, rows) of one kind minus the median of their epoch, in the same unit.
+
+    The median sets the origin of time, because one gross error must not set it.
+    """
     out, present = np.array(m), np.broadcast_to(block.weight > 0.0, m.shape)
     for epoch in np.unique(block.epoch):
-        own = block.epoch == epoch
+        in_epoch = block.epoch == epoch
         with np.errstate(all="ignore"):
-            middle = np.nanmedian(np.where(present[:, own], m[:, own], np.nan), axis=1, keepdims=True)
-        out[:, own] -= np.where(np.isfinite(middle), middle, 0.0)
+            middle = np.nanmedian(np.where(present[:, in_epoch], m[:, in_epoch], np.nan), axis=1, keepdims=True)
+        out[:, in_epoch] -= np.where(np.isfinite(middle), middle, 0.0)
     return out
 
 
 def _lift_others(problem: Problem, block: Rows, start: int, to: Coordinates) -> _SparsePart | None:
-    """Return the linear rows of measurements without ranges of one kind, or None if it has no linear form."""
+    """Return the linear rows of measurements without ranges of one kind, or None if the kind has no linear form.
+
+    `start` is the number of the first row of the kind, and `to` has the scaled coordinates.
+    """
     lifted = lift_rows(problem, block, start, None, to)
     if lifted is None:
         return None
@@ -247,7 +276,7 @@ def sparse(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def _starts(problem: Problem, pool: Pool | None) -> Pool:
-    """Return the starts of `sparse` without reasons for missing ones."""
+    """Return the starts of `sparse`, without reasons for missing starts."""
     began = perf_counter()
     if not one_position(problem):
         x = from_pieces(problem, lambda piece: fix_by(piece, lambda one: _starts(one, None)))
@@ -265,7 +294,10 @@ def _starts(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def spread_rows(wrong: Array, origin: Sequence[Array], count: int) -> Array:
-    """Return flags (N, count) of rows that contain a wrong arrival time (N, m) (`optloc.problem.arrival_times`)."""
+    """Return flags (N, count) of rows that contain a wrong arrival time (`optloc.problem.arrival_times`).
+
+    `wrong` (N, m) flags the m arrival times, and `origin` lists the rows of each.
+    """
     out = np.zeros((len(wrong), count), dtype=bool)
     for i, rows in enumerate(origin):
         out[:, rows] |= wrong[:, i, None]
@@ -297,7 +329,7 @@ def sparse_errors(problem: Problem) -> SparseErrors:
 
 
 def _lift(problem: Problem) -> tuple[Array, Array]:
-    """Return positions (N, d) from the squared rows in two weightings, and flags (N,) of failed programs.
+    """Return positions (N, d), metres, from the squared rows in two weightings, and flags (N,) of failed programs.
 
     If these rows leave a direction undetermined, the position is the closed form of all rows: pairs without a common
     station have one more unknown each.
@@ -316,7 +348,10 @@ def _lift(problem: Problem) -> tuple[Array, Array]:
 
 
 def _linearise(problem: Problem, x: Array) -> tuple[Array, Array, Array]:
-    """Return vectors (N, size) after one step with sparse errors, the support (N, m), and flags of failed programs."""
+    """Return vectors (N, size) after one step with sparse errors, support (N, m), and flags (N,) of failed programs.
+
+    The support are the rows whose gross error is not zero. The rows are linearised at x (N, size).
+    """
     residual, jacobian = _derivatives(problem, x)
     move, errors, failed = _fit(jacobian, residual, _sigma(problem))
     return x + move, errors != 0.0, failed
@@ -325,22 +360,23 @@ def _linearise(problem: Problem, x: Array) -> tuple[Array, Array, Array]:
 def _fit(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) -> tuple[Array, Array, Array]:
     """Return the unknowns (N, n) and errors in sigmas (N, m) of linear rows, and flags (N,) of failed programs.
 
-    Unknowns that no row contains are zero.
+    `rows` (N, m, n), `right` (N, m) and `sigma` (N, m) are coefficients, right sides and standard deviations. `lifts`
+    adds its cones. Unknowns that no row contains are zero. Unknowns are NaN for a failed program or invalid rows.
     """
     from formulations.sparse_errors import sparse_fit
 
     y, errors = np.full((len(rows), rows.shape[-1]), np.nan), np.zeros(right.shape)
     failed = np.zeros(len(rows), dtype=bool)
-    white, side = rows / sigma[..., None], right / sigma
+    white, white_right = rows / sigma[..., None], right / sigma
 
     def fit(i: int) -> None:
         used = (white[i] != 0.0).any(0)
-        if not (used.any() and np.isfinite(white[i]).all() and np.isfinite(side[i]).all()):
+        if not (used.any() and np.isfinite(white[i]).all() and np.isfinite(white_right[i]).all()):
             return
         # the last column of a cone is its constant
         kept = np.append(used, True)
         cones = [] if lifts is None else [cone[:, kept] for column, cone in lifts.cones(i) if used[column]]
-        found = sparse_fit(white[i][:, used], side[i], cones=cones)
+        found = sparse_fit(white[i][:, used], white_right[i], cones=cones)
         failed[i] = found.answer is not None and np.isnan(found.answer.primal)
         if failed[i]:
             return
@@ -352,7 +388,10 @@ def _fit(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) 
 
 
 def _test_support(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Array]:
-    """Return the positions (N, d) without the rows in error, and flags (N, m) of these rows."""
+    """Return the positions (N, d) of the fixes without the rows in error, metres, and flags (N, m) of these rows.
+
+    `x` (N, size) are the first fixes, and `wrong` (N, m) flags the suspected rows.
+    """
     present = np.broadcast_to(problem.weight > 0.0, wrong.shape)
     # two-sided, for the greatest of m rows: Bonferroni
     limit = -ndtri(0.5 * _LEVEL / np.maximum(present.sum(1, keepdims=True), 1))
@@ -361,16 +400,16 @@ def _test_support(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Arra
     # if the support leaves too few rows for a fix, its first rows stay in it
     wrong = _spare(problem, wrong.astype(float), wrong)
     for _ in range(_PASSES):
-        part, out = problem.take(active), wrong[active]
-        rest = part.with_rows(weight=np.where(out, 0.0, part.weight))
+        part, left_out = problem.take(active), wrong[active]
+        rest = part.with_rows(weight=np.where(left_out, 0.0, part.weight))
         # the other rows have a closed form that the wrong rows have not biased
         starts = np.stack([x[active], gtrs(rest, None).x[:, 0]], axis=1)
         fixed = judge(rest, lsr(rest, begin(rest, starts))).x
         x[active] = np.where(np.isfinite(fixed), fixed, x[active])
-        size = _standardise(part, x[active], ~out & present[active])
-        found = _spare(part, size, size > limit[active])
-        changed = (found != out).any(1) & np.isfinite(fixed).all(1)
-        wrong[active[changed]] = found[changed]
+        size = _standardise(part, x[active], ~left_out & present[active])
+        now_wrong = _spare(part, size, size > limit[active])
+        changed = (now_wrong != left_out).any(1) & np.isfinite(fixed).all(1)
+        wrong[active[changed]] = now_wrong[changed]
         active = active[changed]
         if not len(active):
             break
@@ -378,7 +417,10 @@ def _test_support(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Arra
 
 
 def _spare(problem: Problem, size: Array, wrong: Array) -> Array:
-    """Return the largest of the rows in error (N, m), limited so that one row more than unknowns remains."""
+    """Return flags (N, m) of the rows in error that may be left out: the largest ones.
+
+    `size` (N, m) orders the rows in error `wrong` (N, m). One row more than unknowns must remain.
+    """
     present = np.broadcast_to(problem.weight > 0.0, wrong.shape)
     most = np.maximum(present.sum(1, keepdims=True) - present_unknowns(problem)[:, None] - 1, 0)
     # argsort of argsort is the rank: 0 for the largest
@@ -387,9 +429,11 @@ def _spare(problem: Problem, size: Array, wrong: Array) -> Array:
 
 
 def _standardise(problem: Problem, x: Array, kept: Array) -> Array:
-    """Return residuals (N, m) at the fix of the rows kept, divided by their standard deviations.
+    """Return absolute residuals (N, m) at the fix of the rows kept, divided by their standard deviations.
 
-    The residual of a row in the fix has the variance s^2 - J C J', the residual of a row left out s^2 + J C J'.
+    The residual of a row in the fix has the variance s^2 - J C J', the residual of a row left out s^2 + J C J'. Here s
+    is the standard deviation of the row, J its derivatives, and C the covariance of the fix. A row that the fix always
+    fits has the result 0. `kept` (N, m) flags the rows in the fix.
     """
     residual, jacobian = _derivatives(problem, x)
     sigma = _sigma(problem)
@@ -407,7 +451,10 @@ def _standardise(problem: Problem, x: Array, kept: Array) -> Array:
 
 
 def _derivatives(problem: Problem, x: Array) -> tuple[Array, Array]:
-    """Return residuals (N, m) and their derivatives (N, m, size); NaN vectors give NaN."""
+    """Return residuals (N, m) and the derivatives (N, m, size) of predictions; NaN vectors give NaN.
+
+    Derivatives of absent rows are zero.
+    """
     residual, compact = differentiate(problem, x)
     n, width = problem.layout.n_shared, problem.layout.n_local
     full = np.zeros((*compact.shape[:-1], problem.layout.size))

@@ -1,4 +1,7 @@
-"""The stages of methods. A stage maps (problem, pool or None) to a pool."""
+"""The stages of methods. A stage maps (problem, pool or None) to a pool.
+
+Letters: N problems, q starts of a problem, d coordinates, `size` numbers of a parameter vector.
+"""
 
 from __future__ import annotations
 
@@ -52,9 +55,9 @@ def start_with(word: str) -> Solver:
     """Return the stage of a word of a method: it offers the starts of all formulations for the word."""
 
     def start(problem: Problem, pool: Pool | None) -> Pool:
-        began, turned = perf_counter(), headings(problem)
-        if turned is not None:
-            x = oriented_starts(problem, turned, lambda part: begin(part, None).x)
+        began, offsets = perf_counter(), headings(problem)
+        if offsets is not None:
+            x = oriented_starts(problem, offsets, lambda part: begin(part, None).x)
             return offer(problem, x, pool, word, began)
         return begin(problem, pool)
 
@@ -67,11 +70,11 @@ def start_with(word: str) -> Solver:
         # comes first.
         serving.sort(key=lambda form: form.serves is one_position)
         if one_position(problem):
-            alone = problem_at_rest(problem)
+            at_rest = problem_at_rest(problem)
             # an empty slot, so that rows without a serving formulation give a pool without candidates
             nowhere = np.full((problem.batch_shape[0], 1, problem.dimension), np.nan)
-            position = np.concatenate([*(form.starts[word](alone) for form in serving), nowhere], axis=1)
-            return _place(whole, position, pool, word, began)
+            position = np.concatenate([*(form.starts[word](at_rest) for form in serving), nowhere], axis=1)
+            return _offer_positions(whole, position, pool, word, began)
         if serving:
             x = np.concatenate([form.starts[word](problem) for form in serving], axis=1)
         else:
@@ -143,51 +146,51 @@ def lsr_with_mirror(problem: Problem, start: Pool) -> Pool:
 
 
 def _without_halted(problem: Problem, pool: Pool) -> Pool:
-    """Return a settled pool without rivals from which an undamped step would move on."""
+    """Return a settled pool without rivals from which an undamped step would move on; such a point is no minimum."""
     item, slot = pool.occupied
     item, slot = item[slot > 0], slot[slot > 0]
-    # constraints and interfaces hold points that free steps would leave
+    # free steps would leave minima on constraints and interfaces
     if not len(item) or problem.constraints or strata_of(problem) is not None:
         return pool
-    at, x = equations_at(problem.take(item), pool.x[item, slot]), np.array(pool.x)
+    equations, x = equations_at(problem.take(item), pool.x[item, slot]), np.array(pool.x)
     with np.errstate(all="ignore"):
-        move, ok = step(at, np.zeros(len(item)))
-        halted = ~(ok & (decrement(at, move, problem.layout.n_shared) < _ARRIVED))
-    cost, code, lost = np.array(pool.cost), np.array(pool.code), (item[halted], slot[halted])
-    x[lost], cost[lost], code[lost] = np.nan, np.inf, Status.UNAVAILABLE
-    left = max(1, int(np.isfinite(cost).sum(1).max(initial=0)))
-    order = np.argsort(~np.isfinite(cost), axis=1, kind="stable")[:, :left]
+        move, ok = step(equations, np.zeros(len(item)))
+        halted = ~(ok & (decrement(equations, move, problem.layout.n_shared) < _ARRIVED))
+    cost, code, dropped = np.array(pool.cost), np.array(pool.code), (item[halted], slot[halted])
+    x[dropped], cost[dropped], code[dropped] = np.nan, np.inf, Status.UNAVAILABLE
+    width = max(1, int(np.isfinite(cost).sum(1).max(initial=0)))
+    order = np.argsort(~np.isfinite(cost), axis=1, kind="stable")[:, :width]
     cost, code, face = (np.take_along_axis(array, order, axis=1) for array in (cost, code, pool.face))
     return replace(pool, x=np.take_along_axis(x, order[..., None], axis=1), cost=cost, code=code, face=face)
 
 
 def fix_by(problem: Problem, start: Callable[[Problem], Pool]) -> Fix:
-    """Return the refined and judged fixes of a flat batch of problems from starts."""
+    """Return the refined and judged fixes of a flat batch; `start` maps the problems to a pool of starts."""
     return judge(problem, lsr(problem, start(problem)))
 
 
 def add_candidates(problem: Problem, pool: Pool | None) -> Pool:
-    """Return a refined pool with mirror images as starts, and starts of sub-arrays if the verdict has findings."""
+    """Return a pool with more starts: mirror images, and starts of sub-arrays if the verdict has findings."""
     if pool is None:
         raise InvalidProblem("add_candidates needs a fix", "method", "put it after a refinement, as lsr+add_candidates")
     if is_registration_run(problem):
         began, fix = perf_counter(), judge(problem, pool)
         around = step_beside(problem, fix.x, fix.covariance())
-        return _beside(problem, pool, fix, around, began) if np.isfinite(around).any() else pool
+        return _with_starts(problem, pool, fix, around, began) if np.isfinite(around).any() else pool
     if not one_position(problem):
         return pool
-    return in_parts(problem, lambda part, own: _widen(part, take(pool, own)), chunk_size(problem))
+    return in_parts(problem, lambda part, own: _more_candidates(part, take(pool, own)), chunk_size(problem))
 
 
-def _widen(problem: Problem, pool: Pool) -> Pool:
-    """Return the candidates of a refined pool of problems of one position, and additional starts."""
+def _more_candidates(problem: Problem, pool: Pool) -> Pool:
+    """Return the candidates of a refined pool of problems of one position, and additional starts to refine."""
     began, fix, alone = perf_counter(), judge(problem, pool), problem_at_rest(problem.straightened())
     seen = problem.layout.take(surviving_candidates(pool, fix), "position")
     parts = [mirror(alone, fix.position[:, None])]
     # The mirror image is a single start, so it is always tried. The other starts are many, so they are tried only if
     # the verdict has findings.
     unsettled = ~fix.answered | fix.has(*_UNSETTLED) | (fix.p_value < P_SUSPECT)
-    valley = np.flatnonzero(unsettled | _weak(problem, fix))
+    valley = np.flatnonzero(unsettled | _is_weak(problem, fix))
     for items, more in (
         (np.flatnonzero(unsettled), _subarrays),
         (valley, lambda part, at: along_the_valley(part, at.position, at.covariance())),
@@ -197,32 +200,41 @@ def _widen(problem: Problem, pool: Pool) -> Pool:
             spread = np.full((len(fix.x), *found.shape[1:]), np.nan)
             spread[items] = found
             parts.append(spread)
-    fresh = vectors(problem, _fresh(problem, fix, seen, np.concatenate(parts, axis=1)))
-    return _beside(problem, pool, fix, fresh, began)
+    fresh = vectors(problem, _far_from_known(problem, fix, seen, np.concatenate(parts, axis=1)))
+    return _with_starts(problem, pool, fix, fresh, began)
 
 
-def _beside(problem: Problem, pool: Pool, fix: Fix, x: Array, began: float) -> Pool:
-    """Return the candidates of fixes together with more starts x (N, q, size)."""
+def _with_starts(problem: Problem, pool: Pool, fix: Fix, x: Array, began: float) -> Pool:
+    """Return a pool with the candidates of the fixes, and more starts x (N, q, size).
+
+    `began` is the start time of the stage, by `time.perf_counter`.
+    """
     candidates = pack(np.concatenate([surviving_candidates(pool, fix), x], axis=1))
     return offer(problem, candidates, pool, "add_candidates", began)
 
 
 def _subarrays(problem: Problem, fix: Fix) -> Array:
-    """Return the starts (N, q, d) of all sub-arrays and their mirror images."""
+    """Return the starts (N, q, d) of all arrays without one station, metres, and their mirror images.
+
+    `fix` is not used: the function has the arguments of other sources of starts.
+    """
     found = subarray_starts(problem)
     return np.concatenate([found, mirror(problem, found)], axis=1)
 
 
-def _weak(problem: Problem, fix: Fix) -> Array:
-    """Return flags (N,) of fixes whose error exceeds a hundredth of their distance from the stations."""
+def _is_weak(problem: Problem, fix: Fix) -> Array:
+    """Return flags (N,) of fixes whose error is unknown, or at least 1 % of the distance from the stations."""
     centre, _ = spread_of(problem)
     with np.errstate(invalid="ignore"):
         spread = np.sqrt(np.trace(fix.covariance(), axis1=-2, axis2=-1))
         return np.asarray(~(spread < _WEAK * np.sqrt(((fix.position - centre) ** 2).sum(-1))))
 
 
-def _fresh(problem: Problem, fix: Fix, seen: Array, more: Array) -> Array:
-    """Return additional positions, with NaN for positions within one standard deviation of those seen."""
+def _far_from_known(problem: Problem, fix: Fix, seen: Array, more: Array) -> Array:
+    """Return additional positions `more` (N, q, d), with NaN for positions within one standard deviation of known ones.
+
+    `seen` (N, p, d) are the known positions. If the covariance of a fix is unknown, all its positions are returned.
+    """
     covariance = fix.covariance()
     usable = np.asarray(np.isfinite(covariance).all((-1, -2)))
     information, ok = linalg.inverse(np.where(usable[:, None, None], covariance, np.eye(problem.dimension)))
@@ -251,46 +263,52 @@ _STARTLESS = (Status.DISCONNECTED, Status.UNAVAILABLE)
 def search(problem: Problem, pool: Pool | None) -> Pool:
     """Return a pool after a search for its unanswered problems.
 
-    If a proof bounds their cost, the search goes over boxes, else from many positions. Only the latter problems are
-    marked as searched.
+    If a proof bounds their cost, the search goes over boxes, else from many positions. Only problems of a search from
+    positions are marked as searched.
     """
     if pool is None or pool.curvature is None:
         raise InvalidProblem("search needs a fix", "method", "put it after a refinement, as in 'gtrs+lsr+search'")
     if not (why_unsupported(problem) or is_scaled(problem)):
-        pool = _answer(problem, pool, lambda part: _with_offsets(part, best_first_starts(part)), lambda why: {})
+        pool = _search_unanswered(
+            problem, pool, lambda part: _with_offsets(part, best_first_starts(part)), lambda why: {}
+        )
     elif moves_at_once(problem):
-        pool = _answer(problem, pool, lambda part: _with_offsets(part, moving_starts(part)), lambda why: {})
+        pool = _search_unanswered(problem, pool, lambda part: _with_offsets(part, moving_starts(part)), lambda why: {})
     if one_position(problem):
-        pool = _answer(problem, pool, lambda part: vectors(part, pack(_search_starts(part))), _searched)
+        pool = _search_unanswered(problem, pool, lambda part: vectors(part, pack(_search_starts(part))), _searched)
     return pool
 
 
-def _answer(
-    problem: Problem, pool: Pool, starts: Callable[[Problem], Array], says: Callable[[Array], dict[str, Any]]
+def _search_unanswered(
+    problem: Problem, pool: Pool, starts: Callable[[Problem], Array], fields_from: Callable[[Array], dict[str, Any]]
 ) -> Pool:
-    """Return a pool whose unanswered problems start again; problems that stay unanswered keep their old pool."""
+    """Return a pool whose unanswered problems start again; problems without a better result keep their old pool.
+
+    `starts` maps the unanswered problems to starts (n, q, size). `fields_from` maps the earlier reasons of their fixes
+    to fields of the new pool.
+    """
     fix = judge(problem, pool)
     # if the Earth hides all known minima, another minimum may be visible
     hidden = np.zeros(len(fix.code), dtype=bool) if pool.hidden is None else pool.hidden != ""
     # closed forms use straight lines, so in layers their starts need not have a ray to every station
     bent = isinstance(problem.medium, Layers) & (fix.code == Status.INFEASIBLE)
-    lost = ~fix.answered & (hidden | bent | ~np.isin(fix.code, _SETTLED))
+    unanswered = ~fix.answered & (hidden | bent | ~np.isin(fix.code, _SETTLED))
     refuted = fix.answered & (fix.code == Status.MISFIT) & problem.frame.geodetic
-    behind: Array = np.flatnonzero(refuted)
-    lost[behind] = is_hidden(problem.take(behind), fix.x[behind]) if len(behind) else False
-    lost &= fix.dof >= 0
-    items = np.flatnonzero(lost)
+    misfits: Array = np.flatnonzero(refuted)
+    unanswered[misfits] = is_hidden(problem.take(misfits), fix.x[misfits]) if len(misfits) else False
+    unanswered &= fix.dof >= 0
+    items = np.flatnonzero(unanswered)
     if not len(items):
         return pool
     began = perf_counter()
     part = problem.take(items)
     found = lsr(part, offer(part, starts(part), take(pool, items), "search", began))
-    now = judge(part, found)
+    new_fix = judge(part, found)
     # a minimum with a finding is better than a missing start
-    better = np.isin(fix.code[items], _STARTLESS) & ~np.isin(now.code, _STARTLESS)
-    good = np.flatnonzero(now.answered | better)
-    found = replace(found, **says(fix.reason[items]))
-    stage = Stage("search", f"{int(now.answered.sum())} of {len(items)} found", perf_counter() - began)
+    better = np.isin(fix.code[items], _STARTLESS) & ~np.isin(new_fix.code, _STARTLESS)
+    good = np.flatnonzero(new_fix.answered | better)
+    found = replace(found, **fields_from(fix.reason[items]))
+    stage = Stage("search", f"{int(new_fix.answered.sum())} of {len(items)} found", perf_counter() - began)
     return pool.merge(items[good], take(found, good), stage)
 
 
@@ -313,7 +331,7 @@ def _with_offsets(problem: Problem, position: Array) -> Array:
 
 
 def _searched(why: Array) -> dict[str, Any]:
-    """Return the fields of a pool for problems that were searched from many positions, with their earlier reasons."""
+    """Return fields of a pool for problems searched from many positions; `why` (n,) are their earlier reasons."""
     remark = np.array([_searched_sentence(each) for each in why], dtype=object)
     return {"searched": np.ones(len(why), dtype=bool), "remark": remark}
 
@@ -364,7 +382,10 @@ def search_widely(problem: Problem) -> Pool:
 
 
 def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int = 100) -> Pool:
-    """Return the minima that damped least squares reaches from all candidates of the pool before."""
+    """Return the minima that damped least squares reaches from all candidates of the pool before.
+
+    `limit` is the largest number of steps. A settled pool without new candidates is returned unchanged.
+    """
     if pool is None:
         raise InvalidProblem("lsr needs a start", "method", "give start= or a method such as 'gtrs+lsr'")
     if damped and pool.refined and not pool.unfinished:
@@ -382,11 +403,11 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
         # with one candidate each, the problems are not copied
         whole = len(item) == len(pool) and bool((item == np.arange(len(pool))).all())
         face = exact(problem) if damped else ()
-        own = None if whole else item
+        item_of = None if whole else item
         # A hundred steps by default: damped steps along a flat valley are short. A refinement that needs more runs to
         # infinity.
         if strata is None:
-            done = refine(problem, x[item, slot], item=own, damped=damped, limit=limit, face=face)
+            done = refine(problem, x[item, slot], item=item_of, damped=damped, limit=limit, face=face)
         else:
             done = refine_in_layers(problem, strata, x[item, slot], item, face, limit)
         x[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
@@ -411,6 +432,9 @@ def taylor(problem: Problem, pool: Pool | None) -> Pool:
     return lsr(problem, pool, damped=False, limit=50)
 
 
-def _place(problem: Problem, position: Array, pool: Pool | None, name: str, began: float) -> Pool:
-    """Return positions (N, q, d) as a pool of starts, with the other unknowns filled in."""
+def _offer_positions(problem: Problem, position: Array, pool: Pool | None, name: str, began: float) -> Pool:
+    """Return positions (N, q, d), metres, as starts of the stage `name`.
+
+    Emission times fit the positions, and other unknowns are at their prior means or zero.
+    """
     return offer(problem, vectors(problem, pack(position)), pool, name, began)

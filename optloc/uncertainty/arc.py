@@ -2,6 +2,9 @@
 
 Ranges from stations on a line leave a circle around it. Ranges from stations in a plane leave an arc through the fix
 and its mirror image. Along such a curve no Gaussian covers; across it a Gaussian does.
+
+A *node* is a point of the curve. Its coordinates z are metres, or those of the inverse-range chart: a direction p and
+an inverse range w, which is 1 at the fix and 0 at infinity (`optloc.problem.chart`). Costs are chi-square values.
 """
 
 from __future__ import annotations
@@ -92,14 +95,14 @@ class Arc:
         z = self.surface.chart.to_chart(points) if self.far else np.asarray(points)
         start, chord = self.node[:-1], np.diff(self.node, axis=0)
         length = np.maximum((chord**2).sum(-1), np.finfo(float).tiny)
-        at = np.clip(((z[:, None] - start) * chord).sum(-1) / length, 0.0, 1.0)
-        apart = z[:, None] - start - at[..., None] * chord
+        fraction = np.clip(((z[:, None] - start) * chord).sum(-1) / length, 0.0, 1.0)
+        apart = z[:, None] - start - fraction[..., None] * chord
         nearest = (apart**2).sum(-1).argmin(1)
-        own = np.arange(len(z))
+        index = np.arange(len(z))
         before = np.append(0.0, np.cumsum(self.mass))
-        share = before[nearest] + at[own, nearest] * self.mass[nearest]
-        beside = np.linalg.pinv(self.across[nearest]) @ apart[own, nearest][..., None]
-        return share, np.sqrt((beside[..., 0] ** 2).sum(-1))
+        share = before[nearest] + fraction[index, nearest] * self.mass[nearest]
+        across = np.linalg.pinv(self.across[nearest]) @ apart[index, nearest][..., None]
+        return share, np.sqrt((across[..., 0] ** 2).sum(-1))
 
     def draw(self, n: int, seed: int) -> tuple[Array, Array, Array]:
         """Return samples from along the curve.
@@ -121,12 +124,12 @@ class Arc:
             Coordinates along the curve at which they were drawn, see `locate`.
         """
         mass, d = self.mass, self.node.shape[-1]
-        spaced, wide, density = student(d - 1, n, seed)
+        spaced, offsets, density = student(d - 1, n, seed)
         before = np.append(0.0, np.cumsum(mass))
         piece = np.searchsorted(before[1:-1], spaced, side="right")
-        at = np.clip((spaced - before[piece]) / np.where(mass[piece] > 0.0, mass[piece], 1.0), 0.0, 1.0)
-        along = self.node[piece] + at[:, None] * np.diff(self.node, axis=0)[piece]
-        z = along + _WIDER * (self.across[piece] @ wide[..., None])[..., 0]
+        fraction = np.clip((spaced - before[piece]) / np.where(mass[piece] > 0.0, mass[piece], 1.0), 0.0, 1.0)
+        along = self.node[piece] + fraction[:, None] * np.diff(self.node, axis=0)[piece]
+        z = along + _WIDER * (self.across[piece] @ offsets[..., None])[..., 0]
         with np.errstate(divide="ignore"):
             density = density + np.log(mass[piece] / self._lengths()[piece]) - self._log_width()[piece]
         good = z[:, -1] > _LEAST_W if self.far else np.ones(n, dtype=bool)
@@ -135,15 +138,15 @@ class Arc:
         return position, np.where(good, -0.5 * (cost - self.surface.least) - density, -np.inf), spaced
 
     def _to_position(self, z: Array) -> Array:
-        """Return the positions, metres, of node coordinates."""
+        """Return the positions (..., d), metres, of node coordinates (..., d)."""
         return self.surface.chart.to_position(z) if self.far else z
 
     def _lengths(self) -> Array:
-        """Return the lengths (m - 1,) of the chords between nodes."""
+        """Return the lengths (m - 1,) of the chords between nodes, in the unit of their coordinates."""
         return np.asarray(np.sqrt((np.diff(self.node, axis=0) ** 2).sum(-1)))
 
     def _log_width(self) -> Array:
-        """Return the logarithm of the volume (m,) of one standard deviation across the curve."""
+        """Return the logarithms (m,) of the volumes that one standard deviation across the curve spans at each node."""
         gram = np.swapaxes(self.across, -1, -2) @ self.across
         return np.asarray(0.5 * np.linalg.slogdet(gram)[1])
 
@@ -198,7 +201,11 @@ def trace_from(surface: RegionSurface) -> Arc:
 
 @dataclass(frozen=True, slots=True)
 class _Node:
-    """A point of the curve: coordinates, cost, direction (d,), and standard deviations across it (d, d - 1)."""
+    """A point of the curve.
+
+    `z` (d,) are its coordinates, `cost` its cost, and `along` (d,) the unit direction of the curve. `across` (d, d - 1)
+    are standard deviations across the curve, in columns.
+    """
 
     z: Array
     cost: float
@@ -208,13 +215,13 @@ class _Node:
 
 @dataclass(frozen=True, slots=True)
 class _Valley:
-    """The cost in the coordinates in which a curve is traced."""
+    """The cost in the coordinates in which a curve is traced: metres, or the inverse-range chart if `far`."""
 
     surface: RegionSurface
     far: bool
 
     def look(self, z: Array) -> tuple[float, Array, Array]:
-        """Return cost, information (d, d) and vector (d,) at coordinates (d,)."""
+        """Return cost, information (d, d) and half the downhill gradient (d,) at coordinates z (d,)."""
         if not self.far:
             cost, information, vector = self.surface.look(z)
             return float(cost), information, vector
@@ -224,7 +231,7 @@ class _Valley:
         return float(cost), G.T @ information @ G, G.T @ vector
 
     def start(self) -> tuple[_Node, Array]:
-        """Return the fix as a node, and the first step (d,)."""
+        """Return the fix as a node, and the first step (d,) along the direction of least information."""
         z = self.surface.chart.mean if self.far else self.surface.position
         cost, information, _ = self.look(z)
         values, vectors = np.linalg.eigh(information)
@@ -233,7 +240,10 @@ class _Valley:
         return node, size * vectors[:, 0]
 
     def walk(self, start: _Node, first: Array) -> tuple[list[_Node], bool]:
-        """Return the nodes in one direction, the fix first, and whether the curve has returned to it."""
+        """Return the nodes in the direction of the first step (d,), and whether the curve has returned to the fix.
+
+        The first node is the fix, `start`.
+        """
         size = least = float(np.sqrt((first**2).sum()))
         least *= _TINY
         nodes, along = [start], first / size
@@ -253,7 +263,10 @@ class _Valley:
         return nodes, False
 
     def _settle(self, z: Array, along: Array) -> tuple[_Node | None, float]:
-        """Return the node next to coordinates, and their distance from it in standard deviations."""
+        """Return the node next to coordinates z (d,), and the first correction in standard deviations.
+
+        `along` (d,) is the direction of the curve before. Without a node the result is None and infinity.
+        """
         moved = 0.0
         for number in range(_CORRECTIONS + 1):
             if self.far and not z[-1] > _LEAST_W:
@@ -273,18 +286,21 @@ class _Valley:
         return None, np.inf
 
     def _node(self, z: Array, cost: float, information: Array, along: Array) -> _Node:
-        """Return the node at coordinates z (d,), with one standard deviation across the curve."""
+        """Return the node at coordinates z (d,), with one standard deviation across the curve.
+
+        `along` (d,) is the unit direction of the curve, and `information` (d, d) is in the coordinates of the node.
+        """
         sides = basis(along)
         values, vectors = np.linalg.eigh(sides.T @ information @ sides)
         root = vectors / np.sqrt(np.maximum(values, np.finfo(float).tiny))
         return _Node(z, cost, along, sides @ root)
 
     def _passes(self, start: _Node, here: _Node, there: _Node) -> bool:
-        """Return whether the chord between two nodes passes the first one."""
+        """Return whether the chord between two nodes passes near the node `start`, so that the curve is closed."""
         chord, away = there.z - here.z, start.z - here.z
         share = (away @ chord) / max(chord @ chord, np.finfo(float).tiny)
-        beside = np.linalg.pinv(there.across) @ (away - share * chord)
-        return bool(0.0 < share <= 1.0 and np.sqrt((beside**2).sum()) < _HARD)
+        offset = np.linalg.pinv(there.across) @ (away - share * chord)
+        return bool(0.0 < share <= 1.0 and np.sqrt((offset**2).sum()) < _HARD)
 
 
 # Points from which samples are drawn: a Student distribution, spread evenly.

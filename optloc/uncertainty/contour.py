@@ -1,8 +1,11 @@
 """Contours of a function of two coordinates: the set where it is negative, as closed lines.
 
-The grid is inside cells that hold the set, and it is refined until enough of its nodes are in the set. Each point of a
-line is then moved along its edge of the grid to the zero of the function. So the grid decides the number of parts and
+The grid is inside cells that contain the set, and it is refined until enough of its nodes are in the set. Each point of
+a line is then moved along its edge of the grid to the zero of the function. So the grid decides the number of parts and
 corners, but not the course of a line.
+
+A *node* is a point of the grid, given by two indices. An *edge* joins two neighbouring nodes. A *polygon* is a closed
+line and the lines around its holes. Letters: m cells of v corners, a grid of (nx, ny) nodes, r points of a line.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ _COARSE = 200
 _FIRST, _INSIDE, _MOST = 4000, 600, 40_000
 # Factor of the nodes inside at which several parts are accepted: fewer may be one ridge that is thinner than a step.
 _APART_AT = 10
-# Most grids: each has half the step of the one before.
+# Most grids: each has half the step of the grid before.
 _PASSES = 8
 # Values below which a node is near the set, the widest first: at a ridge of half width w the value is 3 at distance 2
 # w.
@@ -54,7 +57,7 @@ class _Grid:
 
 
 def trace(value: Value, cells: Array) -> list[Polygon]:
-    """Return the polygons in which a function is negative, inside cells that hold all of them.
+    """Return the polygons in which a function is negative, inside cells that contain all of them.
 
     Parameters
     ----------
@@ -88,7 +91,10 @@ def holds(line: Array, point: Array) -> bool:
 
 
 def trace_nodes(value: Value, nodes: Array, step: float) -> list[Polygon]:
-    """Return the polygons in which a function is negative around nodes (n, 2) of a grid through the origin."""
+    """Return the polygons in which a function is negative around nodes (n, 2) of a grid through the origin.
+
+    `step` is the distance between neighbouring nodes.
+    """
     low = nodes.min(0) - 2
     mask = np.zeros(np.ptp(nodes, axis=0) + 5, dtype=bool)
     mask[tuple((nodes - low).T)] = True
@@ -101,7 +107,7 @@ def trace_nodes(value: Value, nodes: Array, step: float) -> list[Polygon]:
 
 
 def _parts(cells: Array) -> list[Array]:
-    """Return the cells (m, v, 2) in groups that do not touch each other."""
+    """Return the cells (m, v, 2) in groups that do not touch each other; each group gets a separate grid."""
     from scipy.ndimage import label
 
     low, high = cells.min((0, 1)), cells.max((0, 1))
@@ -109,16 +115,19 @@ def _parts(cells: Array) -> list[Array]:
     if len(cells) == 1 or step <= 0.0:
         return [cells]
     first, last = np.floor((cells.min(1) - low) / step).astype(int), np.ceil((cells.max(1) - low) / step).astype(int)
-    groups, count = label(_painted(first, last, (_COARSE + 1, _COARSE + 1)), np.ones((3, 3)))
+    groups, count = label(_nodes_in_rectangles(first, last, (_COARSE + 1, _COARSE + 1)), np.ones((3, 3)))
     if count <= 1:
         return [cells]
-    own = groups[tuple(first.T)]
+    group_of_cell = groups[tuple(first.T)]
     # a group may separate further on its finer grid
-    return [part for i in range(1, count + 1) for part in _parts(cells[own == i])]
+    return [part for i in range(1, count + 1) for part in _parts(cells[group_of_cell == i])]
 
 
-def _painted(first: Array, last: Array, shape: tuple[int, int]) -> Array:
-    """Return flags of the nodes of a grid in rectangles from first to last nodes, both (m, 2)."""
+def _nodes_in_rectangles(first: Array, last: Array, shape: tuple[int, int]) -> Array:
+    """Return flags of the nodes of a grid that are in one of m rectangles, from first to last nodes, both (m, 2).
+
+    `shape` is the shape of the grid.
+    """
     count = np.zeros((shape[0] + 1, shape[1] + 1), dtype=int)
     (west, south), (east, north) = first.T, last.T + 1
     for x, y, sign in ((west, south, 1), (east, south, -1), (west, north, -1), (east, north, 1)):
@@ -127,7 +136,7 @@ def _painted(first: Array, last: Array, shape: tuple[int, int]) -> Array:
 
 
 def _trace_part(value: Value, cells: Array) -> list[Polygon]:
-    """Return the polygons of one group of cells."""
+    """Return the polygons of one group of cells (m, v, 2), on a grid along the principal axes of the cells."""
     flat = cells.reshape(-1, 2)
     middle = flat.mean(0)
     axes = np.linalg.eigh(np.cov((flat - middle).T))[1].T[::-1].copy()
@@ -148,7 +157,10 @@ def _trace_part(value: Value, cells: Array) -> list[Polygon]:
 
 
 def _first_grid(cells: Array, axes: Array, middle: Array) -> tuple[_Grid, Array]:
-    """Return a grid over cells (m, v, 2) along its axes, and flags of its nodes in or next to cells."""
+    """Return a grid over cells (m, v, 2), and flags (nx, ny) of its nodes in or next to cells.
+
+    The cells are relative to `middle` (2,) and in rotated axes, the rows of `axes` (2, 2).
+    """
     low, high = cells.min((0, 1)), cells.max((0, 1))
     size = np.maximum(high - low, _THIN * float((high - low).max()))
     step = size / np.sqrt(_FIRST)  # separate steps: a long thin set takes as many nodes as a round one
@@ -156,13 +168,16 @@ def _first_grid(cells: Array, axes: Array, middle: Array) -> tuple[_Grid, Array]
         shape = np.ceil(size / step).astype(int) + 5
         first = np.floor((cells.min(1) - low) / step).astype(int) + 1
         last = np.ceil((cells.max(1) - low) / step).astype(int) + 3
-        mask = _painted(first, last, (int(shape[0]), int(shape[1])))
-        own, step = step, step * np.sqrt(mask.sum() / _FIRST)
-    return _Grid(middle + (low - 2.0 * own) @ axes, axes, own), mask
+        mask = _nodes_in_rectangles(first, last, (int(shape[0]), int(shape[1])))
+        used_step, step = step, step * np.sqrt(mask.sum() / _FIRST)
+    return _Grid(middle + (low - 2.0 * used_step) @ axes, axes, used_step), mask
 
 
 def _promising(values: Array, mask: Array) -> Array | None:
-    """Return flags of the nodes near the set on a grid of half the step, or None if there are too many."""
+    """Return flags of the nodes near the set on a grid of half the step; None if there are too many.
+
+    `values` (nx, ny) are the values on the present grid, and `mask` (nx, ny) flags its nodes in use.
+    """
     from scipy.ndimage import binary_dilation
 
     around = np.ones((3, 3), dtype=bool)
@@ -179,7 +194,10 @@ def _promising(values: Array, mask: Array) -> Array | None:
 
 
 def _evaluate(value: Value, grid: _Grid, mask: Array) -> Array:
-    """Return the values (nx, ny) at the nodes of a mask, cut off; other nodes get the value far outside the set."""
+    """Return the values (nx, ny) at the nodes flagged in `mask`, limited to plus and minus `_CUT`.
+
+    Other nodes, and the border of the grid, get `_CUT`: far outside the set.
+    """
     out = np.full(mask.shape, _CUT)
     nodes = np.argwhere(mask)
     if len(nodes):
@@ -215,7 +233,7 @@ Edge = tuple[int, int, int]
 
 
 def _polygons(value: Value, grid: _Grid, values: Array) -> list[Polygon]:
-    """Return the polygons of values on a grid, with corners at the zeros of the function."""
+    """Return the polygons of values (nx, ny) on a grid, with corners at the zeros of the function `value`."""
     loops = _loops(values)
     if not loops:
         return []
@@ -233,15 +251,18 @@ def _polygons(value: Value, grid: _Grid, values: Array) -> list[Polygon]:
 
 
 def _loops(values: Array) -> list[list[Edge]]:
-    """Return the closed sequences of edges that the contour of zero crosses."""
+    """Return the closed sequences of edges that the contour of zero crosses, from values (nx, ny).
+
+    An edge is the indices of its lower or left node, and 1 if it is along the second axis, else 0.
+    """
     inside = values < 0.0
     code = inside[:-1, :-1] + 2 * inside[1:, :-1] + 4 * inside[1:, 1:] + 8 * inside[:-1, 1:]
     following: dict[Edge, Edge] = {}
     for i, j in np.argwhere((code > 0) & (code < 15)).tolist():
-        own = int(code[i, j])
-        joins = _JOINS.get(own)
+        square = int(code[i, j])
+        joins = _JOINS.get(square)
         if joins is None:
-            joins = (_TOGETHER if values[i : i + 2, j : j + 2].mean() < 0.0 else _APART)[own]
+            joins = (_TOGETHER if values[i : i + 2, j : j + 2].mean() < 0.0 else _APART)[square]
         for join in joins:
             (a, b, c), (d, e, f) = _EDGES[join[0]], _EDGES[join[1]]
             following[i + a, j + b, c] = (i + d, j + e, f)
@@ -257,25 +278,28 @@ def _loops(values: Array) -> list[list[Edge]]:
 
 
 def _crossings(value: Value, grid: _Grid, values: Array, edges: Array) -> Array:
-    """Return the zeros (n, 2) of a function along edges (n, 3) of a grid."""
+    """Return the zeros (n, 2) of the function `value` along edges (n, 3) of a grid.
+
+    `values` (nx, ny) are the values at the nodes; an edge is as in `_loops`.
+    """
     begin, along = edges[:, :2].astype(float), np.eye(2)[edges[:, 2]]
     one, two = values[tuple(edges[:, :2].T)], values[tuple((edges[:, :2] + np.eye(2, dtype=int)[edges[:, 2]]).T)]
     # from the end inside to the end outside
     start = np.where((one < 0.0)[:, None], begin, begin + along)
-    way = np.where((one < 0.0)[:, None], along, -along)
+    direction = np.where((one < 0.0)[:, None], along, -along)
     low, high = np.zeros(len(edges)), np.ones(len(edges))
     at_low, at_high = np.minimum(one, two), np.maximum(one, two)
-    side = np.zeros(len(edges))
+    last_side = np.zeros(len(edges))
     for _ in range(_STEPS):
         share = at_low / (at_low - at_high)
         middle = low + np.clip(share, 0.02, 0.98) * (high - low)
-        found = value(grid.points(start + middle[:, None] * way))
+        found = value(grid.points(start + middle[:, None] * direction))
         found = np.where(np.isnan(found), _CUT, np.clip(found, -_CUT, _CUT))
         within = found < 0.0
         low, high = np.where(within, middle, low), np.where(within, high, middle)
         # if one end is used twice, half of its value is taken (Illinois rule), so that both ends approach the zero
-        at_high = np.where(within, np.where(side > 0.0, 0.5 * at_high, at_high), found)
-        at_low = np.where(within, found, np.where(side < 0.0, 0.5 * at_low, at_low))
-        side = np.where(within, 1.0, -1.0)
+        at_high = np.where(within, np.where(last_side > 0.0, 0.5 * at_high, at_high), found)
+        at_low = np.where(within, found, np.where(last_side < 0.0, 0.5 * at_low, at_low))
+        last_side = np.where(within, 1.0, -1.0)
     share = np.clip(at_low / (at_low - at_high), 0.0, 1.0)
-    return grid.points(start + (low + share * (high - low))[:, None] * way)
+    return grid.points(start + (low + share * (high - low))[:, None] * direction)

@@ -3,6 +3,8 @@
 In the plane the region is ``f <= f(fix) + q``. In space a picture shows two coordinates. The third coordinate then
 takes its best value, and q is the quantile of chi-square with two degrees of freedom, as for an ellipse from a
 covariance. So the outline contains the two visible coordinates with the stated probability.
+
+Here f is the cost over the position. Points of the plane are metres from the fix along its two axes.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from optloc.problem.problem import Problem
 from optloc.uncertainty.contour import Polygon, area, trace, trace_nodes
 from optloc.uncertainty.region import RegionSurface, likelihood_region, passes
 
-# Most cells that hold a region, by dimension; the contour is searched in them.
+# Most cells that contain a region, by dimension; the contour is searched in them.
 _CELLS = {2: 400, 3: 3000}
 # Distance, in distances of the fix, at which a picture cuts off a region that reaches to infinity.
 FAR = 3.0
@@ -34,7 +36,7 @@ _AT_EDGE = 0.995
 _STEPS, _BEYOND = {2: 24, 3: 14}, 1.4
 # Positions along the hidden coordinate, and steps from the best two of them: a cost with two minima there has both.
 _ALONG, _NEWTON = 9, 4
-# Nodes across the plane of the table that holds the reach of cells along the third coordinate.
+# Nodes across the plane of the table that contains the reach of cells along the third coordinate.
 _ACROSS = 160
 # Half the drawn width of a region that is a line, as a share of its length: visible, but not mistaken for an area.
 _WIDTH = 2e-3
@@ -68,7 +70,7 @@ class Outline:
 
 
 def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) -> Outline | None:
-    """Return the region of a fix, in a plane through it, if no ellipse covers it.
+    """Return the outline of the region of a fix, in a plane through it, if no ellipse covers the region.
 
     Parameters
     ----------
@@ -92,7 +94,7 @@ def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) ->
     if fix.chart is None or int(fix.chart.kind) not in (CURVED, INVERSE_RANGE) or not np.isfinite(fix.cov).all():
         return None
     if exact(problem):
-        return _held(problem, fix, plane, level)
+        return _outline_on_equalities(problem, fix, plane, level)
     try:
         if int(fix.chart.kind) == INVERSE_RANGE:
             surface, cells = RegionSurface.of(problem, fix), _far_cells(fix.chart, level)
@@ -105,11 +107,15 @@ def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) ->
             cells = np.where(np.isfinite(cells).all(-1, keepdims=True), cells, away)
     except InvalidProblem:
         return None
-    return _free(surface, cells, plane, level)
+    return _outline_in_cells(surface, cells, plane, level)
 
 
-def _free(surface: RegionSurface, cells: Array, plane: Array, level: float) -> Outline | None:
-    """Return the outline of a region that cells (m, v, d) hold."""
+def _outline_in_cells(surface: RegionSurface, cells: Array, plane: Array, level: float) -> Outline | None:
+    """Return the outline, in a plane, of a region without equalities; None if it has no part in the plane.
+
+    `cells` (m, v, d) are the corners of convex cells that contain the region, metres. `plane` (2, d) has the axes of
+    the plane, and `level` is the probability. The outline ends at `FAR` distances of the fix from the stations.
+    """
     q, centre = quantile(level, 2), (surface.chart.centre - surface.position) @ plane.T
     reach = FAR * float(surface.chart.distance)
     cost = _profile(surface, cells, plane)
@@ -124,16 +130,19 @@ def _free(surface: RegionSurface, cells: Array, plane: Array, level: float) -> O
 
 
 def _profile(surface: RegionSurface, cells: Array, plane: Array) -> Callable[[Array], Array]:
-    """Return a function from points (n, 2) of a plane to the least cost (n,) over the hidden coordinate."""
+    """Return a function from points (n, 2) of a plane to the least cost (n,) over the hidden coordinate.
+
+    The hidden coordinate is searched within the cells (m, v, d) only; outside them the cost is infinite.
+    """
     if plane.shape[1] == 2:
         return lambda points: surface.cost(surface.position + points @ plane)
     normal = np.cross(plane[0], plane[1])
-    seen, depth = (cells - surface.position) @ plane.T, (cells - surface.position) @ normal
-    origin = seen.min((0, 1))
-    step = max(float((seen.max((0, 1)) - origin).max()), np.finfo(float).tiny) / (_ACROSS - 3)
+    in_plane, depth = (cells - surface.position) @ plane.T, (cells - surface.position) @ normal
+    origin = in_plane.min((0, 1))
+    step = max(float((in_plane.max((0, 1)) - origin).max()), np.finfo(float).tiny) / (_ACROSS - 3)
     low, high = np.full((_ACROSS + 1, _ACROSS + 1), np.inf), np.full((_ACROSS + 1, _ACROSS + 1), -np.inf)
-    first = np.floor((seen.min(1) - origin) / step).astype(int)
-    last = np.ceil((seen.max(1) - origin) / step).astype(int) + 2
+    first = np.floor((in_plane.min(1) - origin) / step).astype(int)
+    last = np.ceil((in_plane.max(1) - origin) / step).astype(int) + 2
     for (i, j), (m, n), least, most in zip(first, last, depth.min(1), depth.max(1), strict=True):
         np.minimum(low[i:m, j:n], least, out=low[i:m, j:n])
         np.maximum(high[i:m, j:n], most, out=high[i:m, j:n])
@@ -144,15 +153,19 @@ def _profile(surface: RegionSurface, cells: Array, plane: Array) -> Callable[[Ar
         inside = ((node >= 0) & (node <= _ACROSS)).all(1)
         inside[inside] = low[tuple(node[inside].T)] <= high[tuple(node[inside].T)]
         if inside.any():
-            own = tuple(node[inside].T)
-            out[inside] = _least_along(surface, points[inside] @ plane, normal, low[own], high[own])
+            nodes_inside = tuple(node[inside].T)
+            out[inside] = _least_along(surface, points[inside] @ plane, normal, low[nodes_inside], high[nodes_inside])
         return out
 
     return least_cost
 
 
 def _least_along(surface: RegionSurface, base: Array, normal: Array, low: Array, high: Array) -> Array:
-    """Return the least costs (n,) along lines through points (n, d) about the fix, between two ends (n,) of each."""
+    """Return the least costs (n,) along lines in the direction of `normal` (d,), between two ends of each line.
+
+    `base` (n, d) are points of the lines relative to the fix. `low` and `high` (n,) are the ends along the normal,
+    metres.
+    """
 
     def at(t: Array) -> tuple[Array, Array, Array]:
         points = surface.position + base[:, None] + t[..., None] * normal
@@ -176,7 +189,7 @@ def _least_along(surface: RegionSurface, base: Array, normal: Array, low: Array,
 
 
 def _far_cells(chart: Chart, level: float) -> Array:
-    """Return cells (m, 2^d, d) that hold the region of a fix that is Gaussian in its inverse range."""
+    """Return cells (m, 2^d, d), metres, that contain the region of a fix that is Gaussian in its inverse range."""
     d = len(chart.position)
     values, vectors = np.linalg.eigh(chart.spread)
     axes = np.sqrt(np.maximum(values, 0.0) * quantile(level, 2)) * vectors
@@ -185,59 +198,71 @@ def _far_cells(chart: Chart, level: float) -> Array:
     first = np.array(list(product(range(_STEPS[d]), repeat=d)))
     cells = edges[first[:, None] + corner]
     cells = cells[np.sqrt((cells**2).sum(-1)).min(1) <= _BEYOND]
-    at = chart.mean + cells @ axes.T
-    at[..., -1] = np.maximum(at[..., -1], 0.9 / FAR)  # farther points are cut off
-    return chart.to_position(at)
+    in_chart = chart.mean + cells @ axes.T
+    in_chart[..., -1] = np.maximum(in_chart[..., -1], 0.9 / FAR)  # farther points are cut off
+    return chart.to_position(in_chart)
 
 
-# A region that equalities hold: part of a surface, or of a line.
+# A region on equalities: part of a surface, or of a line.
 
 
-def _held(problem: Problem, fix: Fix, plane: Array, level: float) -> Outline | None:
-    """Return the outline of a region along a surface, or a strip around a region along a line."""
+def _outline_on_equalities(problem: Problem, fix: Fix, plane: Array, level: float) -> Outline | None:
+    """Return the outline of a region on the surface of equalities, or a strip around a region on a line.
+
+    None if no node of the grid is in the region. The arguments are as in `outline_of`.
+    """
     assert fix.chart is not None
-    held = cost_along(problem, fix, level, FAR * float(fix.chart.distance))
-    nodes, step = held.flooded()
+    on_equalities = cost_along(problem, fix, level, FAR * float(fix.chart.distance))
+    nodes, step = on_equalities.flooded()
     if not len(nodes):
         return None
-    if held.axes.shape[1] == 1:
-        ends = held.away(nodes * step)
-        return Outline(_strips(held, plane, fix.position), bool(ends.max() > _AT_EDGE))
-    around = trace_nodes(held.value, nodes, step)
-    far = max((held.away(line).max() for polygon in around for line in polygon), default=0.0)
-    seen = [[(held.place(line) - fix.position) @ plane.T for line in polygon] for polygon in around]
-    return Outline(tuple(map(_turned, seen)), bool(far > _AT_EDGE)) if seen else None
+    if on_equalities.axes.shape[1] == 1:
+        ends = on_equalities.away(nodes * step)
+        return Outline(_strips(on_equalities, plane, fix.position), bool(ends.max() > _AT_EDGE))
+    around = trace_nodes(on_equalities.value, nodes, step)
+    far = max((on_equalities.away(line).max() for polygon in around for line in polygon), default=0.0)
+    in_plane = [[(on_equalities.place(line) - fix.position) @ plane.T for line in polygon] for polygon in around]
+    return Outline(tuple(map(_counter_clockwise, in_plane)), bool(far > _AT_EDGE)) if in_plane else None
 
 
-def _turned(polygon: Polygon) -> Polygon:
-    """Return a polygon whose outer line runs counter-clockwise: the axes of a surface may be seen from below."""
+def _counter_clockwise(polygon: Polygon) -> Polygon:
+    """Return a polygon whose outer line runs counter-clockwise.
+
+    The axes of a surface may be seen from below, which reverses the sense of lines.
+    """
     return polygon if area(polygon[0]) >= 0.0 else [line[::-1] for line in polygon]
 
 
-def _strips(held: EqualityCost, plane: Array, position: Array) -> tuple[Polygon, ...]:
-    """Return thin strips around a region along a line: without a width it would be invisible."""
-    nodes, step = held.flooded()
+def _strips(along_line: EqualityCost, plane: Array, position: Array) -> tuple[Polygon, ...]:
+    """Return thin strips around a region along a line, in the plane: without a width it would be invisible.
+
+    `along_line` is the cost along the line, `plane` (2, d) has the axes of the picture, and `position` (d,) is the fix.
+    """
+    nodes, step = along_line.flooded()
     order = np.sort(nodes[:, 0])
     parts = np.split(order, np.flatnonzero(np.diff(order) > 1) + 1)
     found = []
     for part in parts:
-        ends = _ends(held, part, step)
+        ends = _ends(along_line, part, step)
         along = np.concatenate([ends[:1], part[1:-1] * step, ends[1:]])
-        line = (held.place(along[:, None]) - position) @ plane.T
-        way = np.gradient(line, axis=0)
-        length = np.maximum(np.sqrt((way**2).sum(-1, keepdims=True)), np.finfo(float).tiny)
-        aside = _WIDTH * np.ptp(line, axis=0).max() * way[:, ::-1] / length * [-1.0, 1.0]
-        found.append([np.concatenate([line - aside, (line + aside)[::-1], (line - aside)[:1]])])
-    return tuple(map(_turned, found))
+        line = (along_line.place(along[:, None]) - position) @ plane.T
+        tangent = np.gradient(line, axis=0)
+        length = np.maximum(np.sqrt((tangent**2).sum(-1, keepdims=True)), np.finfo(float).tiny)
+        half_width = _WIDTH * np.ptp(line, axis=0).max() * tangent[:, ::-1] / length * [-1.0, 1.0]
+        found.append([np.concatenate([line - half_width, (line + half_width)[::-1], (line - half_width)[:1]])])
+    return tuple(map(_counter_clockwise, found))
 
 
-def _ends(held: EqualityCost, part: Array, step: float) -> Array:
-    """Return the ends (2,) of an interval of nodes, at which the cost meets the level."""
+def _ends(along_line: EqualityCost, part: Array, step: float) -> Array:
+    """Return the ends (2,) of an interval of neighbouring nodes: the coordinates at which the cost meets the level.
+
+    `part` are the indices of the nodes in ascending order, and `step` is their distance.
+    """
     inside = np.array([part[0], part[-1]], dtype=float) * step
     outside = inside + np.array([-step, step])
     for _ in range(_HALVINGS):
         middle = 0.5 * (inside + outside)
-        within = held.value(middle[:, None]) < 0.0
+        within = along_line.value(middle[:, None]) < 0.0
         inside, outside = np.where(within, middle, inside), np.where(within, outside, middle)
     return np.asarray(inside)
 
@@ -245,6 +270,8 @@ def _ends(held: EqualityCost, part: Array, step: float) -> Array:
 @dataclass(frozen=True, slots=True)
 class EqualityCost:
     """The cost along the surface or line of equalities, in coordinates from the fix along its principal axes.
+
+    Coordinates are numbers of standard deviations along the k principal axes; k is 1 for a line, 2 for a surface.
 
     Parameters
     ----------
@@ -254,7 +281,7 @@ class EqualityCost:
         The equalities.
     x : array (1, size)
         All unknowns of the fix.
-    own : slice
+    columns : slice
         Slice of the position in the unknowns.
     axes : array (d, k)
         One standard deviation along each axis, metres.
@@ -265,13 +292,13 @@ class EqualityCost:
     reach : float
         Largest distance from the fix, metres, which also ends a region without an end.
     starts : array (q, k)
-        The fix, and alternatives within the region.
+        Coordinates of the fix, and of alternatives within the region.
     """
 
     problem: Problem
     face: Face
     x: Array
-    own: slice
+    columns: slice
     axes: Array
     least: float
     quantile: float
@@ -280,24 +307,27 @@ class EqualityCost:
 
     def place(self, steps: Array) -> Array:
         """Return the positions (n, d), metres, of coordinates (n, k)."""
-        return np.asarray(self._vectors(steps)[:, self.own])
+        return np.asarray(self._vectors(steps)[:, self.columns])
 
     def away(self, steps: Array) -> Array:
         """Return the distances (n,) of coordinates (n, k) from the fix, as shares of the reach."""
-        return np.asarray(np.sqrt(((self.place(steps) - self.x[0, self.own]) ** 2).sum(-1)) / self.reach)
+        return np.asarray(np.sqrt(((self.place(steps) - self.x[0, self.columns]) ** 2).sum(-1)) / self.reach)
 
     def value(self, steps: Array) -> Array:
-        """Return numbers (n,) that are negative inside the region and zero on its edge."""
+        """Return numbers (n,) at coordinates (n, k) that are negative inside the region and zero on its edge."""
         points = self._vectors(steps)
         cost = profile(self.problem, points[:, None], self.x, passes(self.problem))[0][:, 0]
-        beyond = np.sqrt(((points[:, self.own] - self.x[0, self.own]) ** 2).sum(-1)) / self.reach - 1.0
+        beyond = np.sqrt(((points[:, self.columns] - self.x[0, self.columns]) ** 2).sum(-1)) / self.reach - 1.0
         return np.asarray(np.maximum((cost - self.least) / self.quantile - 1.0, beyond))
 
     def flooded(self) -> tuple[Array, float]:
-        """Return the connected nodes (n, k) of a grid in the region, and the step; empty if there are too many."""
+        """Return the connected nodes (n, k) of a grid in the region, and the step of the grid in standard deviations.
+
+        If a fine grid has too many nodes, the step is doubled. The array is empty if all grids have too many.
+        """
         step = float(np.sqrt(self.quantile)) / _FINE
         for _ in range(_DOUBLINGS):
-            found = _flooded(lambda steps: self.value(steps) <= 0.0, self.starts, step)
+            found = _connected_nodes(lambda steps: self.value(steps) <= 0.0, self.starts, step)
             if found is not None:
                 return found, step
             step *= 2.0
@@ -306,7 +336,7 @@ class EqualityCost:
     def _vectors(self, steps: Array) -> Array:
         """Return vectors (n, size) of coordinates (n, k), moved onto the equalities."""
         points = np.repeat(self.x, len(steps), axis=0)
-        points[:, self.own] += steps @ self.axes.T
+        points[:, self.columns] += steps @ self.axes.T
         return restore(self.problem, self.face, points)
 
 
@@ -316,7 +346,7 @@ def cost_along(problem: Problem, fix: Fix, level: float, reach: float) -> Equali
     Parameters
     ----------
     problem : Problem
-        The problem of the fix: one static position, held by equalities.
+        The problem of the fix: one static position with equalities.
     fix : Fix
         A single fix.
     level : float
@@ -327,32 +357,36 @@ def cost_along(problem: Problem, fix: Fix, level: float, reach: float) -> Equali
     flat, x = problem.flat().with_rows(weight=fix.weights[None]), fix.x[None]
     face, d = exact(flat), problem.dimension
     slot, _ = problem.layout.find("position")
-    own = slice(slot.start, slot.start + d)
-    gradients = levels(flat, face, x)[1][0][:, own]
-    left = np.linalg.svd(gradients)[2][len(gradients) :].T  # orthogonal to all gradients
-    values, vectors = np.linalg.eigh(left.T @ fix.covariance() @ left)
-    axes = left @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    columns = slice(slot.start, slot.start + d)
+    gradients = levels(flat, face, x)[1][0][:, columns]
+    tangent = np.linalg.svd(gradients)[2][len(gradients) :].T  # orthogonal to all gradients
+    values, vectors = np.linalg.eigh(tangent.T @ fix.covariance() @ tangent)
+    axes = tangent @ (vectors * np.sqrt(np.maximum(values, 0.0)))
     q = quantile(level, axes.shape[1])
     least = float(profile(flat, x[None], x, passes(flat))[0][0, 0])
-    others = fix.alternatives.x[:, own][fix.alternatives.gap <= q]
-    starts = np.concatenate([np.zeros((1, axes.shape[1])), (others - x[0, own]) @ np.linalg.pinv(axes).T])
-    return EqualityCost(flat, face, x, own, axes, least, q, reach, starts)
+    others = fix.alternatives.x[:, columns][fix.alternatives.gap <= q]
+    starts = np.concatenate([np.zeros((1, axes.shape[1])), (others - x[0, columns]) @ np.linalg.pinv(axes).T])
+    return EqualityCost(flat, face, x, columns, axes, least, q, reach, starts)
 
 
-def _flooded(inside: Callable[[Array], Array], starts: Array, step: float) -> Array | None:
-    """Return the nodes (n, k) of a grid, in steps, that are connected within a region; None if there are too many."""
+def _connected_nodes(inside: Callable[[Array], Array], starts: Array, step: float) -> Array | None:
+    """Return the nodes (n, k) of a grid, in steps, that are connected within a region; None if there are too many.
+
+    `inside` maps coordinates (n, k) to flags of points in the region. `starts` (q, k) are coordinates in the region,
+    and `step` is the distance of nodes. Neighbours of a start are always included.
+    """
     k = starts.shape[1]
-    ways = np.array([way for way in product((-1, 0, 1), repeat=k) if any(way)])
+    neighbours = np.array([way for way in product((-1, 0, 1), repeat=k) if any(way)])
     # neighbours of a start are included too: the region may be thinner than a step
     seen = {tuple(node) for node in np.round(starts / step).astype(int).tolist()}
-    held, front = set(seen), seen
+    kept, front = set(seen), seen
     while front:
-        fresh = {tuple(node) for at in front for node in (np.array(at) + ways).tolist()} - seen
-        seen |= fresh
-        nodes = np.array(sorted(fresh)).reshape(-1, k)
+        new = {tuple(node) for at in front for node in (np.array(at) + neighbours).tolist()} - seen
+        seen |= new
+        nodes = np.array(sorted(new)).reshape(-1, k)
         good = inside(nodes * step) if len(nodes) else np.zeros(0, dtype=bool)
         front = {tuple(node) for node in nodes[good].tolist()}
-        held |= front
-        if len(held) > _NODES:
+        kept |= front
+        if len(kept) > _NODES:
             return None
-    return np.array(sorted(held)).reshape(-1, k)
+    return np.array(sorted(kept)).reshape(-1, k)

@@ -1,4 +1,8 @@
-"""Samples of the posterior position, and a sum of a few Gaussians that approximates it."""
+"""Samples of the posterior position, and a sum of a few Gaussians that approximates it.
+
+Letters: n samples, d coordinates, q Gaussians. The inverse-range chart has a direction p and an inverse range w, which
+is 1 at the fix and 0 at infinity (`optloc.problem.chart`).
+"""
 
 from __future__ import annotations
 
@@ -60,13 +64,13 @@ class Samples:
 
     @property
     def mean(self) -> Array:
-        """Return the mean (d,), metres; if infinity has density, it needs `within`."""
+        """Return the mean (d,), metres; raise InvalidProblem if infinity has density and no ball limits the samples."""
         self._demand("mean")
         return np.asarray(self.weight @ self.position)
 
     @property
     def covariance(self) -> Array:
-        """Return the covariance (d, d), square metres; if infinity has density, it needs `within`."""
+        """Return the covariance (d, d), square metres; raise InvalidProblem in the same case as `mean`."""
         self._demand("covariance")
         return moments(self.position, self.weight)[1]
 
@@ -82,7 +86,7 @@ class Samples:
         return np.asarray(self.position[chosen])
 
     def _demand(self, what: str) -> None:
-        """Raise InvalidProblem if a moment does not exist."""
+        """Raise InvalidProblem if moments do not exist; `what` is the name of the moment in the message."""
         if not self.bounded:
             raise InvalidProblem(
                 f"infinity has density, so the {what} in metres does not exist",
@@ -92,7 +96,7 @@ class Samples:
 
 
 def moments(position: Array, weight: Array) -> tuple[Array, Array]:
-    """Return mean (d,) and covariance (d, d) of weighted positions (n, d)."""
+    """Return mean (d,) and covariance (d, d) of positions (n, d) with weights (n,), in the unit of the positions."""
     share = weight / weight.sum()
     mean = share @ position
     apart = position - mean
@@ -143,7 +147,10 @@ def samples(
 
 
 def around(surface: RegionSurface, n: int, seed: int, prior: str = "jeffreys", within: float | None = None) -> Samples:
-    """Return samples of a fix that is Gaussian in metres or in the inverse-range chart; arguments as of `samples`."""
+    """Return samples of a fix that is Gaussian in metres or in the inverse-range chart; arguments as of `samples`.
+
+    `surface` is the cost around the fix.
+    """
     chart, inverse = surface.chart, surface.kind == INVERSE_RANGE
     if chart.truncated is not None and chart.cut_off:
         return _within_bounds(surface, chart.truncated, n, seed, prior, within)
@@ -168,7 +175,10 @@ def around(surface: RegionSurface, n: int, seed: int, prior: str = "jeffreys", w
 def _within_bounds(
     surface: RegionSurface, law: Truncated, n: int, seed: int, prior: str, within: float | None
 ) -> Samples:
-    """Return samples of a fix with a truncated law: drawn from the law, weighted by the cost."""
+    """Return samples of a fix with a truncated law: drawn from the law, weighted by the cost.
+
+    The other arguments are as in `samples`.
+    """
     away, excess = law.draw(n, seed)
     position, centre = surface.position + away, surface.chart.centre
     cost, information, _ = surface.look(position)
@@ -180,14 +190,20 @@ def _within_bounds(
 
 
 def _scaled(information: Array, position: Array, centre: Array, inverse: bool) -> Array:
-    """Return information times squared distance from the centre: far away, information in metres is only rounding."""
+    """Return information (n, d, d) times the squared distance from the centre, for the inverse-range chart.
+
+    Far away, information in metres is only rounding. If `inverse` is False, the information is returned unchanged.
+    """
     if not inverse:
         return information
     return np.asarray(information * ((position - centre) ** 2).sum(-1)[:, None, None])
 
 
 def along(arc: Arc, n: int, seed: int, within: float | None = None) -> Samples:
-    """Return samples along an arc, see `optloc.uncertainty.arc.Arc.draw`."""
+    """Return n samples along an arc, see `optloc.uncertainty.arc.Arc.draw`.
+
+    `within` is the radius of a ball that limits the positions, metres; None for no limit.
+    """
     position, log_weight, _ = arc.draw(n, seed)
     if within is not None:
         away = ((position - arc.surface.chart.centre) ** 2).sum(-1)
@@ -196,7 +212,11 @@ def along(arc: Arc, n: int, seed: int, within: float | None = None) -> Samples:
 
 
 def weighed(position: Array, log_weight: Array, prior: str, within: float | None, bounded: bool) -> Samples:
-    """Return samples with normalised weights, and a reason if too few are effective."""
+    """Return samples with normalised weights, and a reason if too few are effective.
+
+    `log_weight` (n,) are logarithms of weights up to a constant; -inf drops a sample. The other arguments are fields of
+    `Samples`.
+    """
     kept = log_weight > -np.inf
     if not kept.any():
         raise InvalidProblem("no sample is within the ball", "within", "the fix is outside: give a larger radius")
@@ -205,10 +225,10 @@ def weighed(position: Array, log_weight: Array, prior: str, within: float | None
     found = Samples(position[kept], weight, prior, within, bounded)
     if found.effective >= _POOR * len(position):
         return found
-    says = (
+    sentence = (
         f"only {found.effective:.0f} of {len(position)} samples are effective: the proposal differs from the posterior"
     )
-    return Samples(found.position, weight, prior, within, bounded, says)
+    return Samples(found.position, weight, prior, within, bounded, sentence)
 
 
 # A sum of a few Gaussians.
@@ -243,7 +263,7 @@ class Mixture:
     covariance: Array
 
     def log_density(self, points: Array) -> Array:
-        """Return the logarithm of the density (...), per metre to the dimension, at points (..., d), metres."""
+        """Return the natural logarithm of the density (...), per m^d, at points (..., d), metres."""
         from scipy.special import logsumexp
 
         apart = np.asarray(points)[..., None, :] - self.mean
@@ -294,7 +314,7 @@ def mixture(problem: Problem, fix: Fix, k: int = _SLICES, seed: int = 0) -> Mixt
 
 
 def _slices(surface: RegionSurface, k: int, seed: int) -> Mixture:
-    """Return the Gaussians of one minimum; their weights sum to one."""
+    """Return the Gaussians of one minimum; their weights sum to one. `k` and `seed` are as in `mixture`."""
     chart = surface.chart
     if surface.kind == CARTESIAN:
         law = chart.truncated if chart.cut_off else None
@@ -313,13 +333,16 @@ def _slices(surface: RegionSurface, k: int, seed: int) -> Mixture:
 
 
 def _quantiles(values: Array, weight: Array) -> list[float]:
-    """Return the weighted quantiles of values at which slices begin and end."""
+    """Return the two weighted quantiles of values (n,) at which slices begin and end."""
     order = np.argsort(values)
     return [float(v) for v in np.interp(_EDGES, np.cumsum(weight[order]), values[order])]
 
 
 def _by_slice(drawn: Samples, slice_of: Array, k: int) -> Mixture:
-    """Return moments and weights of the samples in k slices; slices with too few samples join a neighbour."""
+    """Return moments and weights of the samples in k slices; slices with too few samples join a neighbour.
+
+    `slice_of` (n,) is the slice of each sample; samples outside all slices are dropped.
+    """
     fewest, groups = _FEWEST * drawn.position.shape[1], [np.zeros(len(slice_of), dtype=bool)]
     for i in range(k):
         if groups[-1].sum() >= fewest:
@@ -329,6 +352,8 @@ def _by_slice(drawn: Samples, slice_of: Array, k: int) -> Mixture:
     if len(groups) > 1 and groups[-1].sum() < fewest:
         last = groups.pop()
         groups[-1] = groups[-1] | last
-    found = [(drawn.weight[own].sum(), *moments(drawn.position[own], drawn.weight[own])) for own in groups]
+    found = [
+        (drawn.weight[members].sum(), *moments(drawn.position[members], drawn.weight[members])) for members in groups
+    ]
     weight, mean, covariance = (np.array(each) for each in zip(*found, strict=True))
     return Mixture(weight / weight.sum(), mean, covariance)

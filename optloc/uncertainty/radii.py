@@ -94,7 +94,9 @@ def radius(covariance: Array, level: ArrayLike) -> Array:
 
 
 def _first_guess(variance: Array, level: Array) -> Array:
-    """Return squared radii (...) from the moments of the sum of squares, for variances (..., d) whose sum is 1.
+    """Return approximate squared radii (...) from the moments of the sum of squares, for variances (..., d) with sum 1.
+
+    `level` is the probability inside the radius.
 
     Notes
     -----
@@ -111,12 +113,14 @@ def _first_guess(variance: Array, level: Array) -> Array:
 def probability(variance: Array, square: Array) -> tuple[Array, Array, Array]:
     """Return the probability (...) that independent normal numbers are in a ball, its slope and its curvature.
 
+    Slope and curvature, also (...), are the first and second derivative to the logarithm of the squared radius.
+
     Parameters
     ----------
     variance : array (..., d)
         Variances of the numbers.
     square : array (...)
-        Squared radius of the ball, positive; slope and curvature are derivatives to its logarithm.
+        Squared radius of the ball, positive.
 
     Notes
     -----
@@ -133,7 +137,10 @@ def probability(variance: Array, square: Array) -> tuple[Array, Array, Array]:
 
 @cache
 def _contour() -> tuple[Array, Array]:
-    """Return nodes (n,) of the upper half of Talbot's contour, and weights (n, 3) of the results of `probability`."""
+    """Return nodes (n,) of the upper half of Talbot's contour, and weights (n, 3) for the results of `probability`.
+
+    All are complex numbers.
+    """
     # The constants are from the article: they balance the errors of truncation and of the step.
     turn = np.pi * np.arange(1, _NODES, 2) / _NODES
     cot, sine = 1.0 / np.tan(0.6407 * turn), np.sin(0.6407 * turn)

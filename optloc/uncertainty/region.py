@@ -1,6 +1,7 @@
 """The likelihood region of a fix: all positions whose cost exceeds the cost of the fix by at most a quantile.
 
-A region may have any shape, several parts, and no end.
+A region may have any shape, several parts, and no end. Convex cells enclose it; bounds of the cost, as in a proof,
+certify that no part is outside. Costs are chi-square values. Letters: n cells, k rays, d coordinates, q points.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ TURNS = "biases of angles may reach a whole turn at costs within the region"
 
 @dataclass(frozen=True, slots=True)
 class Cells:
-    """Convex cells that together hold a region, some perhaps out to infinity.
+    """Convex cells that together contain a region; a cell may reach infinity.
 
     Parameters
     ----------
@@ -82,7 +83,7 @@ class Cells:
         return np.asarray(signs @ self.edges)
 
     def _finite(self, corners: Array) -> Array:
-        """Return homogeneous corners as positions, metres; infinite where the last coordinate is zero."""
+        """Return homogeneous corners (..., 1 + d) as positions (..., d), m; infinite if the last coordinate is zero."""
         scale = corners[..., -1:]
         with np.errstate(divide="ignore", invalid="ignore"):
             apart = np.where(corners[..., :-1] == 0.0, 0.0, corners[..., :-1] / np.maximum(scale, 0.0))
@@ -106,7 +107,7 @@ class Region:
         directions between them, in the coordinates in which the fix is Gaussian. In the plane they are in order around
         the fix. NaN for a ray that never leaves the region.
     cells : Cells, optional
-        Cells that hold the region, of any shape and with any number of parts; bounds of the proof certify them.
+        Cells that contain the region, of any shape and with any number of parts; bounds of the proof certify them.
     open : bool
         Whether the region has no end: infinity is as likely. Then only a direction (`cone`) and a least range are
         known.
@@ -132,7 +133,7 @@ class Region:
 
     @property
     def box(self) -> tuple[Array, Array] | None:
-        """Return the least and greatest coordinates (d,) of a box that holds the region, or None without cells."""
+        """Return the least and greatest coordinates (d,), m, of a box that contains the region; None without cells."""
         if self.cells is None:
             return None
         corners = self.cells.corners.reshape(-1, len(self.cells.base))
@@ -140,7 +141,7 @@ class Region:
 
     @property
     def cone(self) -> tuple[Array, float] | None:
-        """Return axis (d,) and half-angle, radians, of a cone from the middle of the stations that holds the region.
+        """Return axis (d,) and half-angle, radians, of a cone from the middle of the stations that contains the region.
 
         The angle is pi if the region surrounds the middle; None without cells.
         """
@@ -191,7 +192,7 @@ def likelihood_region(problem: Problem, fix: Fix, level: float = 0.95, *, boxes:
     level : float
         Probability that the region contains the target.
     boxes : int, optional
-        Most cells that may hold the region; more are finer. By default 1 000 in the plane and 8 000 in space.
+        Most cells that may contain the region; more are finer. By default 1 000 in the plane and 8 000 in space.
 
     Notes
     -----
@@ -211,12 +212,15 @@ def likelihood_region(problem: Problem, fix: Fix, level: float = 0.95, *, boxes:
 
 
 def _cover(surface: RegionSurface, threshold: float, boxes: int | None) -> tuple[Cells | None, bool, str]:
-    """Return cells that hold the region or None, whether a cell reaches infinity, and why there are no cells."""
+    """Return cells that contain the region or None, whether a cell reaches infinity, and the reason for None or "".
+
+    `threshold` is the highest cost in the region, and `boxes` the largest number of cells, None for the default.
+    """
     why = why_unsupported(surface.problem) or why_too_large(surface.problem)
     if why:
         return None, False, why
     costs = position_costs(surface.problem)
-    cost, x = _present(costs.kinds, costs.data[0], costs.K[0], costs.w[0]), np.array(surface.position)
+    cost, x = _without_unused_terms(costs.kinds, costs.data[0], costs.K[0], costs.w[0]), np.array(surface.position)
     box, d = empty_box(*cost.K.shape), len(x)
     most = boxes or (_MOST[d] if enabled() else _MOST_PLAIN)
     base, edges, ends = np.zeros(3), np.zeros((2 * most, 1 + d, 1 + d)), np.zeros(2 * most)
@@ -229,8 +233,11 @@ def _cover(surface: RegionSurface, threshold: float, boxes: int | None) -> tuple
     return Cells(base[:d], edges[:count], inside), bool((ends[:count] <= highest).any()), ""
 
 
-def _present(kinds: Array, data: Array, K: Array, w: Array) -> Cost:
-    """Return the cost without terms that no row has: the tables of a proof need terms that count."""
+def _without_unused_terms(kinds: Array, data: Array, K: Array, w: Array) -> Cost:
+    """Return the cost without terms that no row contains: the tables of a proof need terms that count.
+
+    The cost has the rows ``K phi = w``. The values phi of its terms follow from `kinds` and `data`.
+    """
     used = (K != 0.0).any(0)
     rows = (K != 0.0).any(1) | (w != 0.0)
     return cost_of(*(np.ascontiguousarray(each) for each in (kinds[used], data[used], K[rows][:, used], w[rows])))
@@ -251,7 +258,10 @@ _NEAR_INFINITY = 1e-6
 
 
 def boundary(surface: RegionSurface, threshold: float) -> Array:
-    """Return the first points (k, d) at which rays from the fix leave the region; NaN for endless rays."""
+    """Return the first points (k, d), metres, at which rays from the fix leave the region; NaN for endless rays.
+
+    `threshold` is the highest cost in the region.
+    """
     rays = directions(len(surface.position))
     q = np.sqrt(threshold - surface.least)
     count = int(np.ceil(np.log(_LAST / _FIRST) / np.log(_FACTOR)))
@@ -263,8 +273,8 @@ def boundary(surface: RegionSurface, threshold: float) -> Array:
     costs = surface.cost(_points(surface, start + along[..., None] * steps[:, None]))
     above = np.asarray(costs > threshold)
     first = above.argmax(1)
-    own = np.arange(len(rays))
-    low, high = np.where(first > 0, along[own, np.maximum(first - 1, 0)], 0.0), along[own, first]
+    ray = np.arange(len(rays))
+    low, high = np.where(first > 0, along[ray, np.maximum(first - 1, 0)], 0.0), along[ray, first]
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         outside = np.asarray(surface.cost(_points(surface, start + middle[:, None] * steps)) > threshold)
@@ -274,7 +284,7 @@ def boundary(surface: RegionSurface, threshold: float) -> Array:
 
 
 def directions(d: int) -> Array:
-    """Return unit vectors (k, d): around the circle, or the axes of space and all their diagonals."""
+    """Return k unit vectors (k, d): 64 around the circle, or the axes of space and all their diagonals."""
     if d == 2:
         turn = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
         return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
@@ -291,12 +301,15 @@ def _axes(chart: Chart) -> tuple[Array, Array]:
 
 
 def _points(surface: RegionSurface, at: Array) -> Array:
-    """Return the positions, metres, of coordinates in which the fix is Gaussian."""
+    """Return the positions (..., d), metres, of coordinates in which the fix is Gaussian."""
     return surface.chart.to_position(at) if surface.kind == INVERSE_RANGE else at
 
 
 def _limit(surface: RegionSurface, steps: Array) -> Array:
-    """Return the largest multiples (k,) of ray steps (k, d); infinite in metres."""
+    """Return the largest multiples (k,) of ray steps (k, d), at which a ray is close to infinity.
+
+    In metres a ray has no limit, and the result is infinite.
+    """
     if surface.kind != INVERSE_RANGE:
         return np.full(len(steps), np.inf)
     with np.errstate(divide="ignore"):
@@ -332,7 +345,7 @@ class RegionSurface:
 
     @classmethod
     def of(cls, problem: Problem, fix: Fix) -> RegionSurface:
-        """Return the surface of a single fix of one static position; raise InvalidProblem for others."""
+        """Return the surface of a single fix of one static position; raise InvalidProblem for other fixes."""
         _check(problem, fix)
         if not np.isfinite(fix.position).all() or not np.isfinite(fix.covariance()).all():
             raise InvalidProblem("the fix has no position with a covariance", "fix", "see fix.status for the reason")
@@ -355,7 +368,10 @@ class RegionSurface:
 
     @classmethod
     def _about(cls, problem: Problem, fix: Fix, x: Array, cov: Array, kind: int | None) -> RegionSurface:
-        """Return the surface of a minimum from the covariance of its shared unknowns."""
+        """Return the surface of a minimum x (size,) from the covariance of its shared unknowns (n, n).
+
+        `kind` is the kind of its chart, or None if it is not known yet.
+        """
         flat, x = problem.flat().with_rows(weight=fix.weights[None]), x[None]
         slot, _ = problem.layout.find("position")
         part = slice(slot.start, slot.start + slot.size)
@@ -426,7 +442,7 @@ def passes(problem: Problem) -> int:
 
 
 def _check(problem: Problem, fix: Fix) -> None:
-    """Raise InvalidProblem unless the fix is a single fix of one static position that no equality holds."""
+    """Raise InvalidProblem unless the fix is a single fix of one static position without equalities."""
     advice = "take one fix of a batch: `problem.flat().take([i])` and `fix.flat()[i]`"
     if fix.shape != () or int(np.prod(problem.batch_shape)) != 1:
         raise InvalidProblem("a region or samples need a single fix, and this is a batch", "fix", advice)

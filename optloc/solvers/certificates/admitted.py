@@ -1,8 +1,13 @@
 """Proofs for problems with inequalities: whether a fix is the best position that the constraints admit.
 
-A minimum under inequalities is a minimum over all positions, or a minimum along a face: a set of inequalities that hold
-with equality. So every candidate is among the minima along the faces, and each face is a problem without inequalities.
-Minima that violate another constraint do not count. Minima from which the cost falls inwards do not count either.
+A minimum under inequalities is a minimum over all positions, or a minimum along a face: a set of inequalities that are
+satisfied with equality. So every candidate is among the minima along the faces, and each face is a problem without
+inequalities. Minima that violate another constraint do not count. Minima from which the cost falls inwards do not
+count either.
+
+Letters: n problems, q slots for minima of a problem, d coordinates, `size` numbers of a parameter vector. Costs are
+chi-square values. `margin` is the difference of costs to prove: other minimum minus fix. `effort` multiplies the
+number of boxes that a proof may use.
 """
 
 from __future__ import annotations
@@ -81,32 +86,33 @@ LEFT = "no minimum was found along the edge {}"
 def certified(
     problem: Problem, pool: Pool | None, region: Array | None = None, margin: float = LISTED_GAP, effort: float = 1
 ) -> Pool:
-    """Return the pools of a flat batch with certificates: the stage "certify"; region (2, d) as of `certify`.
+    """Return the pools of a flat batch with certificates: the stage "certify".
 
-    `effort` multiplies the number of boxes that a proof may use.
+    `region` (2, d) has the corners of the requested box, metres, as of `certify`. `margin` is the gap of cost to prove
+    to other minima. `effort` multiplies the number of boxes that a proof may use.
     """
     limited = any(not is_exact(constraint) for constraint in problem.constraints)
     if pool is None or region is not None or not limited or why_unsupported(problem) or problem.motions[0].order:
         return certified_freely(problem, pool, region, margin, effort)
     began, stages, fix = perf_counter(), pool.stages, judge(problem, pool)
     proven = claims_before(pool)
-    asked, same = fixes_to_prove(pool, fix)
+    asked, proven_before = fixes_to_prove(pool, fix)
     if pool.tried_before is not None:
-        proven.write(same, take(pool.tried_before.proven, same))
-    items, more = np.flatnonzero(asked & ~same), 0
+        proven.write(proven_before, take(pool.tried_before.proven, proven_before))
+    items, more = np.flatnonzero(asked & ~proven_before), 0
     pool, claims, done = _prove_freely(problem, pool, items, margin, effort)
     proven.write(items[done], take(claims, done))
     items, fix = items[~done], judge(problem, pool)
     for _ in range(_ROUNDS):
         if not len(items):
             break
-        part, own = problem.take(items), take(pool, items)
-        claims, minima = _prove_within(part, own, fix[items], margin, effort)
-        new = _with_minima(part, own, minima)
+        part, part_pool = problem.take(items), take(pool, items)
+        claims, minima = _prove_within(part, part_pool, fix[items], margin, effort)
+        new = _with_minima(part, part_pool, minima)
         better = judge(part, new)
         changed = np.flatnonzero(_is_new(fix[items], better))
         proven.write(items, claims)
-        if not has_law(problem):  # the covariance of a fix that an inequality holds describes the edge only
+        if not has_law(problem):  # the covariance of a fix with an active inequality describes the edge only
             proven.write(items[~is_free(problem, fix, items)], unknown_claim(HELD))
         more += len(changed)
         pool = pool.merge(items[changed], take(new, changed))
@@ -120,9 +126,10 @@ def certified(
 def _prove_freely(
     problem: Problem, pool: Pool, items: Array, margin: float, effort: float
 ) -> tuple[Pool, Claims, Array]:
-    """Return pools after proofs of items without inequalities, the claims of the items, and which claims hold (n,).
+    """Return pools after proofs of items without inequalities, claims of the items, and flags (n,) of valid claims.
 
-    A claim holds if the bounds are out of reach: then the fix is the only minimum, with and without bounds.
+    A claim is valid if the bounds are out of reach: then the fix is the only minimum, with and without bounds. `items`
+    (n,) are numbers of problems. The claims have n entries.
     """
     edges, part = edges_of(problem), problem.take(items)
     if edges is None or is_run(problem) or not len(items):
@@ -143,7 +150,10 @@ def _prove_freely(
 
 
 def _is_new(fix: Fix, other: Fix) -> Array:
-    """Return flags (n,) where the other fixes cost less, have more alternatives, or have no answer."""
+    """Return flags (n,) of other fixes that replace the fixes: lower cost, more alternatives, or no answer.
+
+    A replaced fix needs a new proof.
+    """
     with np.errstate(invalid="ignore"):
         lower = other.cost < fix.cost - equal_cost(fix.cost)
     more = np.isfinite(other.alternatives.gap).sum(1) > np.isfinite(fix.alternatives.gap).sum(1)
@@ -182,10 +192,13 @@ Minima = tuple[Array, Array, Array]
 
 
 def _with_minima(problem: Problem, pool: Pool, minima: Minima) -> Pool:
-    """Return settled pools with additional minima, which are already refined."""
+    """Return settled pools with additional minima, which are already refined.
+
+    The caller judges these pools again, since a new minimum may be the best one or an alternative.
+    """
     x, cost, face = minima
-    here = np.isfinite(cost)
-    code = np.where(here, np.int8(Status.OK), np.int8(Status.INFEASIBLE))
+    filled = np.isfinite(cost)
+    code = np.where(filled, np.int8(Status.OK), np.int8(Status.INFEASIBLE))
 
     def join(one: Array, other: Array) -> Array:
         return np.concatenate([one, other], axis=1)
@@ -197,45 +210,57 @@ def _with_minima(problem: Problem, pool: Pool, minima: Minima) -> Pool:
         code=join(pool.code, code),
         face=join(pool.face, face),
     )
-    stage = Stage("certify", f"{int(here.sum())} minima along edges", 0.0)
+    stage = Stage("certify", f"{int(filled.sum())} minima along edges", 0.0)
     return keep_evidence(settle(problem, both, stage), pool)
 
 
 def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort: float) -> tuple[Claims, Minima]:
-    """Return claims (n,) about fixes, and all admitted minima."""
-    sides, known, found, costs = faces(problem), dict[Face, FaceMinima](), list[Minima](), eliminate_nuisance(problem)
-    sure, boxes = np.full(len(pool), margin), np.zeros(len(pool), dtype=np.int64)
-    why, seeds, tight = filled_objects(len(pool), ""), pool.x, np.zeros(len(pool), dtype=bool)
-    for number, face in enumerate(sides):
+    """Return claims (n,) about fixes under inequalities, and the minima along all explored faces.
+
+    The cost of a minimum that the constraints do not admit is infinite.
+    """
+    all_faces, known, found_minima, costs = (
+        faces(problem),
+        dict[Face, FaceMinima](),
+        list[Minima](),
+        eliminate_nuisance(problem),
+    )
+    proven_gap, boxes = np.full(len(pool), margin), np.zeros(len(pool), dtype=np.int64)
+    reasons, seeds, all_admitted = filled_objects(len(pool), ""), pool.x, np.zeros(len(pool), dtype=bool)
+    for number, face in enumerate(all_faces):
         # the cost along a part of an edge is at least the cost along the whole edge
         above = _least_around(known, face, len(pool))
         if not (above < margin).any():
             continue
         along = known[face] = _explore_face(problem, costs, fix, face, seeds, margin, effort)
-        own, admitted = np.maximum(above, along.rest), _is_admitted(problem, face, along)
+        face_gap, admitted = np.maximum(above, along.rest), _is_admitted(problem, face, along)
         if number:
             # The proof does not cover every edge. If all free minima are admitted, the cost falls from an uncovered
             # edge to one of them, so this edge needs no proof.
-            own = np.where(np.isfinite(along.rest) | ~tight, own, margin)
+            face_gap = np.where(np.isfinite(along.rest) | ~all_admitted, face_gap, margin)
         else:
             seeds = pack(np.concatenate([fix.x[:, None], along.x], axis=1))
-            tight = np.asarray((admitted | ~(along.cost < fix.cost[:, None] + margin)).all(1))
-        found.append((along.x, np.where(admitted, along.cost, np.inf), np.full(admitted.shape, number)))
-        sure, boxes = np.minimum(sure, own), boxes + along.boxes
-        why = np.where((own < 0.0) & (why == ""), along.why, why)
-    listed = (fix.alternatives.gap < sure[:, None]).sum(1)
+            all_admitted = np.asarray((admitted | ~(along.cost < fix.cost[:, None] + margin)).all(1))
+        found_minima.append((along.x, np.where(admitted, along.cost, np.inf), np.full(admitted.shape, number)))
+        proven_gap, boxes = np.minimum(proven_gap, face_gap), boxes + along.boxes
+        reasons = np.where((face_gap < 0.0) & (reasons == ""), along.why, reasons)
+    listed = (fix.alternatives.gap < proven_gap[:, None]).sum(1)
     bound = fix.cost - equal_cost(fix.cost)
-    claims, lost = state_claims(fix.cost, bound, sure, boxes, listed), sure < 0.0
-    claims.write(lost, unknown_claim(""))
-    claims.reason[lost], claims.boxes[lost] = why[lost], boxes[lost]
-    x, cost, face_of = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
+    claims, unproven = state_claims(fix.cost, bound, proven_gap, boxes, listed), proven_gap < 0.0
+    claims.write(unproven, unknown_claim(""))
+    claims.reason[unproven], claims.boxes[unproven] = reasons[unproven], boxes[unproven]
+    x, cost, face_of = (np.concatenate(each, axis=1) for each in zip(*found_minima, strict=True))
     return claims, (x, cost, face_of)
 
 
 def _least_around(known: dict[Face, FaceMinima], face: Face, size: int) -> Array:
-    """Return lower bounds (n,) of the cost of a face minus the cost of the fixes, from faces that contain it."""
-    own = set(face)
-    around = [along.least for other, along in known.items() if own > {*other}]
+    """Return lower bounds (n,) of the cost of a face minus the cost of the fixes, from faces that contain it.
+
+    `known` has the faces explored before; -inf without a bound. A face with fewer constraints contains the face. `size`
+    is n.
+    """
+    levels_of_face = set(face)
+    around = [along.least for other, along in known.items() if levels_of_face > {*other}]
     return np.asarray(np.max([np.full(size, -np.inf), *around], axis=0))
 
 
@@ -249,32 +274,34 @@ def _explore_face(
     (n, q, size) are the starts of the search for minima.
     """
     n, size = len(seeds), seeds.shape[-1]
-    dear, boxes = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
+    costly, boxes = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
     if len(face) > len(exact(problem)) and not why_unsupported(on_face(problem, face)):
         limits = admitted_states(problem, problem.dimension)
-        dear, boxes = _is_costly(on_face(problem, face), limits, costs, seeds, fix.cost + margin, effort)
+        costly, boxes = _is_costly(on_face(problem, face), limits, costs, seeds, fix.cost + margin, effort)
     least = np.full(n, margin)
     out = FaceMinima(np.full((n, 1, size), np.nan), np.full((n, 1), np.inf), least, least, boxes, filled_objects(n, ""))
-    rest = np.flatnonzero(~dear)
+    rest = np.flatnonzero(~costly)
     if not len(rest):
         return out
-    some = _prove_face(problem.take(rest), fix[rest], face, seeds[rest], margin, effort)
-    return overwrite(out, rest, replace(some, boxes=some.boxes + boxes[rest]))
+    result = _prove_face(problem.take(rest), fix[rest], face, seeds[rest], margin, effort)
+    return overwrite(out, rest, replace(result, boxes=result.boxes + boxes[rest]))
 
 
 def _is_costly(
     on: Problem, limits: Array, costs: Costs, seeds: Array, level: Array, effort: float
 ) -> tuple[Array, Array]:
-    """Return flags (n,) of faces of equalities that cost at least a level (n,) everywhere, and the boxes used (n,).
+    """Return flags (n,) of problems on a face whose cost is at least `level` (n,) everywhere, and the boxes used (n,).
 
-    The proof covers positions within the limits (2, d) of the coordinates: no position beyond is admitted.
+    `on` has the n problems with the face as equalities. `costs` are the position costs without the face, and `seeds`
+    (n, q, size) are starts. The proof covers positions within the limits (2, d) of the coordinates: no position beyond
+    is admitted.
 
     A proof has the form: no position costs less than a given position by more than a difference. Here the difference is
     the cost of that position minus the level. So every position above the level will do; it need not be a minimum. The
     proof restarts nearer to the minimum in two cases: the cost is steep at the position, or the proof found a position
     with less than half of the difference.
     """
-    dear, boxes = np.zeros(len(seeds), dtype=bool), np.zeros(len(seeds), dtype=np.int64)
+    costly, boxes = np.zeros(len(seeds), dtype=bool), np.zeros(len(seeds), dtype=np.int64)
     x, cost = _cheapest(on, costs, seeds)
     # angles may be off by a whole turn, and then costs above `costs.level` are not the costs of the rows
     items = np.flatnonzero(np.isfinite(cost) & (costs.level > level))
@@ -282,24 +309,27 @@ def _is_costly(
         items = items[cost[items] - level[items] > equal_cost(level[items])]
         if not len(items):
             break
-        part, own = on.take(items), costs.take(items)
-        answer = prove(own, _request(part, limits, own, x[items], cost[items] - level[items], effort))
+        part, part_costs = on.take(items), costs.take(items)
+        answer = prove(part_costs, _request(part, limits, part_costs, x[items], cost[items] - level[items], effort))
         boxes[items] += answer.boxes
         # coarse rounding may make the proven bound lower than requested
-        dear[items] = (answer.verdict == VALUE) & (answer.bound > level[items] - equal_cost(level[items]))
-        near, met, steep = x[items], *(np.flatnonzero(answer.verdict == code) for code in (BETTER, STATIONARY))
-        if len(met):
-            near[met] = vectors(part.take(met), answer.found[met][:, None])[:, 0]
+        costly[items] = (answer.verdict == VALUE) & (answer.bound > level[items] - equal_cost(level[items]))
+        next_x, cheaper, steep = x[items], *(np.flatnonzero(answer.verdict == code) for code in (BETTER, STATIONARY))
+        if len(cheaper):
+            next_x[cheaper] = vectors(part.take(cheaper), answer.found[cheaper][:, None])[:, 0]
         if len(steep):
-            near[steep] = refine(part.take(steep), near[steep], face=exact(on), limit=_STEPS).x
-        x[items], before = near, cost[items]
-        cost[items] = _costs(part, own, near[:, None])[:, 0]
+            next_x[steep] = refine(part.take(steep), next_x[steep], face=exact(on), limit=_STEPS).x
+        x[items], before = next_x, cost[items]
+        cost[items] = _costs(part, part_costs, next_x[:, None])[:, 0]
         items = items[cost[items] < before]
-    return dear, boxes
+    return costly, boxes
 
 
 def _cheapest(on: Problem, costs: Costs, seeds: Array) -> tuple[Array, Array]:
-    """Return the cheapest of some vectors (n, q, size) after a move onto a face, (n, size), and its cost (n,)."""
+    """Return the cheapest vectors (n, size) and their costs (n,), after a move of all vectors onto the face.
+
+    `on` has the n problems with the face as equalities; `seeds` (n, q, size) are the vectors to move.
+    """
     n, q, size = seeds.shape
     with np.errstate(all="ignore"):
         x = restore(on.take(np.repeat(np.arange(n), q)), exact(on), seeds.reshape(-1, size)).reshape(seeds.shape)
@@ -309,14 +339,18 @@ def _cheapest(on: Problem, costs: Costs, seeds: Array) -> tuple[Array, Array]:
 
 
 def _costs(problem: Problem, costs: Costs, x: Array) -> Array:
-    """Return position costs (n, q) of vectors (n, q, size); infinite where the cost is not finite."""
+    """Return position costs (n, q) of parameter vectors (n, q, size); infinite for costs that are not finite."""
     with np.errstate(all="ignore"):
         cost = costs_of(costs, x[..., state_columns(problem)])[0]
     return np.where(np.isfinite(cost), cost, np.inf)
 
 
-def _request(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, effort: float) -> ProofRequest:
-    """Return the proof request: no position of a face costs less than x (n, size) by more than `less` (n,)."""
+def _request(on: Problem, limits: Array, costs: Costs, x: Array, difference: Array, effort: float) -> ProofRequest:
+    """Return the request to prove that no position of a face costs less than vector x by more than a difference (n,).
+
+    `on` has the n problems with the face as equalities. `limits` (2, d) are the least and greatest coordinates. x has
+    shape (n, size).
+    """
     place = x[:, state_columns(on)]
     (n, d), value = place.shape, np.zeros(len(x))
     planes, surface = surfaces_of(on, place)
@@ -327,7 +361,7 @@ def _request(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, ef
         known=np.zeros(n, dtype=np.int64),
         hidden=np.zeros(n, dtype=np.int64),
         gaps=value[:, None],
-        eps=less,
+        eps=difference,
         region=np.repeat(region[None], n, axis=0),
         fallback=np.full((n, 2, d), np.nan),
         budget=budgets(n, costs.dense, effort),
@@ -337,7 +371,10 @@ def _request(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, ef
 
 
 def _prove_face(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: float, effort: float) -> FaceMinima:
-    """Return minima and bounds of n problems along a face; the search for minima starts at seeds (n, q, size)."""
+    """Return minima and bounds of n problems along a face; the search for minima starts at seeds (n, q, size).
+
+    `fix` has the fixes that the costs are compared with. `margin` is the gap of cost to prove above the fixes.
+    """
     began, on, limits = perf_counter(), on_face(problem, face), admitted_states(problem, problem.dimension)
     names = " and ".join(face_names(problem, face)) or "inside"
     pool = lsr(on, offer(on, seeds, None, "certify", began))
@@ -390,20 +427,23 @@ def _prove_face(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: fl
 
 
 def _excess(cost: Array, best: Array) -> Array:
-    """Return the costs (n,) minus the costs of fixes; zero for differences within rounding."""
-    gain = np.where(np.isfinite(cost), cost - best, -np.inf)
-    return np.where(np.abs(gain) <= equal_cost(best), 0.0, gain)
+    """Return costs (n,) minus the costs `best` (n,) of fixes: 0 within rounding, -inf for a cost that is not finite."""
+    excess = np.where(np.isfinite(cost), cost - best, -np.inf)
+    return np.where(np.abs(excess) <= equal_cost(best), 0.0, excess)
 
 
 def _minima(fix: Fix) -> tuple[Array, Array]:
-    """Return fixes and their alternatives: vectors (n, q, size) and costs (n, q), infinite in empty slots."""
+    """Return the fix and the alternatives of each problem: vectors (n, q, size) and costs (n, q).
+
+    The fix is in slot 0. Costs are infinite in empty slots.
+    """
     others = fix.alternatives
     cost = np.concatenate([fix.cost[:, None], fix.cost[:, None] + others.gap], axis=1)
     return np.concatenate([fix.x[:, None], others.x], axis=1), np.where(np.isfinite(cost), cost, np.inf)
 
 
 def _is_sure(claims: Claims, limits: Array) -> Array:
-    """Return flags (n,) of claims that cover all positions, or all positions within the limits (2, d)."""
+    """Return flags (n,) of claims that cover all positions, or a region that contains the limits (2, d)."""
     out = np.asarray(claims.proof == GLOBAL)
     for i in np.flatnonzero(claims.proof == REGION):
         lower, upper = np.array(claims.region[i])
@@ -412,7 +452,10 @@ def _is_sure(claims: Claims, limits: Array) -> Array:
 
 
 def _within_limits(problem: Problem, pool: Pool, limits: Array, margin: float, effort: float) -> Pool:
-    """Return pools in which claims cover the limits (2, d) if they cannot cover all positions."""
+    """Return pools whose claims cover the box `limits` (2, d) if they cannot cover all positions.
+
+    Pools do not change if a limit is infinite. The constraints admit no position outside the box.
+    """
     assert pool.proven is not None
     open_ones = np.flatnonzero(~_is_sure(pool.proven, limits))
     if not len(open_ones) or not np.isfinite(limits).all():
@@ -423,7 +466,7 @@ def _within_limits(problem: Problem, pool: Pool, limits: Array, margin: float, e
 
 
 def _is_admitted(problem: Problem, face: Face, along: FaceMinima) -> Array:
-    """Return flags (n, q) of minima along a face that are minima under all constraints."""
+    """Return flags (n, q) of minima along a face that are also minima under all constraints."""
     out = np.isfinite(along.cost)
     item, slot = np.nonzero(out)
     out[item, slot] = is_minimum(problem.take(item), face, along.x[item, slot])
@@ -490,12 +533,12 @@ def certify(
 
 
 def value_certified(problem: Problem, pool: Pool | None) -> Pool:
-    """Return the pools of a flat batch of problems with a proof that no position costs less: the stage "value"."""
+    """Return the pools of a flat batch with a proof that no position costs less than the fix: the stage "value"."""
     return certified(problem, pool, margin=0.0)
 
 
 def _corners(problem: Problem, region: tuple[Array, Array]) -> Array:
-    """Return the corners (2, d) of a box, or (2, 2 d) if the region includes velocities."""
+    """Return the corners (2, d) of a box, or (2, 2 d) with velocities; raise InvalidProblem if it is no box."""
     corners = np.array([np.asarray(corner, dtype=float) for corner in region])
     sizes = sorted({problem.dimension, problem.dimension * (problem.motions[0].order + 1)})
     shaped = corners.ndim == 2 and len(corners) == 2 and corners.shape[1] in sizes

@@ -1,6 +1,10 @@
 """Proofs by branch and bound, over all positions, that a fix is the best minimum.
 
 A proof may find a better or another minimum. The minimum is then refined and added to the candidates.
+
+Letters: N problems of a batch, n problems of a round, q gaps, P points of a problem. d is the number of coordinates of
+the state: position, and velocity if the target moves. Costs, gaps and margins are chi-square values. `items` (n,) are
+numbers of problems in the batch, and `work` is the state of all proofs, which functions change.
 """
 
 from __future__ import annotations
@@ -73,7 +77,7 @@ MISMATCHED = "the cost in the proof differs from the cost of the fix"
 
 
 def unknown_claim(reason: str) -> Claims:
-    """Return the claim () about fixes without a proof, with the reason."""
+    """Return the claim "unknown" for fixes without a proof, with the reason as a sentence; shape ()."""
     return claim(Certificate("unknown", reason, METHOD))
 
 
@@ -112,9 +116,11 @@ _SPACE = 3
 
 @lru_cache(maxsize=256)  # the fixes of a call have few different margins, and formatting numbers is slow
 def claim_sentence(margin: float, listed: int, region: tuple[Corner, Corner] | None) -> str:
-    """Return the claim about a proven fix, over all positions or over a region, in words.
+    """Return the claim about a proven fix as a sentence: over all positions, or over a region.
 
-    Another position means another local minimum: chi-square rises continuously around the fix. See `state_claims`.
+    `margin` is the proven gap of cost and `listed` the number of alternatives that the claim excepts, as in
+    `state_claims`. `region` has the corners of the region, metres and metres per second; None means all positions.
+    Another position means another local minimum: chi-square rises continuously around the fix.
     """
     where = "" if region is None else f" {_where(*region)}"
     if margin <= 0.0:
@@ -125,7 +131,7 @@ def claim_sentence(margin: float, listed: int, region: tuple[Corner, Corner] | N
 
 
 def _where(lower: Corner, upper: Corner) -> str:
-    """Return a region in words: positions in m, and velocities in m/s where the corners have them."""
+    """Return the part of a claim that names the region: lower and upper corner in m, and in m/s for velocities."""
     d = len(lower) // 2 if len(lower) > _SPACE else len(lower)
     words = f"from {_text(lower[:d])} to {_text(upper[:d])} m"
     return words if d == len(lower) else f"{words} at a velocity from {_text(lower[d:])} to {_text(upper[d:])} m/s"
@@ -219,7 +225,11 @@ class BoundWorkspace:
     def begin(
         cls, problem: Problem, pool: Pool, fix: Fix, answered: Array, region: Array | None, margin: float, effort: float
     ) -> BoundWorkspace:
-        """Return the state of the proofs before the first round."""
+        """Return the state of the proofs before the first round.
+
+        `answered` (N,) flags the fixes to prove; `region` (2, d) has the requested corners; `margin` is the requested
+        gap of cost; `effort` multiplies budgets and rounds.
+        """
         size, state = len(fix.x), fix.x[:, state_columns(problem)]
         d = state.shape[-1]
         corners, limited = regions_of(problem, state, region)
@@ -253,14 +263,17 @@ class BoundWorkspace:
 
 
 def gaps_below(margin: float, dimension: int) -> list[float]:
-    """Return the gaps to prove, from the requested gap down to the value alone."""
+    """Return the gaps of cost to prove in turn, in descending order: from the requested gap down to 0, the value alone.
+
+    `dimension` is the number of coordinates of the state. It determines the cost of the 95 % region.
+    """
     below = [m for m in _MARGINS if m < margin]
     near = min(quantile(_LEVEL, dimension), margin)
     return [margin, *below[:-1], near, 0.0] if margin > 0.0 else [0.0]
 
 
 def settle(work: BoundWorkspace) -> BoundWorkspace:
-    """Return the state with a final claim for every pending fix."""
+    """Run rounds of proofs and return the state with a final claim for every pending fix."""
     asked = np.flatnonzero(work.pending)
     for _ in range(int(_ROUNDS * max(work.effort, 1))):
         items = np.flatnonzero(work.pending)
@@ -273,7 +286,7 @@ def settle(work: BoundWorkspace) -> BoundWorkspace:
 
 
 def _compare(work: BoundWorkspace, items: Array) -> None:
-    """Withdraw proofs whose cost is not the cost of their fix."""
+    """Withdraw proofs of a position cost that differs from the cost of the problem: they do not apply to the fix."""
     proven = items[np.isin(work.proven.proof[items], (GLOBAL, REGION))]
     if not len(proven):
         return
@@ -287,7 +300,7 @@ def _run_round(work: BoundWorkspace, items: Array) -> None:
     free = is_free(work.problem, work.fix, items)
     _give_up(work, items[~free], HELD)
     asked, costs = _requests(work, items), work.costs.take(items)
-    # Above `costs.level`, wrapping may change a residual by a whole turn, and the bounds of the proof do not hold.
+    # Above `costs.level`, wrapping may change a residual by a whole turn, and the bounds of the proof are not valid.
     turning = free & (costs.level < work.fix.cost[items] + asked.gaps[:, 0])
     _lower_margin(work, items[turning], TURNS)
     good = np.flatnonzero(free & ~turning)
@@ -297,16 +310,16 @@ def _run_round(work: BoundWorkspace, items: Array) -> None:
         items, asked, costs = items[good], asked.take(good), costs.take(good)
     answer = prove(costs, asked)
     work.spent[items] += answer.boxes
-    done, beside = np.isin(answer.verdict, (UNIQUE, VALUE)), answer.met > 0
-    holds = done & ~beside
-    if (done & beside).any():
-        holds[done & beside] = _list_rivals(work, items[done & beside], answer.take(done & beside))
+    done, has_rivals = np.isin(answer.verdict, (UNIQUE, VALUE)), answer.met > 0
+    holds = done & ~has_rivals
+    if (done & has_rivals).any():
+        holds[done & has_rivals] = _list_rivals(work, items[done & has_rivals], answer.take(done & has_rivals))
     _claim(work, items, asked, answer, np.flatnonzero(holds))
-    short, last = answer.verdict == BUDGET, len(work.margins) - 1
+    out_of_budget, last = answer.verdict == BUDGET, len(work.margins) - 1
     # the budget of the value alone may show what the budget of the gap did not
-    below = short & (answer.gap < asked.gaps[:, 0])
+    below = out_of_budget & (answer.gap < asked.gaps[:, 0])
     work.level[items[below]] = last - 1
-    _lower_margin(work, items[short], _unfinished(work.costs, len(items)))
+    _lower_margin(work, items[out_of_budget], _unfinished(work.costs, len(items)))
     remote = answer.verdict == UNBOUNDED
     work.level[items[remote & (answer.gap == 0.0)]] = last
     _lower_margin(work, items[remote], REMOTE, remote=True)
@@ -321,39 +334,43 @@ def _run_round(work: BoundWorkspace, items: Array) -> None:
         (FAST if has_one_epoch_velocity(work.problem) else SCALED) if scaled else _unfinished(work.costs, len(items))
     )
     _give_up(work, items[unclosed], AROUND if work.limited and not scaled else unbounded)
-    _give_up(work, items[~(done | short | remote | found | fine | unclosed)], UNSETTLED)
+    _give_up(work, items[~(done | out_of_budget | remote | found | fine | unclosed)], UNSETTLED)
 
 
 def _requests(work: BoundWorkspace, items: Array) -> ProofRequest:
-    """Return the proof requests of some fixes, with the margins, regions and known minima of this round."""
+    """Return the proof requests of items (n,), with the margins, regions and known minima of this round."""
     fix, ignored, last = work.fix, work.ignored[items], len(work.margins) - 1
     gaps = work.margins[np.minimum(work.level[items, None] + np.arange(last + 1), last)]
-    kappa = gaps[:, 0]
-    own = state_columns(work.problem)
+    gap_now = gaps[:, 0]
+    columns = state_columns(work.problem)
     planes, surface = surfaces_of(work.problem.take(items), fix.position[items])
     gap = fix.alternatives.gap[items]
     with np.errstate(invalid="ignore"):
-        listed = np.isfinite(gap) & (gap < np.maximum(kappa, AMBIGUOUS_GAP)[:, None])
-    place = fix.alternatives.x[items][..., own]
+        listed = np.isfinite(gap) & (gap < np.maximum(gap_now, AMBIGUOUS_GAP)[:, None])
+    place = fix.alternatives.x[items][..., columns]
     others = pack(np.concatenate([np.where(listed[..., None], place, np.nan), ignored], axis=1))
-    seen = np.isfinite(ignored).all(-1).sum(1)
+    hidden = np.isfinite(ignored).all(-1).sum(1)
     return ProofRequest(
-        x=fix.x[items, own],
+        x=fix.x[items, columns],
         others=np.where(np.isfinite(others), others, 0.0),
         known=np.isfinite(others).all(-1).sum(1),
-        hidden=seen,
+        hidden=hidden,
         gaps=gaps,
         eps=equal_cost(fix.cost[items]),
         region=work.region[items],
         fallback=work.fallback[items],
-        budget=budgets(len(kappa), work.costs.dense, work.effort) * (ALL_AROUND if surface.shape[1] else 1),
+        budget=budgets(len(gap_now), work.costs.dense, work.effort) * (ALL_AROUND if surface.shape[1] else 1),
         planes=planes,
         surface=surface,
     )
 
 
 def budgets(n: int, nodes: float, effort: float) -> Array:
-    """Return the boxes (n,) that proofs may use: the time of a box grows with the square of the terms of dense rows."""
+    """Return the numbers of boxes (n,) that n proofs may use.
+
+    `nodes` is the number of residual terms of dense rows: the time of a box grows with its square. `effort` multiplies
+    the budget of compiled code. Plain Python has a fixed budget, which the n proofs share.
+    """
     if not enabled():
         return np.full(n, max(_AT_LEAST, _SLOW_BUDGET // max(n, 1)))
     # the budget limits the time, so the number of boxes falls with the number of terms
@@ -362,12 +379,16 @@ def budgets(n: int, nodes: float, effort: float) -> Array:
 
 
 def _unfinished(costs: Costs, count: int) -> str:
-    """Return the reason of an unfinished proof, with a hint if machine code is missing."""
+    """Return the reason of an unfinished proof, with a hint if machine code for `count` fixes is missing."""
     return UNFINISHED + (LACKS_CODE if lacks(costs, count) else "")
 
 
 def _lower_margin(work: BoundWorkspace, items: Array, why: str, *, remote: bool = False) -> None:
-    """Lower the margin of failed proofs, then limit them to a region; give up if both were tried."""
+    """Lower the margin of failed proofs, then limit the claim to a region; give up if both were tried.
+
+    `why` is the reason for giving up. `remote` allows the gap of the 95 % region, for fixes with a low cost at
+    infinity.
+    """
     last = len(work.margins) - 1
     work.level[items] += 1
     if not remote:
@@ -388,7 +409,7 @@ def _give_up(work: BoundWorkspace, items: Array, why: str) -> None:
 
 
 def _claim(work: BoundWorkspace, items: Array, asked: ProofRequest, answer: ProofResult, done: Array) -> None:
-    """Write the claims of finished proofs `done` among the items."""
+    """Write the claims of finished proofs; `done` are their indices among the n items, requests and results."""
     proven, kappa = items[done], answer.gap[done]
     listed = (work.fix.alternatives.gap[proven] < kappa[:, None]).sum(1)
     claims = state_claims(
@@ -406,18 +427,21 @@ def _claim(work: BoundWorkspace, items: Array, asked: ProofRequest, answer: Proo
 
 
 def _add_candidates(work: BoundWorkspace, items: Array, points: Array, better: Array) -> None:
-    """Refine points (n, d) that the proofs of some fixes found, and add them to the candidates."""
+    """Refine points (n, d) that proofs found, and add them to the candidates; `better` (n,) flags cheaper points."""
     _, changed = _judge_with_points(work, items, points[:, None])
     _handle_unchanged(work, items[~changed], points[~changed], better[~changed])
 
 
 def _list_rivals(work: BoundWorkspace, items: Array, answer: ProofResult) -> Array:
-    """Refine the other minima of finished proofs and add them to the candidates; return which claims hold (n,)."""
+    """Refine the other minima of finished proofs, add them to the candidates, and return flags (n,) of valid claims.
+
+    A claim is valid if the fix is still the best minimum and every other minimum is now a listed alternative.
+    """
     rivals = answer.rivals[:, : answer.met.max()]
     rivals = np.where((np.arange(rivals.shape[1]) < answer.met[:, None])[..., None], rivals, np.nan)
     lower, changed = _judge_with_points(work, items, rivals)
-    fix, own = work.fix[items], state_columns(work.problem)
-    known, place = fix.alternatives.x[..., own], fix.x[:, None, own]
+    fix, columns = work.fix[items], state_columns(work.problem)
+    known, place = fix.alternatives.x[..., columns], fix.x[:, None, columns]
     with np.errstate(invalid="ignore"):
         apart = np.linalg.norm(known[:, None] - rivals[:, :, None], axis=-1)
         near = (apart <= _SAME * np.linalg.norm(rivals - place, axis=-1, keepdims=True)).any(-1)
@@ -433,33 +457,39 @@ def _judge_with_points(work: BoundWorkspace, items: Array, points: Array) -> tup
     Return flags (n,) of fixes that cost less now, and flags (n,) of fixes that changed in any way.
     """
     began = perf_counter()
-    part, own, before = work.problem.take(items), work.fix[items], take(work.pool, items)
-    x = pack(np.concatenate([surviving_candidates(before, own), vectors(part, points)], axis=1))
+    part, old, before = work.problem.take(items), work.fix[items], take(work.pool, items)
+    x = pack(np.concatenate([surviving_candidates(before, old), vectors(part, points)], axis=1))
     pool = keep_evidence(lsr(part, offer(part, x, before, "certify", began)), before)
-    new = judge(part, pool)
+    judged = judge(part, pool)
     with np.errstate(invalid="ignore"):
-        lower = new.cost < own.cost - equal_cost(own.cost)
-        more = np.isfinite(new.alternatives.gap).sum(1) > np.isfinite(own.alternatives.gap).sum(1)
-    changed = lower | more | ~new.answered
+        lower = judged.cost < old.cost - equal_cost(old.cost)
+        more = np.isfinite(judged.alternatives.gap).sum(1) > np.isfinite(old.alternatives.gap).sum(1)
+    changed = lower | more | ~judged.answered
     work.replaced += int(lower.sum())
     work.listed += int(more.sum())
     keep = np.flatnonzero(changed)
     if len(keep):
         work.pool = work.pool.merge(items[keep], take(pool, keep))
-        work.fix = overwrite(work.fix, items[keep], new[keep])
-        work.pending[items[keep]] = new.answered[keep]
+        work.fix = overwrite(work.fix, items[keep], judged[keep])
+        work.pending[items[keep]] = judged.answered[keep]
     return lower, changed
 
 
 def _handle_unchanged(work: BoundWorkspace, items: Array, points: Array, better: Array) -> None:
-    """Handle points (n, d) that changed no candidate: store hidden minima, give up fixes, or lower margins."""
+    """Store hidden minima, give up fixes, or lower margins for points (n, d) that changed no candidate.
+
+    If a point costs less than its fix, flagged in `better` (n,), and is not hidden, the fix is given up.
+    """
     stuck = np.flatnonzero(~_ignore(work, items, points))
     _give_up_forbidden(work, items, points, stuck[better[stuck]])
     _lower_margin(work, items[stuck[~better[stuck]]], _unfinished(work.costs, len(items)))
 
 
 def _give_up_forbidden(work: BoundWorkspace, items: Array, points: Array, barred: Array) -> None:
-    """Give up fixes with a cheaper point that did not replace them, and write what forbids this point."""
+    """Give up the fixes whose cheaper point did not replace them, with the reason why the point is forbidden.
+
+    `barred` are the indices of these fixes among `items` (n,) and `points` (n, d).
+    """
     if not len(barred):
         return
     part = work.problem.take(items[barred])
@@ -489,7 +519,7 @@ def _ignore(work: BoundWorkspace, items: Array, points: Array) -> Array:
 
 
 def keep_evidence(pool: Pool, before: Pool) -> Pool:
-    """Return a pool with the cost at infinity and the remarks that its problems had before."""
+    """Return a pool with the lower cost at infinity of both pools, and with the remarks of the pool `before`."""
     infinity = pool.infinity if before.infinity is None else before.infinity
     if pool.infinity is not None and before.infinity is not None:
         infinity = np.fmin(pool.infinity, before.infinity)
@@ -501,18 +531,8 @@ def certified_freely(
 ) -> Pool:
     """Return the pools of a flat batch with certificates over all positions; inequalities are ignored.
 
-    Parameters
-    ----------
-    problem : Problem
-        N problems.
-    pool : Pool
-        Refined.
-    region : array (2, d), optional
-        As of `optloc.solvers.certificates.admitted.certify`.
-    margin : float
-        Gap to prove.
-    effort : float
-        Factor of the boxes that a proof may use.
+    `pool` has the refined candidates of N problems. `region` (2, d) is as of `admitted.certify`, `margin` the gap of
+    cost to prove, and `effort` the factor of the boxes that a proof may use.
     """
     if pool is None:
         raise InvalidProblem("certify needs a fix", "method", "put it after a refinement, as in 'gtrs+lsr+certify'")
@@ -536,14 +556,14 @@ def certified_freely(
 
 
 def tried_before(pool: Pool, fix: Fix, items: Array) -> TriedBefore | None:
-    """Return the proofs tried for some fixes (N,) of a pool; None if no proof was tried."""
+    """Return the proofs tried for fixes `items` of a pool, for a later stage; None without tried proofs."""
     if pool.proven is None:
         return None
     return TriedBefore(fix.cost[items], _count_listed(fix)[items], take(pool.proven, items))
 
 
 def claims_before(pool: Pool) -> Claims:
-    """Return a writable copy of the claims of a pool."""
+    """Return a writable copy of the claims (N,) of a pool; empty claims if no proof was tried."""
     return empty_claims(len(pool)) if pool.proven is None else change(pool.proven, lambda array, core: np.array(array))
 
 
@@ -553,7 +573,7 @@ def _count_listed(fix: Fix) -> Array:
 
 
 def fixes_to_prove(pool: Pool, fix: Fix) -> tuple[Array, Array]:
-    """Return flags (N,) of fixes that can be proven, and flags of those whose earlier claim is still valid."""
+    """Return flags (N,) of fixes that can be proven, and flags (N,) of those whose earlier claim is still valid."""
     answered = fix.answered & np.isfinite(fix.cost)
     if pool.conclusion is not None:
         answered &= ~present(pool.conclusion)  # a conclusion leaves rows out
@@ -561,7 +581,7 @@ def fixes_to_prove(pool: Pool, fix: Fix) -> tuple[Array, Array]:
 
 
 def _is_still_valid(before: TriedBefore | None, fix: Fix) -> Array:
-    """Return flags (N,) of earlier claims that are about the same minima as the fixes, so that they are still valid.
+    """Return flags (N,) of earlier claims, in `before`, about the same minima as the fixes: they are still valid.
 
     Known minima stay candidates. So an equal number of minima and an equal least cost mean the same minima.
     """

@@ -4,6 +4,9 @@ After a proof over all positions, every region of low cost contains a known mini
 admitted, and that every position of a plane between them and the forbidden side costs too much. Then no region of low
 cost crosses the plane, and the bound does not matter. A bound of a coordinate is such a plane. For "above ground" it is
 the tangent plane below the fix: the Earth is convex, so it is on the other side.
+
+Letters: N or n fixes, e edges (bounds) of a problem, k constraints, d coordinates. Proofs number the pairs of fix and
+edge: n e planes, the edges of the first fix first.
 """
 
 from __future__ import annotations
@@ -30,16 +33,16 @@ _ON_PLANE = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """Bounds of a problem, one entry for each side of each constraint.
+    """Bounds of a problem, one entry for each finite side of each constraint.
 
     Parameters
     ----------
     levels : tuple of Level
-        Constraint and side of each bound.
+        Number of the constraint, and its side: lower or upper.
     value : array (e,)
-        Bounds.
+        Bounds, in the unit of the constraint.
     region : array (2, d)
-        Corners of the admitted box if all coordinates are bounded on both sides; else NaN.
+        Corners of the admitted box, metres, if all coordinates are bounded on both sides; else NaN.
     """
 
     levels: tuple[Level, ...]
@@ -48,12 +51,15 @@ class Edges:
 
     @property
     def constraint(self) -> Array:
-        """Return the number of the constraint of each edge, (e,)."""
+        """Return the number, in the problem, of the constraint of each edge, (e,)."""
         return np.array([level.constraint for level in self.levels], dtype=np.int64)
 
 
 def edges_of(problem: Problem) -> Edges | None:
-    """Return the bounds of a problem; None if a plane cannot separate the two sides of one of them."""
+    """Return the bounds of a problem; None if one of them has no plane between its two sides.
+
+    None is also the result for equalities and for bounds that vary within the batch.
+    """
     found: list[tuple[Level, float]] = []
     if exact(problem):
         return None
@@ -70,7 +76,10 @@ def edges_of(problem: Problem) -> Edges | None:
 
 
 def new_questions(edges: Edges, count: int, d: int, nodes: float) -> ProofRequest:
-    """Return a request for the proofs about the edges of `count` fixes in d coordinates, without their positions."""
+    """Return an empty request for proofs about the edges of `count` fixes in d coordinates.
+
+    `nodes` is the number of residual terms of a problem, for the budget. `lay_planes` writes positions and planes.
+    """
     n = count * len(edges.levels)
     none = np.zeros(n, dtype=np.int64)
     return ProofRequest(
@@ -96,21 +105,21 @@ def lay_planes(edges: Edges, x: Array, cov: Array, missing: Array, slope: Array,
     edges : Edges
         Edges of the problems.
     x, cov : array (n, d), (n, d, d)
-        Fixes and covariances.
+        Fixes, metres, and covariances, m^2.
     missing, slope : array (n, e), (n, e, d)
-        Bounds minus the bounded quantities at the fixes, and gradients.
+        Bounds minus the bounded quantities at the fixes, and gradients of these quantities.
     asked : ProofRequest
-        Written.
+        Request of n e proofs; its fields `x` and `planes` are written.
     """
     d = x.shape[1]
-    across = (cov[:, None] @ slope[..., None])[..., 0]
-    place = x[:, None] + (missing / (slope * across).sum(-1))[..., None] * across
+    toward = (cov[:, None] @ slope[..., None])[..., 0]
+    place = x[:, None] + (missing / (slope * toward).sum(-1))[..., None] * toward
     unit = slope / np.sqrt((slope * slope).sum(-1, keepdims=True))
     if np.isfinite(edges.region[0, 0]):
         inside = np.clip(place, *edges.region)
         # an oblique plane does not contain the clipped point, so nothing is proven for it
-        left = np.abs(((inside - place) * unit).sum(-1)) > _ON_PLANE * np.abs(missing)
-        place = np.where(left[..., None], np.nan, inside)
+        clipped_off = np.abs(((inside - place) * unit).sum(-1)) > _ON_PLANE * np.abs(missing)
+        place = np.where(clipped_off[..., None], np.nan, inside)
     asked.x[:] = place.reshape(-1, d)
     asked.planes[:, 0, :d] = unit.reshape(-1, d)
 
@@ -119,7 +128,10 @@ def lay_planes(edges: Edges, x: Array, cov: Array, missing: Array, slope: Array,
 
 
 class ReachWorkspace(NamedTuple):
-    """Arrays of a thread, for n fixes and e edges: costs, request, results, and costs at points."""
+    """Stored arrays of a thread for n e planes: costs, request, results, and (2, n e, 1) costs at points.
+
+    `found[0]` has the costs, and `found[1]` the rounding errors of the residuals.
+    """
 
     costs: PositionCosts
     asked: ProofRequest
@@ -128,7 +140,7 @@ class ReachWorkspace(NamedTuple):
 
 
 def new_workspace(affine: Affine, edges: Edges, count: int, d: int) -> ReachWorkspace:
-    """Return the workspace for `count` fixes in d coordinates."""
+    """Return the workspace for `count` fixes in d coordinates; `affine` describes the costs of the problem."""
     n = count * len(edges.levels)
     costs = affine.room(n)
     return ReachWorkspace(
@@ -155,12 +167,12 @@ def are_out_of_reach(
     costs : PositionCosts
         Costs of the fixes, with their measurements.
     x, cov, cost : array (n, d), (n, d, d), (n,)
-        Fixes, covariances and costs.
+        Fixes, metres, covariances, m^2, and costs (chi-square).
     value, normal : array (n, k), (n, k, d)
-        Bounded quantities there, and their gradients.
+        Quantities of the constraints at the fixes, and their gradients.
     """
-    count, own = len(edges.levels), edges.constraint
-    lay_planes(edges, x, cov, edges.value - value[:, own], normal[:, own], room.asked)
+    count, constraint = len(edges.levels), edges.constraint
+    lay_planes(edges, x, cov, edges.value - value[:, constraint], normal[:, constraint], room.asked)
     room.costs.w[:] = np.repeat(costs.w, count, axis=0)
     if len(room.costs.data) > 1:
         room.costs.data[:] = np.repeat(costs.data, count, axis=0)
@@ -174,7 +186,7 @@ def are_out_of_reach(
 
 
 def _are_shown(answered: ProofResult, level: Array) -> Array:
-    """Return flags (n,) of planes that are proven to cost at least a level everywhere."""
+    """Return flags (n,) of planes where every position is proven to cost at least `level` (n,)."""
     # coarse rounding may make the proven bound lower than the level
     return np.asarray((answered.verdict == VALUE) & (answered.bound > level - equal_cost(level)))
 
@@ -191,19 +203,19 @@ def out_of_reach(problem: Problem, edges: Edges, costs: PositionCosts, fix: Fix,
     costs : PositionCosts
         Their costs over the position.
     fix : Fix
-        Their fixes: answers that no bound holds.
+        Their fixes: answers without an active bound.
     gap : float
         Difference of costs.
     """
-    own, count = state_columns(problem), len(edges.levels)
+    columns, count = state_columns(problem), len(edges.levels)
     values, gradients = levels(problem, edges.levels, fix.x)
-    asked = new_questions(edges, len(fix.x), own.stop - own.start, costs.dense)
-    lay_planes(edges, fix.x[:, own], fix.cov[:, own, own], -values, gradients[..., own], asked)
-    every = costs.take(np.repeat(np.arange(len(fix.x)), count))
+    asked = new_questions(edges, len(fix.x), columns.stop - columns.start, costs.dense)
+    lay_planes(edges, fix.x[:, columns], fix.cov[:, columns, columns], -values, gradients[..., columns], asked)
+    plane_costs = costs.take(np.repeat(np.arange(len(fix.x)), count))
     level = np.repeat(fix.cost + gap, count)
-    asked.eps[:] = costs_at(every, asked.x[:, None])[0][:, 0] - level
+    asked.eps[:] = costs_at(plane_costs, asked.x[:, None])[0][:, 0] - level
     out = np.zeros(len(level), dtype=bool)
-    items = np.flatnonzero((asked.eps > equal_cost(level)) & (every.level > level))
+    items = np.flatnonzero((asked.eps > equal_cost(level)) & (plane_costs.level > level))
     if len(items):
-        out[items] = _are_shown(prove_all(every.take(items), asked.take(items)), level[items])
+        out[items] = _are_shown(prove_all(plane_costs.take(items), asked.take(items)), level[items])
     return np.asarray(out.reshape(len(fix.x), count).all(1))

@@ -1,4 +1,8 @@
-"""The inputs of a proof: costs over the position, surfaces and regions; and a check that a cost belongs to its fix."""
+"""The inputs of a proof: costs over the position, surfaces and regions; and a check that a cost belongs to its fix.
+
+Letters: N problems, P states for each problem, d coordinates, and n numbers of a state: d for the position, or 2 d with
+the velocity. Positions are in metres in the frame of the problem, and velocities in metres per second.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +40,10 @@ Costs = PositionCosts | ScaledCosts | Runs | CourseCosts
 
 
 def eliminate_nuisance(problem: Problem) -> Costs:
-    """Return the costs of a flat batch over the state of the target, minimised over all other unknowns."""
+    """Return the costs of a flat batch over the state of the target, minimised over all other unknowns.
+
+    Proofs split boxes of states only, so the other unknowns must be eliminated first.
+    """
     if has_one_epoch_velocity(problem):
         return velocity_costs(problem)
     if problem.motions[0].order > 0:
@@ -47,7 +54,7 @@ def eliminate_nuisance(problem: Problem) -> Costs:
 
 
 def prove(costs: Costs, asked: ProofRequest) -> ProofResult:
-    """Return the results of the proofs of n fixes from the costs of their problems."""
+    """Return the results of the proofs of n fixes, from the costs of their problems and the n requests `asked`."""
     if isinstance(costs, CourseCosts):
         return prove_courses(costs, asked)
     if isinstance(costs, ScaledCosts):
@@ -56,14 +63,14 @@ def prove(costs: Costs, asked: ProofRequest) -> ProofResult:
 
 
 def lacks(costs: Costs, count: int) -> bool:
-    """Return whether proofs of `count` fixes ended early because their machine code is not compiled yet."""
+    """Return True if proofs of `count` fixes ended early because their machine code is not compiled yet."""
     if isinstance(costs, ScaledCosts):
         return scaled_lack_code(count)
     return lacks_code(count) if isinstance(costs, PositionCosts) else runs_lack_code(costs, count)
 
 
 def costs_of(costs: Costs, states: Array) -> tuple[Array, Array]:
-    """Return position costs (N, P) of states (N, P, n) and the rounding errors of their residuals."""
+    """Return position costs (N, P) of states (N, P, n), and the rounding errors (N, P) of their residuals, in sigma."""
     if isinstance(costs, CourseCosts):
         return costs_of_courses(costs, states)
     if isinstance(costs, ScaledCosts):
@@ -72,7 +79,7 @@ def costs_of(costs: Costs, states: Array) -> tuple[Array, Array]:
 
 
 def state_columns(problem: Problem) -> slice:
-    """Return the slice of parameter vectors that holds the state of a proof."""
+    """Return the columns of parameter vectors that contain the state of a proof."""
     slot, _ = problem.layout.find("position")
     return slice(slot.start, slot.start + _state_size(problem))
 
@@ -86,7 +93,7 @@ def _state_size(problem: Problem) -> int:
 
 
 def surfaces_of(problem: Problem, position: Array) -> tuple[Array, Array]:
-    """Return the planes and the surface to which equalities hold the fixes of a flat batch.
+    """Return the planes and the surface to which equalities restrict the fixes of a flat batch.
 
     Parameters
     ----------
@@ -98,7 +105,7 @@ def surfaces_of(problem: Problem, position: Array) -> tuple[Array, Array]:
     Returns
     -------
     planes : array (N, e, 3)
-        Unit normals of planes.
+        Unit normals of e planes.
     surface : array (N, w)
         Numbers of the surface of a height (`optloc.proof.surface`); its upward axis is the normal at the position.
         Without a height w is 0.
@@ -110,7 +117,7 @@ def surfaces_of(problem: Problem, position: Array) -> tuple[Array, Array]:
 
 
 def _planes(problem: Problem, bands: list[Band], size: int) -> Array:
-    """Return the unit normals (N, e, 3) of plane constraints."""
+    """Return the unit normals (N, e, 3) of the e plane constraints among `bands`; N is `size`."""
     normals = [band.coefficients for band in bands if band.kind == "plane"]
     out = np.zeros((size, len(normals), 3))
     for i, normal in enumerate(normals):
@@ -119,7 +126,11 @@ def _planes(problem: Problem, bands: list[Band], size: int) -> Array:
 
 
 def _surface(problem: Problem, bands: list[Band], position: Array) -> Array:
-    """Return the numbers (N, w) of the surface of a height constraint; w is 0 without one."""
+    """Return the w numbers (N, w) that describe the surface of a height constraint; w is 0 without a height.
+
+    `bands` are the equalities of the problem. The order of the numbers is in `optloc.proof.surface`. The upward axis is
+    the normal of the ellipsoid at the positions.
+    """
     levels = [band.lower for band in bands if band.kind == "height"]
     if not levels:
         return np.zeros((len(position), 0))
@@ -132,7 +143,10 @@ def _surface(problem: Problem, bands: list[Band], position: Array) -> Array:
 
 
 def is_free(problem: Problem, fix: Fix, items: Array) -> Array:
-    """Return flags (n,) of fixes that only equalities hold, no inequalities."""
+    """Return flags (n,) of fixes without an active inequality; `items` (n,) are their numbers in the batch.
+
+    If active constraints are not recorded, the flags are False for a problem with equalities, else True.
+    """
     face = exact(problem)
     if fix.active is None or not problem.constraints:
         return np.full(len(items), not face)
@@ -178,7 +192,7 @@ def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Ar
 
 
 def why_unlimited(problem: Problem) -> str:
-    """Return why a proof of a moving target is useless without a requested region, or ""."""
+    """Return the reason why a proof of a moving target is useless without a requested region; "" if it is useful."""
     n = _state_size(problem)
     if n == problem.dimension or np.isfinite(np.delete(admitted_states(problem, n), _across(problem), axis=1)).all():
         return ""
@@ -186,12 +200,18 @@ def why_unlimited(problem: Problem) -> str:
 
 
 def _across(problem: Problem) -> list[int]:
-    """Return the indices of the state that a fixed height determines in a local frame: upward position and velocity."""
+    """Return the indices in the state that a fixed height determines in a local frame: upward position and velocity.
+
+    The list is empty without a fixed height or in an Earth-centred frame.
+    """
     return [2, 5] if held_height(problem) is not None and problem.frame.kind != "ecef" else []
 
 
 def admitted_states(problem: Problem, n: int) -> Array:
-    """Return the least and greatest state (2, n) that constraints on coordinates and speed admit, or infinity."""
+    """Return the least and the greatest states (2, n) that constraints admit; -inf and inf without a limit.
+
+    Bounds of one coordinate, polygons and a greatest speed count. The speed limits each component of the velocity.
+    """
     d = problem.dimension
     out = np.stack([np.full(n, -np.inf), np.full(n, np.inf)])
     for band in problem.constraints:
@@ -212,7 +232,7 @@ def admitted_states(problem: Problem, n: int) -> Array:
 
 
 def boxes_around(problem: Problem, state: Array) -> Array:
-    """Return the corners (N, 2, n) of boxes that hold states (N, n) well inside.
+    """Return the corners (N, 2, n) of boxes that contain states (N, n), far from the borders of the boxes.
 
     Positions are in cubes around the middle of the stations. Velocities of moving targets are in cubes around zero.
     """
@@ -244,6 +264,8 @@ _STEPS = 6
 def matches_problem_cost(problem: Problem, fix: Fix, costs: Costs) -> Array:
     """Return flags (N,): the position cost equals the cost of its problem, at the fix and near it.
 
+    The check finds an error in the elimination of the other unknowns, before a proof about the wrong cost is used.
+
     Parameters
     ----------
     problem : Problem
@@ -253,39 +275,45 @@ def matches_problem_cost(problem: Problem, fix: Fix, costs: Costs) -> Array:
     costs : PositionCosts, Runs or CourseCosts
         Their costs over the position, without equalities.
     """
-    places = _places(problem, fix)
-    own = _own_costs(problem, fix, places)
+    states = _test_states(problem, fix)
+    expected = _costs_of_problem(problem, fix, states)
     with np.errstate(all="ignore"):
-        found, blur = costs_of(costs, places)
-        good = np.abs(found - own) <= _tolerance(own, blur)
-        good[:, 0] &= np.abs(own[:, 0] - fix.cost) <= _tolerance(fix.cost, blur[:, 0])
+        actual, rounding = costs_of(costs, states)
+        good = np.abs(actual - expected) <= _tolerance(expected, rounding)
+        good[:, 0] &= np.abs(expected[:, 0] - fix.cost) <= _tolerance(fix.cost, rounding[:, 0])
     return np.asarray(good.all(1))
 
 
-def _tolerance(cost: Array, blur: Array) -> Array:
-    """Return the allowed difference of costs: a relative share, plus the effect of rounded residuals."""
-    return np.asarray(_EQUAL * (1.0 + cost) + _ROUNDINGS * blur * (np.sqrt(np.maximum(cost, 0.0)) + blur))
+def _tolerance(cost: Array, rounding: Array) -> Array:
+    """Return the allowed difference of costs: a relative share, plus the effect of rounded residuals.
+
+    `rounding` has the shape of `cost`: rounding errors of the residuals, in sigma.
+    """
+    return np.asarray(_EQUAL * (1.0 + cost) + _ROUNDINGS * rounding * (np.sqrt(np.maximum(cost, 0.0)) + rounding))
 
 
-def _places(problem: Problem, fix: Fix) -> Array:
-    """Return the fixes and states about a standard deviation away, (N, 1 + P, n); the same in every run."""
-    own = state_columns(problem)
-    position, covariance = fix.x[..., own], fix.cov[..., own, own]
+def _test_states(problem: Problem, fix: Fix) -> Array:
+    """Return the fixes and P states about a standard deviation away, (N, 1 + P, n); the same in every run."""
+    columns = state_columns(problem)
+    position, covariance = fix.x[..., columns], fix.cov[..., columns, columns]
     d = position.shape[-1]
     root = linalg.factor_semidefinite(np.where(np.isfinite(covariance), covariance, 0.0))
-    way = np.random.default_rng(1).standard_normal((_BESIDE, d))
-    beside = root[:, None] @ way[..., None]
-    return np.concatenate([position[:, None], position[:, None] + beside[..., 0]], axis=1)
+    direction = np.random.default_rng(1).standard_normal((_BESIDE, d))
+    offset = root[:, None] @ direction[..., None]
+    return np.concatenate([position[:, None], position[:, None] + offset[..., 0]], axis=1)
 
 
-def _own_costs(problem: Problem, fix: Fix, places: Array) -> Array:
-    """Return the costs (N, P) of the problems at states (N, P, n), minimised over all other unknowns."""
-    count, several = places.shape[:2]
-    own = state_columns(problem)
-    part = problem.take(np.repeat(np.arange(count), several)) if count > 1 else problem
-    x = np.repeat(fix.x, several, axis=0)
-    x[:, own] = places.reshape(len(x), -1)
-    others = np.delete(np.arange(problem.layout.n_shared), own)
+def _costs_of_problem(problem: Problem, fix: Fix, states: Array) -> Array:
+    """Return the costs (N, P) of the problems at states (N, P, n), minimised over all other unknowns.
+
+    This computation uses the normal equations of the problem, so it is independent of the position cost of the proof.
+    """
+    count, per_problem = states.shape[:2]
+    columns = state_columns(problem)
+    part = problem.take(np.repeat(np.arange(count), per_problem)) if count > 1 else problem
+    x = np.repeat(fix.x, per_problem, axis=0)
+    x[:, columns] = states.reshape(len(x), -1)
+    others = np.delete(np.arange(problem.layout.n_shared), columns)
     with np.errstate(all="ignore"):
         equations = equations_at(part, x)
         if problem.stations.unknown_for:
@@ -299,7 +327,7 @@ def _own_costs(problem: Problem, fix: Fix, places: Array) -> Array:
             # scaled pseudo-inverse: a combination of unknowns that no row measures has no effect
             size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
             size = np.where(size > 0.0, size, 1.0)
-            turned = np.linalg.pinv(information / size[..., :, None] / size[..., None, :], _OPEN, hermitian=True)
+            covariance = np.linalg.pinv(information / size[..., :, None] / size[..., None, :], _OPEN, hermitian=True)
             vector = vector / size
-            cost = cost - ((turned @ vector[..., None])[..., 0] * vector).sum(-1)
-    return cost.reshape(count, several)
+            cost = cost - ((covariance @ vector[..., None])[..., 0] * vector).sum(-1)
+    return cost.reshape(count, per_problem)

@@ -1,7 +1,9 @@
 """Lower bounds of the maximum-likelihood cost from convex relaxations, independent of branch and bound.
 
-Every bound is recomputed from a dual point. It holds over all positions or over a named region. For a method that
+Every bound is recomputed from a dual point. It is valid over all positions or over a named region. For a method that
 bounds another cost than the likelihood, the bound is NaN and the reason names that cost.
+
+Letters: N fixes of a batch, i the number of one of them, d coordinates. Costs are chi-square values.
 """
 
 from __future__ import annotations
@@ -68,7 +70,7 @@ class Reference:
     point: Array
 
     def tight(self, cost: Array) -> Array:
-        """Return flags (N,) of bounds that are tight for costs (N,)."""
+        """Return flags (N,) of bounds that are tight for costs (N,): cost and bound agree within `TIGHT` (1 + cost)."""
         with np.errstate(invalid="ignore"):
             return np.asarray(cost - self.bound <= TIGHT * (1.0 + cost))
 
@@ -119,7 +121,7 @@ def reference_bound(problem: Problem, fix: Fix, method: str, *, region: float | 
 
 
 def _beyond(problem: Problem) -> str:
-    """Return why no relaxation of this module covers the problem, or ""."""
+    """Return the reason why no relaxation of this module covers the problem; "" if one may cover it."""
     if not one_position(problem) or problem.motions[0].order > 0:
         return "the relaxation supports one target at rest only"
     if problem.biases or problem.priors:
@@ -130,7 +132,7 @@ def _beyond(problem: Problem) -> str:
 
 
 def _beyond_moments(problem: Problem) -> str:
-    """Return why the moment relaxation does not cover the problem, or ""."""
+    """Return the reason why the moment relaxation does not cover the problem; "" if it does."""
     from optloc.models import MODELS
 
     for rows in problem.rows:
@@ -140,7 +142,7 @@ def _beyond_moments(problem: Problem) -> str:
 
 
 def _beyond_directions(problem: Problem) -> str:
-    """Return why the relaxation over directions does not cover the problem, or ""."""
+    """Return the reason why the relaxation over directions does not cover the problem; "" if it does."""
     for rows in problem.rows:
         if rows.kind not in ("azimuth", "elevation"):
             return f"{rows.kind} rows are not angles"
@@ -151,7 +153,10 @@ def _beyond_directions(problem: Problem) -> str:
 
 
 def _nothing(problem: Problem, method: str, why: str) -> Reference:
-    """Return a reference without bounds, with one reason for all fixes."""
+    """Return a reference without bounds for all fixes: bounds and points are NaN, and `why` is the reason.
+
+    `method` is the name of the relaxation.
+    """
     size = problem.batch_shape[0]
     scope, reason = np.full(size, "", dtype=object), np.full(size, why, dtype=object)
     return Reference(method, np.full(size, np.nan), scope, reason, np.full((size, problem.dimension), np.nan))
@@ -159,20 +164,20 @@ def _nothing(problem: Problem, method: str, why: str) -> Reference:
 
 def _by_directions(problem: Problem, fix: Fix) -> Reference:
     """Return the bounds of the relaxation over unit directions."""
-    out, seen = _nothing(problem, "directions", ""), bearings(problem)
+    reference, seen = _nothing(problem, "directions", ""), bearings(problem)
     assert seen is not None
     bound = angle_bounds(seen, np.where(fix.answered[:, None], fix.position, np.nan))
     known = np.isfinite(bound)
-    out.bound[known], out.scope[known] = bound[known], "global"
-    out.reason[~known] = "there are fewer than two complete bearings, or no fix"
-    return out
+    reference.bound[known], reference.scope[known] = bound[known], "global"
+    reference.reason[~known] = "there are fewer than two complete bearings, or no fix"
+    return reference
 
 
 def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
     """Return the bounds of the moment relaxation; `region` is the radius of a ball, metres, or None."""
     from formulations.moment_sdp import moment_bound
 
-    out, found = _nothing(problem, "moment", ""), ranges(problem_at_rest(problem))
+    reference, found = _nothing(problem, "moment", ""), ranges(problem_at_rest(problem))
     assert found is not None
     position = np.broadcast_to(
         problem.stations.position, (problem.batch_shape[0], *problem.stations.position.shape[-3:])
@@ -180,38 +185,43 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
     place = position[:, found.epoch, found.station]
 
     def bounded(i: int) -> None:
-        out.reason[i] = _declined(found, i, bool(fix.answered[i]))
-        if out.reason[i]:
+        reference.reason[i] = _declined(found, i, bool(fix.answered[i]))
+        if reference.reason[i]:
             return
         nodes = _nodes(found, i)
         centre, spread = centre_and_spread(place[i, nodes])
         size = float(spread) or 1.0
-        own = _scaled(found, i, nodes, (place[i, nodes] - centre) / size, size)
+        scaled = _scaled(found, i, nodes, (place[i, nodes] - centre) / size, size)
         point = (fix.position[i] - centre) / size
-        cost = float(own.cost(point))
+        cost = float(scaled.cost(point))
         # the misfit of the rows among themselves, computed without the cancellation of large sums of squares
         loops = float(fix.cost[i]) - cost
         if not abs(loops - found.cost[i]) <= _SAME * (1.0 + fix.cost[i]):
-            out.reason[i] = "the cost of the ranges differs from the cost of the fix"
+            reference.reason[i] = "the cost of the ranges differs from the cost of the fix"
             return
-        box = enclosure(own, point, cost + _MARGIN)
-        out.scope[i] = "global" if box is not None else "region"
-        box = box or _region(own, region, size)
-        answer = None if box is None else moment_bound(own, box, cost + _MARGIN)
+        box = enclosure(scaled, point, cost + _MARGIN)
+        reference.scope[i] = "global" if box is not None else "region"
+        box = box or _region(scaled, region, size)
+        answer = None if box is None else moment_bound(scaled, box, cost + _MARGIN)
         if answer is None or not np.isfinite(answer.bound):
-            out.scope[i] = ""
-            out.reason[i] = _OPEN if answer is None else f"the solver found no dual point ({answer.answer.status})"
+            reference.scope[i] = ""
+            reference.reason[i] = (
+                _OPEN if answer is None else f"the solver found no dual point ({answer.answer.status})"
+            )
             return
-        out.bound[i] = max(answer.bound, 0.0) + loops
+        reference.bound[i] = max(answer.bound, 0.0) + loops
         if answer.rank_ratio < _RANK_ONE:
-            out.point[i] = centre + size * answer.point
+            reference.point[i] = centre + size * answer.point
 
     map_on_threads(bounded, range(len(place)), least=WORTH)
-    return out
+    return reference
 
 
 def _declined(found: Ranges, i: int, answered: bool) -> str:
-    """Return why the moment relaxation is not computed for problem i, or ""."""
+    """Return the reason why the moment relaxation is not computed for problem i; "" if it is computed.
+
+    `answered` is True if there is a fix with a cost to compare.
+    """
     count = int(found.inside[i].sum())
     if not answered:
         return "there is no fix with a cost to compare"
@@ -221,18 +231,24 @@ def _declined(found: Ranges, i: int, answered: bool) -> str:
 
 
 def _nodes(found: Ranges, i: int) -> Array:
-    """Return the stations of problem i that have ranges, the reference first."""
+    """Return the numbers of the stations of problem i that have ranges, the reference station first."""
     nodes, first = np.flatnonzero(found.inside[i]), int(found.reference[i])
     return np.concatenate([[first], nodes[nodes != first]])
 
 
 def _scaled(found: Ranges, i: int, nodes: Array, station: Array, size: float) -> Ranged:
-    """Return the ranges of problem i in units of `size` metres."""
+    """Return the ranges of problem i, in units of `size` metres.
+
+    `nodes` are the numbers of its stations, and `station` their positions relative to the centre, in the same unit.
+    """
     covariance = found.covariance[i if len(found.covariance) > 1 else 0][np.ix_(nodes, nodes)]
     sign, offset = found.sign[i, nodes].astype(float), found.offset[i, nodes] / size
     return Ranged(station, sign, offset, covariance / size**2, bool(found.sign[i].any()))
 
 
-def _region(own: Ranged, region: float | None, size: float) -> EnclosingBox | None:
-    """Return the box around a ball of radius `region` metres, or None without a region."""
-    return None if region is None else ball(own, np.zeros(own.station.shape[1]), region / size)
+def _region(ranges_of_one: Ranged, region: float | None, size: float) -> EnclosingBox | None:
+    """Return the box around a ball of radius `region` metres, or None without a region.
+
+    `size` is the unit of the scaled ranges, metres. The centre of the ball is the middle of the stations.
+    """
+    return None if region is None else ball(ranges_of_one, np.zeros(ranges_of_one.station.shape[1]), region / size)

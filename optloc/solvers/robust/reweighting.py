@@ -1,4 +1,9 @@
-"""Iteratively reweighted least squares: the minima of a robust cost next to given starts, for a batch."""
+"""Iteratively reweighted least squares: the minima of a robust cost next to given starts, for a batch.
+
+Letters: N or M problems, m rows, r residuals, sigma their standard deviations, u residuals in sigma. R is the
+covariance of the noise, and rho the cost of a residual under the loss. A *weight of the loss* is a factor from 0 to 1
+for a row.
+"""
 
 from __future__ import annotations
 
@@ -63,9 +68,9 @@ class Doubt:
     base : array (N, m)
         Weights of the rows before the loss; 0 = absent.
     own, given : array (N, m)
-        Variance of each row, and its variance given all other rows present.
+        Variance of each row, and its variance given all other rows present; squared units of the row.
     sided : bool array (m,)
-        Rows whose gross errors are positive only, because signals can only be late.
+        True for rows whose gross errors are positive only, because signals can only be late.
     """
 
     noise: Noise
@@ -103,7 +108,7 @@ class Doubt:
         return Doubt(Noise(blocks), self.base[index], self.own[index], self.given[index], self.sided)
 
     def row_weight(self, weight: Array) -> Array:
-        """Return the weights (N, m) for `Problem.with_rows` from the weights of a loss."""
+        """Return the weights (N, m) for `Problem.with_rows` from the weights (N, m) of a loss; 0 for absent rows."""
         # own + given (1 / weight - 1) is the variance with the added error; base is the weight without it
         ratio = self.given / self.own
         with np.errstate(divide="ignore", over="ignore"):
@@ -113,10 +118,11 @@ class Doubt:
     def residual(self, problem: Problem, x: Array, weight: Array) -> Array:
         """Return residuals in sigma (N, m) at vectors x (N, size), zero for absent rows.
 
-        For correlated rows it is the residual of a row given its partners, which count by their weights.
+        For correlated rows it is the residual of a row given its partners, which count by their weights (N, m) of the
+        loss.
         """
-        left = np.where(self.base > 0.0, residuals(problem, x), 0.0)
-        u = left / np.sqrt(self.given)
+        residual = np.where(self.base > 0.0, residuals(problem, x), 0.0)
+        u = residual / np.sqrt(self.given)
         # for independent rows `given` equals `own`, and weights of other rows have no effect
         if all(block.row.shape[1] == 1 for block in self.noise.blocks):
             return u
@@ -124,7 +130,7 @@ class Doubt:
         for whitener in whiten(self.noise, self.row_weight(least)):
             rows = whitener.row
             if rows.shape[1] > 1:
-                white = whitener.matrix @ left[:, rows][..., None]
+                white = whitener.matrix @ residual[:, rows][..., None]
                 # with weights w, (R^-1 r)_i is the residual of row i given its partners, over its variance given / w_i
                 share = (np.swapaxes(whitener.matrix, -1, -2) @ white)[..., 0]
                 u[:, rows] = share * np.sqrt(self.given[:, rows]) / least[:, rows]
@@ -132,17 +138,21 @@ class Doubt:
 
 
 def residuals(problem: Problem, x: Array) -> Array:
-    """Return residuals (N, m) of a flat batch at vectors x (N, size); angles are wrapped."""
-    left = problem.observed - predict(problem, x)
+    """Return residuals (N, m) of a flat batch at vectors x (N, size), in units of the rows; angles are wrapped."""
+    residual = problem.observed - predict(problem, x)
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         if MODELS[rows.kind].period is not None:
             part = slice(start, start + rows.count)
-            left[..., part] = wrap(left[..., part])
-    return np.asarray(left)
+            residual[..., part] = wrap(residual[..., part])
+    return np.asarray(residual)
 
 
 def fold_signs(loss: Loss, u: Array, sided: Array) -> Array:
-    """Return residuals for a loss: signed for rows with positive gross errors only, absolute for the others."""
+    """Return residuals u (N, m), in sigma, as arguments of a loss: absolute, or signed for `sided` rows (m,).
+
+    A one-sided loss limits late signals only. Rows that are not sided may have gross errors of either sign, so their
+    absolute residuals count. For a loss of both signs all residuals are returned unchanged.
+    """
     return np.where(sided, u, np.abs(u)) if loss.one_sided else u
 
 
@@ -202,9 +212,9 @@ def reweight(
         Most updates of the weights.
     tolerance : float
         A step shorter than this many standard deviations ends the iteration, once the weights have converged too. The
-        weights may change by the tolerance if it exceeds the least change that shows in a fix.
+        weights have converged if they change by less than the tolerance or 1e-4, the larger of the two.
     face : Face
-        Constraints that hold with equality.
+        Constraints that are satisfied with equality.
     """
     # more than fifty updates mean slow progress along a flat valley, and the status shows it
     x, weight = np.array(start), np.ones(doubt.base.shape)
@@ -212,26 +222,26 @@ def reweight(
     status = np.full(len(x), int(Status.MAX_ITERATIONS), dtype=np.int8)
     active = np.arange(len(x))
     # the weighted cost is no upper bound of the robust cost, so steps are checked
-    uneven = loss.one_sided or any(block.row.shape[1] > 1 for block in doubt.noise.blocks)
+    must_check = loss.one_sided or any(block.row.shape[1] > 1 for block in doubt.noise.blocks)
     with np.errstate(all="ignore"):
         for iteration in range(limit):
             # the batch is not copied before some starts have finished
             whole = len(active) == len(x)
-            part, own = (problem, doubt) if whole else (problem.take(active), doubt.take(active))
-            here, before = x[active], weight[active]
-            now = weigh_by(loss, part, own, here, before)
-            step = _step(part.with_rows(weight=own.row_weight(now)), here, last[active], face, tolerance)
-            moved = _backtrack(loss, part, own, here, step.x, now) if uneven else step.x
-            # extrapolation leaves a face that constraints hold, so there only plain steps are taken
+            part, part_doubt = (problem, doubt) if whole else (problem.take(active), doubt.take(active))
+            here, old_weight = x[active], weight[active]
+            new_weight = weigh_by(loss, part, part_doubt, here, old_weight)
+            step = _step(part.with_rows(weight=part_doubt.row_weight(new_weight)), here, last[active], face, tolerance)
+            moved = _backtrack(loss, part, part_doubt, here, step.x, new_weight) if must_check else step.x
+            # extrapolation leaves a face of constraints, so there only plain steps are taken
             if iteration >= _PATIENCE and iteration % _OFTEN == 0 and not face:
-                moved = _extrapolate(loss, part, own, step, now)
-            x[active], weight[active], last[active] = moved, now, step.x - here
+                moved = _extrapolate(loss, part, part_doubt, step, new_weight)
+            x[active], weight[active], last[active] = moved, new_weight, step.x - here
             # converged: weights and position are constant; stalled: no step lowers the cost, although the gradient is
             # not zero
-            same = np.abs(now - before).max(-1, initial=0.0) <= max(_SETTLED, tolerance)
-            settled = same & (step.length <= tolerance)
+            constant = np.abs(new_weight - old_weight).max(-1, initial=0.0) <= max(_SETTLED, tolerance)
+            settled = constant & (step.length <= tolerance)
             status[active[settled]] = step.status[settled]
-            status[active[same & ~settled & (moved == here).all(-1)]] = Status.STALLED
+            status[active[constant & ~settled & (moved == here).all(-1)]] = Status.STALLED
             status[active[~np.isfinite(step.length)]] = Status.NUMERICAL
             active = active[status[active] == Status.MAX_ITERATIONS]
             if not len(active):
@@ -244,7 +254,11 @@ def reweight(
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """A least-squares step: end point, length in sigma, status, and the limit of a geometric series of such steps."""
+    """A least-squares step of M starts.
+
+    `x` (M, size) are the end points, `length` (M,) the lengths in sigma, and `status` (M,) the status of the
+    refinement. `tried` (M, size) is the limit of a geometric series of such steps.
+    """
 
     x: Array
     length: Array
@@ -253,7 +267,10 @@ class _Step:
 
 
 def _step(problem: Problem, x: Array, last: Array, face: Face, tolerance: float) -> _Step:
-    """Return one least-squares step with fixed weights from x (M, size); `last` is the step before."""
+    """Return one least-squares step with fixed weights from x (M, size).
+
+    `last` (M, size) is the step before, and `tolerance` the length of a last step in sigma.
+    """
     strata = strata_of(problem, face)
     if strata is None:
         done = refine(problem, x, tolerance=_SHARE * tolerance, limit=_STEPS, face=face)
@@ -279,7 +296,11 @@ def _step(problem: Problem, x: Array, last: Array, face: Face, tolerance: float)
 
 
 def _backtrack(loss: Loss, problem: Problem, doubt: Doubt, here: Array, there: Array, weight: Array) -> Array:
-    """Return points (M, size) between `here` and `there` that cost no more than `here`."""
+    """Return points (M, size) between `here` and `there` (M, size) that cost no more than `here`.
+
+    `weight` (M, m) are the current weights of the loss. After `_HALVINGS` halvings a point may still cost more, and it
+    is almost at `here`.
+    """
     least = robust_cost(loss, problem, doubt, here, weight)
     share = np.ones(len(here))
     for _ in range(_HALVINGS):
@@ -293,7 +314,10 @@ def _backtrack(loss: Loss, problem: Problem, doubt: Doubt, here: Array, there: A
 
 
 def _extrapolate(loss: Loss, problem: Problem, doubt: Doubt, step: _Step, weight: Array) -> Array:
-    """Return the limit of the steps if each shrinks by the same ratio (Aitken 1926), where the limit costs less."""
+    """Return the limits (M, size) of the steps if each shrinks by the same ratio (Aitken 1926).
+
+    If the limit does not cost less, the end point of the step is returned. `weight` (M, m) are the weights of the loss.
+    """
     cost = []
     for x in (step.x, step.tried):
         now = weigh_by(loss, problem, doubt, x, weight)
@@ -313,7 +337,7 @@ def weigh_by(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Array
     weight : array (N, m)
         Current weights, used for the partners of correlated rows.
     scale : array (N, 1) or float
-        Above 1 fewer rows are doubted.
+        Above 1 fewer rows get a reduced weight.
     """
     u = fold_signs(loss, doubt.residual(problem, x, weight) / scale, doubt.sided)
     return np.where(np.isfinite(u), loss.weight(u), 0.0)
@@ -328,10 +352,11 @@ def robust_cost(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Ar
 
 
 def robust_equations(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Array) -> Normal:
-    """Return normal equations (N) whose inverse is the covariance of the estimate.
+    """Return normal equations of N estimates x (N, size), whose inverse is the covariance of the estimates.
 
-    They are the weighted normal matrix of the rows over ``loss.spread``, plus the priors. The right-hand side is not
-    scaled: it is half the downhill gradient of the robust cost, from which the multipliers follow.
+    `weight` (N, m) are the weights of the loss. The equations are the weighted normal matrix of the rows over
+    ``loss.spread``, plus the priors. The right-hand side is not scaled: it is half the downhill gradient of the robust
+    cost, from which the multipliers follow.
     """
     rows = summed(problem.with_rows(weight=doubt.row_weight(weight)), x)
     information = {name: getattr(rows, name) / loss.spread for name in ("shared", "local", "cross")}

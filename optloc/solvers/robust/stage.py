@@ -1,4 +1,7 @@
-"""Robust fixes: the minimum of a loss that limits the effect of gross errors, without a first guess."""
+"""Robust fixes: the minimum of a loss that limits the effect of gross errors, without a first guess.
+
+Letters: N problems, q slots for candidates, m rows, M starts, `size` numbers of a parameter vector.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,7 @@ def by_arrivals(problem: Problem, start: Array | None, minimise: Minimise) -> Po
     problem : Problem
         N problems.
     start : array (N, q, size), optional
-        Starts.
+        Starts; None: the robust starts of `minimise`.
     minimise : callable
         Finds the minima.
     """
@@ -60,21 +63,27 @@ def by_arrivals(problem: Problem, start: Array | None, minimise: Minimise) -> Po
 
 
 def _add_emission_time(problem: Problem, x: Array) -> Array:
-    """Return vectors (N, q, size) with the emission time of the median arrival, from vectors without emission time."""
+    """Return vectors (N, q, size + 1) with an emission time as last entry, from vectors x (N, q, size) without it.
+
+    The emission time is the median of the arrivals minus the travel times, in metres.
+    """
     whole = np.concatenate([x, np.zeros((*x.shape[:-1], problem.layout.size - x.shape[-1]))], axis=-1)
     item, slot = np.nonzero(np.isfinite(x).all(-1))
     if len(item):
         arrivals = problem.rows[0].count
         # At emission time zero the residual of an arrival is the emission time plus its error. Gross errors do not move
         # a median.
-        left = residuals(problem.take(item), whole[item, slot])[:, :arrivals]
-        whole[item, slot, -1] = np.median(left, axis=-1)
+        residual = residuals(problem.take(item), whole[item, slot])[:, :arrivals]
+        whole[item, slot, -1] = np.median(residual, axis=-1)
     known = np.asarray(np.isfinite(x).all(-1))
     return np.where(known[..., None], whole, np.nan)
 
 
 def _weights(problem: Problem, taken: Arrivals, found: Pool) -> Array:
-    """Return the weight (N, m) of each row: the least weight of the arrivals that were made from it."""
+    """Return the weight (N, m) of each row: the least weight of the arrivals that were made from it.
+
+    `taken` has the arrivals of the problem, and `found` the minima with their weights.
+    """
     weights = np.array(np.broadcast_to(problem.weight, (len(found), problem.count)))
     for row, origin in enumerate(taken.origin):
         weights[:, origin] = np.minimum(weights[:, origin], found.weights[:, row, None])
@@ -120,14 +129,17 @@ class Robust:
         return in_parts(problem, work, chunk_size(problem))
 
     def _minima(self, problem: Problem, start: Array | None, stages: tuple[Stage, ...]) -> Pool:
-        """Return the minima of the loss, tested if the stage does so and found them by a search."""
+        """Return the settled minima of the loss; minima of a search are tested if `states` is True."""
         found = _minimise(problem, self.loss, start, stages)
         # given starts lead to the nearest minima only, so these are not tested
         return check_minima(problem, self.loss, found) if self.states and start is None else found
 
 
 def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[Stage, ...]) -> Pool:
-    """Return the settled minima of a loss, from given starts (N, q, size) or from robust starts."""
+    """Return the settled minima of a loss, from starts `start` (N, q, size), or from robust starts if it is None.
+
+    `stages` are the stages that ran before.
+    """
     began = perf_counter()
     pool = _minima(problem, loss, robust_starts(problem, loss) if start is None else start)
     # A flat loss has a minimum for almost every set of rows. So start from a rising loss, and try sets next to the best
@@ -149,14 +161,17 @@ def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[S
 
 
 def _on_face(loss: Loss, problem: Problem, start: Array, item: Array, face: Face) -> tuple[Array, Array, Array]:
-    """Return x (M, size), cost (M,) and status (M,) of the minima of a loss on a face of the constraints."""
+    """Return x (M, size), cost (M,) and status (M,) of the minima of a loss on a face of the constraints.
+
+    `start` (M, size) are the starts, and `item` (M,) is the problem of each start.
+    """
     part = problem.take(item)
     done = reweight(part, start, loss, Doubt.of(part, start), face=face)
     return done.x, done.cost, done.status
 
 
 def _join(one: Pool, two: Pool) -> Pool:
-    """Return the candidates of both pools."""
+    """Return a pool with the candidates of both pools of the same problems."""
     return replace(
         one,
         x=np.concatenate([one.x, two.x], axis=1),
@@ -214,7 +229,7 @@ def _minima(problem: Problem, loss: Loss, pool: Array) -> Pool:
 
 
 def _equations(problem: Problem, loss: Loss, x: Array) -> tuple[Normal, Array]:
-    """Return the normal equations of the estimates x (N, size), and the weights of all rows there."""
+    """Return the normal equations of the estimates x (N, size), and the weights (N, m) of all rows there."""
     doubt = Doubt.of(problem, x)
     weight = np.ones(doubt.base.shape)
     with np.errstate(all="ignore"):
@@ -224,7 +239,10 @@ def _equations(problem: Problem, loss: Loss, x: Array) -> tuple[Normal, Array]:
 
 
 def _drop_near(problem: Problem, loss: Loss, pool: Pool) -> Pool:
-    """Return candidates without those in the 95 % ellipsoid of the cheapest, which are the same answer."""
+    """Return candidates without those in the 95 % ellipsoid of the cheapest, which are the same answer.
+
+    The cost of a removed candidate is infinite.
+    """
     from scipy.special import gammaincinv
 
     finished = np.where(pool.code == Status.OK, pool.cost, np.inf)
@@ -251,24 +269,24 @@ def _rivals(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     Under truncated least squares all gross errors cost the same. Its gap is evidence, if each row left out adds the gap
     of a rival: a candidate that leaves out one row more than the cheapest is then less likely for that reason.
     """
-    found = np.isfinite(pool.cost) & (pool.code == Status.OK)
-    item, slot = np.nonzero(found & (found.sum(1) > 1)[:, None])
+    finished = np.isfinite(pool.cost) & (pool.code == Status.OK)
+    item, slot = np.nonzero(finished & (finished.sum(1) > 1)[:, None])
     if not len(item):
         return pool
     evidence, truncated = np.full(pool.cost.shape, np.inf), LOSSES["truncated"]
     part, start = problem.take(item), pool.x[item, slot]
     doubt = Doubt.of(part, start)
     done = reweight(part, start, truncated, doubt, face=exact(problem))
-    out = ((done.weight == 0.0) & (doubt.base > 0.0)).sum(-1)
+    left_out = ((done.weight == 0.0) & (doubt.base > 0.0)).sum(-1)
     # without this price, leaving out more rows would always cost less
-    price = AMBIGUOUS_GAP * out
+    price = AMBIGUOUS_GAP * left_out
     evidence[item, slot] = np.where(done.status == Status.OK, done.cost + price, np.inf)
-    best = np.where(found, pool.cost, np.inf).argmin(1)[:, None]
+    best = np.where(finished, pool.cost, np.inf).argmin(1)[:, None]
     least, base = np.take_along_axis(pool.cost, best, 1), np.take_along_axis(evidence, best, 1)
     with np.errstate(invalid="ignore"):
         rival = least + np.maximum(evidence - base, _CLOSE)
     rival = np.where(np.isnan(rival), np.inf, rival)
     # a rising loss may only reduce the gap below the evidence, never increase it
-    cost = np.where(found, rival if loss.flat else np.minimum(pool.cost, rival), pool.cost)
+    cost = np.where(finished, rival if loss.flat else np.minimum(pool.cost, rival), pool.cost)
     np.put_along_axis(cost, best, least, 1)
     return replace(pool, cost=cost)

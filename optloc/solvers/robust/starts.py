@@ -1,4 +1,8 @@
-"""Starts for a robust cost, without a first guess: fixes without some stations or rows."""
+"""Starts for a robust cost, without a first guess: fixes without some stations or rows.
+
+Letters: N problems, m rows, S subsets of rows, q starts of a problem, M starts of all problems, `size` numbers of a
+parameter vector. u are residuals in sigma.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +63,7 @@ _GROWTH, _GRADES, _SHARP = 1.4, 40, 1e3
 
 
 def subsets(problem: Problem, clean: Array) -> tuple[Array, Array]:
-    """Return the subsets of all problems of a flat batch: problem of each subset (S,), and its rows (S, m).
+    """Return the subsets of all problems of a flat batch: problem of each subset (S,), and flags (S, m) of its rows.
 
     A subset leaves out one station or two. If a problem has few stations, three are left out too; if it has few rows,
     single rows are left out too.
@@ -86,12 +90,16 @@ def subsets(problem: Problem, clean: Array) -> tuple[Array, Array]:
     return item[enough], kept[enough]
 
 
-def _unite(own: Array, touched: Array, size: int) -> tuple[Array, Array, Array]:
-    """Return problems (S,), unions (S, m) of the rows (g, m) of up to `size` of their members, and sizes (S,)."""
-    count = own.sum(1)
+def _unite(members_of: Array, touched: Array, size: int) -> tuple[Array, Array, Array]:
+    """Return the unions of the rows of up to `size` members: problems (S,), rows (S, m), sizes (S,).
+
+    A member is a station or a row, g in total. `members_of` (N, g) flags the members of each problem, and `touched` (g,
+    m) the rows of each member.
+    """
+    count = members_of.sum(1)
     most = int(count.max(initial=0))
     # the members of each problem come first, so that one list of index sets serves all problems
-    local = np.argsort(~own, axis=1, kind="stable")[:, :most]
+    local = np.argsort(~members_of, axis=1, kind="stable")[:, :most]
     sizes = range(1, 1 + (size if most <= _THREE else min(size, 2)))
     items, unions = [np.zeros(0, dtype=int)], [np.zeros((0, touched.shape[1]), dtype=bool)]
     lengths = [np.zeros(0, dtype=int)]
@@ -158,13 +166,19 @@ def _through_epochs(problem: Problem, loss: Loss) -> Array:
 
 
 def _annealed(problem: Problem, pool: Array, loss: Loss) -> Array:
-    """Return the end points (N, q, size) of annealing from starts (N, q, size), the cheapest first."""
+    """Return the end points (N, q, size) of annealing from starts `pool` (N, q, size), the cheapest first.
+
+    Annealing means steps under the Cauchy loss with a falling scale of the residuals.
+    """
     item, slot = np.nonzero(np.isfinite(pool).all(-1))
     return _cheapest(problem, pool[item, slot], item, loss, _KEPT, anneal=True)
 
 
 def _leave_out(problem: Problem, loss: Loss, clean: Array) -> Array:
-    """Return the best starts (N, q, size) from closed forms of all subsets."""
+    """Return the best starts (N, q, size) from closed forms of all subsets.
+
+    For problems flagged in `clean` (N,) the subsets leave out one station only.
+    """
     # Correlation matters for the answer, but little for its start, and it costs time.
     noise = with_station_noise(problem).noise if not depends_on_place(problem) else problem.noise
     problem = replace(problem, noise=independent(variances(noise, problem.count)))
@@ -178,7 +192,7 @@ def _leave_out(problem: Problem, loss: Loss, clean: Array) -> Array:
 
 
 def _start_subsets(problem: Problem, loss: Loss, clean: Array) -> Array:
-    """Return the best starts (N, q, size) from closed forms of all subsets of one part of the batch."""
+    """Return the best starts (N, q, size) from closed forms of all subsets, for a part of the batch of `_leave_out`."""
     item, kept = subsets(problem, clean)
     if not len(item):
         return np.full((problem.batch_shape[0], 0, problem.layout.size), np.nan)
@@ -192,7 +206,11 @@ def _start_subsets(problem: Problem, loss: Loss, clean: Array) -> Array:
 
 
 def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *, anneal: bool) -> Array:
-    """Return the cheapest starts (N, most, size) of starts (M, size) of given problems (M,), without repetitions."""
+    """Return the cheapest starts (N, q, size) of starts x (M, size), q at most `most`, without repetitions.
+
+    `item` (M,) is the problem of each start. `anneal` moves the starts by annealing before the comparison. Two starts
+    are equal if their residuals differ by less than `_SAME` sigma. NaN in empty slots.
+    """
     size, count = problem.batch_shape[0], len(x)
     cost, u, x = np.full(count, np.inf), np.zeros((count, problem.count)), np.array(x)
     usable = np.flatnonzero(np.isfinite(x).all(-1))
@@ -212,13 +230,18 @@ def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *,
         begins = np.append(True, item[1:] != item[:-1])
         best = np.flatnonzero(begins)
         chosen[item[best], slot] = x[best]
-        left = np.abs(u - u[:, best[np.cumsum(begins) - 1]]).max(0) >= _SAME
-        x, u, item = x[left], u[:, left], item[left]
+        different = np.abs(u - u[:, best[np.cumsum(begins) - 1]]).max(0) >= _SAME
+        x, u, item = x[different], u[:, different], item[different]
     return chosen
 
 
 def _anneal(problem: Problem, x: Array, loss: Loss, halvings: int) -> tuple[Array, Array, Array]:
-    """Return vectors after steps under the Cauchy loss with falling scale, their costs and residuals."""
+    """Return vectors (M, size) after annealing, their costs (M,) and residuals (M, m).
+
+    Annealing means steps under the Cauchy loss with a falling scale. The scale is halved `halvings` times. With 0
+    halvings the vectors do not move. Residuals are in sigma. Costs are the costs under `loss`, infinite for invalid
+    vectors.
+    """
     doubt, cauchy, face = Doubt.of(problem, x), LOSSES["cauchy"], exact(problem)
     weight = np.ones(doubt.base.shape)
     with np.errstate(all="ignore"):
@@ -247,21 +270,22 @@ def flip_rows(problem: Problem, loss: Loss, pool: Pool) -> Array:
     doubt, q = Doubt.of(part, x[item]), min(_FLIPPED, problem.count)
     weight = weigh_by(loss, part, doubt, x[item], np.ones(doubt.base.shape))
     u = np.where(doubt.base > 0.0, np.abs(doubt.residual(part, x[item], weight)), np.inf)
-    brink = np.argsort(np.abs(u - loss.constant), axis=1)[:, :q]
+    near_cut = np.argsort(np.abs(u - loss.constant), axis=1)[:, :q]
     each = np.repeat(np.arange(len(item)), q)
-    changed, row = weight[each], (np.arange(len(each)), brink.ravel())
+    changed, row = weight[each], (np.arange(len(each)), near_cut.ravel())
     changed[row] = 1.0 - changed[row]
-    beside = part.take(each).with_rows(weight=doubt.take(each).row_weight(changed))
+    changed_problems = part.take(each).with_rows(weight=doubt.take(each).row_weight(changed))
     out = np.full((len(x), q, x.shape[-1]), np.nan)
-    out[item] = refine(beside, x[item][each], limit=_FEW, face=exact(problem)).x.reshape(len(item), q, -1)
+    out[item] = refine(changed_problems, x[item][each], limit=_FEW, face=exact(problem)).x.reshape(len(item), q, -1)
     return out
 
 
 def _graduate(problem: Problem, start: Array) -> Array:
-    """Return the minima (N, q, size) of truncated least squares by graduation from a convex cost.
+    """Return the minima (N, q, size) of truncated least squares by graduation from a convex cost, next to starts.
 
     H. Yang, P. Antonante, V. Tzoumas, L. Carlone, "Graduated non-convexity for robust spatial perception", IEEE Robot.
-    Autom. Lett. 5 (2020), eq. 14 for the weights and section III-C for the schedule.
+    Autom. Lett. 5 (2020), eq. 14 for the weights and section III-C for the schedule. c is the cut of the loss in sigma,
+    and mu the control parameter: small for a convex cost, large for the truncated cost.
     """
     item, slot = np.nonzero(np.isfinite(start).all(-1))
     out = np.full(start.shape, np.nan)

@@ -1,4 +1,8 @@
-"""Tests that a robust fix must pass to be `ok`: a proof from the rows with weight, single rows, and repeats."""
+"""Tests that a robust fix must pass to be `ok`: a proof from the rows with weight, single rows, and repeats.
+
+Letters: N problems, m rows, M changes of rows, `size` numbers of a parameter vector. Rejected rows have a weight below
+a quarter of the original one.
+"""
 
 from __future__ import annotations
 
@@ -66,16 +70,17 @@ def check_minima(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     fix = judge(problem, pool)
     present = np.broadcast_to(problem.weight, pool.weights.shape) > 0.0
     doubted = present & (pool.weights < REJECTED * problem.weight)
-    spent = doubted.sum(1)
-    left = degrees_of_freedom(problem.with_rows(weight=np.where(doubted, 0.0, problem.weight)))
-    sole = fix.answered & ~fix.has(Status.AMBIGUOUS, Status.UNBOUNDED, Status.CONTRADICTORY)
+    rejected_count = doubted.sum(1)
+    redundancy = degrees_of_freedom(problem.with_rows(weight=np.where(doubted, 0.0, problem.weight)))
+    unrivalled = fix.answered & ~fix.has(Status.AMBIGUOUS, Status.UNBOUNDED, Status.CONTRADICTORY)
     # the rows with weight must name the doubted rows, and one more row must show if another choice exists
-    checked = left > spent
-    for i in np.flatnonzero(sole & ~checked):
+    checked = redundancy > rejected_count
+    for i in np.flatnonzero(unrivalled & ~checked):
         remark[i] = (
-            f"redundancy {left[i]} without {spent[i]} rejected rows is too small to exclude another choice of rows"
+            f"redundancy {redundancy[i]} without {rejected_count[i]} rejected rows "
+            "is too small to exclude another choice of rows"
         )
-    items = np.flatnonzero(sole & checked)
+    items = np.flatnonzero(unrivalled & checked)
     if not len(items):
         return pool
     part, out = problem.take(items), doubted[items]
@@ -87,7 +92,11 @@ def check_minima(problem: Problem, loss: Loss, pool: Pool) -> Pool:
 
 
 def _examine(problem: Problem, loss: Loss, x: Array, doubted: Array) -> tuple[Array, Array, Array]:
-    """Return flags (N,) of fixes that pass, reasons (N,) of the others, and shares of repeats (N, 3)."""
+    """Return flags (N,) of fixes that pass, reasons (N,) of the others, and results of repeats (N, 3).
+
+    `x` (N, size) are the minima of the loss, and `doubted` (N, m) flags the rejected rows. The numbers of the repeats
+    are as in `Curvature.repeats`; NaN if a fix failed before.
+    """
     rest = problem.with_rows(weight=np.where(doubted, 0.0, problem.weight))
     fix = verdict(rest, certified(rest, lsr(rest, begin(rest, x))))
     reason, repeats = filled_objects(len(x), ""), np.full((len(x), 3), np.nan)
@@ -109,14 +118,17 @@ def _examine(problem: Problem, loss: Loss, x: Array, doubted: Array) -> tuple[Ar
     items = np.flatnonzero(good)
     if len(items):
         repeats[items] = _repeat(problem.take(items), loss, fix[items], doubted[items])
-        held = holds(repeats)
-        reason[good & ~held] = "the ellipses of simulated repeats do not cover the true positions"
-        good &= held
+        covered = holds(repeats)
+        reason[good & ~covered] = "the ellipses of simulated repeats do not cover the true positions"
+        good &= covered
     return good, reason, repeats
 
 
 def _squared(fix: Fix, step: Array) -> Array:
-    """Return squared lengths (N,) of steps (N, size) in standard deviations of fixes, for the shared unknowns only."""
+    """Return squared lengths (N,) of steps (N, size) in standard deviations of fixes, for the shared unknowns only.
+
+    A squared length is step' covariance^-1 step.
+    """
     n = fix.cov.shape[-1]
     with np.errstate(all="ignore"):
         return np.asarray((step[:, :n] * linalg.solve(fix.cov, step[:, :n, None])[0][..., 0]).sum(-1))
@@ -140,33 +152,37 @@ def _decides(problem: Problem, fix: Fix, doubted: Array) -> Array:
     out = np.zeros(len(doubted), dtype=bool)
     step = max(1, _TOGETHER // problem.count)
     for first in range(0, len(item), step):
-        own, some = item[first : first + step], slice(first, first + step)
-        part = problem.take(own)
-        part = part.with_rows(weight=np.where(doubted[own] ^ change[some], 0.0, part.weight))
+        numbers, chunk = item[first : first + step], slice(first, first + step)
+        part = problem.take(numbers)
+        part = part.with_rows(weight=np.where(doubted[numbers] ^ change[chunk], 0.0, part.weight))
         with np.errstate(all="ignore"):
-            done = refine(part, fix.x[own])
-            as_good = (done.cost - fix.cost[own] < limit[some]) & (done.status == Status.OK)
-        moved = _squared_position(problem, fix[own], done.x - fix.x[own])
-        out[own[as_good & ~(moved <= quantile(REGION_LEVEL, problem.dimension))]] = True
+            done = refine(part, fix.x[numbers])
+            as_good = (done.cost - fix.cost[numbers] < limit[chunk]) & (done.status == Status.OK)
+        moved = _squared_position(problem, fix[numbers], done.x - fix.x[numbers])
+        out[numbers[as_good & ~(moved <= quantile(REGION_LEVEL, problem.dimension))]] = True
     return out
 
 
 def _changes(present: Array, doubted: Array) -> tuple[Array, Array, Array]:
-    """Return the problem (M,) of each change, its rows (M, m), and the largest rise of the cost (M,) that counts."""
+    """Return the problem (M,) of each change, flags (M, m) of its rows, and the limit (M,) of the rise of the cost.
+
+    A changed row is left out, or taken back if it is rejected. If the cost rises by less than the limit, the change is
+    another explanation. `present` and `doubted` (N, m) flag rows with weight before the loss and rejected rows.
+    """
     item, row = np.nonzero(present)
     change = np.zeros((len(item), present.shape[1]), dtype=bool)
     change[np.arange(len(item)), row] = True
     limit = np.where(doubted[item, row], _BACK, -_OUT)
-    swapped, back, out = np.nonzero(doubted[:, :, None] & (present & ~doubted)[:, None, :])
+    swapped, taken_back, left_out = np.nonzero(doubted[:, :, None] & (present & ~doubted)[:, None, :])
     more = np.zeros((len(swapped), present.shape[1]), dtype=bool)
-    more[np.arange(len(swapped)), back] = more[np.arange(len(swapped)), out] = True
+    more[np.arange(len(swapped)), taken_back] = more[np.arange(len(swapped)), left_out] = True
     # an exchange leaves out equally many rows, so the costs alone decide
     limits = np.concatenate([limit, np.full(len(swapped), AMBIGUOUS_GAP)])
     return np.concatenate([item, swapped]), np.concatenate([change, more]), limits
 
 
 def _squared_position(problem: Problem, fix: Fix, step: Array) -> Array:
-    """Return squared lengths (N,) of position steps, from steps (N, size), in standard deviations of fixes."""
+    """Return squared lengths (N,) of position steps, in standard deviations of fixes, from steps (N, size)."""
     slot, _ = problem.layout.find("position")
     where = slice(slot.start, slot.start + slot.size)
     with np.errstate(all="ignore"):
@@ -175,13 +191,16 @@ def _squared_position(problem: Problem, fix: Fix, step: Array) -> Array:
 
 
 def _repeat(problem: Problem, loss: Loss, fix: Fix, doubted: Array) -> Array:
-    """Return shares of repeats of the loss whose ellipses contain the truth, and an inflation, (N, 3)."""
+    """Return two shares of repeats of the loss whose ellipses contain the truth, and an inflation, (N, 3).
+
+    See `Curvature.repeats`. The rows flagged in `doubted` (N, m) keep their residuals in all repeats.
+    """
     z = np.where(doubted, problem.observed - predict(problem, fix.x), 0.0)
     return repeated(problem, fix.x, fix.cov, lambda many, truth: _refit(many, loss, truth), z)
 
 
 def _refit(problem: Problem, loss: Loss, truth: Array) -> Repeats:
-    """Return the minima of a loss next to true vectors, with covariances."""
+    """Return the minima of a loss next to true vectors (N, size), with covariances and flags of valid results."""
     doubt = Doubt.of(problem, truth)
     done = reweight(problem, truth, loss, doubt, limit=_WEIGHINGS, tolerance=TOLERANCE)
     information, _, ok = marginal(robust_equations(loss, problem, doubt, done.x, done.weight))

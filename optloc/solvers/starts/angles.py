@@ -1,4 +1,7 @@
-"""Starts and bounds from angles alone: instrumental variables, unit directions, the smallest maximal angle."""
+"""Starts and bounds from angles alone: instrumental variables, unit directions, the smallest maximal angle.
+
+Letters: N problems, m bearings or rows, k epochs, d coordinates, `order` the degree of a polynomial course.
+"""
 
 from __future__ import annotations
 
@@ -31,11 +34,11 @@ class Bearings:
     weight : array (N, m, 2)
         One over the standard deviations, 1/radians; zero for absent angles.
     axes : array (N, m, d, d), optional
-        Axes of the stations.
+        Axes of the stations, as rows.
     centre : array (N, d)
-        Metres.
+        Middle of the stations, metres.
     scale : array (N,)
-        Metres.
+        Spread of the stations, metres.
     """
 
     station: Array
@@ -64,32 +67,38 @@ def bearings(problem: Problem) -> Bearings | None:
     if "elevation" in rows:
         other, begin = rows["elevation"]
         value, importance = _values(problem, other, begin)
-        keys = {key: i for i, key in enumerate(_keys(other))}
-        for i, key in enumerate(_keys(block)):
+        keys = {key: i for i, key in enumerate(_station_epochs(other))}
+        for i, key in enumerate(_station_epochs(block)):
             if key in keys:
                 angle[:, i, 1], weight[:, i, 1] = value[:, keys[key]], importance[:, keys[key]]
-    place = _at(problem.stations.position, 3, block, size)
-    axes = None if problem.stations.axes is None else _at(problem.stations.axes, 4, block, size)
+    place = _for_rows(problem.stations.position, 3, block, size)
+    axes = None if problem.stations.axes is None else _for_rows(problem.stations.axes, 4, block, size)
     centre, spread = centre_and_spread(place)
     scale = np.where(spread > 0.0, spread, 1.0)
     return Bearings((place - centre[:, None]) / scale[:, None, None], angle, weight, axes, centre, scale[:size])
 
 
-def _keys(rows: Rows) -> list[tuple[int, int]]:
-    """Return station and epoch of each row."""
+def _station_epochs(rows: Rows) -> list[tuple[int, int]]:
+    """Return pairs (station, epoch) of the rows, to find the elevation that belongs to an azimuth."""
     return list(zip(rows.a.tolist(), rows.epoch.tolist(), strict=True))
 
 
 def _values(problem: Problem, rows: Rows, start: int) -> tuple[Array, Array]:
-    """Return the angles (N, m), radians, and one over their standard deviations; zero for absent rows."""
+    """Return the angles (N, m), radians, and one over their standard deviations (N, m); zero for absent rows.
+
+    `start` is the number of the first of the rows in the problem.
+    """
     sigma = np.sqrt(variances(problem.noise, problem.count)[..., start : start + rows.count])
     shape = (problem.batch_shape[0], rows.count)
     importance = np.where(rows.weight > 0.0, np.sqrt(rows.weight) / sigma, 0.0)
     return np.broadcast_to(rows.z - rows.correction, shape), np.broadcast_to(importance, shape)
 
 
-def _at(array: Array, core: int, rows: Rows, size: int) -> Array:
-    """Return a per-station quantity (N, m, ...) at the stations and epochs of rows."""
+def _for_rows(array: Array, core: int, rows: Rows, size: int) -> Array:
+    """Return a quantity of stations at the stations and epochs of rows, (N, m, ...).
+
+    `array` (..., k or 1, s, ...) has `core` axes without the batch axes. `size` is N.
+    """
     full = np.broadcast_to(array, (size, *array.shape[array.ndim - core :]))
     epoch = rows.epoch if full.shape[1] > 1 else np.zeros_like(rows.epoch)
     return full[:, epoch, rows.a]
@@ -149,7 +158,8 @@ def courses(problem: Problem) -> BearingCourses | None:
 def course_states(problem: Problem) -> Array | None:
     """Return the states (N, order + 1, d) of the instrumental courses, or None if rows are not all angles.
 
-    NaN if the run does not determine a course, or if the course is not in front of the stations.
+    A state is position, velocity and acceleration, in m and s. It is NaN if the run does not determine a course, or if
+    the course is not in front of the stations.
     """
     found = courses(problem)
     if found is None:
@@ -173,7 +183,11 @@ _SPACE = 3
 
 
 def _at_height(problem: Problem, plan: Array) -> Array:
-    """Return states (N, q, 3) from states in the plane, at the known height, without the curvature of the Earth."""
+    """Return states (N, q, 3) from states in the plane (N, q, 2), at the known height.
+
+    A state has q vectors: position, then its derivatives. The height above the origin ignores the curvature of the
+    Earth.
+    """
     level = known_height(problem)
     assert level is not None
     assert problem.frame.origin is not None
@@ -183,7 +197,7 @@ def _at_height(problem: Problem, plan: Array) -> Array:
 
 
 def by_directions(seen: Bearings) -> Array:
-    """Return the fixes (N, 1, d) of the unit-direction relaxation, over threads; NaN without elevations."""
+    """Return the fixes (N, 1, d), metres, of the unit-direction relaxation, over threads; NaN without elevations."""
     from formulations.direction_sdp import directions
 
     out = np.full((len(seen.station), 1, seen.station.shape[-1]), np.nan)
@@ -200,7 +214,7 @@ def by_directions(seen: Bearings) -> Array:
 
 
 def least_worst(seen: Bearings) -> Array:
-    """Return the fixes (N, 1, d) with the smallest maximal angle in sigma."""
+    """Return the fixes (N, 1, d), metres, with the smallest maximal angle in sigma; NaN without two bearings."""
     from formulations.minimax_cone import minimax
 
     d = seen.station.shape[-1]
@@ -244,7 +258,10 @@ def angle_bounds(seen: Bearings, point: Array) -> Array:
 
 
 def _complete_bearings(seen: Bearings) -> list[tuple[int, Array]]:
-    """Return the problems with at least two complete bearings, each with flags of these bearings."""
+    """Return the problems with at least two complete bearings: pairs of their number and flags (m,) of these bearings.
+
+    The list is empty in a plane.
+    """
     if seen.station.shape[-1] != 3:
         return []
     use = np.asarray((seen.weight > 0.0).all(-1) & np.isfinite(seen.angle).all(-1))
@@ -278,15 +295,15 @@ def course_starts(problem: Problem) -> Array | None:
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         kind = ("azimuth", "elevation", "range_sum").index(rows.kind)
         value[kind][:, rows.epoch] = rows.z - rows.correction
-        own = deviation[..., start : start + rows.count]
-        sigma[kind][:, rows.epoch] = np.where(rows.weight > 0.0, own, np.inf)
+        values = deviation[..., start : start + rows.count]
+        sigma[kind][:, rows.epoch] = np.where(rows.weight > 0.0, values, np.inf)
     place = np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))[:, 0]
     home, away = place[:, receiver], place[:, illuminator] - place[:, receiver]
     length = float(spread_of(problem)[1][0])
     axes = triad(value[0], value[1])
     if problem.stations.axes is not None:
-        own = np.broadcast_to(problem.stations.axes, (size, *problem.stations.axes.shape[-4:]))[:, 0, receiver]
-        axes = axes @ own[:, None]
+        values = np.broadcast_to(problem.stations.axes, (size, *problem.stations.axes.shape[-4:]))[:, 0, receiver]
+        axes = axes @ values[:, None]
     # path by the target minus direct path
     excess = value[2] - np.sqrt((away**2).sum(-1))[:, None]
     # The error across the line of sight is the error of the angle in radians times the range; for azimuths also times
@@ -301,7 +318,7 @@ def course_starts(problem: Problem) -> Array | None:
 
 
 def pair(problem: Problem) -> tuple[int, int] | None:
-    """Return receiver and illuminator of all rows, or None if they are not one bistatic pair at rest."""
+    """Return the numbers of receiver and illuminator of all rows; None without one bistatic pair at rest."""
     kinds = {rows.kind: rows for rows in problem.rows}
     if problem.dimension != 3 or set(kinds) != {"range_sum", "azimuth", "elevation"} or len(kinds) != len(problem.rows):
         return None

@@ -1,4 +1,7 @@
-"""Starts for every mixture of kinds that a proof can bound: minima that a best-first search of boxes finds."""
+"""Starts for every mixture of kinds that a proof can bound: minima that a best-first search of boxes finds.
+
+The search splits the box with the lowest bound of the cost first. Letters: N problems, q minima, d coordinates, metres.
+"""
 
 from __future__ import annotations
 
@@ -52,12 +55,12 @@ def best_first_starts(problem: Problem) -> Array:
 
 
 def _place(places: FoundPlaces, i: int) -> FoundPlaces:
-    """Return the positions of one problem as a batch."""
+    """Return the positions of problem i as a batch of one problem."""
     return FoundPlaces(*(array[i : i + 1] for array in places))
 
 
 def _on_planes(problem: Problem, x: Array) -> Array:
-    """Return positions (N, d) moved onto the planes that hold the target."""
+    """Return positions (N, d), metres, moved onto the planes to which equalities restrict the target."""
     for band in problem.constraints:
         if isinstance(band, Band) and is_exact(band) and band.kind == "plane":
             # One plane after the other: oblique planes leave a remainder, which does not matter along the axes of the

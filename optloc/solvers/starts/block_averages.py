@@ -1,4 +1,8 @@
-"""Block averages: a long run as a short run with the same unknowns, as the start of a fix."""
+"""Block averages: a long run as a short run with the same unknowns, as the start of a fix.
+
+A *block* is a number of consecutive epochs. The new row of a block is the value, in the middle of the block, of a line
+through the old rows of the same kind, stations and target.
+"""
 
 from __future__ import annotations
 
@@ -82,7 +86,7 @@ def _blocks(problem: Problem, length: int, longest: float) -> Problem:
         noise=_noise(problem, means, np.concatenate([block.epoch for block in rows])),
         times=middle,
         motions=tuple(
-            replace(m, reference=_reference(problem, m.reference), rise=_at(problem.times, m.rise, middle))
+            replace(m, reference=_reference(problem, m.reference), rise=_rise_at(problem.times, m.rise, middle))
             for m in problem.motions
         ),
         biases=tuple(_bias(bias, np.concatenate([mean.first for mean in means])) for bias in problem.biases),
@@ -91,7 +95,11 @@ def _blocks(problem: Problem, length: int, longest: float) -> Problem:
 
 @dataclass(frozen=True, slots=True)
 class _Blocks:
-    """Block of each epoch (-1 for none), seconds since its middle, and the middles."""
+    """The division of k epochs into b blocks.
+
+    `place` (k,) is the block of each epoch, -1 for none. `since` (k,) are the seconds since the middle of this block.
+    `middle` (b,) are the times of the middles, seconds.
+    """
 
     place: Array
     since: Array
@@ -102,8 +110,10 @@ class _Blocks:
 class _Mean:
     """The old rows of a kind in each new row, sorted by block, with their coefficients.
 
-    `order` are rows of the kind, `head` the first entry of each new row among them, `row` the new row of each entry.
-    `first` is the global number of one old row in each new row.
+    `order` (e,) are the old rows, numbers within the kind, and `coefficient` (e,) their factors. `row` (e,) is the new
+    row of each. `head` are the first entries of the new rows among the e old rows. `block` and `first` give the block
+    of each new row and the global number of one of its old rows. `start` and `taken` are the numbers of the first old
+    and the first new row of the kind.
     """
 
     order: Array
@@ -126,8 +136,11 @@ def _reference(problem: Problem, reference: float | None) -> float:
     return float(problem.times[0]) if reference is None else reference
 
 
-def _at(times: Array, rise: Array | None, middle: Array) -> Array | None:
-    """Return the known shape of a height (..., b, 2) at the middles, interpolated linearly between epochs."""
+def _rise_at(times: Array, rise: Array | None, middle: Array) -> Array | None:
+    """Return the known shape of a height (..., b, 2) at the middles (b,) of b blocks; None without a known shape.
+
+    The shape `rise` (..., k, 2) at the times (k,) of the epochs is interpolated linearly.
+    """
     if rise is None:
         return None
     after = np.clip(np.searchsorted(times, middle), 1, len(times) - 1)
@@ -136,23 +149,30 @@ def _at(times: Array, rise: Array | None, middle: Array) -> Array | None:
 
 
 def _means(rows: Rows, when: _Blocks, present: Array, start: int, taken: int) -> _Mean:
-    """Return the averages of the rows of a kind, whose global numbers begin at `start`."""
+    """Return the averages of the rows of a kind as combinations of old rows.
+
+    `present` flags the old rows to use. `start` is the global number of their first row, and `taken` the number of new
+    rows of earlier kinds.
+    """
     inside = np.flatnonzero((when.place[rows.epoch] >= 0) & present)
     key = np.stack([when.place[rows.epoch], rows.a, rows.b, rows.target])[:, inside]
     # lexsort takes its last key first: block, then stations, then target
     order = np.lexsort(key[::-1])
     key, order = key[:, order], inside[order]
     new = np.ones(len(order), dtype=bool)
-    # an entry that differs from the one before begins a new row
+    # an entry that differs from the entry before begins a new row
     new[1:] = (key[:, 1:] != key[:, :-1]).any(0)
     head, row = np.flatnonzero(new), np.cumsum(new) - 1
     since = when.since[rows.epoch[order]]
-    coefficient = _middle(since, row)
+    coefficient = _line_coefficients(since, row)
     return _Mean(order, head, row, coefficient, key[0][head], start + order[head], start, taken)
 
 
-def _middle(since: Array, row: Array) -> Array:
-    """Return the coefficients that give the line through the values of each row at time zero."""
+def _line_coefficients(since: Array, row: Array) -> Array:
+    """Return the coefficients (e,) of old values in new rows: the line through the values of a new row at time zero.
+
+    `since` (e,) are seconds since the middle of the block, and `row` (e,) the new row of each old value.
+    """
     total = [np.bincount(row, since**j) for j in range(3)]
     spread = total[0] * total[2] - total[1] ** 2
     # Values at one time have no slope. By the inequality of Cauchy and Schwarz the spread is between zero and the
@@ -164,7 +184,7 @@ def _middle(since: Array, row: Array) -> Array:
 
 
 def _average_rows(rows: Rows, mean: _Mean) -> Rows:
-    """Return the averaged rows of one kind."""
+    """Return the averaged rows of one kind; angles are averaged relative to one angle of their row."""
 
     def middle(values: Array, wrapped: bool) -> Array:
         sorted_, base = values[..., mean.order], np.zeros(())
@@ -186,7 +206,7 @@ def _average_rows(rows: Rows, mean: _Mean) -> Rows:
 def _stations(stations: Stations, when: _Blocks) -> Stations:
     """Return the stations with positions, velocities and axes averaged over blocks."""
     inside = np.flatnonzero(when.place >= 0)
-    coefficient = _middle(when.since[inside], when.place[inside])
+    coefficient = _line_coefficients(when.since[inside], when.place[inside])
     head = np.flatnonzero(np.diff(when.place[inside], prepend=-1))
 
     def middle(values: Array | None, core: int) -> Array | None:
@@ -206,7 +226,11 @@ def _stations(stations: Stations, when: _Blocks) -> Stations:
 
 
 def _noise(problem: Problem, means: list[_Mean], block: Array) -> Noise:
-    """Return the covariance of the new rows, C R C', with one block per time block."""
+    """Return the covariance of the new rows, C R C', with one noise block for each block of epochs.
+
+    R is the covariance of the old rows, and C has the coefficients of old rows in new rows. `block` is the block of
+    each new row.
+    """
     count, size = problem.count, sum(len(mean.head) for mean in means)
     # C (new rows, old rows) is sparse
     entries = [(mean.taken + mean.row, mean.start + mean.order, mean.coefficient) for mean in means]
@@ -222,7 +246,7 @@ def _noise(problem: Problem, means: list[_Mean], block: Array) -> Noise:
 
 
 def _sparse(problem: Problem) -> sparse.csr_array:
-    """Return the covariance of all rows; for a batch, the mean."""
+    """Return the covariance of all rows (m, m) as a sparse matrix; for a batch, the mean of all problems."""
     parts = []
     for block in problem.noise.blocks:
         covariance = block.covariance.reshape(-1, *block.covariance.shape[-3:]).mean(0)
@@ -233,7 +257,7 @@ def _sparse(problem: Problem) -> sparse.csr_array:
 
 
 def _bias(bias: Bias, first: Array) -> Bias:
-    """Return the bias with the effect on the new rows, taken from one old row of each."""
+    """Return the bias with the effect on the new rows; `first` is the number of one old row of each new row."""
     # old rows of one new row have the same stations and target, so a bias affects all of them equally
     new = np.full(int(max(first.max(initial=0), bias.row.max(initial=0))) + 1, -1)
     new[first] = np.arange(len(first))

@@ -1,4 +1,8 @@
-"""Starts from Doppler shifts: a relaxation with a limited number of rows, range rows, and a known height."""
+"""Starts from Doppler shifts: a relaxation with a limited number of rows, range rows, and a known height.
+
+A *node* is a pair of epoch and station: one position and velocity of a receiver. Letters: N problems, m rows in the
+relaxation, M nodes, n shared unknowns, d coordinates.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +68,7 @@ def doppler_starts(problem: Problem) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _DopplerRows:
-    """The rows in the relaxation, for all problems of a batch: numbers (m,) or (N, m) of each.
+    """The m rows in the relaxation, for all problems of a batch.
 
     Parameters
     ----------
@@ -95,27 +99,33 @@ class _DopplerRows:
 
 
 def _gather(problem: Problem) -> _DopplerRows:
-    """Return the rows in the relaxation, with groups and coefficients."""
+    """Return the rows of all problems that the relaxation can use, with groups and coefficients."""
     shared, parts = problem.layout.n_shared, list(_parts(problem))
     row, epoch, a, b, kind, rates, ranges = (np.concatenate(values) for values in zip(*parts, strict=True))
     design = np.zeros((problem.count, shared))
     for links, start in zip(block_links(problem), problem.starts, strict=True):
-        mine = links.adds.column < shared
-        np.add.at(design, (start + links.adds.row[mine], links.adds.column[mine]), links.adds.coefficient[mine])
+        is_shared = links.adds.column < shared
+        np.add.at(
+            design, (start + links.adds.row[is_shared], links.adds.column[is_shared]), links.adds.coefficient[is_shared]
+        )
     _, group = np.unique(np.stack([kind, a, b]), axis=1, return_inverse=True)
     return _DopplerRows(row, epoch, a, b, group.reshape(-1), rates, ranges, design[row])
 
 
 def _parts(problem: Problem) -> Iterator[tuple[Array, ...]]:
-    """Yield number, epoch, stations, kind and coefficients of the rows in the relaxation."""
+    """Yield seven arrays for each kind: number, epoch, stations a and b, number of the kind, and coefficients.
+
+    The last two arrays (m, 2) are the coefficients of the rates and of the ranges. Kinds that the relaxation does not
+    use yield empty arrays.
+    """
     for i, (rows, start) in enumerate(zip(problem.rows, problem.starts, strict=True)):
         rates, ranges = _rates(rows), _ranges(rows)
         count = rows.count if rates != (0, 0) or ranges != (0, 0) else 0
         one = np.ones((count, 1))
-        cut = slice(0, count)
-        other = rows.b[cut] if MODELS[rows.kind].stations > 1 else np.full(count, -1)
-        which = np.full(count, i)
-        yield start + np.arange(count), rows.epoch[cut], rows.a[cut], other, which, one * rates, one * ranges
+        part = slice(0, count)
+        other = rows.b[part] if MODELS[rows.kind].stations > 1 else np.full(count, -1)
+        kind = np.full(count, i)
+        yield start + np.arange(count), rows.epoch[part], rows.a[part], other, kind, one * rates, one * ranges
 
 
 def _rates(rows: Rows) -> tuple[int, int]:
@@ -132,7 +142,10 @@ def _ranges(rows: Rows) -> tuple[int, int]:
 
 
 def _start(problem: Problem, i: int, every: _DopplerRows, surface: Ellipsoid | None) -> Array:
-    """Return the points (1 + 2 d, d) of one problem."""
+    """Return the points (1 + 2 d, d) of the relaxation of problem i, metres; NaN without usable rates.
+
+    `every` are the rows of all problems in the relaxation. `surface` is the ellipsoid of a known height, or None.
+    """
     one = problem.take(np.array([i]))
     z, weight = one.observed[0, every.row], np.broadcast_to(one.weight, (1, one.count))[0, every.row]
     present = (weight > 0.0) & np.isfinite(z)
@@ -140,7 +153,7 @@ def _start(problem: Problem, i: int, every: _DopplerRows, surface: Ellipsoid | N
     nowhere = np.full((1 + 2 * problem.dimension, problem.dimension), np.nan)
     if not rows.rates.any():
         return nowhere
-    pick, values, sigma = _few(one, rows, z, weight)
+    pick, values, sigma = _limit_rows(one, rows, z, weight)
     chosen = rows.take(pick)
     nodes, ranges, rates = _nodes(one, chosen)
     if sigma is None:
@@ -149,15 +162,19 @@ def _start(problem: Problem, i: int, every: _DopplerRows, surface: Ellipsoid | N
         white = whitening(covariance[None])[0]
     else:
         white = np.diag(1.0 / sigma)
-    place, speed = _moving(one, nodes, surface is not None)
+    place, speed = _motion_of_nodes(one, nodes, surface is not None)
     used = np.flatnonzero(chosen.design.any(axis=0))
     design = chosen.design[:, used]
     found = doppler(place, speed, values, white, ranges=ranges, rates=rates, design=design, surface=surface).point
     return found if surface is None else problem.frame.from_ecef(found)
 
 
-def _few(problem: Problem, rows: _DopplerRows, z: Array, weight: Array) -> tuple[Array, Array, Array | None]:
-    """Return the numbers of the rows used, their values, and standard deviations if they are normal points."""
+def _limit_rows(problem: Problem, rows: _DopplerRows, z: Array, weight: Array) -> tuple[Array, Array, Array | None]:
+    """Return the numbers of the rows used, their values, and their standard deviations; None if they are original rows.
+
+    If the relaxation is too large, rows of one group are averaged to normal points, which are independent. `z` and
+    `weight` (m,) are the values and weights of the rows.
+    """
     if _size(problem, rows) <= SIZE:
         return np.arange(len(z)), z, None
     time = problem.times[rows.epoch]
@@ -175,13 +192,16 @@ def _few(problem: Problem, rows: _DopplerRows, z: Array, weight: Array) -> tuple
 
 
 def _size(problem: Problem, rows: _DopplerRows) -> int:
-    """Return the size of the lifted matrix of the relaxation with these rows."""
+    """Return the size of the lifted matrix of the relaxation with these rows; its time grows steeply with this size."""
     _, ranges, rates = _nodes(problem, rows)
     return lifted_size(problem.dimension, ranges, rates, rows.design[:, rows.design.any(axis=0)])
 
 
 def _nodes(problem: Problem, rows: _DopplerRows) -> tuple[Array, Array, Array]:
-    """Return the nodes (M, 2) of rows, epoch and station, and the coefficients of their ranges and rates."""
+    """Return the nodes (M, 2) of rows, and the coefficients (m, M) of their ranges and of their rates.
+
+    A node is a pair (epoch, station); if no station moves, all epochs count as epoch 0.
+    """
     stations = problem.stations
     assert stations.velocity is not None
     stays = stations.position.shape[-3] == 1 and stations.velocity.shape[-3] == 1
@@ -196,8 +216,8 @@ def _nodes(problem: Problem, rows: _DopplerRows) -> tuple[Array, Array, Array]:
     return nodes, out[0], out[1]
 
 
-def _moving(problem: Problem, nodes: Array, geocentric: bool) -> tuple[Array, Array]:
-    """Return positions and velocities (M, d) of nodes."""
+def _motion_of_nodes(problem: Problem, nodes: Array, geocentric: bool) -> tuple[Array, Array]:
+    """Return positions and velocities (M, d) of nodes (M, 2), m and m/s; Earth-centred if `geocentric`."""
     stations = problem.stations
     assert stations.velocity is not None
     place, speed = (

@@ -3,6 +3,10 @@
 Given the position, rates are linear in the velocity, which is eliminated at the centre of each box. Over the box the
 lines of sight turn. For a velocity of limited size, the search bounds the change of the residuals by this turn.
 It takes boxes in the order of these bounds.
+
+An *atlas* covers all space by 2 d + 1 *pieces*: a cube around the stations, and one piece for each direction to
+infinity. A box is a piece, a centre and half-widths in the coordinates of the piece. A node is one term of the rows: a
+range, a rate or an angle as a function of the position.
 """
 
 from __future__ import annotations
@@ -54,7 +58,10 @@ def problem_at_rest(problem: Problem) -> Problem:
 
 
 def moving_starts(problem: Problem) -> Array:
-    """Return the cheapest positions (N, q, d) that a best-first search of a flat batch finds; NaN after the last.
+    """Return the cheapest positions (N, q, d), metres, that a search over boxes of all space finds; NaN after the last.
+
+    Each problem has at most q = 24 positions, far from each other, in ascending order of cost. The cost of a position
+    is the cost with the best velocity. The refinement starts from all of them.
 
     Parameters
     ----------
@@ -70,7 +77,10 @@ def moving_starts(problem: Problem) -> Array:
 
 
 def _search(costs: PositionCosts, d: int) -> Array:
-    """Return the cheapest centres (q, d) of boxes that are far apart."""
+    """Return the cheapest centres (q, d) of boxes that are far apart, metres; `costs` is the cost of one problem.
+
+    q is 0 if the cost grows without limit towards infinity: the atlas of all positions does not apply.
+    """
     kinds, data, K, w = costs.kinds, costs.data[0], costs.K[0], costs.w[0]
     with plain():
         if not reaches_infinity(kinds, K):
@@ -96,7 +106,11 @@ def _search(costs: PositionCosts, d: int) -> Array:
 
 
 def _whole(piece: int, d: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return centre and half-widths of a whole piece of an atlas."""
+    """Return centre and half-widths, three numbers each, of the box that covers a whole piece of an atlas.
+
+    With d = 2 the third numbers are zero. The first 2 d pieces reach to infinity: their last coordinate in use is from
+    0 to 1.
+    """
     at, half = [0.0] * 3, [1.0] * d + [0.0] * (3 - d)
     if piece < 2 * d:
         at[d - 1] = half[d - 1] = 0.5
@@ -104,7 +118,10 @@ def _whole(piece: int, d: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def _apart(met: list[tuple[float, tuple[float, ...]]], middle: Array) -> Array:
-    """Return the cheapest of the positions found, each far from the cheaper ones."""
+    """Return the cheapest of the positions found (q, d), each far from all cheaper ones.
+
+    `met` has pairs of cost and position. Far means a share `_APART` of the distance from the middle of the stations.
+    """
     out: list[Array] = []
     for _, place in sorted(met):
         x = np.array(place)
@@ -117,14 +134,24 @@ def _apart(met: list[tuple[float, tuple[float, ...]]], middle: Array) -> Array:
 
 
 class _MovingRows:
-    """Whitened rows, and bounds of their residuals over a box of an atlas, for the best velocity at its centre."""
+    """Whitened rows, and bounds of their residuals over a box of an atlas, for the best velocity at its centre.
+
+    The rows are ``K phi = w``, in sigma: phi are the values of the nodes, K the coefficients, w the measurements.
+    """
 
     def __init__(self, K: Array, w: Array, data: Array, rates: Array) -> None:
-        """Store whitened rows K, right sides w, and the stations of the rates."""
+        """Store the whitened rows K (m, nodes), right sides w (m,), and the stations of the rates.
+
+        `rates` flags the nodes that are rates. `data` has the numbers of the nodes; the first three are the station.
+        """
         self.K, self.w, self.rates, self.stations = K, w, rates, data[rates, :3]
 
     def bound(self, atlas: Atlas, nodes: Array, half: Array, d: int) -> tuple[float, float, int]:
-        """Return the cost at the centre, a bound of the residual over the box, and the side to halve."""
+        """Return the cost at the centre, a lower bound of the residual norm over the box, and the side to halve.
+
+        `atlas` is set to the centre of the box. `nodes` has values, slopes and remainder bounds of all nodes in the
+        box. `half` are the half-widths of the box.
+        """
         lines, slants = self._lines(atlas, d)
         length = np.linalg.norm(lines, axis=1)
         sight = lines / np.where(length > 0.0, length, 1.0)[:, None]
@@ -142,13 +169,17 @@ class _MovingRows:
         return size * size, max(low, 0.0), int(np.argmax(steep))
 
     def _lines(self, atlas: Atlas, d: int) -> tuple[Array, Array]:
-        """Return scaled lines (n, d) to the stations of the rates, and their derivatives (n, d, 3)."""
+        """Return scaled lines (n, d) from the stations of n rates to the centre, and derivatives (n, d, 3)."""
         a = ((self.stations - atlas.middle) / atlas.radius)[:, :d]
         slants = atlas.slant[:d] - a[:, :, None] * atlas.scale[1:4]
         return atlas.point[:d] - atlas.scale[0] * a, slants
 
     def _turned(self, pull: Array, sight: Array, slants: Array, length: Array, half: Array) -> float:
-        """Return the largest change of a residual over the box per metre per second, as lines of sight turn."""
+        """Return the largest change of a residual over the box per metre per second, as lines of sight turn.
+
+        `pull` (n,) are the weights of the n rates in the residual. `sight` (n, d) are unit lines of sight at the
+        centre, `length` (n,) their scaled lengths, and `slants` (n, d, 3) their derivatives.
+        """
         reach = np.sqrt(((np.abs(slants) @ half) ** 2).sum(-1))
         share = np.where(length > 0.0, reach / np.where(length > 0.0, length, 1.0), np.inf)
         near = share < 1.0  # elsewhere the station may be in the box, so that the line may have any direction

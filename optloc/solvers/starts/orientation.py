@@ -4,9 +4,12 @@ An offset of azimuths without a prior, or with a wide one, may be any part of a 
 prior means, and least squares does not correct an offset that is wrong by a right angle. Three rules find each offset:
 
 1. If the station measures targets of known position, the offset is the circular mean of ``z - h(x)`` over these rows.
-   These rows also overrule a narrow prior.
+   These rows also overrule a narrow prior. Here z is the measurement and h(x) the prediction.
 2. Else the rows of oriented stations locate the targets, and rule 1 applies to the located targets.
 3. Else no target can be located. Then a grid of turns is tried for the offset with the most rows.
+
+In a vector, NaN means that an offset or a position is not found yet. Letters: N problems, q vectors of a problem, m
+rows, n offsets, `size` numbers of a vector. Angles are in radians.
 """
 
 from __future__ import annotations
@@ -43,13 +46,13 @@ class Headings:
     Parameters
     ----------
     names : tuple of str
-        Biases with such an offset.
+        Names of the biases with offsets of this kind.
     column : int array (n,)
         Column of each offset in the vector of unknowns; all members of these biases.
     touch : array (n, m)
         Factor with which each offset enters each row: 1, -1 or 0.
     mean : array (n,)
-        Prior mean, or zero.
+        Prior mean, or zero, radians.
     known : bool array (n,)
         Whether the prior is narrow and no target of known position is measured: then the prior mean is the start.
     free : bool array (n,)
@@ -66,24 +69,24 @@ class Headings:
 
 def headings(problem: Problem) -> Headings | None:
     """Return the offsets of azimuths that may be any part of a turn, or None without such offsets."""
-    turns = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
-    marks = [i for i, motion in enumerate(problem.motions) if motion.known is not None]
-    marked = np.isin(np.concatenate([rows.target for rows in problem.rows]), marks)
+    is_azimuth = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
+    known_targets = [i for i, motion in enumerate(problem.motions) if motion.known is not None]
+    to_known_target = np.isin(np.concatenate([rows.target for rows in problem.rows]), known_targets)
     parts = []
     for bias in problem.biases:
-        count, tied = len(bias.members), any(prior.name == bias.name for prior in problem.priors)
-        wide = np.broadcast_to(True if bias.sigma is None else bias.sigma > _WIDE, (count,))
-        seen = np.bincount(bias.member, marked[bias.row], count) > 0
+        count, correlated = len(bias.members), any(prior.name == bias.name for prior in problem.priors)
+        is_wide = np.broadcast_to(True if bias.sigma is None else bias.sigma > _WIDE, (count,))
+        has_known_target = np.bincount(bias.member, to_known_target[bias.row], count) > 0
         form = form_of(bias)
         constant = form.enters == "adds" and not form.rate and form.steps is None and form.values_at is None
-        if not constant or tied or not (wide | seen).any() or not turns[bias.row].all():
+        if not constant or correlated or not (is_wide | has_known_target).any() or not is_azimuth[bias.row].all():
             continue
-        touch = np.zeros((count, problem.count))
-        touch[bias.member, bias.row] = bias.coefficient
+        factor = np.zeros((count, problem.count))
+        factor[bias.member, bias.row] = bias.coefficient
         slot, _ = problem.layout.find(bias.name)
         mean = np.broadcast_to(bias.mean if bias.sigma is not None else 0.0, (count,))
-        known, free = ~(wide | seen), np.full(count, bias.sigma is None)
-        parts.append((slot.start + np.arange(count), touch, mean, known, free, bias.name))
+        known, free = ~(is_wide | has_known_target), np.full(count, bias.sigma is None)
+        parts.append((slot.start + np.arange(count), factor, mean, known, free, bias.name))
     if not parts:
         return None
     *arrays, names = zip(*parts, strict=True)
@@ -106,12 +109,12 @@ def oriented_starts(problem: Problem, found: Headings, start: Callable[[Problem]
     x[..., _states(problem)] = np.nan
     x[..., found.column] = np.where(found.known, found.mean, np.nan)
     x, grids = _orient(problem, found, x), 0
-    while (lacking := _lacking(found, x)).any():
+    while (lacking := _is_missing(found, x)).any():
         located = _orient(problem, found, _locate(problem, found, x, start))
-        if _lacking(found, located).sum() < lacking.sum():
+        if _is_missing(found, located).sum() < lacking.sum():
             x = located
         elif grids < _GRIDS:
-            x, grids = _turn(problem, found, x, lacking), grids + 1
+            x, grids = _with_turns(problem, found, x, lacking), grids + 1
         else:
             break
     out = _locate(problem, found, x, start)
@@ -134,56 +137,64 @@ def unwind(found: Headings, x: Array) -> Array:
 
 
 def _states(problem: Problem) -> Array:
-    """Return the columns of the states of all targets that are not known."""
-    every, count, found = np.arange(problem.epochs), len(problem.motions), [np.zeros(0, dtype=int)]
+    """Return the columns, in a vector of unknowns, of the states of all targets that are not known."""
+    epochs, count, found = np.arange(problem.epochs), len(problem.motions), [np.zeros(0, dtype=int)]
     for i, motion in enumerate(problem.motions):
         names = () if motion.known is not None else state_names(i, count, motion.order)
-        found += [columns(problem.layout, name, every).ravel() for name in names]
+        found += [columns(problem.layout, name, epochs).ravel() for name in names]
     return np.unique(np.concatenate(found))
 
 
 def _located(problem: Problem, x: Array) -> Array:
-    """Return a flag for each row (N, q, m) whose target has a position in vectors (N, q, size)."""
+    """Return flags (N, q, m) of rows whose target has a known position, or a position in vectors x (N, q, size)."""
     count, out = len(problem.motions), np.ones((*x.shape[:2], problem.count), dtype=bool)
     target, epoch = np.concatenate([rows.target for rows in problem.rows]), problem.epoch
     for i, motion in enumerate(problem.motions):
-        own = np.flatnonzero(target == i)
+        rows_of_target = np.flatnonzero(target == i)
         for name in () if motion.known is not None else state_names(i, count, motion.order):
-            out[..., own] &= np.isfinite(x[..., columns(problem.layout, name, epoch[own])]).all(-1)
+            out[..., rows_of_target] &= np.isfinite(x[..., columns(problem.layout, name, epoch[rows_of_target])]).all(
+                -1
+            )
     return out
 
 
 def _orient(problem: Problem, found: Headings, x: Array) -> Array:
-    """Return vectors (N, q, size) whose offsets are circular means over the rows of targets that have a position."""
+    """Return vectors (N, q, size) with circular means as offsets, over the rows of targets that have a position.
+
+    Offsets with a value, and offsets without such rows, do not change.
+    """
     size, q = x.shape[:2]
     part, value = problem.take(np.repeat(np.arange(size), q)), x[..., found.column]
     bare = x.copy()
     bare[..., found.column] = 0.0
     bare = np.nan_to_num(bare)
-    left = (part.observed - predict(part, bare.reshape(size * q, -1))).reshape(size, q, -1)
+    residual = (part.observed - predict(part, bare.reshape(size * q, -1))).reshape(size, q, -1)
     weight = np.broadcast_to(part.weight / variances(part.noise, part.count), (size * q, part.count))
-    usable = _located(problem, x) & (weight.reshape(size, q, -1) > 0.0) & np.isfinite(left)
-    left = np.where(usable, left, 0.0) - np.nan_to_num(value) @ found.touch
+    usable = _located(problem, x) & (weight.reshape(size, q, -1) > 0.0) & np.isfinite(residual)
+    residual = np.where(usable, residual, 0.0) - np.nan_to_num(value) @ found.touch
     # a row with two offsets determines one of them if the other is known
-    single = np.isnan(value).astype(float) @ np.abs(found.touch) == 1.0
-    share = np.where(usable & single, weight.reshape(size, q, -1), 0.0)
+    one_unknown = np.isnan(value).astype(float) @ np.abs(found.touch) == 1.0
+    share = np.where(usable & one_unknown, weight.reshape(size, q, -1), 0.0)
     sine, cosine = (
-        (share * part_of(left)) @ sign.T for part_of, sign in ((np.sin, found.touch), (np.cos, np.abs(found.touch)))
+        (share * part_of(residual)) @ sign.T for part_of, sign in ((np.sin, found.touch), (np.cos, np.abs(found.touch)))
     )
-    seen = share @ np.abs(found.touch).T > 0.0
+    has_rows = share @ np.abs(found.touch).T > 0.0
     mean = found.mean + wrap(np.arctan2(sine, cosine) - found.mean)
     out = x.copy()
-    out[..., found.column] = np.where(np.isnan(value) & seen, mean, value)
+    out[..., found.column] = np.where(np.isnan(value) & has_rows, mean, value)
     return out
 
 
-def _lacking(found: Headings, x: Array) -> Array:
-    """Return a flag for each offset (N, n) that has no value in any of the vectors (N, q, size)."""
+def _is_missing(found: Headings, x: Array) -> Array:
+    """Return flags (N, n) of offsets that have no value in any of the vectors x (N, q, size)."""
     return np.asarray(np.isnan(x[..., found.column]).all(1))
 
 
 def _locate(problem: Problem, found: Headings, x: Array, start: Callable[[Problem], Array]) -> Array:
-    """Return starting vectors (N, q c, size) from the rows whose offsets have a value in x (N, q, size)."""
+    """Return starting vectors (N, q c, size) from the rows whose offsets have a value in x (N, q, size).
+
+    `start` maps problems with offsets about zero to c starting vectors each.
+    """
     size, q = x.shape[:2]
     value = x[..., found.column].reshape(size * q, -1)
     part = problem.take(np.repeat(np.arange(size), q))
@@ -202,8 +213,11 @@ def _locate(problem: Problem, found: Headings, x: Array, start: Callable[[Proble
     return out.reshape(size, -1, out.shape[-1])
 
 
-def _turn(problem: Problem, found: Headings, x: Array, lacking: Array) -> Array:
-    """Return vectors (N, q turns, size) with a grid of turns for the unknown offset that has the most rows."""
+def _with_turns(problem: Problem, found: Headings, x: Array, lacking: Array) -> Array:
+    """Return vectors (N, q turns, size) with a grid of turns for the unknown offset that has the most rows.
+
+    `lacking` (N, n) flags the unknown offsets. A problem without such an offset keeps its vectors, repeated.
+    """
     rows = np.broadcast_to(problem.weight > 0.0, (len(x), problem.count)) @ np.abs(found.touch).T
     chosen = np.argmax(np.where(lacking, rows, -1.0), axis=1)
     turns = 2.0 * np.pi * np.arange(_TURNS) / _TURNS

@@ -31,7 +31,7 @@ _STEPS = np.array([-12.0, -6.0, -3.0, -1.5, 1.5, 3.0, 6.0, 12.0])
 
 
 def squared_range_starts(problem: Problem, pick: Pick) -> Array:
-    """Return squared-range candidates (N, q, d) of a flat batch with one static target; NaN in empty slots.
+    """Return squared-range candidates (N, q, d), metres, of a flat batch with one static target; NaN in empty slots.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def along_the_valley(problem: Problem, position: Array, covariance: Array) -> Ar
 
 
 def subarray_starts(problem: Problem) -> Array:
-    """Return the candidates (N, q, d) of all arrays that lack one station; NaN in empty slots."""
+    """Return the candidates (N, q, d), metres, of all arrays that lack one station; NaN in empty slots."""
     parts = []
     for touched in rows_of_stations(problem):
         weight = np.where(touched, 0.0, np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count)))
@@ -113,7 +113,7 @@ def spread_of(problem: Problem) -> tuple[Array, Array]:
 
 
 def distance_of(problem: Problem, position: Array) -> Array:
-    """Return the distances of positions (N, ..., d) from the stations, in units of the spread of the stations."""
+    """Return the distances (N, ...) of positions (N, ..., d) from the centre of the stations, in their spreads."""
     centre, spread = spread_of(problem)
     extra = (1,) * (position.ndim - 2)
     # a run to infinity may overflow, and infinity is then the right distance
@@ -192,15 +192,18 @@ def height_starts(problem: Problem, *, relax: bool = False) -> Array:
     # height
     for count, mask in ((3, found.free), (2, ~found.free)):
         subsets = _subsets(place, found, mask, count)
-        met = _relax if relax and count == 3 else _intersect
-        parts += [met(place, found, nodes, surface, mask & (nodes[:, 0] >= 0)) for nodes in subsets]
+        method = _relax if relax and count == 3 else _intersect
+        parts += [method(place, found, nodes, surface, mask & (nodes[:, 0] >= 0)) for nodes in subsets]
     if not parts:
         return np.full((size, 0, 3), np.nan)
     return problem.frame.from_ecef(np.concatenate(parts, axis=1) * WGS84_A)
 
 
 def _subsets(place: Array, found: Ranges, mask: Array, count: int) -> list[Array]:
-    """Return up to six sets of nodes (N, count) for each problem, the widest first; -1 in empty slots."""
+    """Return up to six sets of stations for each problem, the widest first: arrays (N, count), -1 in empty slots.
+
+    `place` (N, s, 3) are the stations with ranges, `mask` (N,) flags the problems, and `count` is the size of a set.
+    """
     nodes = place.shape[1]
     if not mask.any() or nodes < count:
         return []
@@ -224,7 +227,12 @@ def _subsets(place: Array, found: Ranges, mask: Array, count: int) -> list[Array
 
 
 def _relax(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:
-    """Return the points (N, 1, 3) of the reduced relaxation, nearest to the point below the stations (Earth radii)."""
+    """Return the points (N, 1, 3) of the reduced relaxation, in Earth radii: nearest to the point below the stations.
+
+    `place` (N, s, 3) are the stations with ranges, in Earth radii. `nodes` (N, 3) are the numbers of the stations to
+    use. `surface` is the ellipsoid of the height. `mask` (N,) flags the problems to solve, and NaN is the result for
+    others.
+    """
     from formulations.range_height_conic import lift
 
     out = np.full((len(place), 1, 3), np.nan)
@@ -233,29 +241,35 @@ def _relax(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: 
     )
 
     def relax(i: int) -> None:
-        own = Ellipsoid(whole.shape[i], whole.centre[i])
+        ellipsoid_of_one = Ellipsoid(whole.shape[i], whole.centre[i])
         stations, offset = place[i, nodes[i]], found.offset[i, nodes[i]] / WGS84_A
         above = stations.mean(0)
         # stations above the Earth measure targets below them, so of two solutions the one on their side is taken
-        below = own.centre + (above - own.centre) / np.sqrt(own.polar(above, above))
-        out[i, 0] = lift(stations, found.sign[i, nodes[i]].astype(float), offset, own, below).x
+        below = ellipsoid_of_one.centre + (above - ellipsoid_of_one.centre) / np.sqrt(
+            ellipsoid_of_one.polar(above, above)
+        )
+        out[i, 0] = lift(stations, found.sign[i, nodes[i]].astype(float), offset, ellipsoid_of_one, below).x
 
     map_on_threads(relax, np.flatnonzero(mask & np.isfinite(whole.shape).all((-1, -2))).tolist(), least=WORTH)
     return out
 
 
 def _intersect(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:
-    """Return the intersections of the ellipsoid with the ranges of some nodes, (N, 4, 3) in Earth radii."""
+    """Return the intersections of the ellipsoid with the ranges of some stations, (N, 4, 3) in Earth radii.
+
+    The arguments are as in `_relax`, with two known ranges or three ranges with a common unknown. NaN in empty
+    slots.
+    """
     items = np.flatnonzero(mask)
     out = np.full((len(place), 4, 3), np.nan)
     pick = items[:, None]
     stations, offset = place[pick, nodes[items]], found.offset[pick, nodes[items]] / WGS84_A
-    own = Ellipsoid(
+    ellipsoids = Ellipsoid(
         np.broadcast_to(surface.shape, (len(place), 3, 3))[items],
         np.broadcast_to(surface.centre, (len(place), 3))[items],
     )
     if nodes.shape[1] == 3:
-        out[items] = locate(stations, found.sign[pick, nodes[items]], offset, own).x
+        out[items] = locate(stations, found.sign[pick, nodes[items]], offset, ellipsoids).x
     else:
-        out[items] = locate_by_ranges(stations, offset, own).x
+        out[items] = locate_by_ranges(stations, offset, ellipsoids).x
     return out

@@ -1,6 +1,9 @@
 """Starts for a whole run: minima of its block averages.
 
 The minima are reached from a closed form or a relaxation, from mirror images, and from circles around the stations.
+
+Letters: N runs, C candidates of a run, k epochs or blocks, s stations, d coordinates, q biases, `size` numbers of a
+parameter vector. A *pool* is a pair here: vectors (N, C, size) and costs (N, C), the cheapest first.
 """
 
 from __future__ import annotations
@@ -56,8 +59,8 @@ _ANYWHERE = (0.3, 0.8, 1.5, 5.0)
 _STEPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)
 # Share of the distance above which the error of a fix of a whole run allows another minimum within a few sigma, which
 # block averages merge with it. There are few steps, since each is refined on all epochs.
-_BLURRED = 2e-3
-_BESIDE = (-6.0, -2.0, 2.0, 6.0)
+_WEAK_WHOLE = 2e-3
+_WHOLE_STEPS = (-6.0, -2.0, 2.0, 6.0)
 # Images of the best minimum: turns by eighths of a circle about the axis of the stations. Images of new minima follow
 # as long as they lower the cost by more than two refinements of one minimum differ. Of 1 800 targets of any speed, with
 # stations in space, 3 were lost with the mirror image only. Rounds normally end earlier than the limit.
@@ -88,7 +91,10 @@ def run_starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Ar
 
 
 def group_alike(problem: Problem) -> list[Array]:
-    """Return the item numbers of a flat batch in groups with the same rows, which share their block averages."""
+    """Return groups of the runs of a flat batch that have the same rows, as arrays of their numbers.
+
+    The runs of a group share their block averages.
+    """
     present = np.broadcast_to(problem.weight > 0.0, (problem.batch_shape[0], problem.count))
     if problem.weight.ndim == 1 or (present == present[:1]).all():
         return [np.arange(len(present))]
@@ -97,11 +103,11 @@ def group_alike(problem: Problem) -> list[Array]:
 
 
 def _start_group(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
-    """Return starting vectors (N, C, size) of runs that have the same rows."""
+    """Return starting vectors (N, C, size) of runs that have the same rows; `begin` is as of `run_starts`."""
     # on the averages a step is cheap, so every candidate is refined there; few are refined on all epochs
     straight = _straighten(problem, local=False)
     blocks = average_blocks(straight, BLOCKS)
-    x = _begin(blocks, begin)
+    x = _starts_of_blocks(blocks, begin)
     x = _around(blocks, _ANYWHERE) if x is None else x
     pool = _with_images(blocks, _minima(blocks, x))
     # circles and valley give most of the candidates, so they are used only for doubtful minima
@@ -114,8 +120,11 @@ def _start_group(problem: Problem, begin: Callable[[Problem], Array | None]) -> 
     return x if straight is problem else _bend(problem, straight, x)
 
 
-def _begin(blocks: Problem, begin: Callable[[Problem], Array | None]) -> Array | None:
-    """Return starting vectors of blocks; for the start, biases that walk become offsets that drift."""
+def _starts_of_blocks(blocks: Problem, begin: Callable[[Problem], Array | None]) -> Array | None:
+    """Return starting vectors (N, C, size) of blocks; None if `begin` does not apply.
+
+    For the start, biases that walk become offsets that drift.
+    """
     steady = _straighten(blocks, local=True)
     x = begin(steady)
     return x if x is None or steady is blocks else _bend(blocks, steady, x)
@@ -136,16 +145,19 @@ def _straighten(problem: Problem, local: bool) -> Problem:
 
 
 def _bend(problem: Problem, straight: Problem, x: Array) -> Array:
-    """Return vectors (N, C, size) of a problem from vectors of its form with straight biases; NaN stay NaN."""
+    """Return vectors (N, C, size) of a problem from vectors x of its form with straight biases; NaN vectors stay NaN.
+
+    `straight` is the result of `_straighten` for the problem.
+    """
     layout, out = problem.layout, np.zeros((*x.shape[:2], problem.layout.size))
     moments = {bias.name: at(bias) for bias in problem.biases if (at := form_of(bias).values_at) is not None}
     for slot in layout.shared:
-        part, own = slice(slot.start, slot.start + slot.size), straight.layout.take(x, slot.name)
-        if slot.name in moments and own.shape[-1] != slot.size:
+        part, value_in = slice(slot.start, slot.start + slot.size), straight.layout.take(x, slot.name)
+        if slot.name in moments and value_in.shape[-1] != slot.size:
             # a coefficient of a spline is the value of the straight line at its time
             slope = straight.layout.take(x, rate_name(slot.name))[..., None]
-            own = own[..., None] + slope * (moments[slot.name] - problem.origin)
-        out[..., part] = own.reshape(*x.shape[:2], -1)
+            value_in = value_in[..., None] + slope * (moments[slot.name] - problem.origin)
+        out[..., part] = value_in.reshape(*x.shape[:2], -1)
     local = out[..., layout.n_shared :].reshape(*x.shape[:2], layout.epochs, layout.n_local)
     since = (problem.times - problem.origin)[:, None]
     for bias in walks(problem):
@@ -164,7 +176,7 @@ def _bend(problem: Problem, straight: Problem, x: Array) -> Array:
 
 
 def _minima(blocks: Problem, x: Array) -> tuple[Array, Array]:
-    """Return the refined starts (N, C, size), the cheapest first, and their costs (N, C), infinite for failures."""
+    """Return the refined starts (N, C, size), the cheapest first, and their costs (N, C); infinite for failures."""
     cost, out = np.full(x.shape[:2], np.inf), x.copy()
     item, slot = np.nonzero(np.isfinite(x).all(-1))
     if len(item):
@@ -176,10 +188,10 @@ def _minima(blocks: Problem, x: Array) -> tuple[Array, Array]:
 
 
 def _with_images(blocks: Problem, pool: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return minima, and the minima that images of the best one lead to, repeated for each better minimum.
+    """Return a pool of minima, extended by the minima that images of the best minimum lead to.
 
-    Images are mirror images in the plane of the stations. In space, if the target may have any speed, turns about the
-    axis of the stations are images too.
+    The images of a better minimum follow in turn. Images are mirror images in the plane of the stations. In space, if
+    the target may have any speed, turns about the axis of the stations are images too.
     """
     turns, items = blocks.dimension == 3 and blocks.motions[0].order > 0, np.arange(len(pool[0]))
     for _ in range(_ROUNDS):
@@ -195,19 +207,19 @@ def _with_images(blocks: Problem, pool: tuple[Array, Array]) -> tuple[Array, Arr
 
 
 def _merge(one: tuple[Array, Array], two: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return the union of two sets of minima, the cheapest first."""
+    """Return the union of two pools of minima of the same runs, the cheapest first."""
     x, cost = (np.concatenate(parts, axis=1) for parts in zip(one, two, strict=True))
     return _sort(x, cost)
 
 
 def _sort(x: Array, cost: Array) -> tuple[Array, Array]:
-    """Return minima (N, C, size) and their costs (N, C), the cheapest first."""
+    """Return minima (N, C, size) and their costs (N, C), sorted by cost."""
     order = np.argsort(cost, axis=1, kind="stable")
     return np.take_along_axis(x, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
 
 
 def _scatter(found: tuple[Array, Array], items: Array, count: int) -> tuple[Array, Array]:
-    """Return minima of some items as arrays for all `count` items, with empty slots for the others."""
+    """Return a pool for all `count` runs from the minima of runs `items`; the other runs have empty slots."""
     x = np.full((count, *found[0].shape[1:]), np.nan)
     cost = np.full((count, found[1].shape[1]), np.inf)
     x[items], cost[items] = found
@@ -228,7 +240,7 @@ def _is_settled(blocks: Problem, pool: tuple[Array, Array]) -> Array:
 
 
 def _covariance(blocks: Problem, x: Array) -> Array:
-    """Return the covariance of the position (N, d, d) in units of the squared spread of the stations."""
+    """Return the covariance of the position (N, d, d), in squared spreads of the stations; NaN if unknown."""
     usable = np.asarray(np.isfinite(x).all(-1))
     slot, _ = blocks.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
@@ -245,7 +257,10 @@ def _length(blocks: Problem) -> Array:
 
 
 def _around(blocks: Problem, radii: tuple[float, ...]) -> Array:
-    """Return vectors (N, C, size) of targets at rest on circles around the stations, and above and below."""
+    """Return vectors (N, C, size) of targets at rest on circles around the stations, and above and below them.
+
+    `radii` are in spreads of the stations.
+    """
     d, centre = blocks.dimension, spread_of(blocks)[0]
     angle = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
     # in space circles are level and the poles (up and down) are added; in the plane there are no poles
@@ -260,7 +275,7 @@ def _around(blocks: Problem, radii: tuple[float, ...]) -> Array:
 
 
 def _valley(blocks: Problem, x: Array) -> Array:
-    """Return vectors (N, C, size) along the longest axis of the error ellipsoid of the best minimum."""
+    """Return vectors (N, C, size) along the longest axis of the error ellipsoid of the best minimum x (N, size)."""
     return _along(blocks, x, _covariance(blocks, x) * _length(blocks)[:, None, None] ** 2, _STEPS)
 
 
@@ -280,8 +295,8 @@ def step_beside(problem: Problem, x: Array, covariance: Array) -> Array:
     """
     far = distance_of(problem, problem.layout.take(x, "position")) * _length(problem)
     with np.errstate(invalid="ignore"):
-        weak = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)) > _BLURRED * far
-    return np.where(weak[:, None, None], _along(problem, x, covariance, _BESIDE), np.nan)
+        weak = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)) > _WEAK_WHOLE * far
+    return np.where(weak[:, None, None], _along(problem, x, covariance, _WHOLE_STEPS), np.nan)
 
 
 def _along(problem: Problem, x: Array, covariance: Array, steps: tuple[float, ...]) -> Array:
@@ -310,7 +325,7 @@ def _best(blocks: Problem, x: Array, cost: Array) -> Array:
 
 
 def _at_one_place(blocks: Problem, x: Array, y: Array) -> Array:
-    """Return flags (N,) of vector pairs with equal positions, relative to the spread of the stations."""
+    """Return flags (N,) of vectors x and y (N, size) with equal positions, within 1e-4 spreads of the stations."""
     apart = blocks.layout.take(x, "position") - blocks.layout.take(y, "position")
     return np.asarray(np.sqrt((apart**2).sum(-1)) < _SAME * _length(blocks))
 
@@ -355,8 +370,9 @@ def _map_courses(blocks: Problem, x: Array, maps: Array) -> Array:
     blocks : Problem
         N runs.
     x : array (N, C, size)
+        Vectors with the courses to map.
     maps : array (N or 1, m, epochs or 1, d, d)
-        Linear maps. If the maps of all epochs are equal, the result is a course; else it is the nearest polynomial.
+        m linear maps. If a map is equal at all epochs, the result is a course; else it is the nearest polynomial.
     """
     order = blocks.motions[0].order
     # (k, order + 1): the course at epoch k is the sum of state_j t^j / j!
@@ -394,7 +410,7 @@ class RegistrationRun:
     column : int array (q,)
         Column of each bias in the shared unknowns.
     origin : array (d,)
-        Metres.
+        Origin of the scaled coordinates, metres.
     length, duration : float
         Units, metres and seconds.
     """
@@ -422,7 +438,7 @@ def closed_form(problem: Problem) -> Array | None:
 
 
 def place_states(problem: Problem, run: RegistrationRun, state: Array, bias: Array) -> Array:
-    """Return vectors (N, C, size) from states (N, C, order + 1, d) and biases (N, C, q) in the units of a run."""
+    """Return vectors (N, C, size) from states (N, C, order + 1, d) and biases (N, C, q), both in the units of a run."""
     state = state * (run.length / run.duration ** np.arange(state.shape[2])[:, None])
     state[:, :, 0] += run.origin
     x = np.repeat(vectors(problem, None)[:, None], state.shape[1], axis=1)
@@ -482,7 +498,11 @@ def _places(problem: Problem, station: Array | slice = slice(None)) -> Array:
 
 
 def _whiten(found: Ranges, others: Array, present: Array) -> Array:
-    """Return whitening matrices (N k, s - 1, s - 1) of the offsets; zero for stations without one."""
+    """Return whitening matrices (N k, s - 1, s - 1) of the offsets, 1/metres; zero for stations without an offset.
+
+    `others` are the numbers of the s - 1 stations without the reference, and `present` (N k, s - 1) flags their
+    offsets.
+    """
     covariance = found.covariance[:, others][:, :, others]
     return linalg.whitening(np.where(present[:, :, None] & present[:, None, :], covariance, 0.0))
 
@@ -498,9 +518,9 @@ def _effects(problem: Problem, found: Ranges) -> tuple[Array, Array]:
         # a batch with one item per bias: its rows contain one unit of the bias
         zero = tuple(replace(rows, correction=np.zeros(rows.count)) for rows in problem.rows)
         single = replace(problem.take(np.zeros(1, dtype=int)), rows=zero)
-        same = ranges(split_epochs(single.with_rows(z=unit)).flat())
-        assert same is not None
-        effect = same.offset.reshape(effect.shape)
+        offsets = ranges(split_epochs(single.with_rows(z=unit)).flat())
+        assert offsets is not None
+        effect = offsets.offset.reshape(effect.shape)
     return column, effect
 
 
@@ -517,7 +537,7 @@ def _units(problem: Problem) -> tuple[Array, Array]:
 
 
 def _prior(problem: Problem, column: Array) -> tuple[Array, Array]:
-    """Return prior means and standard deviations (q,) of some shared unknowns; infinite without a prior."""
+    """Return prior means and standard deviations (q,) of unknowns in columns (q,); infinite without a prior."""
     mean, information = np.zeros(problem.layout.n_shared), np.zeros(problem.layout.n_shared)
     for name, value, precision in prior_parts(problem):
         slot, shared = problem.layout.find(name)
@@ -575,6 +595,6 @@ def relax_run(problem: Problem) -> Array | None:
     width = max(1, *(len(pairs) for pairs in found))
     state, delta = np.full((size, width, order + 1, d), np.nan), np.zeros((size, width, len(run.column)))
     for i, pairs in enumerate(found):
-        for j, (target, own) in enumerate(pairs):
-            state[i, j], delta[i, j] = target, own
+        for j, (target, bias_of) in enumerate(pairs):
+            state[i, j], delta[i, j] = target, bias_of
     return place_states(problem, run, state, delta)

@@ -49,9 +49,9 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         for j, name in enumerate(names):
             slot, shared = problem.layout.find(name)
             if shared:
-                own, found = slice(slot.start, slot.start + slot.size), state[:, 0, j]
+                columns, found = slice(slot.start, slot.start + slot.size), state[:, 0, j]
                 usable = np.isfinite(found) | (name not in known)  # otherwise the prior mean, which is in x, is kept
-                x[:, 0, own] = np.where(usable, found, x[:, 0, own])
+                x[:, 0, columns] = np.where(usable, found, x[:, 0, columns])
                 continue
             for k in range(problem.epochs):
                 start = n + k * length + slot.start
@@ -60,27 +60,27 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
 
 
 def _isolate(problem: Problem, target: int) -> Problem:
-    """Return the problem of one target: its rows, without other unknowns."""
+    """Return the problem of one target: its rows and its constraints that help a start, without other unknowns."""
     problem = without_biases(problem)
     problem = _take_rows(problem, target) if len(problem.motions) > 1 else problem
     motion = problem.motions[target]
-    # A constraint at the reference time may not hold at other times, but a known height is a good start.
+    # A constraint at the reference time may not apply at other times, but a known height is a good start.
     constraints = tuple(
         replace(c, target=0)
         for c in problem.constraints
-        if c.target == target and (motion.order == 0 or ((is_exact(c) or _along(c)) and not needs_velocity(c)))
+        if c.target == target and (motion.order == 0 or ((is_exact(c) or _applies_along(c)) and not needs_velocity(c)))
     )
     return replace(problem, motions=(motion,), constraints=constraints)
 
 
-def _along(constraint: Band | Polygon) -> bool:
-    """Return whether a constraint holds along the whole course."""
+def _applies_along(constraint: Band | Polygon) -> bool:
+    """Return whether a constraint applies along the whole course, not at the reference time only."""
     return isinstance(constraint, Band) and constraint.along
 
 
 def _take_rows(problem: Problem, target: int) -> Problem:
-    """Return the problem with the rows of one target, which becomes the first."""
-    own = [np.flatnonzero(rows.target == target) for rows in problem.rows]
+    """Return the problem with the rows of one target only, which becomes target 0."""
+    rows_of = [np.flatnonzero(rows.target == target) for rows in problem.rows]
     rows = [
         replace(
             r,
@@ -92,15 +92,15 @@ def _take_rows(problem: Problem, target: int) -> Problem:
             weight=r.weight[..., i],
             correction=r.correction[..., i],
         )
-        for r, i in zip(problem.rows, own, strict=True)
+        for r, i in zip(problem.rows, rows_of, strict=True)
         if len(i)
     ]
-    kept = np.concatenate([start + i for start, i in zip(problem.starts, own, strict=True)])
+    kept = np.concatenate([start + i for start, i in zip(problem.starts, rows_of, strict=True)])
     return replace(problem, rows=tuple(rows), noise=_take_noise(problem.noise, kept, problem.count))
 
 
 def _take_noise(noise: Noise, kept: Array, count: int) -> Noise:
-    """Return the noise of some of the rows, which get new numbers in their order."""
+    """Return the noise of the rows `kept` among `count` rows; they get new numbers in their order."""
     # new number of each row; -1 for dropped rows
     number = np.full(count, -1)
     number[kept] = np.arange(len(kept))
@@ -113,13 +113,16 @@ def _take_noise(noise: Noise, kept: Array, count: int) -> Noise:
             if not len(inside):
                 continue
             groups = np.flatnonzero((present == pattern).all(1))
-            own = block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., groups, :, :]
-            blocks.append(Block(number[block.row[groups][:, inside]], own[..., inside[:, None], inside]))
+            covariance = block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., groups, :, :]
+            blocks.append(Block(number[block.row[groups][:, inside]], covariance[..., inside[:, None], inside]))
     return group(blocks)
 
 
 def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
-    """Return the state (N, k or 1, order + 1, d) of the only target; NaN without a fix."""
+    """Return the state (N, k or 1, order + 1, d) of the only target: position and derivatives; NaN without a fix.
+
+    `fixed` maps problems of one position to their fixes.
+    """
     motion, size = problem.motions[0], problem.batch_shape[0]
     if one_position(problem):
         position = fixed(problem_at_rest(problem)).position
@@ -127,30 +130,30 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         state[:, 0, 0] = position
         return state
     # rows of single stations give one fix, measured at any time, if the target is at rest
-    if _meets(problem):
+    if _can_merge_epochs(problem):
         return fixed(_merge_epochs(problem)).position[:, None, None]
     # closed forms of whole courses come first: a single epoch need not determine a position
-    ahead = course_starts(problem) if motion.span == "run" else None
-    if ahead is not None and np.isfinite(ahead).all():
-        return ahead[:, None]
-    seen = course_states(problem) if motion.span == "run" else None
-    if seen is not None and np.isfinite(seen).all():
-        return seen[:, None]
+    bistatic = course_starts(problem) if motion.span == "run" else None
+    if bistatic is not None and np.isfinite(bistatic).all():
+        return bistatic[:, None]
+    from_angles = course_states(problem) if motion.span == "run" else None
+    if from_angles is not None and np.isfinite(from_angles).all():
+        return from_angles[:, None]
     # else epoch by epoch, and a polynomial through the fixes: inaccurate for weak epochs, but good enough as a start
-    free = by_epoch(without_epoch_correlation(replace(problem, motions=(Motion(span="epoch", rise=motion.rise),))))
-    fix = fixed(free.flat()).reshape((size, problem.epochs))
+    epochs = by_epoch(without_epoch_correlation(replace(problem, motions=(Motion(span="epoch", rise=motion.rise),))))
+    fix = fixed(epochs.flat()).reshape((size, problem.epochs))
     if motion.span == "epoch":
         state = np.zeros((size, problem.epochs, motion.order + 1, problem.dimension))
         state[:, :, 0] = _fill_gaps(fix.position)
         return state
     state = _polynomial(fix, elapsed(problem, 0), motion.order)
     # the course from angles is better, since it uses all epochs
-    if seen is not None:
-        state = np.where(np.isfinite(seen).all((-2, -1), keepdims=True), seen, state)
+    if from_angles is not None:
+        state = np.where(np.isfinite(from_angles).all((-2, -1), keepdims=True), from_angles, state)
     return state[:, None]
 
 
-def _meets(problem: Problem) -> bool:
+def _can_merge_epochs(problem: Problem) -> bool:
     """Return whether the rows of one target at rest may be merged into one epoch: each row has one station only."""
     motion = problem.motions[0]
     alone = all(MODELS[rows.kind].stations < 2 for rows in problem.rows)
@@ -158,7 +161,10 @@ def _meets(problem: Problem) -> bool:
 
 
 def _merge_epochs(problem: Problem) -> Problem:
-    """Return the problem of a target at rest as one epoch: every position of a station becomes a station."""
+    """Return the problem of a target at rest as one epoch: every position of a station becomes a station.
+
+    Then one fix uses the rows of all epochs.
+    """
     s = problem.stations
     nodes = [np.where(rows.a < 0, -1, rows.epoch * s.count + rows.a) for rows in problem.rows]
     used = np.unique(np.concatenate(nodes))
@@ -193,7 +199,10 @@ def _fill_gaps(position: Array) -> Array:
 
 
 def _polynomial(fix: Fix, since: Array, order: int) -> Array:
-    """Return the state (N, order + 1, d) of the polynomial nearest to the fixes (N, k), weighted by their variances."""
+    """Return the state (N, order + 1, d) of the polynomial nearest to the fixes (N, k), weighted by their variances.
+
+    `since` (k,) are seconds since the reference time. NaN if too few epochs have a fix.
+    """
     variance = np.trace(fix.covariance(), axis1=-2, axis2=-1)
     good = fix.answered & np.isfinite(variance) & np.isfinite(fix.position).all(-1)
     # a fix has the weight of its variance; epochs without a fix have weight zero

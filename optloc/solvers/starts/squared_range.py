@@ -1,4 +1,12 @@
-"""From rows of any kind to squared-range rows: linear in (x, t) on a cone, or in (x, |x|^2) on a paraboloid."""
+"""From rows of any kind to squared-range rows: linear in (x, t) on a cone, or in (x, |x|^2) on a paraboloid.
+
+If all ranges share an unknown, t is the range to the reference station, and ``t = |x|`` is a cone. If ranges are known,
+the last unknown is |x|^2. Both surfaces are quadrics.
+
+Letters: N problems, m rows, s stations with ranges, n = d + 1 unknowns y, d coordinates, q points of a problem. The
+range of station i is r_i = c_i + sign_i t. A squared-range problem is ``rows . y = right`` in least squares, with y on
+the quadric: rows (N, m, n), right (N, m).
+"""
 
 from __future__ import annotations
 
@@ -96,7 +104,10 @@ def candidates(problem: Problem, found: Ranges | None, pick: Pick) -> Array:
 
 
 def _pick(squared: Squared, distance: Array, point: Array | None, pick: Pick) -> Array:
-    """Return the picked points (N, q, d), scaled, of the rows weighted by distances (N, s)."""
+    """Return the picked points (N, q, d), scaled, of the rows weighted by distances (N, s).
+
+    `point` (N, d) is an approximate position for the weights of other rows; None means one scale away.
+    """
     rows, right = _weigh(squared, distance, point)
     # with bearings only, no row contains the last coordinate, and the quadric would add false information
     linear = squared.quadric.shape == "paraboloid" and not rows[..., -1].any()
@@ -105,7 +116,10 @@ def _pick(squared: Squared, distance: Array, point: Array | None, pick: Pick) ->
 
 
 def minimum(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
-    """Return the exact minimisers (N, 1 or 2, n) of squared-range problems, and flags; a minimal set has two."""
+    """Return the exact minimisers (N, 1 or 2, n) of squared-range problems, and flags (N, 1 or 2) of valid ones.
+
+    A minimal set of rows has two points that fit equally well.
+    """
     positive = quadric.shape == "cone"
     y, ok = minimiser(rows, right, quadric, positive=positive)
     # with one row less than unknowns, the line of points that fit meets the quadric twice
@@ -120,7 +134,7 @@ def minimum(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
 
 
 def stationary_points(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
-    """Return all real stationary points (N, K, n) of squared-range problems, best first, and flags of valid ones."""
+    """Return all real stationary points (N, q, n), best first, of squared-range problems, and flags (N, q)."""
     y, _, valid = stationary(rows, right, quadric, positive=quadric.shape == "cone")
     return y, valid
 
@@ -140,7 +154,11 @@ def hull(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
 
 
 def _one_by_one(relax: Callable[..., Any], rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
-    """Return the relaxed point, and the two points of the quadric on both sides of it if the solution is not unique."""
+    """Return three points (N, 3, n) of a relaxation for each problem, and flags (N, 3) of valid ones.
+
+    The first is the relaxed point. If the solution is not unique, the others are the points of the quadric on both
+    sides of it. `relax` solves one problem.
+    """
     # problems with missing data are skipped
     usable = np.isfinite(rows).all((-1, -2)) & np.isfinite(right).all(-1)
     y = np.full((len(rows), 3, quadric.size), np.nan)
@@ -154,7 +172,10 @@ def _one_by_one(relax: Callable[..., Any], rows: Array, right: Array, quadric: Q
 
 
 def _linear(rows: Array, right: Array) -> tuple[Array, Array]:
-    """Return the plain least-squares point of rows without ranges."""
+    """Return the plain least-squares points (N, 1, n) of rows without ranges, and flags (N, 1) of valid ones.
+
+    The last entry of a point, which no row contains, is zero.
+    """
     transposed = np.swapaxes(rows, -1, -2)
     x, ok = linalg.solve(transposed @ rows, transposed @ right[..., None])
     y = np.concatenate([np.swapaxes(x, -1, -2), np.zeros((*x.shape[:-2], 1, 1))], axis=-1)
@@ -202,7 +223,10 @@ def squared_rows(problem: Problem, found: Ranges | None) -> Squared:
 
 
 def _station_nodes(problem: Problem, found: Ranges | None) -> tuple[Array, Array]:
-    """Return the positions (N, s, d) of the stations of ranges, or of all used stations, and flags of used ones."""
+    """Return the positions (N, s, d), metres, of the stations of ranges, and flags (N, s) of stations in use.
+
+    Without ranges these are all stations with rows.
+    """
     position = np.broadcast_to(
         problem.stations.position, (problem.batch_shape[0], *problem.stations.position.shape[-3:])
     )
@@ -215,7 +239,11 @@ def _station_nodes(problem: Problem, found: Ranges | None) -> tuple[Array, Array
 
 
 def _range_rows(found: Ranges, place: Array, scale: Array, on_cone: bool) -> tuple[Array, Array]:
-    """Return squared rows of r_i = c_i + sign_i t: t^2 = |y|^2 cancels on the cone, and is unknown otherwise."""
+    """Return squared rows (N, s, n) of the ranges r_i = c_i + sign_i t, and their right sides (N, s).
+
+    ``|x - place_i|^2 = r_i^2`` contains |x|^2. On the cone this cancels with t^2; on the paraboloid it is the last
+    unknown. Rows without a range are zero. `place` is scaled.
+    """
     c = found.offset / scale[:, None]
     squares = (place**2).sum(-1)
     usable = found.inside
@@ -231,7 +259,10 @@ def _range_rows(found: Ranges, place: Array, scale: Array, on_cone: bool) -> tup
 
 
 def _weigh(squared: Squared, distance: Array, point: Array | None) -> tuple[Array, Array]:
-    """Return rows and right sides, each divided by its error from the measurements at an approximate point."""
+    """Return rows (N, m, n) and right sides (N, m), each divided by its standard deviation at an approximate point.
+
+    `distance` (N, s) are scaled ranges for the weights, and `point` (N, d) the scaled point, None for one scale away.
+    """
     # d(r^2) = 2 r dr: divided by twice the range, a squared range has the error of the range, here in metres
     factor = 0.5 * squared.scale[:, None] / distance
     stacked = np.concatenate([squared.ranged, squared.ranged_right[..., None]], axis=-1)
@@ -325,7 +356,10 @@ def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to
     if entry is None:
         return None
     size = problem.batch_shape[0]
-    row, right = _wide([*entry.x, entry.last], size, rows.count), _wide([entry.right], size, rows.count)[..., 0]
+    row, right = (
+        _as_columns([*entry.x, entry.last], size, rows.count),
+        _as_columns([entry.right], size, rows.count)[..., 0],
+    )
     weight = np.broadcast_to(rows.weight, right.shape)
     present = (weight > 0.0) & (True if paired is None else paired)
     sigma = np.sqrt(variances(problem.noise, problem.count)[..., start : start + rows.count])
@@ -340,13 +374,13 @@ def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to
     return LiftedRows(np.where(present[..., None], row, 0.0), np.where(present, right, 0.0), sigma, factor)
 
 
-def _wide(parts: list[Any], size: int, count: int) -> Array:
-    """Return numbers as columns, (N, m, parts)."""
+def _as_columns(parts: list[Any], size: int, count: int) -> Array:
+    """Return scalars and arrays as the last axis of one array (N, m, parts); `size` is N and `count` is m."""
     return np.stack([np.broadcast_to(part, (size, count)) for part in parts], axis=-1)
 
 
 def _point(problem: Problem, rows: Rows, index: Array, to: Coordinates) -> Point:
-    """Return the scaled positions and axes of the stations `index` of rows, as components."""
+    """Return the scaled positions and axes of the stations `index` (m,) of rows, component by component."""
     stations, still = problem.stations, np.zeros_like(rows.epoch)
     epoch = rows.epoch if stations.position.shape[-3] > 1 else still
     place = (stations.position[..., epoch, index, :] - to.origin[:, None]) / to.scale[:, None, None]
@@ -360,13 +394,16 @@ def _point(problem: Problem, rows: Rows, index: Array, to: Coordinates) -> Point
 
 
 def _stays_unknown(entry: LiftEntry, known: tuple[KnownLift, KnownLift]) -> bool:
-    """Return whether a row contains a range that is unknown even up to the common unknown."""
+    """Return whether a row contains a range that is unknown even up to t: it then has no linear form.
+
+    `entry` is the linear form of the rows, and `known` has the ranges at their two stations.
+    """
     lost = np.isnan(known[0].sign) | np.isnan(known[1].sign)
     return bool((np.isnan(entry.last) & lost).any())
 
 
 def _known(found: Ranges, rows: Rows, to: Coordinates) -> tuple[KnownLift, KnownLift]:
-    """Return the scaled ranges at both ends of rows; NaN for an unknown range."""
+    """Return the scaled ranges at the stations a and b of rows; NaN for an unknown range."""
     both = []
     for index in (rows.a, rows.b):
         node = np.array([_node(found, int(s), int(e)) for s, e in zip(index, rows.epoch, strict=True)])
@@ -377,6 +414,6 @@ def _known(found: Ranges, rows: Rows, to: Coordinates) -> tuple[KnownLift, Known
 
 
 def _node(found: Ranges, station: int, epoch: int) -> int:
-    """Return the number of a station among the ranges; -1 if some problem lacks its range."""
+    """Return the index of a station and epoch among the ranges; -1 if some problem lacks its range."""
     at = np.flatnonzero((found.station == station) & ((found.epoch == epoch) | (found.epoch.max(initial=0) == 0)))
     return int(at[0]) if len(at) and found.inside[:, at[0]].all() else -1

@@ -1,4 +1,9 @@
-"""The stage "suspects": it names the measurements, stations and priors that contradict the other data."""
+"""The stage "suspects": it names the measurements, stations and priors that contradict the other data.
+
+A *group* is a row, the rows of a station, a prior or a common offset. A *rest* is the problem without some groups. An
+*explanation* is a set of groups whose rest passes the chi-square test. Letters: N problems, m rows, `size` numbers of a
+parameter vector. A *score* is a chi-square cost plus the prices of the groups left out.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +71,7 @@ _Explained = list[tuple[Array, tuple[Group, ...], list[Outcome]]]
 
 @dataclass(frozen=True, slots=True)
 class _RejectedRows:
-    """Rows (N, m) that an earlier robust fix rejected, and the vectors (N, size) of that fix."""
+    """Flags (N, m) of rows that an earlier robust fix rejected, and the vectors (N, size) of that fix."""
 
     rows: Array
     x: Array
@@ -101,7 +106,7 @@ def suspects(
         Kinds of groups that may be wrong: all rows of a station, one measurement, a prior, or all lengths of a kind by
         one offset.
     together : bool
-        Whether one statement of the noise holds for the whole batch and all epochs. If so, the noise is a suspect too
+        Whether one statement of the noise applies to the whole batch and all epochs. If so, the noise is a suspect too
         when many fixes contradict themselves. False for unrelated problems.
 
     Returns
@@ -129,7 +134,10 @@ def suspects(
 
 
 def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS, *, together: bool = True) -> Pool:
-    """Return the pool of a flat batch with the conclusions of a search for suspects: the stage behind `suspects`."""
+    """Return the pool of a flat batch with the conclusions of a search for suspects: the stage behind `suspects`.
+
+    `by` and `together` are as in `suspects`.
+    """
     if pool is None:
         raise InvalidProblem("suspects needs a fix", "method", "put it after a refinement, as in 'gtrs+lsr+suspects'")
     began = perf_counter()
@@ -142,8 +150,8 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
             problem, offer(problem, surviving_candidates(pool, judge(problem, pool)), pool, "start", perf_counter())
         )
     before = pool.stages
-    asked = partial(_explain, present=present, doubted=doubted, by=by)
-    larger, found = _choose_noise(problem, pool, asked, together)
+    explain_all = partial(_explain, present=present, doubted=doubted, by=by)
+    larger, found = _choose_noise(problem, pool, explain_all, together)
     count = sum(len(items) for items, _, _ in found)
     if larger is None:
         pool = _with_conclusions(problem, pool, found)
@@ -154,15 +162,15 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
 
 
 def _with_conclusions(problem: Problem, pool: Pool, found: _Explained) -> Pool:
-    """Return pools with the conclusions from explanations."""
+    """Return pools with the conclusions from explanations: for each set of items their groups and outcomes."""
     pool = replace(pool, asked=True)
     fix, conclusion = judge(problem, pool), filled_objects(len(pool), None)
     step = chunk_size(problem)
     for items, groups, outcomes in found:
         for first in range(0, len(items), step):
             part = slice(first, first + step)
-            own = items[part]
-            conclusion[own] = _conclude(problem.take(own), fix[own], groups, outcomes[part])
+            numbers = items[part]
+            conclusion[numbers] = _conclude(problem.take(numbers), fix[numbers], groups, outcomes[part])
     return replace(pool, conclusion=conclusion)
 
 
@@ -189,22 +197,25 @@ class _LargerNoise:
 
 
 def _choose_noise(
-    problem: Problem, pool: Pool, asked: Callable[[Problem, Fix], _Explained], together: bool
+    problem: Problem, pool: Pool, explain_all: Callable[[Problem, Fix], _Explained], together: bool
 ) -> tuple[_LargerNoise | None, _Explained]:
-    """Return a larger noise if it is likelier for all problems together, else None; and the explanations with it."""
+    """Return a larger noise if it is likelier for all problems together, else None; and the explanations with it.
+
+    `explain_all` maps problems and their fixes to explanations. If `together` is False, no larger noise is tried.
+    """
     fix = judge(problem, pool)
     larger = _larger_noise(problem, pool, fix) if together else None
     if larger is None:
-        return None, asked(problem, fix)
+        return None, explain_all(problem, fix)
     # with the larger noise fewer rows are suspects
     other = judge(larger.problem, larger.pool)
-    again, present = asked(larger.problem, other), np.broadcast_to(problem.weight, fix.weights.shape)
+    again, present = explain_all(larger.problem, other), np.broadcast_to(problem.weight, fix.weights.shape)
     more = 2.0 * (present @ np.log(larger.sizes)) / np.maximum(present.sum(1), 1.0)
     score = _score(again, other, more) + ROW_PRICE
     # a lower bound of the score with the stated noise: each fix costs at least its cost or the price of a row
     if score < np.fmin(fix.cost, ROW_PRICE)[np.isfinite(fix.cost) & (fix.dof > 0)].sum():
         return larger, again
-    found = asked(problem, fix)
+    found = explain_all(problem, fix)
     return (larger, again) if score < _score(found, fix, np.zeros(len(more))) else (None, found)
 
 
@@ -226,19 +237,21 @@ def _larger_noise(problem: Problem, pool: Pool, fix: Fix) -> _LargerNoise | None
         return None
     batch = batch_of(problem.take(kept))
     level = common_level_at(batch, restore_order(batch.layout, problem.layout, fix.x[kept]))
-    grown = level.factor > 1.0
-    if not level.refutes or not np.isfinite(level.high[grown]).all():
+    is_larger = level.factor > 1.0
+    if not level.refutes or not np.isfinite(level.high[is_larger]).all():
         return None
-    used = replace(level, factor=np.where(grown, level.high, 1.0))
+    used = replace(level, factor=np.where(is_larger, level.high, 1.0))
     sentences = [
         f"the noise of {kind} rows is {factor:.2g} ({low:.2g} to {high:.2g}) times as large as stated"
-        for kind, factor, low, high, larger in zip(level.kinds, level.factor, level.low, level.high, grown, strict=True)
+        for kind, factor, low, high, larger in zip(
+            level.kinds, level.factor, level.low, level.high, is_larger, strict=True
+        )
         if larger
     ]
-    loud = used.scale(problem)
-    refined = lsr(loud, offer(loud, surviving_candidates(pool, fix), pool, "start", perf_counter()))
+    scaled = used.scale(problem)
+    refined = lsr(scaled, offer(scaled, surviving_candidates(pool, fix), pool, "start", perf_counter()))
     return _LargerNoise(
-        loud, refined, used.sizes(problem), f"{' and '.join(sentences)}: the upper end of the interval is used"
+        scaled, refined, used.sizes(problem), f"{' and '.join(sentences)}: the upper end of the interval is used"
     )
 
 
@@ -249,7 +262,7 @@ def _fix_with_larger_noise(larger: _LargerNoise, found: _Explained) -> Array:
     marks, reason = np.array(fix.marks), np.array(fix.reason)
     items = np.flatnonzero(fix.answered)
     marks[items] |= Status.RESCALED.mark
-    reason[items] = [f"{larger.reason}; {own}" if own else larger.reason for own in reason[items]]
+    reason[items] = [f"{larger.reason}; {sentence}" if sentence else larger.reason for sentence in reason[items]]
     out, fix = filled_objects(len(reason), None), replace(fix, marks=marks, reason=reason)
     for i in range(len(out)):
         out[i] = fix[i]
@@ -257,32 +270,36 @@ def _fix_with_larger_noise(larger: _LargerNoise, found: _Explained) -> Array:
 
 
 def _explain(problem: Problem, fix: Fix, present: Array, doubted: _RejectedRows, by: Sequence[GroupKind]) -> _Explained:
-    """Return the explanations of problems with a contradiction: item numbers, groups, and outcomes."""
+    """Return the explanations of problems with a contradiction: sets of item numbers, their groups, and their outcomes.
+
+    `present` (N, m) are the weights of the rows, `doubted` the rows to suspect first, and `by` the kinds of groups.
+    """
     with np.errstate(invalid="ignore"):
         # at a lower cost every set has a score beyond the gap
         noticed = ~fix.answered | (fix.cost > ROW_PRICE - AMBIGUOUS_GAP)
     noticed |= problem.epochs > 1  # the chi-square test of a whole run does not notice a few wrong rows
     items = np.flatnonzero(noticed & (fix.dof > 0) & ~np.isin(fix.code, _BEYOND))
-    patterns = [items[own] for own in _group_alike(present[items] > 0.0)]
-    alike = [_alike(problem, fix, own, by) for own in patterns]
+    patterns = [items[numbers] for numbers in _group_alike(present[items] > 0.0)]
+    alike = [_same_rows(problem, fix, numbers, by) for numbers in patterns]
     # if the sets are few, all are tried; in runs and for many groups, one group at a time
     many = [problem.epochs > 1 or not enumerable(one.groups, one.batch.count, 1) for one in alike]
-    found = iter(explain([one for one, grown in zip(alike, many, strict=True) if not grown]))
+    found = iter(explain([one for one, too_many in zip(alike, many, strict=True) if not too_many]))
     out: _Explained = []
-    for own, one, grown in zip(patterns, alike, many, strict=True):
-        part = doubted.take(own)
-        if grown:
-            outcomes = [_grow(one, i, part, None) for i in range(len(own))]
+    for numbers, one, too_many in zip(patterns, alike, many, strict=True):
+        part = doubted.take(numbers)
+        if too_many:
+            outcomes = [_group_by_group(one, i, part, None) for i in range(len(numbers))]
         else:
-            outcomes = _with_grown(one, part, next(found))
-        out.append((own, one.groups, outcomes))
+            outcomes = _with_group_by_group(one, part, next(found))
+        out.append((numbers, one.groups, outcomes))
     return out
 
 
 def _score(found: _Explained, fix: Fix, more: Array) -> float:
-    """Return the least score of all problems together; `more` (N,) is the price of larger noise per degree of freedom.
+    """Return the sum of the least scores of all problems.
 
-    It is twice the negative logarithm of the restricted likelihood, in which a factor f of sigma costs r ln f^2.
+    `more` (N,) is the price of larger noise per degree of freedom. The sum is twice the negative logarithm of the
+    restricted likelihood, in which a factor f of sigma costs r ln f^2, with redundancy r.
     """
     good = np.isfinite(fix.cost) & (fix.dof > 0)
     score, dof = np.where(good, fix.cost, 0.0), np.where(good, fix.dof, 0)
@@ -294,15 +311,15 @@ def _score(found: _Explained, fix: Fix, more: Array) -> float:
 
 
 def _group_alike(present: Array) -> list[Array]:
-    """Return the numbers of the problems (N, m) that have the same rows, for each pattern."""
+    """Return groups of problems with the same rows, as arrays of their numbers; `present` (N, m) flags rows."""
     if not len(present):
         return []
     _, pattern = np.unique(present, axis=0, return_inverse=True)
     return [np.flatnonzero(pattern.reshape(-1) == i) for i in range(int(pattern.max()) + 1)]
 
 
-def _alike(problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind]) -> SameRows:
-    """Return problems in which the same rows are present, and their groups.
+def _same_rows(problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind]) -> SameRows:
+    """Return problems `items` in which the same rows are present, and their groups of the kinds `by`.
 
     Range differences become arrival times if the two forms are equivalent.
     """
@@ -316,18 +333,24 @@ def _alike(problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind]) ->
     return SameRows(work, np.arange(len(items)), groups, fix[items])
 
 
-def _with_grown(alike: SameRows, doubted: _RejectedRows, outcomes: list[Outcome]) -> list[Outcome]:
-    """Return outcomes after a search group by group, from the closest rest, for problems with too many sets."""
+def _with_group_by_group(alike: SameRows, doubted: _RejectedRows, outcomes: list[Outcome]) -> list[Outcome]:
+    """Return outcomes after a search group by group for the problems whose sets were too many to try all.
+
+    The search starts from the rest with the least cost so far.
+    """
     dof = alike.whole.dof
-    untried = [not own.rests and own.tried < most - 1 for own, most in zip(outcomes, dof, strict=True)]
+    untried = [not outcome.rests and outcome.tried < most - 1 for outcome, most in zip(outcomes, dof, strict=True)]
     for i in np.flatnonzero(untried).tolist():
-        more = _grow(alike, i, doubted, outcomes[i].closest)
+        more = _group_by_group(alike, i, doubted, outcomes[i].closest)
         outcomes[i] = replace(more, p_value=outcomes[i].p_value | more.p_value)
     return outcomes
 
 
 def _conclude(problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: Sequence[Outcome]) -> Array:
-    """Return the conclusions (N,) for problems with the same rows; None if the fix of all data is kept."""
+    """Return the conclusions (N,) for problems with the same rows; None if the fix of all data is kept.
+
+    `fix` has the fixes of all data, and `outcomes` the results of the search.
+    """
     arrivals, out = as_arrivals(problem), filled_objects(len(outcomes), None)
     cases: list[SuspectCase] = []
     chosen: dict[int, RemainingFix] = {}
@@ -348,34 +371,37 @@ def _conclude(problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: S
             chosen |= dict(zip(items, proven, strict=True))
     rests = {i: (best, *outcomes[i].rests[1:]) for i, best in chosen.items()}
     group_errors = _errors(problem if arrivals is None else arrivals.problem, groups, rests)
-    for i, own in rests.items():
-        out[i] = _explained(cases[i], outcomes[i], own, group_errors[i])
+    for i, rests_of in rests.items():
+        out[i] = _explained(cases[i], outcomes[i], rests_of, group_errors[i])
     return out
 
 
-def _grow(alike: SameRows, i: int, doubted: _RejectedRows, start: RemainingFix | None) -> Outcome:
+def _group_by_group(alike: SameRows, i: int, doubted: _RejectedRows, start: RemainingFix | None) -> Outcome:
     """Return the explanations of problem i from a search group by group.
 
     Wrong rows draw the fix of all data away, perhaps to another minimum, so that right rows look wrong there. If the
     first search finds a contradiction, more searches start from the minima of a robust loss, which wrong rows cannot
-    draw far.
+    draw far. The first search starts from the rest `start`; None: from all data. Rows that a robust fix rejected, in
+    `doubted`, replace this start.
     """
     # the fix has the layout of the given problem; with arrivals the layout also has emission times
-    one, own, groups = alike.batch.take(alike.items[[i]]), alike.whole[i], alike.groups
-    if own.layout != one.layout or not np.isfinite(own.x).all():
+    one, whole, groups = alike.batch.take(alike.items[[i]]), alike.whole[i], alike.groups
+    if whole.layout != one.layout or not np.isfinite(whole.x).all():
         n = one.layout.n_shared
-        known = np.isfinite(own.x[:n]).all()
-        near = complete(one, own.x[None, None, :n]) if known else None
-        own = (fix_remaining(one) if near is None else fix_by(one, lambda _: begin(one, near)))[0]
-    handed = doubted.rows.shape[1] == one.count and doubted.rows[i].any()
-    if handed:
+        known = np.isfinite(whole.x[:n]).all()
+        near = complete(one, whole.x[None, None, :n]) if known else None
+        whole = (fix_remaining(one) if near is None else fix_by(one, lambda _: begin(one, near)))[0]
+    has_rejected = doubted.rows.shape[1] == one.count and doubted.rows[i].any()
+    if has_rejected:
         start = begin_without(one, groups, doubted.rows[i], doubted.x[i])
-    first = grow_explanation(one, groups, own, start or remaining_fix_of(groups, (), own))
+    first = grow_explanation(one, groups, whole, start or remaining_fix_of(groups, (), whole))
     if not first.rests and not first.note:
         return first
     minima = doubted_minima(one, LOSSES["truncated"], _MINIMA)
-    begun = [begin_without(one, groups, rows, x) for x, rows in minima]
-    return explain_from_beginnings([first, *(grow_explanation(one, groups, own, each) for each in begun)], groups)
+    beginnings = [begin_without(one, groups, rows, x) for x, rows in minima]
+    return explain_from_beginnings(
+        [first, *(grow_explanation(one, groups, whole, each) for each in beginnings)], groups
+    )
 
 
 # From outcomes to explanations: suspects, their errors, and the evidence.
@@ -408,7 +434,10 @@ class SuspectCase:
         return self.problem if self.arrivals is None else self.arrivals.problem
 
     def vector(self, fix: Fix, x: Array | None = None) -> Array:
-        """Return the vector of a fix, or vectors (..., size) in its layout, in the layout of the given problem."""
+        """Return the vector of a fix in the layout of the given problem, (size,).
+
+        `x` (..., size of the fix) replaces the vector of the fix.
+        """
         x, layout = fix.x if x is None else x, self.problem.layout
         return x if fix.layout == layout else restore_order(layout, fix.layout, x)
 
@@ -428,7 +457,10 @@ def _unexplained(case: SuspectCase, outcome: Outcome) -> Conclusion | None:
 
 
 def _best_rest(case: SuspectCase, outcome: Outcome) -> RemainingFix | None:
-    """Return the best rest of a problem, which is not proven yet; None if the fix of all data is kept."""
+    """Return the best rest of a problem, to be proven; None if the fix of all data is kept.
+
+    The fix is kept if it is the best rest and all other rests have the same position.
+    """
     best, *others = outcome.rests
     if not best.left and all(_same_place(best.fix, rest.fix) for rest in others):
         return None
@@ -438,7 +470,10 @@ def _best_rest(case: SuspectCase, outcome: Outcome) -> RemainingFix | None:
 def _explained(
     case: SuspectCase, outcome: Outcome, rests: Sequence[RemainingFix], group_errors: Sequence[_GroupErrors]
 ) -> Conclusion:
-    """Return the conclusion of a problem from its rests, of which the first is proven, and the errors of each rest."""
+    """Return the conclusion of a problem from its rests, of which the first is proven.
+
+    `group_errors` has the estimated errors of the groups that each rest leaves out.
+    """
     (best, *_), (first, *others) = rests, outcome.rests
     elsewhere = [rest for rest in others if not _same_place(first.fix, rest.fix)]
     pairs = zip(rests, group_errors, strict=True)
@@ -450,14 +485,14 @@ def _explained(
 def _same_place(best: Fix, other: Fix) -> bool:
     """Return whether two fixes give the same answer: the position of `other` is inside the ellipsoid of `best`."""
     # unknowns that only one of the fixes has, such as an offset, do not count
-    theirs = {slot.name for slot in other.layout.shared}
-    common = [slot for slot in best.layout.shared if slot.name in theirs]
+    other_names = {slot.name for slot in other.layout.shared}
+    common = [slot for slot in best.layout.shared if slot.name in other_names]
     common = [slot for slot in common if slot.name.partition("[")[0] == "position"] or common
     if not common:
         return False
     alike = Layout(tuple(common), (), 0)
-    where, there = shared_places(alike, best.layout), shared_places(alike, other.layout)
-    step, covariance = other.x[there] - best.x[where], best.cov[np.ix_(where, where)]
+    columns, other_columns = shared_places(alike, best.layout), shared_places(alike, other.layout)
+    step, covariance = other.x[other_columns] - best.x[columns], best.cov[np.ix_(columns, columns)]
     if not (np.isfinite(step).all() and np.isfinite(covariance).all()):
         return False
     inverse, regular = linalg.inverse(covariance)
@@ -465,7 +500,7 @@ def _same_place(best: Fix, other: Fix) -> bool:
 
 
 def _in_layout(case: SuspectCase, fix: Fix) -> Fix:
-    """Return a fix with only the shared unknowns of the given problem."""
+    """Return a fix with only the shared unknowns of the given problem, without added offsets and emission times."""
     layout = case.problem.layout
     if fix.layout == layout:
         return fix
@@ -478,7 +513,7 @@ def _in_layout(case: SuspectCase, fix: Fix) -> Fix:
 
 
 def _name_closest(case: SuspectCase, outcome: Outcome) -> str:
-    """Return a sentence on the set that came closest to an explanation."""
+    """Return a sentence on the set of groups with the largest p-value, since no set explains the data."""
     tested = {left: p for left, p in outcome.p_value.items() if left and np.isfinite(p)}
     if not tested:
         return outcome.note
@@ -489,7 +524,7 @@ def _name_closest(case: SuspectCase, outcome: Outcome) -> str:
 
 
 def _explanation(case: SuspectCase, rest: RemainingFix, outcome: Outcome, error_of: _GroupErrors) -> Explanation:
-    """Return the explanation of a rest: its suspects with errors and p-values, and its fix."""
+    """Return the explanation of a rest: its suspects with errors, from `error_of`, and p-values, and its fix."""
     fix = rest.fix
     p_without = float(fix.p_value)
     # errors of compass bearings are reported in the sense of the readings
@@ -499,8 +534,8 @@ def _explanation(case: SuspectCase, rest: RemainingFix, outcome: Outcome, error_
         group, error = case.groups[i], error_of.get(i)
         known = outcome.p_value.get(tuple(j for j in rest.left if j != i))
         p_with = _p_with(fix, error) if known is None else known
-        none = np.full(1, np.nan)
-        value, sigma = (none, none) if error is None else (error.value, error.sigma)
+        unknown = np.full(1, np.nan)
+        value, sigma = (unknown, unknown) if error is None else (error.value, error.sigma)
         if group.rows and len(value) == len(group.rows):
             value = senses[list(group.rows)] * value
         suspects.append(Suspect(group.name, group.kind, case.rows(group), value, sigma, p_with, p_without))
@@ -510,14 +545,15 @@ def _explanation(case: SuspectCase, rest: RemainingFix, outcome: Outcome, error_
 def _errors(
     work: Problem, groups: Sequence[Group], rests: dict[int, tuple[RemainingFix, ...]]
 ) -> dict[int, list[_GroupErrors]]:
-    """Return the estimated errors of the groups that each rest leaves out, by number of the group.
+    """Return the estimated errors of the groups left out: for each problem a list, one entry for each rest.
 
-    Rests with the same offsets have the same unknowns, so they are linearised together.
+    An entry maps the number of a group to its error. Rests with the same offsets have the same unknowns, so they are
+    linearised together.
     """
-    out: dict[int, list[_GroupErrors]] = {i: [{} for _ in own] for i, own in rests.items()}
+    out: dict[int, list[_GroupErrors]] = {i: [{} for _ in rests_of] for i, rests_of in rests.items()}
     alike: dict[tuple[int, ...], list[tuple[int, RemainingFix, _GroupErrors]]] = {}
-    for i, own in rests.items():
-        for rest, estimates in zip(own, out[i], strict=True):
+    for i, rests_of in rests.items():
+        for rest, estimates in zip(rests_of, out[i], strict=True):
             if not np.isfinite(rest.fix.x).all() or not rest.left:
                 continue
             offsets = tuple(j for j in rest.left if groups[j].offset is not None)
@@ -527,21 +563,21 @@ def _errors(
     for offsets, members in alike.items():
         part = leave_out_of(work.take(np.array([i for i, _, _ in members])), groups, offsets)
         found = influences(part, np.stack([rest.fix.x for _, rest, _ in members]))
-        for at, (_, rest, estimates) in zip(found, members, strict=True):
+        for influence_of, (_, rest, estimates) in zip(found, members, strict=True):
             others = [j for j in rest.left if j not in offsets]
-            estimates |= dict(zip(others, errors(at, [groups[j] for j in others]), strict=True))
+            estimates |= dict(zip(others, errors(influence_of, [groups[j] for j in others]), strict=True))
     return out
 
 
 def _offset_error(group: Group, fix: Fix) -> Error:
-    """Return the error of an offset group from a fix that estimates the offset."""
+    """Return the error of an offset group from a fix that estimates the offset; units of the rows."""
     value, sigma = fix.take(group.name), fix.sigma(group.name)
     statistic = float((value / sigma) @ (value / sigma)) if np.isfinite(sigma).all() else np.nan
     return Error(value, sigma, statistic, len(value))
 
 
 def _p_with(fix: Fix, error: Error | None) -> float:
-    """Return the chi-square probability of a rest with one of its suspects taken back, to first order."""
+    """Return the chi-square probability of a rest with a suspect taken back, to first order; NaN if unknown."""
     from scipy.special import gammaincc
 
     if error is None:
@@ -551,7 +587,7 @@ def _p_with(fix: Fix, error: Error | None) -> float:
 
 
 def _alternatives(case: SuspectCase, best: RemainingFix, elsewhere: Sequence[RemainingFix]) -> Alternatives:
-    """Return the other positions of the best and of the other explanations, in ascending order of their gaps."""
+    """Return the other positions of the best rest and of the rests `elsewhere`, in ascending order of their gaps."""
     first = best.fix
     x = [case.vector(first, first.alternatives.x), *(case.vector(rest.fix)[None] for rest in elsewhere)]
     gap = [first.alternatives.gap, *(np.array([max(rest.score - best.score, 0.0)]) for rest in elsewhere)]

@@ -1,7 +1,8 @@
 """Search for suspects over sets of groups: leave each set out and fix the remaining rows again, without a first guess.
 
 If the sets are few, all of them are tried, so that one error cannot mask another. If they are many, `grow_explanation`
-leaves out one group at a time.
+leaves out one group at a time. A *group* is a row, the rows of a station, a prior or a common offset. A *rest* is the
+problem without a set of groups.
 """
 
 from __future__ import annotations
@@ -76,13 +77,13 @@ class Outcome:
 
     Parameters
     ----------
-    rests : tuple of Rest
+    rests : tuple of RemainingFix
         Rests whose score is within the gap of the least, the best first; empty if no rest passes.
     p_value : dict of tuple of int to float
         Chi-square probability of the rest without each set that was tried; NaN without redundancy.
     note : str
         Sentence on the limit of the search.
-    closest : Rest, optional
+    closest : RemainingFix, optional
         The cheapest of the rests that were tried last.
     tried : int
         Size of the largest sets that are covered: all were tried, or their prices exclude them.
@@ -102,7 +103,7 @@ class Outcome:
 
 
 def remaining_fix_of(groups: Sequence[Group], left: tuple[int, ...], fix: Fix) -> RemainingFix:
-    """Return the rest of one problem without some groups, with its score."""
+    """Return the rest of one problem without the groups `left`, with its score."""
     return RemainingFix(left, fix, float(fix.cost) + sum(groups[i].price for i in left))
 
 
@@ -116,7 +117,7 @@ def passes_noise_test(fix: Fix) -> Array:
 
 
 def enumerable(groups: Sequence[Group], rows: int, size: int) -> bool:
-    """Return whether all sets of `size` groups are few enough to be tried."""
+    """Return whether all sets of `size` groups are few enough to be tried, for problems of `rows` rows."""
     return comb(len(groups), size) * rows <= _MOST
 
 
@@ -144,7 +145,7 @@ class SameRows:
 
 @dataclass(frozen=True, slots=True)
 class _Request:
-    """Sets of groups (C,) to leave out of some problems of an `SameRows`, and the least scores so far."""
+    """Sets of groups to leave out of problems `items` of a `SameRows`, and their least scores `best` so far."""
 
     alike: SameRows
     items: Array
@@ -175,7 +176,7 @@ def explain(alike: Sequence[SameRows]) -> list[list[Outcome]]:
 
 
 def _search(alike: SameRows) -> Generator[list[_Request], list[list[_Tried]], list[Outcome]]:
-    """Yield requests for the sets to try, size by size, and return the outcomes (N,)."""
+    """Yield requests for the sets to try, size by size; receive their results, and return the outcomes (N,)."""
     groups, whole, count = alike.groups, alike.whole, alike.batch.count
     prices = np.cumsum(np.sort([group.price for group in groups]))
     rests = [[remaining_fix_of(groups, (), whole[i])] if ok else [] for i, ok in enumerate(passes_noise_test(whole))]
@@ -184,7 +185,7 @@ def _search(alike: SameRows) -> Generator[list[_Request], list[list[_Tried]], li
     least = [(float(c), int(r)) for c, r in zip(whole.cost, whole.dof, strict=True)]
     tried = np.zeros(len(rests), dtype=np.int64)
     for size in range(1, len(groups) + 1):
-        best = np.array([min((rest.score for rest in own), default=np.inf) for own in rests])
+        best = np.array([min((rest.score for rest in rests_of), default=np.inf) for rests_of in rests])
         # no set of this size or larger can come within the gap
         done = (prices[size - 1] > best + AMBIGUOUS_GAP) | (whole.dof <= size)
         tried[done] = len(groups)
@@ -197,8 +198,8 @@ def _search(alike: SameRows) -> Generator[list[_Request], list[list[_Tried]], li
             # If all data agree, few of many sets matter, and the cost of their rests is known to first order.
             agree = [i for i in items if rests[i] and not rests[i][0].left]
             for i in agree:
-                own = _promising(alike.batch.take(alike.items[[i]]), groups, sets, whole[i], best[i])
-                requests += [_Request(alike, np.array([i]), own, best[[i]])] if own else []
+                rests_of = _promising(alike.batch.take(alike.items[[i]]), groups, sets, whole[i], best[i])
+                requests += [_Request(alike, np.array([i]), rests_of, best[[i]])] if rests_of else []
             items = np.setdiff1d(items, agree)
         requests += [_Request(alike, items, sets, best[items])] if len(items) else []
         answers = (yield requests) if requests else []
@@ -209,7 +210,10 @@ def _search(alike: SameRows) -> Generator[list[_Request], list[list[_Tried]], li
                 closest[item], least[item] = one.closest, min(least[item], one.least)
     notes = ["" if dof > 1 else _BLIND for dof in whole.dof]
     parts = zip(rests, probability, notes, closest, tried, least, strict=True)
-    return [Outcome(within_gap(own, groups), p, note, near, int(most), *low) for own, p, note, near, most, low in parts]
+    return [
+        Outcome(within_gap(rests_of, groups), p, note, near, int(most), *low)
+        for rests_of, p, note, near, most, low in parts
+    ]
 
 
 def within_gap(rests: Sequence[RemainingFix], groups: Sequence[Group]) -> tuple[RemainingFix, ...]:
@@ -225,28 +229,28 @@ def within_gap(rests: Sequence[RemainingFix], groups: Sequence[Group]) -> tuple[
     for rest in order:
         if rest.score > order[0].score + AMBIGUOUS_GAP:
             break
-        own = _parts(groups, rest.left)
-        if not any(_adds_nothing(rest, len(own), other, len(parts)) for parts, other in kept if parts <= own):
-            kept.append((own, rest))
+        numbers = _parts(groups, rest.left)
+        if not any(_adds_nothing(rest, len(numbers), other, len(parts)) for parts, other in kept if parts <= numbers):
+            kept.append((numbers, rest))
     return tuple(rest for _, rest in kept)
 
 
 def _adds_nothing(rest: RemainingFix, size: int, other: RemainingFix, fewer: int) -> bool:
-    """Return whether the further rows of a rest lower the cost by no more than chance."""
+    """Return whether the `size` rows of a rest lower the cost no more than chance, beyond the `fewer` of `other`."""
     if size == fewer:  # the same rows under other names: their costs differ by rounding
         return True
     return float(other.fix.cost - rest.fix.cost) <= (ROW_PRICE - AMBIGUOUS_GAP) * (size - fewer)
 
 
 def _parts(groups: Sequence[Group], left: Sequence[int]) -> frozenset[tuple[int, int]]:
-    """Return the numbers that a set of groups leaves out: rows, and the components of groups without rows."""
+    """Return the parts that a set of groups leaves out: pairs (-1, row), or (group without rows, component)."""
     rows = {(-1, row) for i in left for row in groups[i].rows}
     return frozenset(rows | {(i, j) for i in left if not groups[i].rows for j in range(groups[i].size)})
 
 
 @dataclass(slots=True)
 class _Tried:
-    """Collected results of the sets of one size for one problem."""
+    """Results of the sets of one size for a problem: `best` is the least score, `cheapest` the cost of `closest`."""
 
     rests: list[RemainingFix]
     p_value: dict[tuple[int, ...], float]
@@ -257,9 +261,10 @@ class _Tried:
 
 
 def _promising(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set], whole: Fix, best: float) -> list[_Set]:
-    """Return the sets whose rest may come within the gap: to first order the cost falls by half of the need.
+    """Return the sets whose rest may come within the gap of the least score `best`, to first order.
 
-    Sets with an offset or a prior are all kept. If the fix is at infinity, all sets are kept.
+    The first-order fall of the cost must be half of the need. Sets with an offset or a prior, and all sets of a fix at
+    infinity, are kept.
     """
     if not np.isfinite(whole.x).all():
         return list(sets)
@@ -274,7 +279,7 @@ def _promising(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set], 
 
 
 def _try_requests(asked: dict[int, list[_Request]]) -> dict[int, list[list[_Tried]]]:
-    """Return the results of the sets of each request for each of its problems."""
+    """Return the results of the sets: for each search and request a list of records, one for each item."""
     out = {number: [[_Tried([], {}) for _ in one.items] for one in requests] for number, requests in asked.items()}
     pairs: dict[Any, list[_Pair]] = {}
     # Problems of a batch have the same priors and unknowns, so sets that change the same ones are fixed together.
@@ -287,11 +292,11 @@ def _try_requests(asked: dict[int, list[_Request]]) -> dict[int, list[list[_Trie
                 for name, one in zip(names, request.sets, strict=True):
                     key = (id(request.alike.batch), name)
                     pairs.setdefault(key, []).append(_Pair(request.alike, item, one, tried))
-    for own in pairs.values():
+    for pairs_of_key in pairs.values():
         # parts that fit the memory
-        step = max(1, _CHUNK // (own[0].alike.batch.count + 1))
-        for first in range(0, len(own), step):
-            _try_pairs(own[first : first + step])
+        step = max(1, _CHUNK // (pairs_of_key[0].alike.batch.count + 1))
+        for first in range(0, len(pairs_of_key), step):
+            _try_pairs(pairs_of_key[first : first + step])
     return out
 
 
@@ -305,15 +310,17 @@ class _Pair(NamedTuple):
 
 
 def _try_pairs(pairs: Sequence[_Pair]) -> None:
-    """Write the results of pairs: rests near the best, probabilities, cheapest rests and least scores."""
+    """Fix the rests of all pairs together, and add the results to the record of each pair."""
     alike, others = pairs[0].alike, sorted(pairs[0].left[2])
     items = np.array([pair.alike.items[pair.item] for pair in pairs])
     rows, changed = np.stack([pair.left[1] for pair in pairs]), [alike.groups[i] for i in others]
     fix = fix_remaining(leave_out(alike.batch.take(items), rows, changed))
     cost = np.where(np.isfinite(fix.cost), fix.cost, np.inf)
     price = np.array([sum(pair.alike.groups[i].price for i in pair.left[0]) for pair in pairs])
-    begins = all(group.offset is None for group in changed)  # a search that starts from the closest rest has no offset
-    good, kept, near = passes_noise_test(fix), list[int](), dict[int, int]()
+    may_start = all(
+        group.offset is None for group in changed
+    )  # a search that starts from the closest rest has no offset
+    good, kept, cheapest_of = passes_noise_test(fix), list[int](), dict[int, int]()
     for j, (pair, p, c, score) in enumerate(
         zip(pairs, fix.p_value.tolist(), cost.tolist(), (cost + price).tolist(), strict=True)
     ):
@@ -323,29 +330,34 @@ def _try_pairs(pairs: Sequence[_Pair]) -> None:
         if good[j] and score <= tried.best + AMBIGUOUS_GAP:  # other rests are never listed
             tried.best = min(tried.best, score)
             kept.append(j)
-        if begins and c < tried.cheapest:
-            tried.cheapest, near[id(tried)] = c, j
-    chosen = sorted({*kept, *near.values()})
+        if may_start and c < tried.cheapest:
+            tried.cheapest, cheapest_of[id(tried)] = c, j
+    chosen = sorted({*kept, *cheapest_of.values()})
     # copies: a view of one fix would keep all fixes in memory
-    own = fix[np.array(chosen, dtype=int)]
-    rests = {j: remaining_fix_of(pairs[j].alike.groups, pairs[j].left[0], own[k]) for k, j in enumerate(chosen)}
+    chosen_fixes = fix[np.array(chosen, dtype=int)]
+    rests = {
+        j: remaining_fix_of(pairs[j].alike.groups, pairs[j].left[0], chosen_fixes[k]) for k, j in enumerate(chosen)
+    }
     for j in kept:
         pairs[j].tried.rests.append(rests[j])
-    for j in near.values():
+    for j in cheapest_of.values():
         pairs[j].tried.closest = rests[j]
 
 
 def _subsets(groups: Sequence[Group], count: int, size: int) -> Iterator[_Set]:
-    """Yield sets of groups, their rows, and the groups without rows. Each group adds a row to its set."""
+    """Yield all sets of `size` groups: their numbers, flags of their rows (count,), and their groups without rows.
+
+    A set is skipped if one of its groups adds no row to the others.
+    """
     masks = [mark_rows([group], count) for group in groups]
     for left in combinations(range(len(groups)), size):
         rows = np.any([masks[i] for i in left], axis=0)
-        idle = any(
+        adds_no_row = any(
             groups[i].rows and not (masks[i] & ~np.any([masks[j] for j in left if j != i], axis=0)).any()
             for i in left
             if size > 1
         )
-        if not idle:
+        if not adds_no_row:
             yield left, rows, frozenset(i for i in left if not groups[i].rows)
 
 
@@ -359,8 +371,10 @@ def fix_remaining(problem: Problem) -> Fix:
     pool = lsr(problem, gtrs(problem, None))
     # a proof of a good rest takes a fraction of the time of other starts
     unproven = ~_is_proven(problem, pool)
-    pool = _redo(problem, pool, unproven, _NEAR, lambda part, own: lsr(part, _beside(part, roots(part, None), own)))
-    pool = _redo(problem, pool, unproven, _CLOSE, lambda part, own: lsr(part, add_candidates(part, own)))
+    pool = _solve_again(
+        problem, pool, unproven, _NEAR, lambda part, own: lsr(part, _with_starts(part, roots(part, None), own))
+    )
+    pool = _solve_again(problem, pool, unproven, _CLOSE, lambda part, own: lsr(part, add_candidates(part, own)))
     if not np.isfinite(pool.cost[:, 0]).any() and (pool.dof >= 0).any():
         pool = search(problem, pool)  # no closed form starts from these kinds
     return judge(problem, pool)
@@ -375,26 +389,31 @@ def _is_proven(problem: Problem, pool: Pool) -> Array:
     return np.asarray(claims.unique & (claims.proof == GLOBAL) & (claims.margin >= LISTED_GAP))
 
 
-def _redo(problem: Problem, pool: Pool, unproven: Array, near: float, better: Callable[[Problem, Pool], Pool]) -> Pool:
-    """Return pools in which unproven items with a cost up to `near` times the limit are solved again by `better`."""
+def _solve_again(
+    problem: Problem, pool: Pool, unproven: Array, near: float, better: Callable[[Problem, Pool], Pool]
+) -> Pool:
+    """Return pools in which `better` solves unproven items again if their cost is at most `near` times the limit.
+
+    The limit is the cost at which the chi-square test fails. Items without a fix are solved again too.
+    """
     cost = np.where(np.isfinite(pool.cost[:, 0]), pool.cost[:, 0], np.nan)
     with np.errstate(invalid="ignore"):
         # written with "not", so that NaN (no fix yet) is tried again too
-        items = np.flatnonzero(unproven & ~(cost > near * _limit(pool.dof)) & (pool.dof >= 0))
+        items = np.flatnonzero(unproven & ~(cost > near * _cost_limit(pool.dof)) & (pool.dof >= 0))
     if not len(items):
         return pool
     other = better(problem.take(items), take(pool, items))
     return pool.merge(items, other, Stage("again", f"{len(items)} from more starts", 0.0))
 
 
-def _beside(problem: Problem, start: Pool, pool: Pool) -> Pool:
+def _with_starts(problem: Problem, start: Pool, pool: Pool) -> Pool:
     """Return a pool of starts together with the candidates of an earlier pool."""
     x = np.concatenate([start.x, surviving_candidates(pool, judge(problem, pool))], axis=1)
     return offer(problem, pack(x), None, "roots", perf_counter())
 
 
-def _limit(dof: Array) -> Array:
-    """Return the cost (N,) at which the chi-square test fails."""
+def _cost_limit(dof: Array) -> Array:
+    """Return the cost (N,) at which the chi-square test fails, for N numbers of degrees of freedom."""
     from scipy.special import gammainccinv
 
     return np.asarray(2.0 * gammainccinv(np.maximum(dof, 1) / 2, P_MISFIT))
@@ -426,13 +445,13 @@ def grow_explanation(problem: Problem, groups: Sequence[Group], fix: Fix, start:
         Groups that may be wrong.
     fix : Fix
         Fix of all data, without batch axes.
-    start : Rest
+    start : RemainingFix
         Start of the search.
     """
     # Bonferroni: a false alarm in one of a hundred clean problems, for any number of groups
     level = float(np.log(P_OUTLIER / len(groups)))
     left, rest = list(start.left), start.fix
-    while (worst := _worst(problem, groups, left, rest, level)) is not None:
+    while (worst := _most_contradictory(problem, groups, left, rest, level)) is not None:
         # no redundancy would remain for a test
         if int(rest.dof) <= len(groups[worst].rows):
             return Outcome(
@@ -459,16 +478,13 @@ def explain_from_beginnings(outcomes: Sequence[Outcome], groups: Sequence[Group]
 
 
 def begin_without(problem: Problem, groups: Sequence[Group], rows: Array, x: Array) -> RemainingFix:
-    """Return the rest of one problem without some rows (m,), refined from a vector (size,).
-
-    The rest is a start for `grow_explanation`.
-    """
+    """Return the rest of one problem without the flagged rows (m,), refined from a vector x (size,)."""
     left = tuple(i for i, group in enumerate(groups) if len(group.rows) == 1 and rows[group.rows[0]])
     return remaining_fix_of(groups, left, fix_without(problem, groups, left, x))
 
 
 def fix_without(problem: Problem, groups: Sequence[Group], left: Sequence[int], x: Array) -> Fix:
-    """Return the fix of one problem without some groups, refined from a vector (size,)."""
+    """Return the fix of one problem without the groups `left`, refined from a vector x (size,)."""
     part = leave_out_of(problem, groups, left)
     return fix_by(part, lambda one: begin(one, x[None]))[0]
 
@@ -491,14 +507,19 @@ def prove_remaining(problem: Problem, groups: Sequence[Group], rests: Sequence[R
 
 
 def leave_out_of(problem: Problem, groups: Sequence[Group], left: Sequence[int]) -> Problem:
-    """Return problems without some groups, and with their offsets."""
+    """Return problems without the rows and priors of the groups `left`, and with their offsets as unknowns."""
     chosen = [groups[i] for i in left]
     rows = np.broadcast_to(mark_rows(chosen, problem.count), (*problem.batch_shape, problem.count))
     return leave_out(problem, rows, [one for one in chosen if not one.rows])
 
 
-def _worst(problem: Problem, groups: Sequence[Group], left: Sequence[int], rest: Fix, level: float) -> int | None:
-    """Return the number of the group that contradicts the rest most; None if no group does so significantly."""
+def _most_contradictory(
+    problem: Problem, groups: Sequence[Group], left: Sequence[int], rest: Fix, level: float
+) -> int | None:
+    """Return the number of the group that contradicts the rest most; None if no probability is below the limit.
+
+    `left` are the groups left out already, and `level` is the natural logarithm of the probability of the limit.
+    """
     if not np.isfinite(rest.x).all():
         return None
     left_out = mark_rows([groups[i] for i in left], problem.count)
@@ -517,14 +538,14 @@ def _worst(problem: Problem, groups: Sequence[Group], left: Sequence[int], rest:
 
 
 def _influence(problem: Problem, groups: Sequence[Group], left: Sequence[int], x: Array) -> Influence:
-    """Return the influence of rows on the fix of one problem without some groups."""
+    """Return the influence of each row on the fix x (size,) of one problem without the groups `left`."""
     dropped = frozenset(groups[i].prior for i in left if groups[i].prior >= 0)
     left_out = mark_rows([groups[i] for i in left], problem.count)
     return influence(leave_out(problem, left_out[None]), x, dropped)
 
 
 def _present(group: Group, left_out: Array) -> Group:
-    """Return a group without the rows that are left out already."""
+    """Return a group without the rows that are left out already; `left_out` (m,) flags these rows."""
     return group if group.prior >= 0 else replace(group, rows=tuple(i for i in group.rows if not left_out[i]))
 
 
@@ -536,7 +557,7 @@ def _inside(one: Group, other: Group) -> bool:
 def _take_back(
     problem: Problem, groups: Sequence[Group], left: list[int], rest: Fix, level: float
 ) -> tuple[list[int], Fix]:
-    """Return the groups left out and the fix of the rest, after every group that fits the rest is taken back."""
+    """Return the groups left out and the fix of the rest; groups with log p above `level` are taken back."""
     while left and np.isfinite(rest.x).all():
         chosen = [groups[i] for i in left]
         # all errors are estimated jointly, to first order; the least significant one is taken back
@@ -550,7 +571,10 @@ def _take_back(
 
 
 def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fix, level: float) -> list[RemainingFix]:
-    """Return other sets of equal size: one group replaces another, if no further group then stands out."""
+    """Return other sets of equal size: one group replaces another of `left`, and no further group then stands out.
+
+    `level` is the natural logarithm of the probability at which a group stands out.
+    """
     found: dict[tuple[int, ...], RemainingFix] = {}
     for i in left if len(left) <= _MOST_LEFT_OUT else ():
         others = [j for j in left if j != i]
@@ -565,7 +589,7 @@ def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fi
             if key in found or tail[j] > level:
                 continue
             other = fix_without(problem, groups, key, fix.x)
-            if bool(other.answered) and _worst(problem, groups, key, other, level) is None:
+            if bool(other.answered) and _most_contradictory(problem, groups, key, other, level) is None:
                 found[key] = remaining_fix_of(groups, key, other)
     return list(found.values())
 

@@ -101,7 +101,7 @@ def _contradictory(conclusion: Conclusion) -> Fix:
 
 
 def list_names(parts: Sequence[str]) -> str:
-    """Return names as a part of a sentence: "a, b and c"."""
+    """Return names as a part of a sentence: "a, b and c". At most four names are listed, and the others counted."""
     if len(parts) > _SHOWN:
         parts = [*parts[:_SHOWN], f"{len(parts) - _SHOWN} more"]
     return parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]
@@ -129,7 +129,10 @@ def _name_rivals(explanations: Sequence[Explanation]) -> str:
 
 
 def _either(explanations: Sequence[Explanation]) -> str:
-    """Return explanations by the names of their suspects, as a part of a sentence: "A or B and C"."""
+    """Return explanations by the names of their suspects, as a part of a sentence: "A or B and C".
+
+    Most `_SHOWN` explanations are named, and the others are counted.
+    """
     shown = [" and ".join(one.names) or "no station" for one in explanations[:_SHOWN]]
     more = f" or {len(explanations) - _SHOWN} others" if len(explanations) > _SHOWN else ""
     return " or ".join(shown) + more

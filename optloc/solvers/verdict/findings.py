@@ -2,6 +2,9 @@
 
 A finding is a test and a sentence. `finding_marks` applies all tests to a batch of settled pools. `examine` computes
 the numbers that the tests read, and `explain` writes the sentences.
+
+Letters: N problems, n of them in a sentence, r other minima, d coordinates, `size` numbers of a parameter vector. A
+*mark* is a bit mask with one bit for each status. Costs and gaps are chi-square values.
 """
 
 from __future__ import annotations
@@ -77,7 +80,7 @@ class Evidence(NamedTuple):
     blind : bool
         Whether a search for suspects was requested, and the redundancy is too low to notice or to name one.
     held : bool
-        Whether the 95 % ellipses of repeated measurements cover.
+        Whether the 95 % ellipses of repeated measurements contain the truth often enough.
     robust : bool
         Whether the minima of a robust loss were searched, and the rows with weight prove the position.
     """
@@ -135,7 +138,10 @@ class Finding:
 
 
 def objections(table: Sequence[Finding], evidence: Any) -> list[tuple[Status, str]]:
-    """Return status and sentence of all findings against one answer, in the order of `PRECEDENCE`."""
+    """Return status and sentence of all findings of a table against one answer, in the order of `PRECEDENCE`.
+
+    `evidence` has the numbers that the tests of the table read.
+    """
     found = [(one.status, words) for one in table if one.test(evidence) for words in one.sentence(evidence)]
     return sorted(found, key=lambda one: PRECEDENCE.index(one[0]))
 
@@ -166,7 +172,7 @@ def finding_marks(problem: Problem, pool: Pool, gap: Array) -> Array:
             improbable,
             np.nan if pool.infinity is None else pool.infinity - cost,
             quantile(REGION_LEVEL, problem.dimension),
-            _apart(pool, gap).min(1, initial=np.inf),
+            _gaps_of_rivals(pool, gap).min(1, initial=np.inf),
             np.nan if kappa is None else kappa[:, 0],
             _is_unique(pool),
             False if pool.searched is None else pool.searched,
@@ -178,15 +184,18 @@ def finding_marks(problem: Problem, pool: Pool, gap: Array) -> Array:
 
 
 def marks_of(*numbers: Any) -> Any:
-    """Return the marks of all findings against one answer, or against N; `numbers` are the fields of `Evidence`."""
+    """Return the marks of all findings against one answer, or against N: one bit for each status.
+
+    `numbers` are the fields of `Evidence`, in their order.
+    """
     evidence, marks = Evidence(*numbers), 0
     for status_mark, test in _TESTS:
         marks = marks | test(evidence) * status_mark
     return marks
 
 
-def _apart(pool: Pool, gap: Array) -> Array:
-    """Return the gaps (N, r); infinite for the mirror image of the best within the same likelihood region."""
+def _gaps_of_rivals(pool: Pool, gap: Array) -> Array:
+    """Return the gaps (N, r) of other minima; infinite for the mirror image of the best in one likelihood region."""
     if pool.pair is None or not gap.shape[1]:
         return gap
     first, second = pool.pair[:, :1], pool.pair[:, 1:]
@@ -199,7 +208,10 @@ def _apart(pool: Pool, gap: Array) -> Array:
 
 
 def is_improbable(cost: Array, dof: Array, probability: float) -> Array:
-    """Return flags (N,) of costs (N,) that noise exceeds with less than the given probability."""
+    """Return flags (N,) of costs (N,) that noise exceeds with less than the given probability.
+
+    `dof` (N,) are the degrees of freedom. Without any, the flag is False.
+    """
     # often all N share one number of degrees of freedom: a view without strides
     if dof.strides == (0,):
         return np.asarray(cost > largest(int(dof[0]) if len(dof) else 0, probability))
@@ -211,7 +223,7 @@ def is_improbable(cost: Array, dof: Array, probability: float) -> Array:
 
 def _is_unique(pool: Pool) -> Array:
     """Return flags (N,) of answers with a proof that every unlisted minimum costs more than the gap."""
-    if pool.loss:  # a proof for squares does not hold for a robust loss
+    if pool.loss:  # a proof for squares does not apply to a robust loss
         return np.zeros(len(pool), dtype=bool) if pool.robust is None else pool.robust
     if pool.proven is None:
         return np.zeros(len(pool), dtype=bool)
@@ -222,11 +234,11 @@ def _is_unique(pool: Pool) -> Array:
 def is_proof_of_one(claims: Claims, infinity: Array) -> Array:
     """Return flags (...) of claims that every unlisted minimum costs more than `AMBIGUOUS_GAP` above the best.
 
-    If infinity costs less than the gap (`infinity` is this difference), a proof up to infinity is enough: the finding
-    `unbounded` covers the rest.
+    `infinity` is the cost at infinity minus the cost of the best. If it is positive and less than the gap, a proof up
+    to infinity is enough: the finding `unbounded` covers the rest.
     """
-    wide = (claims.margin >= AMBIGUOUS_GAP) | ((infinity > 0.0) & (infinity < AMBIGUOUS_GAP))
-    return np.asarray(claims.unique & ((claims.proof == GLOBAL) | claims.asked) & wide)
+    enough = (claims.margin >= AMBIGUOUS_GAP) | ((infinity > 0.0) & (infinity < AMBIGUOUS_GAP))
+    return np.asarray(claims.unique & ((claims.proof == GLOBAL) | claims.asked) & enough)
 
 
 def examine(problem: Problem, pool: Pool) -> Pool:
@@ -260,7 +272,10 @@ def examine(problem: Problem, pool: Pool) -> Pool:
 
 
 def _with_repeats(problem: Problem, pool: Pool, good: Array) -> Pool:
-    """Return a pool with repeats of the fixes whose only finding is `curved`."""
+    """Return a pool with the results of simulated repeats of the fixes whose only finding is `curved`.
+
+    `good` (N,) flags the fixes that may be repeated.
+    """
     assert pool.curvature is not None
     cost = pool.cost[:, 0]
     with np.errstate(invalid="ignore"):
@@ -276,14 +291,17 @@ def _with_repeats(problem: Problem, pool: Pool, good: Array) -> Pool:
 
 
 def repeats_hold(curvature: Curvature | None) -> Any:
-    """Return flags (N,) of fixes whose repeats were computed and cover; False if no repeats were computed."""
+    """Return flags (N,) of fixes whose simulated repeats cover the truth often enough; False without repeats."""
     if curvature is None or curvature.repeats is None:
         return False
     return holds(curvature.repeats)
 
 
 def _departure(problem: Problem, pool: Pool) -> Array:
-    """Return the departures of the cost from a Gaussian's, (N, 2): in metres and in inverse range."""
+    """Return the departures (N, 2) of the cost from a Gaussian's at three sigma: in metres and in inverse range.
+
+    The departures along the inner side of active bounds count too.
+    """
     assert pool.curvature is not None
     if pool.loss:
         problem = problem.with_rows(weight=pool.weights)
@@ -300,14 +318,17 @@ def _departure(problem: Problem, pool: Pool) -> Array:
 
 
 def _departure_inwards(problem: Problem, pool: Pool) -> Array:
-    """Return the departure (N,) of the cost from a Gaussian's, on the inner side of the bounds that hold fixes."""
+    """Return the departure (N,) of the cost from a Gaussian's, on the inner side of active bounds.
+
+    It is infinite if the truncated law of a fix is not valid.
+    """
     law = law_at(problem, pool)
     if law is None:
         return np.full(len(pool), np.inf)
     assert pool.curvature is not None
     assert pool.curvature.free is not None
-    held = np.isfinite(pool.curvature.free).all((-1, -2)) & law.sound & law.truncated.cuts
-    items, out = np.flatnonzero(held), np.full(len(pool), np.inf)
+    usable = np.isfinite(pool.curvature.free).all((-1, -2)) & law.sound & law.truncated.cuts
+    items, out = np.flatnonzero(usable), np.full(len(pool), np.inf)
     if len(items):
         free, one = pool.curvature.free[items], take(law.truncated, items)
         out[items] = departure_inwards(problem.take(items), pool.x[items, 0], free, one)
@@ -315,16 +336,19 @@ def _departure_inwards(problem: Problem, pool: Pool) -> Array:
 
 
 def law_at(problem: Problem, pool: Pool) -> Law | None:
-    """Return the truncated normal laws of the best candidates, or None if no bound is near a candidate."""
+    """Return the truncated normal laws of the best candidates, or None if no bound is near a candidate.
+
+    If bounds cut off a law, its covariance and its regions differ from a Gaussian's.
+    """
     curvature = pool.curvature
     # the covariance under a robust loss is no quadratic model beyond a bound
     if curvature is None or pool.loss or not has_law(problem):
         return None
     covariance, shift = curvature.covariance, np.zeros((len(pool), problem.layout.n_shared))
     if curvature.free is not None and curvature.shift is not None:
-        held = pool.face[:, 0] > 0
-        covariance = np.where(held[:, None, None], curvature.free, covariance)
-        shift = np.where(held[:, None], curvature.shift, shift)
+        on_bound = pool.face[:, 0] > 0
+        covariance = np.where(on_bound[:, None, None], curvature.free, covariance)
+        shift = np.where(on_bound[:, None], curvature.shift, shift)
     return law_of(problem, pool.x[:, 0], covariance, shift)
 
 
@@ -340,7 +364,11 @@ def _is_bent(pool: Pool) -> Array:
 
 
 def _infinity(problem: Problem, pool: Pool, wanted: Array, unseen: Array) -> Array:
-    """Return the least costs (N,) at infinity: from runs to infinity, and from all directions for wanted fixes."""
+    """Return the least known costs (N,) at infinity; NaN if unknown.
+
+    Runs of the refinement to infinity give some of the costs. For fixes flagged in `wanted` (N,) all directions are
+    tried, unless their shape was known before: `unseen` (N,) flags shapes that were not.
+    """
     known = np.full(len(pool), np.nan) if pool.infinity is None else np.array(pool.infinity)
     # A run to infinity tries one direction, so its cost need not be the least. If the shape is already known, all
     # directions were tried before.
@@ -351,7 +379,7 @@ def _infinity(problem: Problem, pool: Pool, wanted: Array, unseen: Array) -> Arr
 
 
 def centre_of(problem: Problem) -> Array:
-    """Return the mean (N or 1, d) of the stations that have rows with weight, metres."""
+    """Return the mean (N or 1, d) of the stations that have rows with weight, metres: the centre of the charts."""
     places = problem.stations.places
     measured = (problem.weight > 0.0).astype(float) @ rows_of_stations(problem).T.astype(float) > 0.0
     # a moving station counts with its positions at all epochs
@@ -372,7 +400,7 @@ def reach_of(problem: Problem, x: Array) -> Array:
     """
     centre, spread = centre_and_spread(problem.stations.places)
     reach = np.broadcast_to(spread, (len(x),))
-    if problem.layout.shares("position"):  # a shared position has a chart, and the chart holds its distance
+    if problem.layout.shares("position"):  # a shared position has a chart, which contains its distance
         return reach
     slots = (*problem.layout.shared, *problem.layout.local)
     for name in (slot.name for slot in slots if slot.name.partition("[")[0] == "position"):
@@ -419,7 +447,8 @@ def chart_of(
 def chart_kind(metres: Any, inverse: Any) -> Any:
     """Return the kind of chart of one fix, or of N fixes, from the two numbers of `Curvature.kappa`.
 
-    It is the first kind whose number is at most `BENT`. NaN counts as larger.
+    `metres` and `inverse` are the departures from a Gaussian in metres and in inverse range. The result is the first
+    kind whose number is at most `BENT`. NaN counts as larger.
     """
     assert (CARTESIAN, INVERSE_RANGE, CURVED) == (0, 1, 2)  # each number above the limit moves to the next kind
     bent = (metres <= BENT) ^ True
@@ -453,7 +482,7 @@ def explain(finished: Finished, code: Array, reason: Array) -> None:
 
 
 def _name_residuals(finished: Finished, items: Array) -> Any:
-    """Return a sentence on the residuals for each item, with the p-value; empty where the residuals fit the noise."""
+    """Return a sentence on the residuals for each item, with the p-value; "" if the residuals fit the noise."""
     pool = finished.pool
     improbable = is_improbable(pool.cost[items, 0], pool.dof[items], P_SUSPECT)
     p_values = tail_probability(pool.cost[items, 0], pool.dof[items])
@@ -462,7 +491,7 @@ def _name_residuals(finished: Finished, items: Array) -> Any:
 
 
 def _name_infinity(finished: Finished, items: Array) -> Any:
-    """Return the sentences of `unbounded`: the rise of chi-square at infinity."""
+    """Return the sentences of `unbounded` for items (n,): the rise of chi-square at infinity."""
     assert finished.pool.infinity is not None
     more = finished.pool.infinity[items] - finished.pool.cost[items, 0]
     rises = [f"only {rise:.2g}" if rise > _NONE else "nothing" for rise in more.tolist()]
@@ -470,18 +499,18 @@ def _name_infinity(finished: Finished, items: Array) -> Any:
 
 
 def _name_rivals(finished: Finished, items: Array) -> Any:
-    """Return the sentences of `ambiguous`: the gap of the nearest rival."""
-    gaps = _apart(finished.pool, finished.gap)[items].min(1).tolist()
+    """Return the sentences of `ambiguous` for items (n,): the gap of the nearest rival."""
+    gaps = _gaps_of_rivals(finished.pool, finished.gap)[items].min(1).tolist()
     return np.array([ambiguity(finished.problem, gap) for gap in gaps], dtype=object)
 
 
 def _name_search(finished: Finished, items: Array) -> Any:
-    """Return the sentences of `searched`: the remark of the search."""
+    """Return the sentences of `searched` for items (n,): the remark of the search."""
     return "" if finished.pool.remark is None else finished.pool.remark[items]
 
 
 def _name_proof(finished: Finished, items: Array) -> Any:
-    """Return the sentences of `unproven`: why there is no proof of uniqueness."""
+    """Return the sentences of `unproven` for items (n,): the reasons why there is no proof of uniqueness."""
     pool = finished.pool
     if pool.loss and pool.robust is not None and pool.remark is not None:
         return np.where(pool.remark[items] == "", NOT_TRIED, pool.remark[items])
@@ -490,7 +519,7 @@ def _name_proof(finished: Finished, items: Array) -> Any:
 
 
 def _name_shape(finished: Finished, items: Array) -> Any:
-    """Return the sentences of `curved`: the coordinates in which the fix is Gaussian, if any."""
+    """Return the sentences of `curved` for items (n,): the coordinates in which a fix is Gaussian, if there are any."""
     curvature = finished.pool.curvature
     assert curvature is not None
     assert curvature.kappa is not None
@@ -501,7 +530,7 @@ def _name_shape(finished: Finished, items: Array) -> Any:
 
 
 def _is_unsafe(evidence: Evidence) -> Any:
-    """Return flags of answers whose start was not safe and that have no proof of uniqueness."""
+    """Return flags of answers whose start was not safe and that have no proof of uniqueness; see `Evidence`."""
     return evidence.searched & (evidence.unique ^ True)
 
 

@@ -1,6 +1,9 @@
 """The verdict: from a pool of candidates to a fix with a status.
 
 Only this module sets the status of a fix, by one set of rules. So a status has the same meaning for every method.
+
+Letters: N problems, q candidates, r other minima, n shared unknowns, `size` numbers of a parameter vector. Marks are
+bit masks with one bit for each status.
 """
 
 from __future__ import annotations
@@ -60,7 +63,7 @@ class Ruling:
     proven : Claims
         Claims of the proofs.
     no_position : bool array (N,)
-        True where the position is not shown.
+        True for fixes whose position is not shown.
     """
 
     marks: Array
@@ -89,34 +92,34 @@ def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     few = (pool.dof < 0) & ~broken
     missing = ~np.isfinite(cost) & ~broken & ~few
     answered = ~(broken | few | missing)
-    # Missing data, missing rows and missing candidates are tested in this order. Other problems have an answer, perhaps
-    # a bad one.
+    # Missing data, missing rows and missing candidates are tested in this order. Other problems have an answer,
+    # perhaps a bad answer.
     weak = answered & ~_is_determined(curvature)
     distance = distance_of(problem, _position(problem, pool))
     with np.errstate(invalid="ignore"):
         improbable = is_improbable(cost, pool.dof, P_SUSPECT)
     far = answered & _runs_away(problem, curvature, distance, (code != Status.OK) | weak | improbable)
     # If no visible minimum fits but a hidden one does, the hidden one explains more than an unfinished refinement.
-    barred = answered & _has_hidden(pool) & ((code != Status.OK) | ((weak | far) & improbable))
-    far &= ~barred
+    hidden_fits = answered & _has_hidden(pool) & ((code != Status.OK) | ((weak | far) & improbable))
+    far &= ~hidden_fits
     # far away every direction is weak, so the distance is the better reason
-    weak &= ~(far | barred)
+    weak &= ~(far | hidden_fits)
     code[broken], code[few], code[far] = Status.REJECTED, Status.TOO_FEW_ROWS, Status.UNBOUNDED
-    code[weak], code[barred] = Status.SINGULAR_GEOMETRY, Status.INFEASIBLE
-    for i in np.flatnonzero(barred):
+    code[weak], code[hidden_fits] = Status.SINGULAR_GEOMETRY, Status.INFEASIBLE
+    for i in np.flatnonzero(hidden_fits):
         reason[i] = _hidden_or(pool, int(i), "")
     for i in np.flatnonzero(few):
-        reason[i] = _lacking(-int(pool.dof[i]))
+        reason[i] = _too_few_sentence(-int(pool.dof[i]))
     for i in np.flatnonzero(answered & np.isin(code, _UNFINISHED)):
         reason[i] = f"the target is too far away: {distance[i]:.3g} times the size of the station array from its middle"
     for i in np.flatnonzero(weak):
-        reason[i] = _open(problem, _information(curvature)[i])
+        reason[i] = _undetermined_sentence(problem, _information(curvature)[i])
     _explain_missing(problem, pool, np.flatnonzero(missing), code, reason)
     finished = answered & (code == Status.OK)
     marks = np.where(finished, finding_marks(problem, pool, gap), 1 << code.astype(np.int32)).astype(np.int32)
     proven = merged_claims(finished, _claims(pool), NO_ANSWER)
     if pool.free is not None:
-        _hold_against_constraints(pool, cost, finished, marks, reason)
+        _mark_contradictions(pool, cost, finished, marks, reason)
     code = first_status(marks)
     explain(Finished(problem, pool, gap, proven), code, reason)
     if pool.hidden is not None:
@@ -124,13 +127,13 @@ def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     if pool.loss:
         _name_rejected(problem, pool, finished & is_improbable(cost, pool.dof, P_SUSPECT), reason)
     if pool.asked:
-        _weigh_redundancy(pool, finished, reason)
-    return Ruling(marks, reason, proven, broken | few | missing | barred | weak | far)
+        _name_redundancy(pool, finished, reason)
+    return Ruling(marks, reason, proven, broken | few | missing | hidden_fits | weak | far)
 
 
 def _is_broken(problem: Problem, count: int) -> Array:
-    """Return flags (N,) of problems that have a measurement which is not a finite number."""
-    # an absent row may hold any value
+    """Return flags (N,) of problems that have a measurement which is not a finite number; `count` is N."""
+    # an absent row may contain any value
     return ~np.broadcast_to((np.isfinite(problem.z) | (problem.weight == 0.0)).all(-1), (count,))
 
 
@@ -155,7 +158,10 @@ def _information(curvature: Curvature) -> Array:
 
 
 def _runs_away(problem: Problem, curvature: Curvature, distance: Array, lost: Array) -> Array:
-    """Return flags (N,) of positions so far away or so uncertain that the data determine a direction only."""
+    """Return flags (N,) of positions so far away or so uncertain that the data determine a direction only.
+
+    `distance` (N,) is in spreads of the stations. `lost` (N,) flags fixes with another fault.
+    """
     covariance = np.where(_is_determined(curvature)[:, None, None], curvature.covariance, np.nan)
     with np.errstate(invalid="ignore"):
         # if the error exceeds the distance from the stations, only the direction is known
@@ -164,33 +170,41 @@ def _runs_away(problem: Problem, curvature: Curvature, distance: Array, lost: Ar
         return np.asarray(((lost | loose) & (distance > FAR)) | (distance > FLAT))
 
 
-def _lacking(count: int) -> str:
-    """Return the sentence for `count` missing measurements."""
+def _too_few_sentence(count: int) -> str:
+    """Return the sentence for `count` missing measurements, compared with the number of unknowns."""
     return f"there {'is 1 measurement' if count == 1 else f'are {count} measurements'} fewer than unknowns"
 
 
-def _open(problem: Problem, information: Array) -> str:
-    """Return a sentence on what the data do not determine: combinations of biases by name, or a direction."""
+def _undetermined_sentence(problem: Problem, information: Array) -> str:
+    """Return a sentence on undetermined unknowns: combinations of biases by name, or a direction.
+
+    `information` (n, n) is the information of the shared unknowns of one problem.
+    """
     # biases compensate each other, and the names of this combination help more than a direction
     named = open_sentences(problem.layout, information) if problem.biases and np.isfinite(information).all() else ()
     return "; ".join(named) or weak_direction(problem, information)
 
 
 def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, reason: Array) -> None:
-    """Write status and reason of problems without a candidate: the cause that prevents every closed-form start."""
+    """Write status and reason of problems without a candidate: the cause that prevents every closed-form start.
+
+    `items` are the numbers of these problems. `code` and `reason` (N,) are written.
+    """
     if pool.missing is not None:
         known = items[pool.missing.reason[items] != ""]
         code[known], reason[known] = pool.missing.code[known], pool.missing.reason[known]
         items = np.setdiff1d(items, known)
     if not len(items):
         return
-    barred = items[(code[items] == Status.INFEASIBLE) | _has_hidden(pool)[items]]
-    code[barred] = Status.INFEASIBLE
-    for i in barred:
+    forbidden = items[(code[items] == Status.INFEASIBLE) | _has_hidden(pool)[items]]
+    code[forbidden] = Status.INFEASIBLE
+    for i in forbidden:
         bounds = violation_names(problem)
-        missed = f"no minimum satisfies all constraints: {bounds}" if bounds else "the Earth hides every minimum found"
-        reason[i] = _hidden_or(pool, int(i), missed)
-    items = np.setdiff1d(items, barred)
+        sentence = (
+            f"no minimum satisfies all constraints: {bounds}" if bounds else "the Earth hides every minimum found"
+        )
+        reason[i] = _hidden_or(pool, int(i), sentence)
+    items = np.setdiff1d(items, forbidden)
     single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
     # the graph of ranges belongs to one position: in a moving run stations are linked over time
     found = ranges(problem.take(items)) if single and len(items) else None
@@ -216,11 +230,14 @@ def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, re
         else:
             code[i] = Status.SINGULAR_GEOMETRY
             one = problem.take(np.array([i]))
-            reason[i] = _short(one) or unmeasured_direction(one) or station_direction(one)
+            reason[i] = _targets_with_few_rows(one) or unmeasured_direction(one) or station_direction(one)
 
 
-def _short(problem: Problem) -> str:
-    """Return a sentence that names the targets of a single problem with fewer rows than their states need."""
+def _targets_with_few_rows(problem: Problem) -> str:
+    """Return a sentence that names the targets of one problem with fewer rows than their states need; "" without one.
+
+    The sentence is also "" for a problem of a single target.
+    """
     lacking = []
     target = np.concatenate([rows.target for rows in problem.rows])
     for i, motion in enumerate(problem.motions):
@@ -237,51 +254,55 @@ def _has_hidden(pool: Pool) -> Array:
 
 
 def _hidden_or(pool: Pool, item: int, otherwise: str) -> str:
-    """Return the sentence on a minimum behind the Earth of one problem, or another sentence if it has none."""
+    """Return the sentence on a minimum behind the Earth of one problem, or the sentence `otherwise` if it has none."""
     return otherwise if pool.hidden is None else pool.hidden[item] or otherwise
 
 
 def _name_hidden(hidden: Array, items: Array, reason: Array) -> None:
-    """Append the sentence on a minimum behind the Earth to the reasons of given items."""
+    """Append the sentence on a minimum behind the Earth to the reasons of items flagged in `items` (N,)."""
     for i in np.flatnonzero(items & (hidden != "")):
         reason[i] = f"{reason[i]}; {hidden[i]}" if reason[i] else hidden[i]
 
 
 def _position(problem: Problem, pool: Pool) -> Array:
-    """Return the position (N, d) of the only target, or the centre of the stations if there is no shared position."""
+    """Return the position (N, d), metres, of the only target; NaN without a candidate.
+
+    Without a shared position it is the centre of the stations.
+    """
     if problem.layout.shares("position"):
         return problem.layout.take(np.where(np.isfinite(pool.cost[:, :1]), pool.x[:, 0], np.nan), "position")
     return np.broadcast_to(spread_of(problem)[0], (len(pool), problem.dimension))
 
 
 def _name_rejected(problem: Problem, pool: Pool, items: Array, reason: Array) -> None:
-    """Write the rows that a robust loss rejected, for items whose residuals are larger than the noise allows."""
+    """Write to the reasons the rows that a robust loss rejected, for problems flagged in `items` (N,)."""
     base = np.broadcast_to(problem.weight, pool.weights.shape)
-    lost = (base > 0.0) & (pool.weights < REJECTED * base)
-    for i in np.flatnonzero(items & lost.any(1)):
-        rows = np.flatnonzero(lost[i])
+    is_rejected = (base > 0.0) & (pool.weights < REJECTED * base)
+    for i in np.flatnonzero(items & is_rejected.any(1)):
+        rows = np.flatnonzero(is_rejected[i])
         shown = ", ".join(map(str, rows[:_SHOWN])) + (" ..." if len(rows) > _SHOWN else "")
         reason[i] = f"{len(rows)} of {int((base[i] > 0.0).sum())} rows were rejected: {shown}; {reason[i]}"
 
 
-def _hold_against_constraints(pool: Pool, cost: Array, finished: Array, marks: Array, reason: Array) -> None:
-    """Mark fixes whose data contradict the constraints that hold them.
+def _mark_contradictions(pool: Pool, cost: Array, finished: Array, marks: Array, reason: Array) -> None:
+    """Mark fixes whose data contradict their active constraints.
 
     Two conditions must be true. The data agree without the constraints. The k active constraints raise the cost by more
     than the chi-square of k degrees of freedom, which noise exceeds once in a thousand cases. Under a robust loss the
-    first condition is dropped, since a robust loss allows gross errors.
+    first condition is dropped, since a robust loss allows gross errors. `marks` and `reason` (N,) are written for
+    problems flagged in `finished` (N,).
     """
     assert pool.curvature is not None
     if pool.curvature.active is None:
         return
     free = pool.free
     assert free is not None
-    held = np.array([len(active) for active in pool.curvature.active])
+    active_count = np.array([len(active) for active in pool.curvature.active])
     with np.errstate(invalid="ignore"):
         # whether the data agree without constraints; always true without redundancy
-        noise = bool(pool.loss) | (pool.dof <= 0) | (chdtrc(np.maximum(pool.dof, 1), free) >= P_SUSPECT)
-        dear = chdtrc(np.maximum(held, 1), np.maximum(cost - free, 0.0)) < P_SUSPECT
-    for i in np.flatnonzero((held > 0) & finished & np.isfinite(free) & noise & dear):
+        data_agree = bool(pool.loss) | (pool.dof <= 0) | (chdtrc(np.maximum(pool.dof, 1), free) >= P_SUSPECT)
+        costly = chdtrc(np.maximum(active_count, 1), np.maximum(cost - free, 0.0)) < P_SUSPECT
+    for i in np.flatnonzero((active_count > 0) & finished & np.isfinite(free) & data_agree & costly):
         names = " and ".join(active.name for active in pool.curvature.active[i])
         marks[i] |= Status.CONTRADICTORY.mark
         reason[i] = (
@@ -289,8 +310,8 @@ def _hold_against_constraints(pool: Pool, cost: Array, finished: Array, marks: A
         )
 
 
-def _weigh_redundancy(pool: Pool, finished: Array, reason: Array) -> None:
-    """Write the limits that a redundancy of 0 or 1 sets to a search for suspects."""
+def _name_redundancy(pool: Pool, finished: Array, reason: Array) -> None:
+    """Write to the reasons the limits that a redundancy of 0 or 1 sets to a search for suspects."""
     for dof, limit in (
         (0, "a wrong measurement would not be noticed"),
         (1, "a wrong measurement would be noticed, but not identified"),
@@ -341,7 +362,7 @@ def judge(problem: Problem, pool: Pool) -> Fix:
     """
     if pool.curvature is None:
         return _show_starts(problem, pool)
-    fix = _plain(problem, pool, pool.curvature)
+    fix = _as_finished(problem, pool, pool.curvature)
     # the rules take longer than a compiled fix, so they run only for fixes with a finding
     if pool.plain is None:
         fix = _apply_rules(problem, pool, fix)
@@ -350,14 +371,14 @@ def judge(problem: Problem, pool: Pool) -> Fix:
         fix = overwrite(fix, items, _apply_rules(problem.take(items), take(pool, items), fix[items]))
     if pool.conclusion is not None:
         items = np.flatnonzero(present(pool.conclusion))
-        own = [_concluded(problem, int(i), pool.conclusion[i]) for i in items]
+        concluded = [_concluded(problem, int(i), pool.conclusion[i]) for i in items]
         # one overwrite for all items: a copy of the whole batch per item would take quadratic time
-        fix = overwrite(fix, items, join(own, len(own))) if own else fix
+        fix = overwrite(fix, items, join(concluded, len(concluded))) if concluded else fix
     return fix
 
 
 def _concluded(problem: Problem, item: int, conclusion: Conclusion | Fix) -> Fix:
-    """Return the fix of an item with a conclusion, a flat batch of one."""
+    """Return the fix of one item with a conclusion, as a flat batch of one."""
     return (
         conclusion.reshape((1,))
         if isinstance(conclusion, Fix)
@@ -366,18 +387,24 @@ def _concluded(problem: Problem, item: int, conclusion: Conclusion | Fix) -> Fix
 
 
 def surviving_candidates(pool: Pool, fix: Fix) -> Array:
-    """Return the candidates (N, q, size) of a pool; NaN for a best candidate whose verdict shows no position."""
+    """Return the candidates (N, q, size) of a pool; NaN for a best candidate whose verdict shows no position.
+
+    The next stage starts from these candidates.
+    """
     if pool.curvature is None:
         return pool.x
     best = np.where(np.isnan(fix.x).all(-1, keepdims=True), np.nan, pool.x[:, 0])
     return np.concatenate([best[:, None], pool.x[:, 1:]], axis=1)
 
 
-def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
-    """Return the fixes of settled pools as if all were finished and near; without a status if `pool.plain` is None."""
+def _as_finished(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
+    """Return the fixes of settled pools as if all were finished and near the stations.
+
+    If `pool.plain` is None, they have no status yet: `_apply_rules` decides it.
+    """
     count, cost, proven = len(pool), pool.cost[:, 0], _claims(pool)
     law = law_at(problem, pool)
-    covariance = curvature.covariance if law is None else _cut_off(problem, pool, law.truncated)
+    covariance = curvature.covariance if law is None else _truncated_covariance(problem, pool, law.truncated)
     truncated = None if law is None else law.truncated
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
@@ -412,8 +439,8 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
     )
 
 
-def _cut_off(problem: Problem, pool: Pool, law: Truncated) -> Array:
-    """Return the covariances (N, n, n) of the shared unknowns after truncation at bounds."""
+def _truncated_covariance(problem: Problem, pool: Pool, law: Truncated) -> Array:
+    """Return the covariances (N, n, n) of the shared unknowns after the bounds have truncated their laws."""
     curvature = pool.curvature
     assert curvature is not None
     out = np.array(curvature.covariance)
@@ -441,7 +468,7 @@ def _without_proof(count: int) -> Claims:
 
 
 def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
-    """Return the fixes with the statuses of the rules."""
+    """Return the fixes with the statuses of the rules; NaN for positions and covariances that are not shown."""
     ruling = decide_statuses(problem, pool, fix.alternatives.gap)
     assert pool.curvature is not None
     regular = pool.curvature.regular
@@ -470,7 +497,7 @@ def _show_starts(problem: Problem, pool: Pool) -> Fix:
     few = (pool.dof < 0) & empty & ~broken
     code[broken & empty], code[few], reason[broken & empty] = Status.REJECTED, Status.TOO_FEW_ROWS, ""
     for i in np.flatnonzero(few):
-        reason[i] = _lacking(-int(pool.dof[i]))
+        reason[i] = _too_few_sentence(-int(pool.dof[i]))
     _explain_missing(problem, pool, np.flatnonzero(empty & ~broken & ~few), code, reason)
     return Fix(
         pool.x[:, 0],
@@ -510,22 +537,22 @@ def failed_fixes(problem: Problem, cause: str) -> Fix:
 
 
 def hide_open_epochs(fix: Fix) -> Fix:
-    """Return fixes of runs with NaN for the states of undetermined epochs; the reason names these epochs."""
+    """Return fixes of runs with NaN for the states of undetermined epochs; their reasons name these epochs."""
     if fix.local is None or not fix.answered.any():
         return fix
     size = fix.local.shape[-1]
-    undone = np.isnan(np.diagonal(fix.local, axis1=-2, axis2=-1)).any(-1) & fix.answered[..., None]
-    if not undone.any():
+    undetermined = np.isnan(np.diagonal(fix.local, axis1=-2, axis2=-1)).any(-1) & fix.answered[..., None]
+    if not undetermined.any():
         return fix
     x, reason = fix.x.copy(), fix.reason.copy()
     n, length = fix.layout.n_shared, fix.layout.n_local
-    states = x[..., n:].reshape(*undone.shape, length)
-    states[undone, :size] = np.nan
+    states = x[..., n:].reshape(*undetermined.shape, length)
+    states[undetermined, :size] = np.nan
     for i in np.ndindex(reason.shape):
-        where = np.flatnonzero(undone[i])
-        if len(where):
-            shown = ", ".join(map(str, where[:_EPOCHS_SHOWN])) + (" ..." if len(where) > _EPOCHS_SHOWN else "")
-            left = f"{len(where)} of {undone.shape[-1]} epochs do not determine their positions: {shown}"
-            reason[i] = f"{reason[i]}; {left}" if reason[i] else left
+        epochs = np.flatnonzero(undetermined[i])
+        if len(epochs):
+            shown = ", ".join(map(str, epochs[:_EPOCHS_SHOWN])) + (" ..." if len(epochs) > _EPOCHS_SHOWN else "")
+            sentence = f"{len(epochs)} of {undetermined.shape[-1]} epochs do not determine their positions: {shown}"
+            reason[i] = f"{reason[i]}; {sentence}" if reason[i] else sentence
     x[..., n:] = states.reshape(*x.shape[:-1], -1)
     return replace(fix, x=x, reason=reason)

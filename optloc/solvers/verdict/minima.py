@@ -1,4 +1,7 @@
-"""From refined candidates to the distinct minima of each problem: the best minimum, its curvature, and its rivals."""
+"""From refined candidates to the distinct minima of each problem: the best minimum, its curvature, and its rivals.
+
+Letters: N problems, q candidates of a problem, r rivals, n shared unknowns, `size` numbers of a parameter vector.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,10 @@ _AWAY, _MOST = 1.3, 0.5
 
 
 def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array) -> Curvature:
-    """Return the curvature of the cost at vectors x (N, size) that lie on given faces (N,) of the constraints."""
+    """Return the curvature of the cost at vectors x (N, size) on faces `face` (N,) of the constraints.
+
+    `optloc.linear.constraints.faces` lists the faces; face 0 has no inequalities.
+    """
     information, vector, ok = marginal(equations)
     covariance, regular = linalg.inverse(information)
     weakest = smallest_pivot(information)
@@ -73,7 +79,8 @@ def _without_bounds(
 ) -> tuple[Array, Array]:
     """Return covariance (N, n, n), and mean minus x (N, n), of the quadratic model with equalities but without bounds.
 
-    NaN where the data and the equalities leave a direction open.
+    `vector` (N, n) is half the downhill gradient of the cost. If the data and the equalities leave a direction
+    undetermined, the result is NaN.
     """
     if equalities:
         covariance, regular = linalg.inverse_within(information, tangent_at(problem, equalities, x))
@@ -85,7 +92,10 @@ def _without_bounds(
 
 
 def _local_covariance(problem: Problem, equations: Normal, shared: Array) -> Array | None:
-    """Return the covariance of the states of targets and walks at each epoch, or None without such states."""
+    """Return the covariance (N, k, p, p) of the states of targets and walks at each epoch, or None without such states.
+
+    `shared` (N, n, n) is the covariance of the shared unknowns.
+    """
     names = {name for i, m in enumerate(problem.motions) for name in state_names(i, len(problem.motions), m.order)}
     names |= set(walk_names(problem))
     # these states come first in the layout
@@ -95,7 +105,11 @@ def _local_covariance(problem: Problem, equations: Normal, shared: Array) -> Arr
 
 
 def _multipliers(problem: Problem, face: Face, x: Array, vector: Array) -> Array:
-    """Return the active constraints of each problem: gradient of the cost + sum of multiplier * gradient = 0."""
+    """Return the active constraints of each problem (N,), tuples of `Active` with Lagrange multipliers.
+
+    The multipliers meet: gradient of the cost + sum of multiplier * gradient of the constraint = 0. `vector` (N, n) is
+    half the downhill gradient of the cost.
+    """
     _, gradients = levels(problem, face, x)
     names = face_names(problem, face)
     out = np.empty(len(x), dtype=object)
@@ -110,7 +124,7 @@ def _multipliers(problem: Problem, face: Face, x: Array, vector: Array) -> Array
 
 
 def smallest_pivot(information: Array) -> Array:
-    """Return the smallest squared pivot (N,) of the information, scaled to a unit diagonal."""
+    """Return the smallest squared pivot (N,) of the information (N, n, n), scaled to a unit diagonal; 0 if singular."""
     diagonal = np.diagonal(information, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         # a unit diagonal makes metres, seconds and radians comparable
@@ -121,7 +135,10 @@ def smallest_pivot(information: Array) -> Array:
 
 
 def weak_direction(problem: Problem, information: Array) -> str:
-    """Return a sentence that names the combination of unknowns that the data do not determine."""
+    """Return a sentence that names the combination of unknowns that the data do not determine.
+
+    `information` (n, n) belongs to one problem.
+    """
     diagonal = np.diagonal(information)
     if not np.isfinite(information).all():
         return "the information is not finite"
@@ -138,7 +155,7 @@ def weak_direction(problem: Problem, information: Array) -> str:
 
 
 def _corners(problem: Problem) -> Array:
-    """Return vectors (N, q, size) with the position at the corners of a box around the stations."""
+    """Return vectors (N, q, size) with the position at the q corners of a box around the stations."""
     centre, spread = spread_of(problem)
     corners = _AWAY * np.array(list(product((-1.0, 1.0), repeat=problem.dimension)))
     places = centre[:, None] + spread[:, None, None] * corners
@@ -154,10 +171,10 @@ def is_measured(problem: Problem) -> Array:
     if not one_position(problem):
         return np.zeros(size, dtype=bool)
     x = _corners(problem)
-    item, flat = np.repeat(np.arange(size), x.shape[1]), x.reshape(-1, x.shape[-1])
+    item, points = np.repeat(np.arange(size), x.shape[1]), x.reshape(-1, x.shape[-1])
     part = problem.take(item)
     with np.errstate(all="ignore"):
-        found = measure_curvature(part, equations_at(part, flat), flat, np.zeros(len(flat), dtype=int))
+        found = measure_curvature(part, equations_at(part, points), points, np.zeros(len(points), dtype=int))
     assert found.regular is not None
     assert found.weakest is not None
     good = found.regular & (found.weakest >= WEAK)
@@ -177,7 +194,7 @@ def unmeasured_direction(problem: Problem) -> str:
 
 
 def station_direction(problem: Problem) -> str:
-    """Return a sentence that names why the stations of one problem cannot determine a position."""
+    """Return a sentence on the geometry because of which the stations of one problem cannot determine a position."""
     position = problem.stations.position.reshape(-1, problem.dimension)
     used = sorted({int(s) for rows in problem.rows for s in (*rows.a, *rows.b) if s >= 0})
     places = position[used]
@@ -229,12 +246,12 @@ def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = eq
     slots = _rivals(problem, pool, x, cost, curvature)
     return replace(
         pool,
-        x=np.concatenate([np.where(found[:, None], x, np.nan)[:, None], _at(pool.x, slots, np.nan)], axis=1),
-        cost=np.concatenate([np.where(found, cost, np.inf)[:, None], _at(pool.cost, slots, np.inf)], axis=1),
+        x=np.concatenate([np.where(found[:, None], x, np.nan)[:, None], _take_slots(pool.x, slots, np.nan)], axis=1),
+        cost=np.concatenate([np.where(found, cost, np.inf)[:, None], _take_slots(pool.cost, slots, np.inf)], axis=1),
         code=np.concatenate(
-            [pool.code[rows, best, None], _at(pool.code, slots, Status.UNAVAILABLE)], axis=1, dtype=np.int8
+            [pool.code[rows, best, None], _take_slots(pool.code, slots, Status.UNAVAILABLE)], axis=1, dtype=np.int8
         ),
-        face=np.concatenate([face[:, None], _at(pool.face, slots, 0)], axis=1),
+        face=np.concatenate([face[:, None], _take_slots(pool.face, slots, 0)], axis=1),
         stages=(*pool.stages, stage),
         refined=True,
         curvature=curvature,
@@ -243,7 +260,10 @@ def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = eq
 
 
 def _without_runs_to_infinity(problem: Problem, pool: Pool) -> tuple[Pool, Array]:
-    """Return the pool without runs to infinity that a finite minimum rivals, and the least cost (N,) of these runs."""
+    """Return the pool without runs to infinity that a finite minimum rivals, and the least cost (N,) of all such runs.
+
+    The cost is NaN without a run to infinity. A rival costs at most `AMBIGUOUS_GAP` more than the run.
+    """
     none = np.full(len(pool), np.nan)
     if not problem.layout.shares("position"):
         return pool, none
@@ -276,7 +296,8 @@ def _sort(pool: Pool) -> Pool:
 def _choose(problem: Problem, pool: Pool) -> Array:
     """Return the slot (N,) of the answer: the cheapest candidate, or the likeliest of finished ones with equal costs.
 
-    Rounding, which differs between processors, must not choose between equal costs.
+    The candidates must be in ascending order of cost. Rounding, which differs between processors, must not choose
+    between equal costs.
     """
     finished, least = pool.code == Status.OK, pool.cost[:, :1]
     with np.errstate(invalid="ignore"):
@@ -311,8 +332,8 @@ def likelihood_of(problem: Problem, x: Array) -> tuple[Array, Array]:
 def _rivals(problem: Problem, pool: Pool, x: Array, cost: Array, curvature: Curvature) -> Array:
     """Return the slots (N, r) of the other finished minima within the listed gap, cheapest first; -1 for empty slots.
 
-    Each minimum is listed once. For a run all minima are listed at any cost: they are few, and users need to know by
-    how much the data exclude them.
+    `x` (N, size) and `cost` (N,) are the best minima. Each minimum is listed once. For a run all minima are listed at
+    any cost: they are few, and users need to know by how much the data exclude them.
     """
     n, limit = problem.layout.n_shared, np.inf if problem.epochs > 1 else LISTED_GAP
     with np.errstate(invalid="ignore"):
@@ -323,7 +344,7 @@ def _rivals(problem: Problem, pool: Pool, x: Array, cost: Array, curvature: Curv
     for slot in np.flatnonzero(np.isfinite(gap).any(0)):
         new = np.isfinite(gap[:, slot])
         for other, present in kept:
-            new &= ~_same(pool.x[:, slot, :n], other, curvature) | ~present
+            new &= ~_is_same_place(pool.x[:, slot, :n], other, curvature) | ~present
         if new.any():
             kept.append((pool.x[:, slot, :n], new))
             slots[:, slot] = np.where(new, gap[:, slot], np.inf)
@@ -331,17 +352,17 @@ def _rivals(problem: Problem, pool: Pool, x: Array, cost: Array, curvature: Curv
     return np.where(np.isfinite(np.take_along_axis(slots, order, axis=1)), order, -1)
 
 
-def _at(values: Array, slots: Array, empty: float) -> Array:
+def _take_slots(values: Array, slots: Array, empty: float) -> Array:
     """Return values (N, q, ...) at slots (N, r); `empty` where the slot is -1."""
     extra = (1,) * (values.ndim - 2)
     index = slots.reshape(*slots.shape, *extra)
     return np.where(index < 0, empty, np.take_along_axis(values, np.maximum(index, 0), axis=1))
 
 
-def _same(x: Array, y: Array, curvature: Curvature) -> Array:
-    """Return flags (N,) of point pairs that are equal, or closer than 0.1 standard deviations in all directions."""
+def _is_same_place(x: Array, y: Array, curvature: Curvature) -> Array:
+    """Return flags (N,) of points x and y (N, n) that are equal, or closer than 0.1 standard deviations."""
     difference = x - y
-    with np.errstate(all="ignore"):  # a point that constraints hold has no spread
+    with np.errstate(all="ignore"):  # a point that constraints determine has no spread
         squared = (difference[:, None, :] @ curvature.information @ difference[..., None])[:, 0, 0]
         spread = np.trace(curvature.covariance, axis1=-2, axis2=-1)  # constraints leave directions without information
         squared = np.maximum(squared, (difference**2).sum(-1) / spread)

@@ -3,6 +3,9 @@
 A test of the likelihood three deviations away refuses many fixes whose 95 % ellipse covers. For these fixes, optloc
 draws true positions from the Gaussian of the fix and simulates a measurement at each. It refines each repeat from its
 true position. The share of ellipses that contain their true position decides.
+
+Letters: N fixes, r = 48 repeats of each, M = N r, m rows, n shared unknowns, `size` numbers of a parameter vector. The
+three results of a fix are the shares at the two `LEVELS`, 0 to 1, and an inflation.
 """
 
 from __future__ import annotations
@@ -51,7 +54,7 @@ _PART = 2**15
 def is_repeatable(problem: Problem) -> bool:
     """Return whether a measurement can be simulated again: one position, no equality, priors on shared unknowns only.
 
-    Inequalities are allowed if none holds the fix.
+    Inequalities are allowed if none is active at the fix.
     """
     free = not exact(problem) and not problem.stations.errors and problem.medium is None
     walks = any(form_of(bias).steps is not None for bias in problem.biases)
@@ -61,7 +64,10 @@ def is_repeatable(problem: Problem) -> bool:
 
 
 def holds(found: Array) -> Array:
-    """Return flags (N,) of repeats (N, 3) whose shares reach `ENOUGH`; False for NaN."""
+    """Return flags (N,) of fixes whose shares of repeats reach `ENOUGH`; `found` (N, 3) is a result of `repeat`.
+
+    NaN gives False.
+    """
     with np.errstate(invalid="ignore"):
         return np.asarray((found[:, :2] >= ENOUGH).all(-1))
 
@@ -84,7 +90,10 @@ def repeat(problem: Problem, x: Array, covariance: Array) -> Array:
 
 
 class Repeats(NamedTuple):
-    """Fixes of M repeated measurements: vectors (M, size), covariances (M, n, n), and flags (M,) of finished ones."""
+    """Fixes of M repeated measurements: vectors x (M, size), covariances `spread` (M, n, n), and flags `good` (M,).
+
+    The flag of a finished fix is True.
+    """
 
     x: Array
     spread: Array
@@ -119,14 +128,17 @@ def repeated(
 
 
 def _parts(count: int) -> Iterator[Array]:
-    """Yield the numbers of fixes whose repeats fit in one part."""
+    """Yield arrays with the numbers of the fixes whose repeats are refined together; `count` fixes exist."""
     size = max(1, _PART // _REPEATS)
     for first in range(0, count, size):
         yield np.arange(first, min(first + size, count))
 
 
 def _measured(problem: Problem, x: Array, covariance: Array, wrong: Array | None) -> tuple[Problem, Array]:
-    """Return repeated measurements, N r problems, and their true vectors (N r, size)."""
+    """Return repeated measurements, N r problems for r repeats, and their true vectors (N r, size).
+
+    `wrong` (N, m) are errors that are added to the rows of all repeats, or None.
+    """
     each = np.repeat(np.arange(len(x)), _REPEATS)
     truth, noise, means = _drawn(problem, x, covariance)
     many = _with_priors(problem.take(each), means)
@@ -141,7 +153,7 @@ def _measured(problem: Problem, x: Array, covariance: Array, wrong: Array | None
 
 
 def _refine(problem: Problem, truth: Array) -> Repeats:
-    """Return the least-squares fixes that start at the true vectors."""
+    """Return the least-squares fixes of M repeated measurements that start at the true vectors (M, size)."""
     with np.errstate(all="ignore"):
         done = refine(problem, truth, tolerance=TOLERANCE, limit=_STEPS)
         information, _, ok = marginal(done.equations)
@@ -150,7 +162,7 @@ def _refine(problem: Problem, truth: Array) -> Repeats:
 
 
 def _shares(problem: Problem, truth: Array, found: Repeats) -> Array:
-    """Return the shares and inflations (N, 3) of one part of the batch."""
+    """Return the shares of repeats whose ellipses contain the truth, and inflations, (N, 3); see `repeat`."""
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
     away = found.x[:, part] - truth[:, part]
@@ -166,7 +178,7 @@ def _shares(problem: Problem, truth: Array, found: Repeats) -> Array:
 
 
 def _with_priors(problem: Problem, means: dict[str, Array]) -> Problem:
-    """Return problems with the drawn means (N, p) of their priors."""
+    """Return problems with the drawn means (N, p) of their priors; priors of biases become separate priors."""
     spreads = {name: linalg.inverse(precision)[0] for name, _, precision in prior_parts(problem)}
     priors = tuple(Prior(name, means[name], spread) for name, spread in spreads.items())
     return replace(problem, biases=tuple(replace(bias, sigma=None) for bias in problem.biases), priors=priors)
@@ -185,11 +197,11 @@ def _drawn(problem: Problem, x: Array, covariance: Array) -> tuple[Array, Array,
     means = {name: np.empty((len(truth), slot.size)) for name, slot in slots.items()}
     for i in range(len(x)):
         rng = np.random.default_rng(crc32(np.ascontiguousarray(z[i]).tobytes()))
-        own, one = slice(i * _REPEATS, (i + 1) * _REPEATS), problem.take(np.array([i]))
-        truth[own, :n] += samples(covariance[i], (_REPEATS,), rng)
-        noise[own] = draw(one.noise, count, (_REPEATS,), rng)
+        part, one = slice(i * _REPEATS, (i + 1) * _REPEATS), problem.take(np.array([i]))
+        truth[part, :n] += samples(covariance[i], (_REPEATS,), rng)
+        noise[part] = draw(one.noise, count, (_REPEATS,), rng)
         for name, _, precision in prior_parts(one):
             spread = linalg.inverse(np.reshape(precision, precision.shape[-2:]))[0]
-            at = slice(slots[name].start, slots[name].start + slots[name].size)
-            means[name][own] = truth[own, at] + samples(spread, (_REPEATS,), rng)
+            columns = slice(slots[name].start, slots[name].start + slots[name].size)
+            means[name][part] = truth[part, columns] + samples(spread, (_REPEATS,), rng)
     return truth, noise, means

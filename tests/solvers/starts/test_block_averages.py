@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optloc import Motion, assemble, measured
-from optloc.solvers.starts.block_averages import _middle, average_blocks
+from optloc.solvers.starts.block_averages import _line_coefficients, average_blocks
 
 STATIONS = np.array([[0.0, 0.0], [1000.0, 0.0], [500.0, 900.0]])
 EPOCHS, SIGMA = 20, 2.0
@@ -46,7 +46,7 @@ def test_a_block_with_a_gap_is_left_out_and_short_runs_stay():
 
 def test_coefficients_of_the_middle_give_back_every_line():
     since, row = np.array([-2.0, 0.5, 1.0, -1.0, 3.0]), np.array([0, 0, 0, 1, 1])
-    coefficient = _middle(since, row)
+    coefficient = _line_coefficients(since, row)
     for line in (np.ones(5), since):
         at_zero = np.bincount(row, coefficient * line)
         np.testing.assert_allclose(at_zero, [line[0] if line is not since else 0.0] * 2, atol=1e-12)
