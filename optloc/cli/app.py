@@ -75,6 +75,7 @@ def main() -> None:
 
 
 def _print_version(wanted: bool) -> None:
+    """Print the version and end, if `--version` is given."""
     if wanted:
         from importlib.metadata import PackageNotFoundError, version
 
@@ -460,6 +461,7 @@ app.command(rich_help_panel=FIRST, epilog=example(*CONVERSIONS))(convert)
 
 # The names of the lists are available without computing any list.
 def _lists() -> list[str]:
+    """Return the names of the lists, for the completion of the command line."""
     from optloc.cli.listing import lists
 
     return list(lists())

@@ -1,4 +1,7 @@
-"""The command ``optloc check``: summary of a file, health of its stations, and advice on possible errors."""
+"""The command ``optloc check``: summary of a file, health of its stations, and advice on possible errors.
+
+In shapes, k is the number of epochs, s the number of stations, d the dimension, and size the number of unknowns.
+"""
 
 from __future__ import annotations
 
@@ -133,6 +136,7 @@ def _advice(loaded: Loaded, checked: Checked | None) -> tuple[Advice, ...]:
 
 
 def _spell(value: Any) -> str:
+    """Return a value of the summary as text."""
     if isinstance(value, dict):
         return ", ".join(f"{key}: {inner}" for key, inner in value.items()) or "none"
     if isinstance(value, list):
@@ -190,8 +194,8 @@ def _errors(problem: Problem) -> str:
         sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
         low, high = sigma.min(), sigma.max()
         sizes.append(f"{low:.4g} {unit}" if low == high else f"{low:.4g} to {high:.4g} {unit}")
-    lasts = f"unknown for each {span}" if span else "noise of each epoch"
-    return f"{' and '.join(sizes)}, {lasts}" if sizes else "none"
+    duration = f"unknown for each {span}" if span else "noise of each epoch"
+    return f"{' and '.join(sizes)}, {duration}" if sizes else "none"
 
 
 def _bias(loaded: Loaded, bias: Bias) -> str:
@@ -214,14 +218,15 @@ def _bias(loaded: Loaded, bias: Bias) -> str:
 
 
 def _apart(problem: Problem, alone: bool) -> Problem:
-    """Return the epochs as a batch if they are fixed separately, else the run as a batch of one."""
+    """Return the epochs as a batch if they are fixed separately (`alone`), else the run as a batch of one."""
     return (by_epoch(problem) if alone else problem).flat()
 
 
 def _components(problem: Problem) -> Array:
     """Return the number of connected groups of stations in each epoch (k,); 0 without differences.
 
-    Differences and ratios connect the two stations of a row.
+    Differences and ratios connect the two stations of a row. Two groups without a connection have separate clocks, so
+    the file may lack rows.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -244,7 +249,10 @@ def _components(problem: Problem) -> Array:
 
 
 def _station_positions(problem: Problem, alone: bool) -> Array:
-    """Return the station positions of each epoch (k, s, d), or of a whole run (1, k s, d), m."""
+    """Return the station positions, m: of each epoch (k, s, d), or of all epochs of a run together (1, k s, d).
+
+    `alone` is whether the epochs are fixed separately.
+    """
     position = problem.stations.position
     return position if alone else position.reshape(1, -1, position.shape[-1])
 
@@ -266,8 +274,9 @@ def _spread(position: Array) -> tuple[Array, Array]:
 class Checked:
     """Result of the health check.
 
-    health: health of the stations, or None. why: reason for None. vectors: parameters of the solved epochs (k, size).
-    level: common factor of the noise. late: late rows.
+    health: health of the stations, or None. why: reason for None. vectors: parameters of the epochs (k, size), NaN for
+    an epoch without a fix; None if the epochs are not solved. level: common factor of the noise, or None. late: late
+    rows, or None.
     """
 
     health: Health | None
@@ -298,6 +307,10 @@ def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
 
 
 def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
+    """Return the health of the stations from a fix of each epoch.
+
+    `method` is the method of the fixes, and `by` groups the errors. Raise InvalidProblem if no epoch has a fix.
+    """
     batch, alone = batch_of(loaded.problem), separable(loaded.problem)
     if not batch.layout.size:
         count = batch.batch_shape[0]
@@ -378,9 +391,12 @@ def _show_health(checked: Checked, console: Console) -> None:
         table.add_column(name, justify="right")
     seen = health.least_noticed
     for i in _order(health):
-        cells = [str(health.count[i]), _told(health.bias[i], health.bias_error[i], health.units[i])]
-        cells += [_told(1e6 * health.scale[i], 1e6 * health.scale_error[i], "")] if scaled else []
-        cells += [_told(health.noise[i], health.noise_error[i], health.units[i]), f"{health.outliers[i]:.1%}"]
+        cells = [str(health.count[i]), _with_sigma_or_dash(health.bias[i], health.bias_error[i], health.units[i])]
+        cells += [_with_sigma_or_dash(1e6 * health.scale[i], 1e6 * health.scale_error[i], "")] if scaled else []
+        cells += [
+            _with_sigma_or_dash(health.noise[i], health.noise_error[i], health.units[i]),
+            f"{health.outliers[i]:.1%}",
+        ]
         cells += [f"{seen[i]:.3g} {health.units[i]}".strip()]
         cells += [f"{health.suspect[i]:.1%}"] if suspected else []
         table.add_row(health.names[i], *cells)
@@ -392,13 +408,14 @@ def _show_health(checked: Checked, console: Console) -> None:
 
 
 def _order(health: Health) -> Array:
-    """Return the order of the groups: by unit, then by decreasing bias."""
+    """Return the order of the groups of the health table (n,): by unit, then by decreasing bias."""
     bias = np.where(np.isfinite(health.bias), health.bias, np.inf)
     # Only biases with the same unit can be compared.
     return np.lexsort((-bias, np.array(health.units)))
 
 
-def _told(value: float, error: float, unit: str) -> str:
+def _with_sigma_or_dash(value: float, error: float, unit: str) -> str:
+    """Return a value with its standard deviation `error` and unit as text; "-" for a missing value."""
     if not np.isfinite(value):
         return "-"
     return with_sigma(float(value), float(error), unit).strip()

@@ -73,6 +73,7 @@ def packages() -> list[Package]:
 
 
 def _or_none(of: Any, name: str) -> Any:
+    """Return `of(name)` for an installed package, None for a missing package."""
     try:
         return of(name)
     except PackageNotFoundError:
@@ -150,6 +151,7 @@ def doctor(as_json: Json = False, verbose: Verbose = False) -> None:
 
 
 def _show(told: dict[str, Any]) -> None:
+    """Print the report as lines and a table."""
     screen, here, code = Screen(), told["machine"], told["machine_code"]
     say(screen, f"optloc {told['optloc']['version'] or '(not installed)'} in {told['optloc']['folder']}")
     say(screen, f"Python {told['python']['version']}: {told['python']['executable']}")

@@ -167,6 +167,7 @@ def show(found: FileFixes, console: Console) -> None:
 
 
 def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
+    """Print one fix in full: table, biases, suspects, undetected errors and alternatives."""
     sheet = fix_sheet(fix, found.columns, found.loaded.title)
     rows = [*sheet.rows, *([("azimuths", found.loaded.azimuths)] if found.loaded.azimuths else [])]
     table = Table(title=sheet.title, show_header=False, title_justify="left", min_width=60)
@@ -195,6 +196,7 @@ def _show_sheet(sheet: FixSheet | None, console: Console) -> None:
 
 
 def _colour(verdict: Status) -> str:
+    """Return the colour of a status: green for ok, yellow for other answers, red for no answer."""
     return _GOOD if verdict is Status.OK else _CARE if verdict in ANSWERED else _BAD
 
 
@@ -208,6 +210,7 @@ def _show_unnoticed(found: FileFixes, fix: Fix, console: Console) -> None:
 
 
 def _show_many(found: FileFixes, console: Console) -> None:
+    """Print the number of fixes by status, and the reasons of the first ten fixes that are not ok."""
     columns = found.columns
     sheet = count_sheet(columns, f"{found.loaded.title}: ")
     table = Table(title=sheet.title, title_justify="left")
@@ -232,7 +235,10 @@ _AUTO = "auto"
 
 
 def _estimate_noise(loaded: Loaded, by: str | None) -> Loaded:
-    """Return the file with noise estimated for each station, pair or kind; unchanged if `by` is None."""
+    """Return the file with noise estimated for each station, pair or kind; unchanged if `by` is None.
+
+    `by` is the value of the option: a grouping, a grouping with "+epoch", or "auto".
+    """
     if by is None:
         return loaded
     grouping, plus, more = by.partition("+")
@@ -259,8 +265,12 @@ def _common_level(problem: Problem) -> CommonLevel:
 _BY_CHANCE = 0.01
 
 
-def _are_refuted(fix: Fix) -> bool:
-    """Return whether a batch has more refuted fixes than chance explains, or a search for suspects was requested."""
+def _needs_causes(fix: Fix) -> bool:
+    """Return whether a common cause of the misfits must be searched, such as a wrong noise or late signals.
+
+    The answer is yes if chance does not explain the number of fixes that the data reject. It is also yes if the method
+    searched for suspects. The probability of each rejection by chance is `P_MISFIT`.
+    """
     from scipy.special import bdtrc
 
     refuted = np.isin(fix.code, [Status.MISFIT, Status.CONTRADICTORY])
@@ -269,15 +279,15 @@ def _are_refuted(fix: Fix) -> bool:
 
 
 def _level_of(found: FileFixes) -> CommonLevel | None:
-    """Return the common factor of the stated noise; None for few fixes, and if the fixes are not refuted."""
-    if not found.apart or len(found.fix) < SEVERAL or not _are_refuted(found.fix):
+    """Return the common factor of the stated noise; None for few fixes, or if no cause must be searched."""
+    if not found.apart or len(found.fix) < SEVERAL or not _needs_causes(found.fix):
         return None
     return common_level_at(batch_of(found.loaded.problem), found.fix.x)
 
 
 def _late_of(found: FileFixes) -> LateSignals | None:
-    """Return the late rows of a file at its fixes; None for few fixes, and if the fixes are not refuted."""
-    if not found.apart or len(found.fix) < SEVERAL or not _are_refuted(found.fix):
+    """Return the late rows of a file at its fixes; None for few fixes, or if no cause must be searched."""
+    if not found.apart or len(found.fix) < SEVERAL or not _needs_causes(found.fix):
         return None
     x, answered = found.fix.x, found.fix.answered
     kept = answered & np.isfinite(x).all(-1)
@@ -287,7 +297,10 @@ def _late_of(found: FileFixes) -> LateSignals | None:
 def tell_level(
     level: CommonLevel | None, used: bool = False, late: LateSignals | None = None, late_used: bool = False
 ) -> tuple[str, ...]:
-    """Return sentences on the stated noise and on late rows, each with the option that helps."""
+    """Return sentences on the stated noise and on late rows, each with the option that helps.
+
+    `used` and `late_used` are whether the fixes already use the common factor, and the loss for late rows.
+    """
     said = []
     if late is not None and late.sentence:
         # If rows are late, do not report the noise: larger noise explains late rows badly, and no other rows well.
@@ -305,12 +318,12 @@ def tell_level(
 
 
 def late_json(late: LateSignals, used: bool = False) -> dict[str, Any]:
-    """Return the result for late rows as a JSON value."""
+    """Return the result for late rows as a JSON value; `used` is whether the fixes use the loss for late rows."""
     return asdict(late) | {"method": late.method, "used": used and late.share > 0.0, "sentence": late.sentence}
 
 
 def level_json(level: CommonLevel, used: bool = False) -> dict[str, Any]:
-    """Return the result for the stated noise as a JSON value."""
+    """Return the result for the stated noise as a JSON value; `used` is whether the fixes use the common factor."""
     return asdict(level) | {"used": used and level.suspect, "sentence": level.sentence}
 
 

@@ -1,6 +1,8 @@
 """Conversion of measurement tables to problem files: receiver readings, pseudoranges, stations, satellite orbits.
 
 A `TableProblem` has the sections of the problem file. `optloc convert` writes it, and other commands read it directly.
+In the functions, `told` has the facts that the table does not contain, as stated by options. `roles` has the table and
+the roles of its columns. `place` has the positions of the stations.
 """
 
 from __future__ import annotations
@@ -123,7 +125,10 @@ def _check_told(told: ColumnHints) -> None:
 
 
 def _sort(word: str) -> str:
-    """Return the sort of readings for a word of --as."""
+    """Return the sort of readings for a word of --as: "arrivals", "sp", or a measurement kind.
+
+    Raise InvalidProblem for an unknown word, or a kind without stations.
+    """
     if word in ("arrivals", "sp"):
         return word
     try:
@@ -154,10 +159,14 @@ def interpret_table(source: Path, told: ColumnHints) -> TableProblem:
 
 
 def _of_table(source: Path, told: ColumnHints) -> TableProblem:
-    """Return the problem of a measurement table."""
+    """Return the problem of a measurement table.
+
+    The table has pseudoranges with satellites, or columns that are named after stations, or one reading in each row.
+    Raise InvalidProblem if its content or the positions of its stations are unknown.
+    """
     table = without_ignored_columns(read_table(source), told.ignore)
-    own = {role: name for role, name in told.columns.items() if told.stations is None or role not in PLACE}
-    roles = Roles.of(table, own)
+    stated_columns = {role: name for role, name in told.columns.items() if told.stations is None or role not in PLACE}
+    roles = Roles.of(table, stated_columns)
     satellites = all(roles.find(role) for role in ("toa", "satellite", "x"))
     if (told.what == "pseudoranges" and roles.find("satellite")) or (told.what is None and satellites):
         return pseudoranges(source, roles, told)
@@ -168,25 +177,27 @@ def _of_table(source: Path, told: ColumnHints) -> TableProblem:
         named = _of_receivers(roles, place)
         chosen = [one for one in named if _may_be(one, told)]
         if len(chosen) > 1 and not _is_long(roles, told, place):
-            roles = Roles.of(table, own, [one.column for one in chosen]).without_stations()
+            roles = Roles.of(table, stated_columns, [one.column for one in chosen]).without_stations()
             return _plan(roles, told, place, source, read_wide(roles, told, chosen, place), named)
     roles = as_angles(roles, told)
-    sorts, heard = sorts_of(roles, told), None
+    sorts, receivers = sorts_of(roles, told), None
     if not sorts:
         raise _unknown(roles, told)
     if told.stations is None:
         if roles.find("lat") is None and roles.find("x") is None:
             advice = "give a table or GeoJSON file with --stations"
             raise InvalidProblem("the station positions are unknown", "--stations", advice)
-        place, heard = read_inline(roles, told)
+        place, receivers = read_inline(roles, told)
     forms = [sort_named(name) for name in sorts]
     return _plan(
-        roles, told, place, source, [read_long(roles, form, told, place, heard, forms) for form in forms], named
+        roles, told, place, source, [read_long(roles, form, told, place, receivers, forms) for form in forms], named
     )
 
 
 def _of_receivers(roles: Roles, place: ColumnPlaces) -> list[Named]:
     """Return the columns that are named after stations, without columns that have another role.
+
+    Other roles are stated roles, and columns of station names.
 
     Raises
     ------
@@ -226,7 +237,7 @@ def _unknown(roles: Roles, told: ColumnHints) -> InvalidProblem:
 
 
 def _may_be(one: Named, told: ColumnHints) -> bool:
-    """Return whether a column that is named after stations can have the requested content."""
+    """Return whether a column that is named after stations can have the sort of readings that `--as` states."""
     return told.what is None or one.form in (None, told.what)
 
 
@@ -241,7 +252,10 @@ def _plan(
     found: Sequence[Readings],
     named: Sequence[Named],
 ) -> TableProblem:
-    """Return the problem of readings; `named` are the columns that are named after stations."""
+    """Return the problem of readings.
+
+    `found` are the sorts of readings in the table. `named` are the columns that are named after stations.
+    """
     place = in_space(place) if any(2 not in MODELS[one.form.kind].dimensions for one in found) else place
     place, turn = stations_turned(place, found)
     epochs = epochs_of(roles, told, found)
@@ -271,7 +285,8 @@ def _plan(
 def _height(found: Sequence[Readings], place: ColumnPlaces) -> tuple[str, str]:
     """Return a height constraint for a target on Earth, as a line of a problem file, and a note; empty texts for none.
 
-    Readings of azimuths alone do not determine the height.
+    Azimuths alone do not determine the height, so the mean height of the stations is assumed. S minus P times are of
+    earthquakes, which are below the highest station.
     """
     if place.frame != "geodetic":
         return "", ""
@@ -322,6 +337,11 @@ def _sp_speed(told: ColumnHints) -> float:
 
 
 def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) -> Section:
+    """Return the section of a problem file for one sort of readings, as the columns and settings of its table.
+
+    `epochs` are columns of the source table that determine epochs. `sigma` is the standard deviation as text; None if
+    it is a column.
+    """
     columns: dict[str, Any] = {name: column[found.row] for name, column in epochs.items()}
     values, text = found.values, found.form.text
     if found.form.kind == "toa":
@@ -333,7 +353,9 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
     lines += [f'positive = "{found.positive}"'] if found.positive != "a-farther" else []
     if found.b is not None and sigma not in (None, ESTIMATE) and MODELS[found.form.kind].signs == (1, -1):
         # As in `optloc.locate`, differences share the errors of their stations, each with half of the variance.
-        lines += [f'arrival_sigma = "{_share(str(sigma), found.unit)}"    # of one station, sigma / sqrt(2)']
+        lines += [
+            f'arrival_sigma = "{_sigma_of_one_station(str(sigma), found.unit)}"    # of one station, sigma / sqrt(2)'
+        ]
         sigma = None
     return Section(found.form.kind, columns, found.unit, sigma, text, tuple(lines))
 
@@ -346,19 +368,23 @@ def _with_declination(section: Section, found: Readings, told: ColumnHints) -> S
     return replace(section, lines=(*section.lines, f"declination = {json.dumps(told.declination.strip())}"))
 
 
-def _share(sigma: str, unit: str) -> str:
-    """Return the standard deviation of one station from the standard deviation of a difference, as text with a unit."""
-    number, own = re.fullmatch(r"\s*([-+.\deE]*)\s*(.*?)\s*", sigma, re.DOTALL).groups()  # type: ignore[union-attr]
+def _sigma_of_one_station(sigma: str, unit: str) -> str:
+    """Return the standard deviation of one station as text with a unit, from `sigma` of a difference: sigma / sqrt(2).
+
+    `unit` applies if `sigma` has no unit. A text that is not a number is returned unchanged.
+    """
+    number, stated_unit = re.fullmatch(r"\s*([-+.\deE]*)\s*(.*?)\s*", sigma, re.DOTALL).groups()  # type: ignore[union-attr]
     try:
-        return f"{float(number) / np.sqrt(2.0):.9g} {own or unit}"
+        return f"{float(number) / np.sqrt(2.0):.9g} {stated_unit or unit}"
     except ValueError:  # the reader of the file reports the error
         return sigma
 
 
 def _from_first(found: Readings, columns: dict[str, Any]) -> Decimals:
-    """Return arrivals relative to the first arrival of their message; add the time of the first as a column if missing.
+    """Return arrivals relative to the first arrival of their message, in the unit of the table.
 
-    Recent times in nanoseconds have 19 digits, a float has 16. So differences are taken before rounding.
+    Recent times in nanoseconds have 19 digits, a float has 16, so differences are taken before rounding. If `columns`
+    has no time, the time of each first arrival, s, is added, unless arrivals are already relative.
     """
     keys = [columns[name] for name in ("epoch", "time", "target") if name in columns]
     _, message = equal_rows(keys, len(found.values))
@@ -374,12 +400,12 @@ def _from_first(found: Readings, columns: dict[str, Any]) -> Decimals:
 
 
 def _few(sections: Sequence[Section], told: ColumnHints) -> list[str]:
-    """Return notes on epochs with few readings."""
+    """Return a note on messages with fewer than three receivers, or on times with one reading; empty without either."""
     names = [name for name in ("epoch", "target") if name in sections[0].columns] or ["time"]
-    held = [section.columns for section in sections if set(names) <= set(section.columns)]
-    if not held:
+    columns_of_sections = [section.columns for section in sections if set(names) <= set(section.columns)]
+    if not columns_of_sections:
         return []
-    columns = [np.concatenate([own[name] for own in held]) for name in names]
+    columns = [np.concatenate([part[name] for part in columns_of_sections]) for name in names]
     counts = np.bincount(equal_rows(columns, len(columns[0]))[1])
     few = int((counts < _FEW).sum())
     if sections[0].kind == "toa" and few:
@@ -393,10 +419,14 @@ def _few(sections: Sequence[Section], told: ColumnHints) -> list[str]:
 # Stations alone, and satellites.
 
 
-def _write_stations(source: Path, out: Path, told: Mapping[str, str], frame: str | None) -> Converted:
+def _write_stations(source: Path, out: Path, stated_columns: Mapping[str, str], frame: str | None) -> Converted:
+    """Write a table of stations as CSV, and return its file.
+
+    `stated_columns` has the stated roles of columns. `frame` is the stated frame, or None.
+    """
     if out.suffix.lower() != ".csv":
         what = "stations alone are not a problem; they are written as a CSV table"
         raise InvalidProblem(what, str(out), "use the ending .csv after --out, or convert the measurements")
-    found = places_of(source, told, frame)
+    found = places_of(source, stated_columns, frame)
     write_csv(out, found.columns)
     return Converted((out,), None, (found.note,) if found.note else ())

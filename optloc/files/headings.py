@@ -16,7 +16,7 @@ from optloc.files.roles import ColumnPlaces, Roles
 from optloc.files.table_import import BOW, COMPASS, ColumnHints, Readings, in_unit, marks_of
 
 # A full turn in degrees, and in radians: an angle without unit that exceeds a turn in radians is in degrees.
-_TURNS = {"deg": Decimal(360)}
+_FULL_TURN = {"deg": Decimal(360)}
 _RADIANS = Decimal("6.2832")
 
 
@@ -48,8 +48,8 @@ def from_bow(found: Readings, roles: Roles, column: str, told: ColumnHints) -> R
         raise InvalidProblem(
             f"the headings {column!r} are magnetic, and the declination is unknown", table.source, advice
         )
-    held, nothing = numbers(table, column), marks_of(told) or frozenset()
-    given = dict(zip(held.row.tolist(), held.values.tolist(), strict=True))
+    column_values, nothing = numbers(table, column), marks_of(told) or frozenset()
+    given = dict(zip(column_values.row.tolist(), column_values.values.tolist(), strict=True))
     lacking = next((row for row in found.row.tolist() if given.get(row) is None or given[row] in nothing), None)
     if lacking is not None:
         advice = "remove the row, or use --azimuth north-clockwise if the bearings are true bearings"
@@ -65,8 +65,8 @@ def from_bow(found: Readings, roles: Roles, column: str, told: ColumnHints) -> R
         value + in_unit(heading, unit, found.unit, found.form)
         for value, heading in zip(found.values.tolist(), used, strict=True)
     ]
-    if found.unit in _TURNS:
-        turn = _TURNS[found.unit]
+    if found.unit in _FULL_TURN:
+        turn = _FULL_TURN[found.unit]
         sums = [(value % turn + turn) % turn for value in sums]
     note = f"bearings are read as clockwise from the bow of the vehicle; the heading in column {column!r} is added"
     note += "" if told.azimuth == BOW else f"; --azimuth {COMPASS} reads them as true bearings"
@@ -99,13 +99,17 @@ def stations_turned(place: ColumnPlaces, found: Sequence[Readings]) -> tuple[Col
     return replace(place, columns={**place.columns, "heading_deg": np.nan_to_num(headings)}), note
 
 
-def _unit(column: str, held: list[Decimal], told: ColumnHints, where: str) -> str:
-    """Return the unit of headings: from the column name, from --unit, or from their size."""
+def _unit(column: str, headings: list[Decimal], told: ColumnHints, where: str) -> str:
+    """Return the unit of headings: from the column name, from --unit, or from their size.
+
+    `headings` are the values of the column, without empty cells. If any exceeds a full turn in radians, the unit is the
+    degree.
+    """
     known = UNITS["angle"]
-    own = unit_of(column, known) or (told.unit if told.unit in known else None)
-    if own is None and any(abs(value) > _RADIANS for value in held):
+    stated = unit_of(column, known) or (told.unit if told.unit in known else None)
+    if stated is None and any(abs(value) > _RADIANS for value in headings):
         return "deg"
-    if own is None:
+    if stated is None:
         advice = f"rename it to {column}_deg or {column}_rad, or use --unit"
         raise InvalidProblem(f"the unit of the column {column!r} is unknown", where, advice)
-    return own
+    return stated

@@ -1,4 +1,9 @@
-"""Long and wide tables of readings: one reading in each row, or a column for each receiver."""
+"""Long and wide tables of readings: one reading in each row, or a column for each receiver.
+
+In the functions, `roles` has the table and the roles of its columns. `told` has the options, and `place` the stations.
+A form is a sort of readings, such as arrivals or ranges. In shapes, m is the number of readings, and n the number of
+rows of the table.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +48,10 @@ _SHOWN = 4
 
 
 def read_wide(roles: Roles, told: ColumnHints, columns: Sequence[Named], place: ColumnPlaces) -> list[Readings]:
-    """Return the readings of a wide table, one set for each sort."""
+    """Return the readings of a wide table, one set for each sort; raise InvalidProblem if the sort is unknown.
+
+    `columns` are the columns that are named after stations.
+    """
     sorts: dict[str, list[Named]] = {}
     for one in columns:
         if one.sigma:
@@ -68,7 +76,11 @@ def _wide_sort(
     place: ColumnPlaces,
     forms: Mapping[str, Form],
 ) -> Readings:
-    """Return the readings of one sort; `errors` are the columns of standard deviations, `forms` all sorts by name."""
+    """Return the readings of one sort of a wide table.
+
+    `columns` are the columns of this sort. `errors` are the columns of standard deviations, and `forms` all sorts of
+    the table by name.
+    """
     table = roles.table
     values: list[Decimals] = []
     rows, ends, notes = [], [], []
@@ -77,20 +89,20 @@ def _wide_sort(
     first, empty = "", 0
     for one in columns:
         dated = form.quantity == "length" and is_dated(table, one.column)
-        held = date_seconds(table, one.column, told.zone) if dated else numbers(table, one.column)
-        unit, note = ("s", "") if dated else unit_for(one.column, form, told, held.values, table.source)
+        cells = date_seconds(table, one.column, told.zone) if dated else numbers(table, one.column)
+        unit, note = ("s", "") if dated else unit_for(one.column, form, told, cells.values, table.source)
         first = first or unit
         notes += [note] if note else []
-        empty += table.count - len(held.row)
-        values.append(_in_unit(held.values, unit, first, form))
-        rows.append(held.row)
+        empty += table.count - len(cells.row)
+        values.append(_in_unit(cells.values, unit, first, form))
+        rows.append(cells.row)
         ends.append(_ends(one, form, told, table.source))
-        own = next((each.column for each in errors if _is_error_of(each, one, form)), None)
-        own = None if stated_sigma(told, form.kind) is not None else own
-        own = own or sigma_column(roles, form, told, list(forms.values()))
-        if own is not None:
-            deviations.append(sigma_of(table, own, form, first, held.row))
-            errors_used.append(own)
+        sigma_name = next((each.column for each in errors if _is_error_of(each, one, form)), None)
+        sigma_name = None if stated_sigma(told, form.kind) is not None else sigma_name
+        sigma_name = sigma_name or sigma_column(roles, form, told, list(forms.values()))
+        if sigma_name is not None:
+            deviations.append(sigma_of(table, sigma_name, form, first, cells.row))
+            errors_used.append(sigma_name)
     if not any(map(len, values)):
         raise InvalidProblem("no cell has a reading", table.source, "check the columns of the receivers")
     pairs = form.stations > 1
@@ -148,20 +160,30 @@ def sigma_column(roles: Roles, form: Form, told: ColumnHints, forms: Sequence[Fo
 
 
 def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Array) -> Array:
-    """Return the standard deviations of the rows `pick`, in the unit of their values."""
+    """Return the standard deviations (m,) of the readings in the rows `pick` (m,), in the unit of the readings.
+
+    `column` has the standard deviations, and `unit` is the unit of the readings. Raise InvalidProblem for a reading
+    without a standard deviation, or for a time in one column and a length in the other.
+    """
     known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
-    own = unit_of(column, known) or unit
-    if {own, unit} & set(UNITS["time"]) and not {own, unit} <= set(UNITS["time"]) and form.quantity == "length":
+    its_unit = unit_of(column, known) or unit
+    if (
+        {its_unit, unit} & set(UNITS["time"])
+        and not {its_unit, unit} <= set(UNITS["time"])
+        and form.quantity == "length"
+    ):
         advice = "give both in one unit, or use --sigma"
-        raise InvalidProblem(f"the column is in {own}, but the readings are in {unit}", table.where(column), advice)
-    held = numbers(table, column)
+        raise InvalidProblem(
+            f"the column is in {its_unit}, but the readings are in {unit}", table.where(column), advice
+        )
+    sigmas = numbers(table, column)
     place = np.full(table.count, -1)
-    place[held.row] = np.arange(len(held.row))
+    place[sigmas.row] = np.arange(len(sigmas.row))
     lacking = pick[place[pick] < 0]
     if len(lacking):
         advice = "give a number, or remove the row"
         raise InvalidProblem("the reading has no standard deviation", table.where(column, int(lacking[0])), advice)
-    return np.asarray(held.values.floats()[place[pick]] * known[own] / known[unit])
+    return np.asarray(sigmas.values.floats()[place[pick]] * known[its_unit] / known[unit])
 
 
 def _ends(one: Named, form: Form, told: ColumnHints, source: str) -> tuple[str, str | None]:
@@ -191,74 +213,84 @@ def read_inline(roles: Roles, told: ColumnHints) -> tuple[ColumnPlaces, Array]:
     every = placed(roles, told.frame, names)
     spots: dict[tuple[Any, ...], str] = {}
     seen: dict[str, int] = {}
-    heard, first = [], []
+    station_of_row, first = [], []
     for row, key in enumerate(zip(*(column.tolist() for column in every.columns.values()), strict=True)):
         if key not in spots:
             # A station with another position in another row becomes a new station: positions matter, not names.
             seen[key[0]] = seen.get(key[0], 0) + 1
             spots[key] = key[0] if seen[key[0]] == 1 else f"{key[0]} ({seen[key[0]]})"
             first.append(row)
-        heard.append(spots[key])
+        station_of_row.append(spots[key])
     columns = {key: column[first] for key, column in every.columns.items()}
-    columns["name"] = np.array([heard[row] for row in first], dtype=object)
-    return replace(every, columns=columns), np.array(heard, dtype=object)
+    columns["name"] = np.array([station_of_row[row] for row in first], dtype=object)
+    return replace(every, columns=columns), np.array(station_of_row, dtype=object)
 
 
 def read_long(
-    roles: Roles, form: Form, told: ColumnHints, place: ColumnPlaces, heard: Array | None, forms: Sequence[Form]
+    roles: Roles, form: Form, told: ColumnHints, place: ColumnPlaces, receivers: Array | None, forms: Sequence[Form]
 ) -> Readings:
     """Return the readings of one sort of a table with one reading in each row.
 
-    `heard` (m,) has the stations of the rows if no column has them. `forms` are all sorts of the table.
+    `receivers` has the station of each row (n,) if no column has them. `forms` are all sorts of the table.
     """
     table = roles.table
     if form.value == "sp" and roles.find("sp") is None:
         return _picks(roles, told, place)
     column = roles.column(form.value)
     dated = form.quantity == "length" and is_dated(table, column)
-    held = date_seconds(table, column, told.zone) if dated else numbers(table, column)
-    unit, note = ("s", "") if dated else unit_for(column, form, told, held.values, table.source)
-    pick = held.row
+    cells = date_seconds(table, column, told.zone) if dated else numbers(table, column)
+    unit, note = ("s", "") if dated else unit_for(column, form, told, cells.values, table.source)
+    pick = cells.row
     if not len(pick):
         raise InvalidProblem("no cell has a reading", table.where(column), "check the column")
-    a = roles.labels("station") if heard is None else heard
+    a = roles.labels("station") if receivers is None else receivers
     positive, b = ("a-farther", None) if form.stations == 1 else _second_station(roles, told)
-    found = _of_column(form, unit, held, column, a)
+    found = _of_column(form, unit, cells, column, a)
     found = replace(found, b=None if b is None else b[pick], notes=(note,) if note else ())
-    if (own := sigma_column(roles, form, told, forms)) is not None:
-        found = replace(found, sigma=sigma_of(table, own, form, unit, pick), errors=(own,))
+    if (sigma_name := sigma_column(roles, form, told, forms)) is not None:
+        found = replace(found, sigma=sigma_of(table, sigma_name, form, unit, pick), errors=(sigma_name,))
     return _checked(found, roles, told, place, table.count - len(pick), positive)
 
 
-def _of_column(form: Form, unit: str, held: NumberColumn, column: str, a: Array) -> Readings:
-    """Return the readings of one column; `a` has the station of each row of the table."""
-    return Readings(form, unit, held.values, held.row, (column,), np.zeros(len(held.row), dtype=int), a[held.row])
+def _of_column(form: Form, unit: str, cells: NumberColumn, column: str, a: Array) -> Readings:
+    """Return the readings of one column.
+
+    `cells` are its numbers, in `unit`. `a` has the station of each row of the table.
+    """
+    return Readings(form, unit, cells.values, cells.row, (column,), np.zeros(len(cells.row), dtype=int), a[cells.row])
 
 
 def _second_station(roles: Roles, told: ColumnHints) -> tuple[str | None, Array]:
-    """Return the sign of differences, None if unknown, and the second station of each row."""
+    """Return the sign of differences, and the second station of each row (n,).
+
+    The sign is "a-farther" for a reference station, None if it is unknown.
+    """
     column = roles.find("reference")
     if told.reference is not None:
         return "a-farther", np.full(roles.table.count, told.reference, dtype=object)
     if column is None:
         advice = "state it with --reference STATION, or state its column with --column reference=NAME"
         raise InvalidProblem("no column looks like the second station", roles.table.source, advice)
-    against = stem(column) in ("reference", "ref", "refstation", "b")
-    return ("a-farther" if against else None), roles.labels("reference")
+    is_reference = stem(column) in ("reference", "ref", "refstation", "b")
+    return ("a-farther" if is_reference else None), roles.labels("reference")
 
 
 def _picks(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> Readings:
-    """Return S minus P times of a table with a column for each wave, or with a column of phases."""
+    """Return S minus P times, s, of a table with a column for each wave, or with a column of phases.
+
+    Stations without both waves are left out. Raise InvalidProblem if S is not after P.
+    """
     table, zone = roles.table, told.zone
 
     def times(role: str) -> list[Decimal | None]:
+        """Return the times in the column of a role, s; None for an empty cell."""
         column, unit = roles.column(role), "s"
         dated = is_dated(table, column)
-        held = date_seconds(table, column, zone) if dated else numbers(table, column)
+        cells = date_seconds(table, column, zone) if dated else numbers(table, column)
         if not dated:
-            unit, _ = unit_for(column, sort_named("sp"), told, held.values, table.source)
+            unit, _ = unit_for(column, sort_named("sp"), told, cells.values, table.source)
         out: list[Decimal | None] = [None] * table.count
-        for row, value in zip(held.row.tolist(), held.values.tolist(), strict=True):
+        for row, value in zip(cells.row.tolist(), cells.values.tolist(), strict=True):
             out[row] = in_unit(value, unit, "s", sort_named("sp"))
         return out
 
@@ -301,7 +333,8 @@ def _checked(
 ) -> Readings:
     """Return checked readings.
 
-    Stations are known, missing readings and repeats are removed, sign and convention are set.
+    Stations are known, missing readings and repeats are removed, sign and convention are set. `empty` is the number of
+    empty cells. `positive` is the sign of differences that the table states; None if it is unknown.
     """
     table, known = roles.table, set(place.names)
     for end in (found.a, found.b):
@@ -374,7 +407,11 @@ def _with_convention(found: Readings, told: ColumnHints, place: ColumnPlaces, so
 
 
 def epochs_of(roles: Roles, told: ColumnHints, found: Sequence[Readings]) -> dict[str, Array]:
-    """Return the available columns epoch, time and target (n,) of the rows of a table."""
+    """Return the available columns epoch, time and target (n,) of the rows of a table, by these names.
+
+    Times are in seconds. Columns of readings are left out, as are times that are the readings. With `--still`, the
+    result has at most the target: all rows are one epoch.
+    """
     table, taken = roles.table, {name for one in found for name in one.columns}
     out: dict[str, Array] = {}
     long = len(taken) == len(found)
@@ -409,12 +446,17 @@ def epochs_of(roles: Roles, told: ColumnHints, found: Sequence[Readings]) -> dic
 
 
 def _no_times() -> InvalidProblem:
+    """Return the error for the option --window without a column of times."""
     advice = "state the time column with --column time=NAME, and its unit with --time-unit"
     return InvalidProblem("a window needs a column of times", "--window", advice)
 
 
 def _clusters(found: Readings, window: str, count: int) -> Array:
-    """Return the message (n,) of each row of arrivals; arrivals less than a window apart belong to one message."""
+    """Return the message of each row (n,) as text, from 1; empty for a row without an arrival.
+
+    Arrivals that are less than a window apart belong to one message. `window` is text such as "0.1 s", and `count` the
+    number of rows n.
+    """
     # Arrivals in metres are times multiplied by the speed of light.
     seconds = Decimal(repr(UNITS["length"][found.unit]))
     seconds = seconds if found.unit in UNITS["time"] else seconds / Decimal(repr(SPEED_OF_LIGHT))

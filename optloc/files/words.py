@@ -53,6 +53,7 @@ class Words:
     __hash__ = None  # type: ignore[assignment]  # like arrays, which are compared entry by entry
 
     def __arrow_array__(self, type: Any = None) -> Any:  # noqa: A002  (its name in the protocol)
+        """Return the column as an array of pyarrow, by the protocol of that library."""
         import pyarrow as pa
 
         return pa.array(np.asarray(self), type)
@@ -105,6 +106,7 @@ def equal_rows(columns: Sequence[Array | Words], count: int) -> tuple[Array, Arr
 
 
 def _numbers(column: Array) -> Array:
+    """Return the number (m,) of the distinct cell of each row."""
     return np.unique(column, return_inverse=True)[1] if column.dtype.kind == "f" else numbered(column)[1]
 
 

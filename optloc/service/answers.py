@@ -1,4 +1,8 @@
-"""Answers of a stream: records of fixes, proofs and tracks, and their conversion to other formats."""
+"""Answers of a stream: records of fixes, proofs and tracks, and their conversion to other formats.
+
+A record is a dictionary that is written as one JSON line. An event has up to two answers: the first phase gives the
+fix, the second phase gives the proof.
+"""
 
 from __future__ import annotations
 
@@ -72,6 +76,7 @@ def unsolved(event: Event, phase: str = "fix", **why: Any) -> Record:
 
 
 def _known(values: Array, known: Array) -> list[Any]:
+    """Return `values` (n, ...) as a list with one entry for each event, None where `known` (n,) is false."""
     given: list[Any] = values.tolist()
     return (
         given if known.all() else [value if good else None for value, good in zip(given, known.tolist(), strict=True)]
@@ -79,7 +84,10 @@ def _known(values: Array, known: Array) -> list[Any]:
 
 
 def _alternatives(fix: Fix) -> dict[int, list[Record]]:
-    """Return the other positions of the events of a batch, by event number."""
+    """Return the other positions of the events of a batch, by event number; events without any are absent.
+
+    Each entry has the position in metres and the gap, which is its cost (chi-square) minus the cost of the fix.
+    """
     gap = fix.alternatives.gap
     if not gap.shape[-1]:
         return {}
@@ -104,10 +112,10 @@ def _add_exceptions(record: Record, event: Event) -> None:
 
 
 def proof_records(fix: Fix, events: Sequence[Event], before: Sequence[Record | None]) -> list[Record]:
-    """Return the answers of the second phase: the proof alone, or a better fix with its proof.
+    """Return the answers of the second phase (n): the proof alone, or a better fix with its proof.
 
-    `fix` has the fixes (n,) of the whole method. `before` has the answers of the first phase; after None, the answer
-    includes the fix.
+    `fix` has the fixes (n,) of the whole method. `before` has the answers of the first phase. If an entry is None, or
+    the fix has changed, the answer includes the fix.
     """
     records = fix_records(fix, events, None)
     out = []
@@ -132,7 +140,10 @@ _ROUNDING = 1e-9
 
 
 def _is_same_fix(new: Record, old: Record) -> bool:
-    """Return whether the whole method gives the same fix as the first phase."""
+    """Return whether the whole method gives the same fix as the first phase.
+
+    Positions may differ by rounding. Both fixes must have a covariance, or both none; the covariances are not compared.
+    """
     if new["position"] is None or old["position"] is None:
         return bool(new["position"] == old["position"])
     size = 1.0 + max(map(abs, old["position"]))
@@ -141,10 +152,11 @@ def _is_same_fix(new: Record, old: Record) -> bool:
 
 
 def track_record(event: Event, time: float, entry: Entry, problem: Problem) -> Record:
-    """Return the answer to an event of a track: metres and seconds in the frame of the site.
+    """Return the answer to an event of a track: metres and seconds in the frame of the site, angles in degrees.
 
-    `time` is the time of the event, s. `entry` is the result of the scan. `problem` has the dimension and the frame.
-    The value `cov` is the covariance of position, velocity and acceleration.
+    `time` is the time of the event, s. `entry` is the result of the scan, with a state of position, velocity and
+    acceleration, or fewer of them. `problem` gives the dimension and the frame. The value `cov` is the covariance of
+    the state. `nis` is the normalised innovation squared of the scan.
     """
     d, mean = problem.dimension, entry.updated.mean
     known = bool(np.isfinite(mean).all())
@@ -164,7 +176,10 @@ def track_record(event: Event, time: float, entry: Entry, problem: Problem) -> R
 
 
 def unproven(event: Event, why: str, before: Record | None) -> Record:
-    """Return the answer to an event whose proof was not finished; `why` is "deadline" or "skipped: load"."""
+    """Return the answer to an event whose proof was not finished.
+
+    `why` is "deadline" or "skipped: load". `before` is the answer of the first phase; None if it was not written yet.
+    """
     proof = {"proof": "unknown", "margin": 0.0, "boxes": 0, "why": why}
     proof |= {"target": event.target} if event.target else {}
     if before is not None:
@@ -173,7 +188,11 @@ def unproven(event: Event, why: str, before: Record | None) -> Record:
 
 
 def join(first: Record | None, then: Record) -> Record:
-    """Return the answers of both phases of an event as one record."""
+    """Return the answers of both phases of an event as one record.
+
+    `first` is the answer of the first phase, or None. Its values are replaced by the values of `then`, the later
+    answer.
+    """
     left_out = ("phase", "reason")  # the second phase replaces the reason of the first
     kept = {} if first is None else {key: value for key, value in first.items() if key not in left_out}
     return kept | {key: value for key, value in then.items() if key != "phase"}
@@ -188,6 +207,7 @@ def to_line(record: Record) -> bytes:
 
 
 def _finite(value: Any) -> Any:
+    """Return a value of JSON with null (None) instead of each number that is not finite, at all depths."""
     if isinstance(value, dict):
         return {key: _finite(inner) for key, inner in value.items()}
     if isinstance(value, list):
@@ -209,7 +229,10 @@ def to_feature(record: Record) -> Record:
 
 
 def to_aircraft(record: Record, seen: float = 0.0) -> Record:
-    """Return a fix on Earth as an entry of readsb's ``aircraft.json``: heights in feet, the target as `hex`."""
+    """Return a fix on Earth as an entry of readsb's ``aircraft.json``: heights in feet, the target as `hex`.
+
+    `seen` is the age of the fix, s.
+    """
     return {
         "hex": record.get("target") or record["event"],
         "type": "mlat",
@@ -254,12 +277,18 @@ def to_mark(record: Record, frame: Frame) -> Mark:
 
 
 def _probability(each: Record) -> float:
-    """Return the probability of an alternative, as `optloc.problem.fix.Alternatives` does."""
+    """Return the probability of an alternative relative to the fix, from its gap (difference of chi-square).
+
+    The formula is the formula of `optloc.problem.fix.Alternatives`.
+    """
     return float(1.0 / (1.0 + np.exp(min(each["gap"] / 2.0, 700.0))))  # exp overflows beyond 700
 
 
 def _of_file(each: Callable[[Mark], str]) -> Callable[[Record, Frame], bytes | None]:
-    """Return a function that writes a record in a file format; its result is None without a position on Earth."""
+    """Return a function that writes a record as a line of a file format, from `each`, which formats one mark.
+
+    The result of the function is None for a record without a position on Earth.
+    """
 
     def line(record: Record, frame: Frame) -> bytes | None:
         if record.get("lat_deg") is None:
@@ -293,7 +322,10 @@ class Latest:
         self._held: dict[str, tuple[float, Record]] = {}
 
     def __call__(self, record: Record) -> None:
-        """Store a record if it has a position, or adds to a stored record."""
+        """Store a record if it has a position, or add it to the stored record of the same event.
+
+        If there are too many targets, the target whose event is oldest is removed. Notes and errors are ignored.
+        """
         if "event" not in record or "note" in record:
             return
         name = record.get("target") or record["event"]
@@ -311,6 +343,7 @@ class Latest:
             self._held.pop(next(iter(self._held)), None)
 
     def _present(self) -> list[tuple[float, Record]]:
+        """Return the age (s) and the record of each target with a fix in the last minute."""
         now = time()
         return [(now - when, record) for when, record in list(self._held.values()) if now - when < _MAX_AGE]
 

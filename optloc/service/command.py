@@ -205,7 +205,7 @@ def serve(
 
 
 def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str, form: str) -> dict[str, Any]:
-    """Return the values of options as arguments of `optloc.service.stream.Settings`."""
+    """Return the values of options as arguments of `optloc.service.stream.Settings`; times in seconds."""
     from optloc.service.answers import FORMATS
     from optloc.service.engine import PHASES
 
@@ -220,7 +220,11 @@ def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str
 
 
 def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, track: bool) -> dict[str, Any]:
-    """Return the tracking options as arguments of `optloc.service.stream.Settings`."""
+    """Return the tracking options as arguments of `optloc.service.stream.Settings`.
+
+    `model` is the motion model and `name` the filter. `noise` is the process noise and `gap` the longest time without
+    rows, s; None for the default. The tracker is imported only if an option differs from its default.
+    """
     if (model, name, noise, gap) == ("cv", "iekf", None, None):
         return {"track": track}
     from optloc.cli import TrackOptions, dynamics_of, rules
@@ -235,11 +239,11 @@ def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, 
 class ServiceOptions:
     """Options of the commands `live` and `serve`.
 
-    settings: arguments of the stream settings; the source decides on shedding. method: method of the fixes. recording:
-    file to read instead of standard input. speed: replay speed relative to the recording. shed: whether proofs are
-    skipped under load; None means yes, unless the source can wait. quiet: whether health is not printed. http, mqtt,
-    zmq, adapter: as the options. stdin: whether lines come from standard input without a recording. stdout: whether
-    answers go to standard output.
+    settings: arguments of the stream settings except `shed`, which depends on the source. method: method of the fixes.
+    recording: file to read instead of standard input. speed: replay speed relative to the recording. shed: whether
+    proofs are skipped under load; None means yes, unless the source can wait. quiet: whether messages and health are
+    not printed. http, mqtt, zmq, adapter: as the options. stdin: whether lines come from standard input if there is no
+    recording. stdout: whether answers go to standard output.
     """
 
     settings: dict[str, Any]
@@ -291,11 +295,14 @@ def run_live(file: Path, asked: ServiceOptions) -> int:
 
 
 def _open(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, stops: ExitStack) -> str:
-    """Open the HTTP, MQTT and ZeroMQ sources, and return a text on them for the ready message."""
+    """Open the HTTP, MQTT and ZeroMQ sources, and return a text on them for the ready message.
+
+    `stops` receives the functions that stop the sources.
+    """
     from optloc.service import serve as requests
     from optloc.service.sources import mqtt, zeromq
 
-    said = ""
+    opened = ""
     if asked.http is not None:
         host, _, port = asked.http.rpartition(":")
         if not port.isdecimal():
@@ -303,11 +310,11 @@ def _open(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, stops:
         host = host.strip("[]") or requests.HOST
         number, stop = requests.serve(stream, host, int(port))
         stops.callback(stop)
-        said = f", http://{f'[{host}]' if ':' in host else host}:{number}/"
+        opened = f", http://{f'[{host}]' if ':' in host else host}:{number}/"
     for address, begin in ((asked.mqtt, mqtt), (asked.zmq, zeromq)):
         if address is not None:
             stops.callback(begin(stream, address, adapter))
-    return said
+    return opened
 
 
 def _read(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None) -> None:
@@ -324,7 +331,7 @@ def _read(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, record
 
 
 def run_check(file: Path, method: str) -> int:
-    """Print the input lines that a stream of a site accepts."""
+    """Print the input lines that a stream of a site accepts, and return the exit code 0."""
     from optloc.service.site import read_site
 
     site = read_site(file, method)
@@ -354,7 +361,10 @@ def told(site: Site) -> Iterator[str]:
 
 
 def wait(stream: Stream, interrupted: Event) -> int:
-    """Wait for the end of a stream and return its exit code."""
+    """Wait for the end of a stream and return its exit code; raise the error that ended the stream, if any.
+
+    The code is `STOPPED` after Ctrl-C (`interrupted` is set), `READER_GONE` if the output was closed, 0 otherwise.
+    """
     # on Windows, a wait without a timeout blocks signals
     while not stream.ended.wait(1.0):
         pass
@@ -365,7 +375,10 @@ def wait(stream: Stream, interrupted: Event) -> int:
 
 @contextmanager
 def _signal_handlers(stream: Stream) -> Iterator[Event]:
-    """Let signals end a stream or reload its site; Ctrl-C sets the event that is yielded."""
+    """End a stream at SIGTERM or SIGINT, and reload its site at SIGHUP, within the block.
+
+    Yield an event that SIGINT (Ctrl-C) sets, since the exit code then differs.
+    """
     interrupted = Event()
 
     def stop(number: int, _: Any) -> None:
@@ -379,12 +392,16 @@ def _signal_handlers(stream: Stream) -> Iterator[Event]:
 
 
 @contextmanager
-def _signals(wanted: dict[str, Callable[[int, Any], None]]) -> Iterator[None]:
-    """Handle the available signals within the block."""
+def _signals(handlers: dict[str, Callable[[int, Any], None]]) -> Iterator[None]:
+    """Handle signals by functions within the block: `handlers` has the functions by the name of the signal.
+
+    Signals that the operating system lacks are left out. Python allows handlers in the main thread only, so another
+    thread sets none.
+    """
     if current_thread() is not main_thread():
         yield
         return
-    old = {name: signal.signal(getattr(signal, name), how) for name, how in wanted.items() if hasattr(signal, name)}
+    old = {name: signal.signal(getattr(signal, name), how) for name, how in handlers.items() if hasattr(signal, name)}
     try:
         yield
     finally:
@@ -400,14 +417,14 @@ _ENVIRONMENT = {"OPTLOC_THREADS": "1", "OPTLOC_COMPILE": "child"}
 @contextmanager
 def _threads() -> Iterator[None]:
     """Set a short thread switch interval, and the environment of a stream unless variables are already set."""
-    old, own = sys.getswitchinterval(), {name: _ENVIRONMENT[name] for name in _ENVIRONMENT.keys() - os.environ.keys()}
+    old, added = sys.getswitchinterval(), {name: _ENVIRONMENT[name] for name in _ENVIRONMENT.keys() - os.environ.keys()}
     sys.setswitchinterval(_SWITCH)
-    os.environ.update(own)
+    os.environ.update(added)
     try:
         yield
     finally:
         sys.setswitchinterval(old)
-        for name in own:
+        for name in added:
             os.environ.pop(name, None)
 
 
@@ -424,6 +441,8 @@ def _begin(source: Callable[[], None], stream: Stream) -> None:
 
 
 def _write(file: Any) -> Callable[[bytes], None]:
+    """Return a function that writes bytes to a binary file at once, without a buffer that delays answers."""
+
     def write(data: bytes) -> None:
         file.write(data)
         file.flush()
@@ -434,32 +453,35 @@ def _write(file: Any) -> Callable[[bytes], None]:
 def _reader(file: Any) -> tuple[Callable[[int], bytes], Callable[[], bool]]:
     """Return a function that reads available bytes, and a function that returns whether bytes are available.
 
-    The read takes no lock, since the end of the process would wait for the lock.
+    The first function takes the largest number of bytes. It reads the file descriptor without the lock of Python's
+    buffer, since the end of the process would wait for this lock. Files in memory have no descriptor: their second
+    function returns False.
     """
     try:
-        number = file.fileno()
+        descriptor = file.fileno()
     except (OSError, AttributeError, ValueError):
         return file.buffer.read1, bool  # in memory, as in tests
 
     def pending() -> bool:
         try:
-            return bool(select.select([number], [], [], 0.0)[0])
+            return bool(select.select([descriptor], [], [], 0.0)[0])
         except (OSError, ValueError):
             return False  # on Windows, select works for sockets only
 
-    return lambda count: os.read(number, count), pending
+    return lambda count: os.read(descriptor, count), pending
 
 
 def _say(line: str) -> None:
+    """Print a line for people to standard error."""
     typer.echo(visible(line), err=True)
 
 
 def _silent(_: str | bytes) -> None:
-    pass
+    """Ignore a line: the output of `--quiet`, and of a command without standard output."""
 
 
 def _is_file(file: Any) -> bool:
-    """Return whether a stream is a file, which waits for its reader."""
+    """Return whether an input is a regular file, or in memory: its data can wait, unlike the data of a pipe."""
     try:
         return stat.S_ISREG(os.fstat(file.fileno()).st_mode)
     except (OSError, AttributeError, ValueError):

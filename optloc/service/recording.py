@@ -38,6 +38,7 @@ def read_recording(path: Path) -> list[Recorded]:
 
 
 def _received(line: bytes) -> float:
+    """Return the time of reading under the key ``received`` of a line, s; NaN if the line has none."""
     if b'"received"' not in line:
         return np.nan
     try:
@@ -48,7 +49,11 @@ def _received(line: bytes) -> float:
 
 
 def _epochs(made: Draft) -> Iterator[Recorded]:
-    """Yield the epochs of a problem file as events, in the order of their times."""
+    """Yield the epochs of a problem file as events, in the order of their times.
+
+    `made` is the problem with the tables of the file. Its rows refer to entries of these tables, whose values are in
+    the units of the file.
+    """
     loaded = made.loaded
     rows: list[list[dict[str, object]]] = [[] for _ in loaded.epochs]
     names = loaded.problem.stations.names

@@ -66,6 +66,7 @@ def serve(stream: Stream, host: str = HOST, port: int = PORT) -> tuple[int, Call
     thread.start()
 
     def stop() -> None:
+        """Stop the server, and wait at most 5 s for its end."""
         server.should_exit = True
         thread.join(5.0)
 
@@ -194,7 +195,11 @@ async def _body(request: Any) -> bytes | None:
 
 
 async def _answers_to(stream: Stream, lines: list[bytes], *, track: bool) -> list[Record] | int:
-    """Return the answers to lines, or an HTTP status code if there are none."""
+    """Return the answers to lines, or an HTTP status code if there are no answers.
+
+    The codes are 429 (queue full), 503 (the stream ends) and 504 (no answer in time). With `track`, the answers are
+    states of tracks.
+    """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[list[Record]] = loop.create_future()
 

@@ -36,7 +36,7 @@ class ChirpStack:
         self._foreign: set[str] = set()
 
     def __call__(self, line: bytes) -> bytes:
-        """Return an uplink as a whole event."""
+        """Return an uplink as a line with a whole event; lines of another form are returned unchanged."""
         found = _object(line)
         if found is None or not isinstance(found.get("rxInfo"), list):
             return line
@@ -82,7 +82,7 @@ class ModeS:
         self._seen: dict[str, tuple[int, int]] = {}
 
     def __call__(self, line: bytes) -> bytes:
-        """Return a message as one arrival."""
+        """Return a message as a line with one arrival; lines of another form are returned unchanged."""
         found = _object(line)
         heard = None if found is None else found.get("mlat")
         if found is None or not isinstance(heard, dict):
@@ -113,6 +113,7 @@ def _address(bits: str) -> str:
 
 
 def _object(line: bytes) -> dict[str, Any] | None:
+    """Return the JSON object of a line; None if it is too long or is not an object."""
     if len(line) > 4 * LINE:  # an uplink has many parts that are not used
         return None
     try:
@@ -186,7 +187,10 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callab
 
 
 def _push(stream: Stream, payload: bytes, source: str, number: int, adapter: Adapter | None) -> int:
-    """Pass the lines of a message to a stream without waiting, and return the number of the last line."""
+    """Pass the lines of a message to a stream without waiting, and return the number of the last line.
+
+    `number` is the number of the last line of the messages before. Old lines that the full queue drops are counted.
+    """
     for data in payload.split(b"\n"):
         if not data.strip():
             continue
