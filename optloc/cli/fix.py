@@ -301,20 +301,20 @@ def tell_level(
 
     `used` and `late_used` are whether the fixes already use the common factor, and the loss for late rows.
     """
-    said = []
+    texts = []
     if late is not None and late.sentence:
         # If rows are late, do not report the noise: larger noise explains late rows badly, and no other rows well.
         use = "this is used" if late_used else "--late-from-data fixes with this loss"
-        said.append(late.sentence if late.alike else f"{late.sentence}: {use}")
+        texts.append(late.sentence if late.alike else f"{late.sentence}: {use}")
     elif late_used:
-        said.append("no late rows are found")
-    if level is not None and level.suspect and (used or not said):
-        said.append(f"{level.sentence}: {'this is used' if used else '--rescale-noise uses it'}")
+        texts.append("no late rows are found")
+    if level is not None and level.suspect and (used or not texts):
+        texts.append(f"{level.sentence}: {'this is used' if used else '--rescale-noise uses it'}")
     elif level is not None and level.alone:
-        said.append(f"{level.sentence}: see `optloc check`, or --noise-from-data auto")
+        texts.append(f"{level.sentence}: see `optloc check`, or --noise-from-data auto")
     elif used:
-        said.append("the noise is used as stated: no common factor explains the residuals better")
-    return tuple(said)
+        texts.append("the noise is used as stated: no common factor explains the residuals better")
+    return tuple(texts)
 
 
 def late_json(late: LateSignals, used: bool = False) -> dict[str, Any]:
@@ -417,7 +417,10 @@ def _explain(found: FileFixes, method: str) -> FileFixes | None:
 
 
 def explained_json(found: FileFixes, other: FileFixes | None) -> dict[str, Any] | None:
-    """Return the explaining error and the fixes with it as a JSON value; None without an explanation."""
+    """Return the error that explains the misfit, and the fixes with it as an unknown, as a JSON value.
+
+    `found` are the fixes without this error and `other` the fixes with it; without `other` the result is None.
+    """
     if other is None:
         return None
     moved = {f"change_{axis}": other.columns[axis] - found.columns[axis] for axis in _axes(found)}
@@ -425,7 +428,7 @@ def explained_json(found: FileFixes, other: FileFixes | None) -> dict[str, Any] 
 
 
 def _show_explained(found: FileFixes, other: FileFixes | None, console: Console) -> None:
-    """Print the fix without and with the explaining error as an unknown."""
+    """Print the fixes without the explaining error (`found`), and with it as an unknown (`other`)."""
     if other is None:
         say(console, "No single error explains the misfit.")
         return
@@ -455,4 +458,5 @@ def _show_explained(found: FileFixes, other: FileFixes | None, console: Console)
 
 
 def _axes(found: FileFixes) -> list[str]:
+    """Return the names of the coordinates in the table of fixes, such as ["x", "y"]."""
     return [axis for axis in "xyz" if axis in found.columns]

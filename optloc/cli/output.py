@@ -58,7 +58,7 @@ def say_all(console: Console, sentences: Sequence[str]) -> None:
 
 
 def dumps(value: Any) -> str:
-    """Return strict JSON."""
+    """Return a value as strict JSON text; numbers that are not finite become null."""
     # JSON has no NaN or infinity: `plain` replaces them by null, so a remaining one is a programming error.
     return json.dumps(plain(value), allow_nan=False, indent=2)
 
@@ -162,6 +162,7 @@ def meter(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]]:
         task = progress.add_task(title, total=None)
 
         def tell(done: int, total: int) -> None:
+            """Store the finished and the total steps, and update the bar."""
             known[:] = done, total
             progress.update(task, completed=done, total=total)
 
@@ -185,6 +186,7 @@ def line(quiet: bool) -> Iterator[Callable[[str], None]]:
         task = progress.add_task("", total=None)
 
         def tell(text: str) -> None:
+            """Store the text, and update the line."""
             known[0] = text
             progress.update(task, description=text)
 

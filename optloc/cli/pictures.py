@@ -72,6 +72,7 @@ def _residuals(asked: PictureRequest) -> None:
 
 
 def _draw_one(draw: Callable[..., Figure], asked: PictureRequest) -> None:
+    """Write a picture of one epoch or run; `draw` makes the figure from a problem, its fix and a title."""
     problem, fix, title = _solve_one(asked)
     write_picture(draw(problem, fix, title), asked.out)
 

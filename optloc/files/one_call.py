@@ -311,12 +311,12 @@ def _problem_of(
     for word, values in given.items():
         found = station_values(word, values, places.names, reference)
         labels = found.labels if labels is None else labels
-        its_unit = _per_word(unit, word, given, "unit") or found.unit or ARGUMENTS[word].unit
+        value_unit = _per_word(unit, word, given, "unit") or found.unit or ARGUMENTS[word].unit
         convention = north.azimuth if word == "bearings" else CARTESIAN
-        step, sigma_si = _SCALES.call(_scale, word, its_unit, sigma, list(given), speed, convention)
+        step, sigma_si = _SCALES.call(_scale, word, value_unit, sigma, list(given), speed, convention)
         made = _rows(word, found, sigma_si, step, places, speed)
-        timed.append(is_time(Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed), its_unit, "unit"))
-        rows.append(_from_north(made, north, its_unit, places) if word == "bearings" else made)
+        timed.append(is_time(Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed), value_unit, "unit"))
+        rows.append(_from_north(made, north, value_unit, places) if word == "bearings" else made)
     at = _heights(height, places, given)
     problem = assemble(places.stations, *rows, frame=places.frame, constraints=at, medium=medium)
     return (problem if speed_sigma is None else _with_speed(problem, speed, speed_sigma, timed)), labels

@@ -111,8 +111,8 @@ def received(
     """
     letter = (system or "G").upper()
     if letter not in SYSTEMS:
-        told = ", ".join(f"{key} ({name})" for key, name in SYSTEMS.items())
-        raise InvalidProblem(f"there is no system {system!r}", "--system", f"write one of {told}")
+        choices = ", ".join(f"{key} ({name})" for key, name in SYSTEMS.items())
+        raise InvalidProblem(f"there is no system {system!r}", "--system", f"write one of {choices}")
     if navigation is None:
         advice = "give the RINEX navigation file of that day with --navigation"
         raise InvalidProblem("the satellite positions are unknown", "--navigation", advice)

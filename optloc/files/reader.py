@@ -301,10 +301,7 @@ def _problem(
 
 
 def _epochs(file: ProblemFile, chunks: Sequence[RowChunk], source: str) -> Epochs:
-    """Return the epochs of the rows of all chunks together.
-
-    Raise InvalidProblem if some tables have a time or a label, and others do not.
-    """
+    """Return the epochs of the rows of all chunks; raise InvalidProblem if only some tables have times or labels."""
     columns: dict[str, Array | None] = {}
     for key in ("label", "time", "written", "target"):
         parts = [getattr(chunk, key) for chunk in chunks]
@@ -336,7 +333,7 @@ def _stations_used(chunk: RowChunk, epoch: Array) -> Array:
 
 
 def _add_baseline(chunk: RowChunk, epoch: Array, stations: Stations) -> RowChunk:
-    """Return a chunk with excess paths converted to path sums, by the distance of the stations at each epoch."""
+    """Return a chunk with excess paths converted to path sums: the distance of the stations is added."""
     if not chunk.excess:
         return chunk
     place = stations.position[epoch if len(stations.position) > 1 else np.zeros_like(epoch)]
@@ -513,7 +510,7 @@ def _check(problem: Problem, source: str, medium: Medium | None = None) -> Probl
 
 
 def _has_moving_target(problem: Problem) -> bool:
-    """Return whether a known target moves: it has a position at each of several epochs."""
+    """Return whether a known target moves: it has several positions."""
     return any(motion.known is not None and len(motion.known) > 1 for motion in problem.motions)
 
 

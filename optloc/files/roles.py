@@ -205,9 +205,9 @@ def with_standard_columns(table: Table, unit: str) -> Table:
     columns = dict(table.columns)
     for key in ("height", *"xyz"):
         name = named.get(key, "")
-        its_unit = unit_of(name, UNITS["length"])
-        if its_unit is not None and its_unit != unit and unit in UNITS["length"]:
-            columns[name] = table.numbers(name, optional=True) * (UNITS["length"][its_unit] / UNITS["length"][unit])
+        unit_in_name = unit_of(name, UNITS["length"])
+        if unit_in_name is not None and unit_in_name != unit and unit in UNITS["length"]:
+            columns[name] = table.numbers(name, optional=True) * (UNITS["length"][unit_in_name] / UNITS["length"][unit])
     return replace(table, columns=columns, names={**table.names, **named})
 
 
@@ -414,9 +414,9 @@ def in_space(place: ColumnPlaces) -> ColumnPlaces:
 
 def scaled(roles: Roles, role: str, quantity: Literal["length", "angle"], unit: str) -> Array:
     """Return the numbers (m,) of a role in `unit`, which is also the unit of a column name without a unit."""
-    its_unit = unit_of(roles.column(role), UNITS[quantity]) or unit
+    unit_in_name = unit_of(roles.column(role), UNITS[quantity]) or unit
     values = roles.numbers(role)
-    return values if its_unit == unit else values * UNITS[quantity][its_unit] / UNITS[quantity][unit]
+    return values if unit_in_name == unit else values * UNITS[quantity][unit_in_name] / UNITS[quantity][unit]
 
 
 # Roles of the third coordinate, the most likely first: with latitude and longitude, and with x and y.

@@ -166,15 +166,15 @@ def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Array) -> A
     without a standard deviation, or for a time in one column and a length in the other.
     """
     known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
-    its_unit = unit_of(column, known) or unit
+    column_unit = unit_of(column, known) or unit
     if (
-        {its_unit, unit} & set(UNITS["time"])
-        and not {its_unit, unit} <= set(UNITS["time"])
+        {column_unit, unit} & set(UNITS["time"])
+        and not {column_unit, unit} <= set(UNITS["time"])
         and form.quantity == "length"
     ):
         advice = "give both in one unit, or use --sigma"
         raise InvalidProblem(
-            f"the column is in {its_unit}, but the readings are in {unit}", table.where(column), advice
+            f"the column is in {column_unit}, but the readings are in {unit}", table.where(column), advice
         )
     sigmas = numbers(table, column)
     place = np.full(table.count, -1)
@@ -183,7 +183,7 @@ def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Array) -> A
     if len(lacking):
         advice = "give a number, or remove the row"
         raise InvalidProblem("the reading has no standard deviation", table.where(column, int(lacking[0])), advice)
-    return np.asarray(sigmas.values.floats()[place[pick]] * known[its_unit] / known[unit])
+    return np.asarray(sigmas.values.floats()[place[pick]] * known[column_unit] / known[unit])
 
 
 def _ends(one: Named, form: Form, told: ColumnHints, source: str) -> tuple[str, str | None]:

@@ -256,8 +256,8 @@ def _sigma(section: StationsTable, table: Table, where: str, key: str) -> Array 
     `key` is "sigma" or "velocity_sigma": a column, or a setting of the section.
     """
     stated, place = getattr(section, key), join(where, "[stations]", f"key {key!r}")
-    units, its_unit = (Units("length"), section.unit) if key == "sigma" else (Units("speed"), section.speed_unit)
-    unit = units.conversion(its_unit, where)
+    units, plain_unit = (Units("length"), section.unit) if key == "sigma" else (Units("speed"), section.speed_unit)
+    unit = units.conversion(plain_unit, where)
     if table.has(key):
         sigma = unit.sigma_to_si(table.numbers(key))
     elif stated is not None:

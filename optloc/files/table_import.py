@@ -435,7 +435,7 @@ def unused_measurement(column: str, lengths: bool = False) -> str | None:
 # Units, missing readings, repeats.
 
 
-def unit_for(column: str, form: Form, told: ColumnHints, held: Decimals, where: str) -> tuple[str, str]:
+def unit_for(column: str, form: Form, told: ColumnHints, values: Decimals, where: str) -> tuple[str, str]:
     """Return the unit of a column and a note; raise InvalidProblem if the unit is unknown.
 
     The unit comes from the option `--unit`, from the column name, or for angles from the size of `values`.
@@ -448,7 +448,7 @@ def unit_for(column: str, form: Form, told: ColumnHints, held: Decimals, where: 
         raise InvalidProblem(f"{told.unit!r} is not a unit of {form.text}", "--unit", nearest(told.unit, list(known)))
     if unit_in_name is not None:
         return unit_in_name, ""
-    if form.quantity == "angle" and bool((np.abs(held.floats()) > _TURN).any()):
+    if form.quantity == "angle" and bool((np.abs(values.floats()) > _TURN).any()):
         return "deg", f"{column!r} is in degrees, because some values exceed a full turn in radians"
     examples = {"length": "ns, or --unit m", "angle": "deg, or --unit rad", "speed": "m/s"}.get(form.quantity, "1")
     raise InvalidProblem(f"the unit of the column {column!r} is unknown", where, f"state it with --unit {examples}")

@@ -94,9 +94,9 @@ class TableProblem:
         out = Path(f"{re.sub(r'[^A-Za-z0-9_-]', '_', self.source.stem)[:_LETTERS]}.toml")
         names = [path.name for path in self.tables(out)]
         # A stated height replaces an assumed one.
-        told = replace(self, height="") if "--height" in (more or {}) else self
+        chosen = replace(self, height="") if "--height" in (more or {}) else self
         # As in a file, replace characters that are not valid Unicode.
-        text = told.text(names).encode("utf-8", "replace").decode("utf-8")
+        text = chosen.text(names).encode("utf-8", "replace").decode("utf-8")
         file = document_of(text, out.name)
         sheets = (self.places.columns, *(section.columns for section in self.sections))
         stations, *tables = (_table(name, columns) for name, columns in zip(names, sheets, strict=True))

@@ -126,7 +126,9 @@ def known_of(
     return states
 
 
-def _states(section: TargetTable, table: Table, name: str, epochs: Epochs, heard: Array, wanted: FrameTable) -> Array:
+def _states(
+    section: TargetTable, table: Table, name: str, epochs: Epochs, needed_epochs: Array, wanted: FrameTable
+) -> Array:
     """Return the states (k or 1, order + 1, d) of a known target from its table: position, and velocity if given.
 
     `needed_epochs` are the epochs with rows of the target. `wanted` is the frame of the stations. SI units.
@@ -141,7 +143,7 @@ def _states(section: TargetTable, table: Table, name: str, epochs: Epochs, heard
     found = replace(survey(units, named, wanted, table.source)[0], noun="target")
     position, velocity = found.position[:, None], None if found.velocity is None else found.velocity[:, None]
     if dated:
-        used = np.stack([heard, np.zeros_like(heard)], axis=-1)
+        used = np.stack([needed_epochs, np.zeros_like(needed_epochs)], axis=-1)
         position, velocity, _ = stations_over_epochs(found, units, epochs, used)
     return position if velocity is None else np.concatenate([position, velocity], axis=-2)
 
@@ -425,6 +427,7 @@ def _reported(
 
 
 def _check_keys(table: ConstraintTable, where: str) -> None:
+    """Raise InvalidProblem for a key that the kind of the constraint does not use, or for a missing bound."""
     known = _KEYS[table.kind]
     foreign = sorted(table.model_fields_set - {"kind", "target", *known})
     if foreign:

@@ -59,7 +59,7 @@ class Words:
         return pa.array(np.asarray(self), type)
 
     def renamed(self, cells: Sequence[Any]) -> Words:
-        """Return the column with other cells (n,); equal cells are joined."""
+        """Return the column with new cells (n,) instead of its distinct cells; equal new cells are joined."""
         names, number = numbered(objects(cells))
         return Words(objects(names), number[self.index])
 

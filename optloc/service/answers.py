@@ -291,6 +291,7 @@ def _of_file(each: Callable[[Mark], str]) -> Callable[[Record, Frame], bytes | N
     """
 
     def line(record: Record, frame: Frame) -> bytes | None:
+        """Return a record in the file format, ending in a line break; None without a position on Earth."""
         if record.get("lat_deg") is None:
             return None
         text = each(to_mark(record, frame))

@@ -382,6 +382,7 @@ def _signal_handlers(stream: Stream) -> Iterator[Event]:
     interrupted = Event()
 
     def stop(number: int, _: Any) -> None:
+        """End the stream at a signal."""
         if number == signal.SIGINT:
             interrupted.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)  # a second Ctrl-C interrupts at once
@@ -432,6 +433,7 @@ def _begin(source: Callable[[], None], stream: Stream) -> None:
     """Read a source in a separate thread, and close the stream at its end."""
 
     def run() -> None:
+        """Read the source, then close the stream, also after an error."""
         try:
             source()
         finally:
@@ -463,6 +465,7 @@ def _reader(file: Any) -> tuple[Callable[[int], bytes], Callable[[], bool]]:
         return file.buffer.read1, bool  # in memory, as in tests
 
     def pending() -> bool:
+        """Return whether the file has bytes that can be read without waiting."""
         try:
             return bool(select.select([descriptor], [], [], 0.0)[0])
         except (OSError, ValueError):

@@ -182,8 +182,8 @@ class Engine:
     def _groups(self, events: Iterable[Event]) -> list[EventGroup]:
         """Return events grouped by rows; answer events whose rows give no problem at once."""
         found: dict[tuple[tuple[int, ...], tuple[SiteRow, ...]], list[Event]] = {}
-        everything = tuple(range(len(self.site.rows)))
-        names: dict[tuple[Any, ...], tuple[SiteRow, ...]] = {everything: self.site.rows}
+        all_rows = tuple(range(len(self.site.rows)))
+        names: dict[tuple[Any, ...], tuple[SiteRow, ...]] = {all_rows: self.site.rows}
         for event in events:
             keys = tuple(event.rows)
             if event.sigmas or keys not in names:

@@ -163,12 +163,14 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callab
     number = 0
 
     def connected(client: Any, _: Any, __: Any, reason: Any, ___: Any) -> None:
+        """Subscribe to the topic after each connection, or log a warning if the broker refuses."""
         if reason.is_failure:
             LOG.warning("%s: the broker refuses (%s)", parts.hostname, reason)
         else:
             client.subscribe(topic, qos=1)  # again after each reconnection
 
     def heard(_: Any, __: Any, message: Any) -> None:
+        """Pass the lines of a message to the stream."""
         nonlocal number
         number = _push(stream, message.payload, "mqtt", number, adapter)
 
@@ -233,6 +235,7 @@ def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> Call
     ends = False
 
     def run() -> None:
+        """Receive messages until the source is stopped (a separate thread), and pass their lines to the stream."""
         number = 0
         while not ends:
             if not socket.poll(200):

@@ -342,7 +342,7 @@ class Stream:
         else:
             self._say(json.dumps(record))
 
-    def _tell(self, record: Record) -> None:
+    def _publish(self, record: Record) -> None:
         """Pass a record to the latest fixes and to the listeners."""
         self.latest(record)
         for listener in self.listeners:
