@@ -81,12 +81,12 @@ def run_check(
     outputs()
     found = summary(loaded)
     checked = _health(loaded, asked, quiet or as_json)
-    told = _advice(loaded, checked)
+    advice = _advice(loaded, checked)
     if as_json:
         more = {} if checked is None else {"health": _health_json(checked)}
         more |= {} if checked is None or checked.level is None else {"noise_level": level_json(checked.level)}
         more |= {} if checked is None or checked.late is None else {"late_signals": late_json(checked.late)}
-        write_text(Path("-"), dumps(found | table_json(loaded) | more | {"advice": advice_json(told)}))
+        write_text(Path("-"), dumps(found | table_json(loaded) | more | {"advice": advice_json(advice)}))
     elif not quiet:
         sheet = Table(title=loaded.title, show_header=False, title_justify="left")
         for name, value in found.items():
@@ -95,7 +95,7 @@ def run_check(
         if checked is not None:
             _show_health(checked, Screen())
             say_all(Screen(), tell_level(checked.level, late=checked.late))
-        show_advice(told, Screen())
+        show_advice(advice, Screen())
     return 1 if found["epochs_with_too_few_rows"] else 0
 
 

@@ -78,17 +78,17 @@ def run_crlb(
         for slot in problem.layout.shared
     ]
     over_time = courses(problem, truth)
-    told = reliability_of(problem, truth)
+    found = reliability_of(problem, truth)
     if plot is not None:
         _draw(plot, loaded, over_time)
     if as_json:
         course = [] if over_time is None else _course_records(*over_time)
-        made = {"file": loaded.source, "bounds": rows, "reliability": reliability_json(told), "course": course}
+        made = {"file": loaded.source, "bounds": rows, "reliability": reliability_json(found), "course": course}
         write_text(Path("-"), dumps(made))
     elif not quiet:
         console = Screen()
         console.print(_bound_table(loaded, rows))
-        show_reliability(told, console)
+        show_reliability(found, console)
         if over_time is not None:
             console.print(_course_table(*over_time, loaded))
     return 0 if all(np.isfinite(row["sigma"]).all() for row in rows) and rows else 1
@@ -187,24 +187,24 @@ def reliability_of(problem: Problem, x: Array, suspects: Sequence[Suspect] = ())
     return Reliability(tuple(worst), least, shift)
 
 
-def reliability_json(told: Reliability | None) -> list[dict[str, Any]]:
+def reliability_json(found: Reliability | None) -> list[dict[str, Any]]:
     """Return the smallest noticed errors as records, in SI units and radians; infinite values are null."""
-    if told is None:
+    if found is None:
         return []
-    parts = zip(told.names, told.least, told.shift, strict=True)
+    parts = zip(found.names, found.least, found.shift, strict=True)
     return [{"channel": name, "least_noticed": least, "moves_position": shift} for name, least, shift in parts]
 
 
-def show_reliability(told: Reliability | None, console: Console) -> None:
+def show_reliability(found: Reliability | None, console: Console) -> None:
     """Print the smallest noticed errors, sorted by decreasing displacement of the position."""
-    if told is None:
+    if found is None:
         return
     table = Table(title="Errors that go unnoticed", title_justify="left")
     for name in ("of all rows", "up to", "moves the position, m"):
         table.add_column(name, justify="left" if name == "of all rows" else "right")
-    order = np.argsort(-told.shift, kind="stable")
+    order = np.argsort(-found.shift, kind="stable")
     for i in order[:_MEMBERS]:
-        table.add_row(told.names[i], _size(told.names[i], told.least[i]), _length(told.shift[i]))
+        table.add_row(found.names[i], _size(found.names[i], found.least[i]), _length(found.shift[i]))
     if len(order) > _MEMBERS:
         table.add_row("...", "", f"{len(order) - _MEMBERS} more")
     console.print(table)

@@ -21,7 +21,7 @@ from optloc.problem.epochs import separable
 from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
-from optloc.show import columns as told
+from optloc.show import columns as tables
 from optloc.show.columns import Columns, fix_detail, level_covariance, records
 from optloc.show.formats.marks import Results
 
@@ -155,7 +155,7 @@ def fix_columns(loaded: Loaded, fix: Fix, first: int | None) -> Columns:
     motions, n = loaded.problem.motions, 1 if first is None else len(fix)
     # A file with known targets only (a calibration) has one row for each target.
     shown = [i for i, m in enumerate(motions) if m.known is None] or range(len(motions))
-    return told.fix_columns(
+    return tables.fix_columns(
         fix,
         targets=[(i, state_names(i, len(motions), motions[i].order)) for i in shown],
         labels=lambda target, spread: _labels(loaded, n, first, target, spread),

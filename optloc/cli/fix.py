@@ -111,18 +111,18 @@ def run_fix(
     level = rescaled or _level_of(found)
     used = rescaled is not None or bool(np.any(found.fix.has(Status.RESCALED)))
     signals = signals or _late_of(found)
-    told = advice_for_fixes(found)
+    advice = advice_for_fixes(found)
     other = _explain(found, method) if explain else None
     if as_json:
         noise_found: dict[str, Any] = {} if levels is None else {"noise": _levels_json(levels)}
         noise_found |= {} if level is None else {"noise_level": level_json(level, used)}
         noise_found |= {"explained": explained_json(found, other)} if explain else {}
         noise_found |= {} if signals is None else {"late_signals": late_json(signals, late)}
-        write_text(Path("-"), dumps(fixes_json(found) | {"advice": advice_json(told)} | noise_found))
+        write_text(Path("-"), dumps(fixes_json(found) | {"advice": advice_json(advice)} | noise_found))
     else:
         console = Screen(stderr=on_output)
         show(found, console)
-        show_advice(told, console)
+        show_advice(advice, console)
         if explain:
             _show_explained(found, other, console)
         if level is not None or signals is not None:
@@ -445,8 +445,8 @@ def _show_explained(found: FileFixes, other: FileFixes | None, console: Console)
         for axis in _axes(found):
             one, two = (each.columns[axis][i] for each in (found, other))
             sigmas = [each.columns[f"sigma_{axis}"][i] for each in (found, other)]
-            told = [with_sigma(value, sigma, "m") for value, sigma in zip((one, two), sigmas, strict=True)]
-            table.add_row(f"{axis}{owner}", *told, f"{two - one:+.4g} m")
+            texts = [with_sigma(value, sigma, "m") for value, sigma in zip((one, two), sigmas, strict=True)]
+            table.add_row(f"{axis}{owner}", *texts, f"{two - one:+.4g} m")
     console.print(table)
     if rows < len(found.columns["x"]):
         say(console, f"{len(found.columns['x']) - rows} more positions changed; --json prints all.")

@@ -225,9 +225,9 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
     from optloc.files.convert import convert as written, interpret_table
     from optloc.files.table_import import ColumnHints
 
-    told, console = ColumnHints(**given), Screen(quiet=quiet or as_json)
+    hints, console = ColumnHints(**given), Screen(quiet=quiet or as_json)
     if out is None:
-        table_problem = interpret_table(file, told)
+        table_problem = interpret_table(file, hints)
         _print_interpretation(table_problem, console)
         table_problem.read()
         say_next(
@@ -237,7 +237,7 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
         if as_json:
             write_text(Path("-"), dumps(table_problem.as_read))
         return 0
-    found = written(file, out, told, tell=lambda table_problem: _print_interpretation(table_problem, console))
+    found = written(file, out, hints, tell=lambda table_problem: _print_interpretation(table_problem, console))
     if as_json:
         write_text(Path("-"), dumps(_json(found)))
     elif found.loaded is None:
@@ -283,7 +283,7 @@ def _json(found: Converted) -> dict[str, Any]:
 # Tables instead of problem files.
 
 
-def table_told(file: Path, given: Mapping[str, Any]) -> ColumnHints | None:
+def table_hints(file: Path, given: Mapping[str, Any]) -> ColumnHints | None:
     """Return the column hints of a table; None for a problem file.
 
     `given` has the values of the table options. Raise InvalidProblem for a problem file with such options.
@@ -304,7 +304,7 @@ def table_told(file: Path, given: Mapping[str, Any]) -> ColumnHints | None:
 
 def read_problem(
     file: Path,
-    told: ColumnHints | None,
+    hints: ColumnHints | None,
     more: Mapping[str, ConstraintTable] | None = None,
     *,
     values: bool = True,
@@ -314,15 +314,15 @@ def read_problem(
     """Return the content of a problem file with more constraints, or of a table with column hints.
 
     For a table, print its interpretation, unless `quiet`; with `on_error`, print to standard error. `values` requires
-    measured values in a problem file. `told` has the column hints of a table; it is None for a problem file.
+    measured values in a problem file. `hints` has the column hints of a table; it is None for a problem file.
     """
     from optloc.files.reader import read
 
-    if told is None:
+    if hints is None:
         return read(file, values=values, more=more)
     from optloc.cli.output import Screen
     from optloc.files.convert import interpret_table
 
-    table_problem = interpret_table(file, told)
+    table_problem = interpret_table(file, hints)
     _print_interpretation(table_problem, Screen(quiet=quiet, stderr=on_error))
     return table_problem.read(more or {})

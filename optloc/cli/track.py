@@ -281,8 +281,8 @@ def _map(loaded: Loaded, ones: list[TargetTrack]) -> str:
     place = degrees(problem, position) if problem.frame.geodetic else position
     names = [f"{name} {label}" if len(ones) > 1 else label for name, label, _ in entries]
     text = [
-        sentence(name, e.label, *told)
-        for name, (_, _, e), told in zip(names, entries, zip(place, sigma, strict=True), strict=True)
+        sentence(name, e.label, *values)
+        for name, (_, _, e), values in zip(names, entries, zip(place, sigma, strict=True), strict=True)
     ]
     return track_page(problem, spots(problem, position, covariance, clean, text), loaded.title)
 

@@ -20,42 +20,42 @@ _FULL_TURN = {"deg": Decimal(360)}
 _RADIANS = Decimal("6.2832")
 
 
-def heading_of(found: Readings, roles: Roles, told: ColumnHints) -> str | None:
+def heading_of(found: Readings, roles: Roles, hints: ColumnHints) -> str | None:
     """Return the column of headings to add to bearings; None if bearings are not relative to the bow.
 
-    `told` may state the convention of the azimuths `found`: any other convention than the bow ignores headings. Raise
+    `hints` may state the convention of the azimuths `found`: any other convention than the bow ignores headings. Raise
     InvalidProblem for bearings from the bow without a column of headings.
     """
-    if told.azimuth not in (None, BOW):
+    if hints.azimuth not in (None, BOW):
         return None
-    column = roles.column("heading") if told.azimuth == BOW else roles.find("heading")
+    column = roles.column("heading") if hints.azimuth == BOW else roles.find("heading")
     # A measured heading is a bearing. The heading of one vehicle does not apply to columns of several receivers.
-    if column is None or column in found.columns or (told.azimuth is None and len(found.columns) > 1):
+    if column is None or column in found.columns or (hints.azimuth is None and len(found.columns) > 1):
         return None
     return column
 
 
-def from_bow(found: Readings, roles: Roles, column: str, told: ColumnHints) -> Readings:
+def from_bow(found: Readings, roles: Roles, column: str, hints: ColumnHints) -> Readings:
     """Return bearings clockwise from north: bearings from the bow plus the heading of their row.
 
-    `column` has the headings, clockwise from north. `told` may state the convention, and the unit if the column name
+    `column` has the headings, clockwise from north. `hints` may state the convention, and the unit if the column name
     has none. Raise InvalidProblem if a bearing has no heading, the unit is unknown, or magnetic headings have no
     declination.
     """
     table = roles.table
-    if "mag" in stem(column) and told.declination is None:
+    if "mag" in stem(column) and hints.declination is None:
         advice = "give it with --declination, such as '4 deg' or the date 2026-06-01"
         raise InvalidProblem(
             f"the headings {column!r} are magnetic, and the declination is unknown", table.source, advice
         )
-    column_values, nothing = numbers(table, column), marks_of(told) or frozenset()
+    column_values, nothing = numbers(table, column), marks_of(hints) or frozenset()
     given = dict(zip(column_values.row.tolist(), column_values.values.tolist(), strict=True))
     lacking = next((row for row in found.row.tolist() if given.get(row) is None or given[row] in nothing), None)
     if lacking is not None:
         advice = "remove the row, or use --azimuth north-clockwise if the bearings are true bearings"
         raise InvalidProblem("the bearing has no heading", table.where(column, lacking), advice)
     used = [given[row] for row in found.row.tolist()]
-    unit = _unit(column, used, told, table.where(column))
+    unit = _unit(column, used, hints, table.where(column))
     turn = in_unit(Decimal(360), "deg", unit, found.form)
     wrong = next((i for i, heading in enumerate(used) if abs(heading) > turn * Decimal("1.0001")), None)
     if wrong is not None:
@@ -69,7 +69,7 @@ def from_bow(found: Readings, roles: Roles, column: str, told: ColumnHints) -> R
         turn = _FULL_TURN[found.unit]
         sums = [(value % turn + turn) % turn for value in sums]
     note = f"bearings are read as clockwise from the bow of the vehicle; the heading in column {column!r} is added"
-    note += "" if told.azimuth == BOW else f"; --azimuth {COMPASS} reads them as true bearings"
+    note += "" if hints.azimuth == BOW else f"; --azimuth {COMPASS} reads them as true bearings"
     return replace(found, values=Decimals.of(sums), azimuth=COMPASS, heading=column, notes=(note, *found.notes))
 
 
@@ -99,14 +99,14 @@ def stations_turned(place: ColumnPlaces, found: Sequence[Readings]) -> tuple[Col
     return replace(place, columns={**place.columns, "heading_deg": np.nan_to_num(headings)}), note
 
 
-def _unit(column: str, headings: list[Decimal], told: ColumnHints, where: str) -> str:
+def _unit(column: str, headings: list[Decimal], hints: ColumnHints, where: str) -> str:
     """Return the unit of headings: from the column name, from --unit, or from their size.
 
     `headings` are the values of the column, without empty cells. If any exceeds a full turn in radians, the unit is the
     degree.
     """
     known = UNITS["angle"]
-    stated = unit_of(column, known) or (told.unit if told.unit in known else None)
+    stated = unit_of(column, known) or (hints.unit if hints.unit in known else None)
     if stated is None and any(abs(value) > _RADIANS for value in headings):
         return "deg"
     if stated is None:

@@ -1,6 +1,6 @@
 """Report on how a table was read: the role of each column, and errors for unused columns that may be measurements.
 
-A sort of readings is a measurement kind in one form, such as arrivals or S minus P times. `told` has the options.
+A sort of readings is a measurement kind in one form, such as arrivals or S minus P times. `hints` has the options.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _ORIENTED = {
 
 def uses_of(
     roles: Roles,
-    told: ColumnHints,
+    hints: ColumnHints,
     found: Sequence[Readings],
     epochs: Mapping[str, Array],
     sigmas: Sequence[str | None],
@@ -62,12 +62,12 @@ def uses_of(
     wanted = wanted if picks else []
     if long:
         wanted += ["station"]
-        wanted += ["reference"] if told.reference is None and any(one.b is not None for one in found) else []
+        wanted += ["reference"] if hints.reference is None and any(one.b is not None for one in found) else []
     wanted += ["target"] if "target" in epochs else []
-    timed = "time" in epochs or (not told.still and roles.find("message") is None)
-    wanted += ["message"] if "epoch" in epochs and told.window is None else []
+    timed = "time" in epochs or (not hints.still and roles.find("message") is None)
+    wanted += ["message"] if "epoch" in epochs and hints.window is None else []
     wanted += ["time"] if timed or by_phase else []
-    if told.stations is None:
+    if hints.stations is None:
         wanted += ["name", *place_roles(roles)]
     for role in wanted:
         column = roles.find(role)
@@ -104,7 +104,7 @@ def unused_columns(
 
 def reading_lines(
     roles: Roles,
-    told: ColumnHints,
+    hints: ColumnHints,
     place: ColumnPlaces,
     found: Sequence[Readings],
     epochs: Mapping[str, Array],
@@ -133,17 +133,17 @@ def reading_lines(
     errors = {name: role.removeprefix("sigma_") for name, role in uses.items() if role.startswith("sigma_")}
     out += [("sigma", f"of {kind}, from column {name}") for name, kind in errors.items()]
     if "epoch" in epochs:
-        names = [roles.find(role) for role in (("message", "time") if told.window is None else ("time",))]
+        names = [roles.find(role) for role in (("message", "time") if hints.window is None else ("time",))]
         label = next(
             (f"column {name}" for name in names if name is not None and set(name.split("+")) <= set(uses)), "row"
         )
         out.append(("epochs", f"{len(set(numbered(epochs['epoch'])[0]) - {''})} by {label}"))
     elif "time" in epochs:
-        each = f"{told.window} each" if told.window else f"{len(np.unique(epochs['time']))}"
+        each = f"{hints.window} each" if hints.window else f"{len(np.unique(epochs['time']))}"
         out.append(("epochs", f"{each} by column {roles.find('time')}"))
     if "target" in epochs:
         out.append(("targets", f"{len(numbered(epochs['target'])[0])} by column {roles.find('target')}"))
-    where = told.stations.name if told.stations is not None else "the table itself"
+    where = hints.stations.name if hints.stations is not None else "the table itself"
     axes = "latitude and longitude" if place.frame == "geodetic" else f"x and y, {place.frame}, in {place.unit}"
     out.append(("stations", f"{len(set(place.names))} of {where}, by {axes}"))
     return out

@@ -54,23 +54,23 @@ class Roles:
         The table.
     by_role : mapping of str to str
         Column of each role; "+" joins several columns to one label.
-    told : frozenset of str
+    stated : frozenset of str
         Roles that the user stated.
     """
 
     table: Table
     by_role: Mapping[str, str]
-    told: frozenset[str] = frozenset()
+    stated: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, table: Table, told: Mapping[str, str], readings: Collection[str] = ()) -> Roles:
+    def of(cls, table: Table, stated: Mapping[str, str], readings: Collection[str] = ()) -> Roles:
         """Return the roles of a table: stated by the user, then suggested by column names.
 
-        `told` has columns by role, or by another word for the role. `readings` are the columns of receiver readings,
+        `stated` has columns by role, or by another word for the role. `readings` are the columns of receiver readings,
         which have no other role. Raise InvalidProblem for an unknown role or column, a unit that does not fit, and a
         column with two roles.
         """
-        given = _stated_columns(table, told)
+        given = _stated_columns(table, stated)
         used = {part for name in given.values() for part in name.split("+")} | set(readings)
         found: dict[str, str] = {}
         for column in table.columns:
@@ -84,7 +84,7 @@ class Roles:
 
         A column of another role may replace it: a station can be named in the column `id`, for instance.
         """
-        if role == "name" and stem(self.by_role.get("name", "")) != "name" and "name" not in self.told:
+        if role == "name" and stem(self.by_role.get("name", "")) != "name" and "name" not in self.stated:
             role = "station"  # a callsign names a station only if no other column does
         if role in self.by_role:
             return self.by_role[role]
@@ -132,14 +132,14 @@ class Roles:
 _NAMES_STATION = ("station", "name", "id")
 
 
-def _stated_columns(table: Table, told: Mapping[str, str]) -> dict[str, str]:
+def _stated_columns(table: Table, stated: Mapping[str, str]) -> dict[str, str]:
     """Return the columns that the user states, by role.
 
     Raise InvalidProblem for a column that does not fit its role.
     """
     given: dict[str, str] = {}
     owner: dict[str, str] = {}
-    for word, name in told.items():
+    for word, name in stated.items():
         role = role_named(word)
         role = _epoch_role(name) if role == "epoch" else role
         if role in given:
@@ -341,17 +341,17 @@ class ColumnPlaces:
         return [str(name) for name in self.columns["name"]]
 
 
-def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> ColumnPlaces:
-    """Return the stations of a file; `told` has the stated columns by role, and `frame` applies to x, y, z."""
+def places_of(path: Path, stated: Mapping[str, str], frame: str | None) -> ColumnPlaces:
+    """Return the stations of a file; `stated` has the stated columns by role, and `frame` applies to x, y, z."""
     if path.suffix.lower() == ".geojson":
         return _of_geojson(json_of(read_text(path), path.name), path.name)
     if path.suffix.lower() == ".json":
         data = json_of(read_text(path), path.name)
         if isinstance(data, list) or (isinstance(data, dict) and "features" in data):
             return _of_geojson(data, path.name)
-        roles = Roles.of(records(data, path.name), told)
+        roles = Roles.of(records(data, path.name), stated)
     else:
-        roles = Roles.of(read_table(path), told)
+        roles = Roles.of(read_table(path), stated)
     found = placed(roles, frame)
     column = roles.find("heading")
     if column is not None:
@@ -372,7 +372,7 @@ def place_roles(roles: Roles) -> tuple[str, ...]:
 
 def check_column_hints(roles: Roles, used: Collection[str]) -> None:
     """Raise InvalidProblem for a stated role that a table of this form does not use."""
-    for role in sorted(roles.told - set(used)):
+    for role in sorted(roles.stated - set(used)):
         what = f"the role {role} of the column {roles.by_role[role]!r} is not used in {roles.table.source}"
         raise InvalidProblem(what, "--column", "remove it, or state the content of the table with --as")
 

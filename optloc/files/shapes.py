@@ -1,6 +1,6 @@
 """Long and wide tables of readings: one reading in each row, or a column for each receiver.
 
-In the functions, `roles` has the table and the roles of its columns. `told` has the options, and `place` the stations.
+In the functions, `roles` has the table and the roles of its columns. `hints` has the options, and `place` the stations.
 A form is a sort of readings, such as arrivals or ranges. In shapes, m is the number of readings, and n the number of
 rows of the table.
 """
@@ -47,7 +47,7 @@ _SHOWN = 4
 # Wide tables: a column for each receiver, or for each pair.
 
 
-def read_wide(roles: Roles, told: ColumnHints, columns: Sequence[Named], place: ColumnPlaces) -> list[Readings]:
+def read_wide(roles: Roles, hints: ColumnHints, columns: Sequence[Named], place: ColumnPlaces) -> list[Readings]:
     """Return the readings of a wide table, one set for each sort; raise InvalidProblem if the sort is unknown.
 
     `columns` are the columns that are named after stations.
@@ -56,7 +56,7 @@ def read_wide(roles: Roles, told: ColumnHints, columns: Sequence[Named], place: 
     for one in columns:
         if one.sigma:
             continue
-        name = one.form or told.what or ("tdoa" if one.minus else None)
+        name = one.form or hints.what or ("tdoa" if one.minus else None)
         if name is None:
             shown = ", ".join(repr(each.column) for each in columns[:_SHOWN])
             advice = "state it with --as arrivals, --as range, --as tdoa or another kind"
@@ -64,13 +64,13 @@ def read_wide(roles: Roles, told: ColumnHints, columns: Sequence[Named], place: 
         sorts.setdefault(name, []).append(one)
     errors = [one for one in columns if one.sigma]
     forms = {name: sort_named(name) for name in sorts}
-    return [_wide_sort(roles, forms[name], told, chosen, errors, place, forms) for name, chosen in sorts.items()]
+    return [_wide_sort(roles, forms[name], hints, chosen, errors, place, forms) for name, chosen in sorts.items()]
 
 
 def _wide_sort(
     roles: Roles,
     form: Form,
-    told: ColumnHints,
+    hints: ColumnHints,
     columns: Sequence[Named],
     errors: Sequence[Named],
     place: ColumnPlaces,
@@ -89,17 +89,17 @@ def _wide_sort(
     first, empty = "", 0
     for one in columns:
         dated = form.quantity == "length" and is_dated(table, one.column)
-        cells = date_seconds(table, one.column, told.zone) if dated else numbers(table, one.column)
-        unit, note = ("s", "") if dated else unit_for(one.column, form, told, cells.values, table.source)
+        cells = date_seconds(table, one.column, hints.zone) if dated else numbers(table, one.column)
+        unit, note = ("s", "") if dated else unit_for(one.column, form, hints, cells.values, table.source)
         first = first or unit
         notes += [note] if note else []
         empty += table.count - len(cells.row)
         values.append(_in_unit(cells.values, unit, first, form))
         rows.append(cells.row)
-        ends.append(_ends(one, form, told, table.source))
+        ends.append(_ends(one, form, hints, table.source))
         sigma_name = next((each.column for each in errors if _is_error_of(each, one, form)), None)
-        sigma_name = None if stated_sigma(told, form.kind) is not None else sigma_name
-        sigma_name = sigma_name or sigma_column(roles, form, told, list(forms.values()))
+        sigma_name = None if stated_sigma(hints, form.kind) is not None else sigma_name
+        sigma_name = sigma_name or sigma_column(roles, form, hints, list(forms.values()))
         if sigma_name is not None:
             deviations.append(sigma_of(table, sigma_name, form, first, cells.row))
             errors_used.append(sigma_name)
@@ -115,7 +115,7 @@ def _wide_sort(
     )
     if len(deviations) == len(columns):
         found = replace(found, sigma=np.concatenate(deviations), errors=tuple(dict.fromkeys(errors_used)))
-    return _checked(found, roles, told, place, empty, "a-farther" if minus else None)
+    return _checked(found, roles, hints, place, empty, "a-farther" if minus else None)
 
 
 def _in_unit(values: Decimals, unit: str, wanted: str, form: Form) -> Decimals:
@@ -137,12 +137,12 @@ def _allows(form: Form, column: str) -> bool:
     return unit is None or unit in UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
 
 
-def sigma_column(roles: Roles, form: Form, told: ColumnHints, forms: Sequence[Form]) -> str | None:
+def sigma_column(roles: Roles, form: Form, hints: ColumnHints, forms: Sequence[Form]) -> str | None:
     """Return the column of standard deviations of a sort of readings; None with --sigma, or without a column.
 
     `forms` are all sorts of the table. Raise InvalidProblem if the column may belong to several sorts.
     """
-    if stated_sigma(told, form.kind) is not None:
+    if stated_sigma(hints, form.kind) is not None:
         return None
     named = roles.by_role.get(f"sigma_{form.kind}")
     named = named or next((name for name in roles.table.columns if sigma_kind(name) == form.kind), None)
@@ -186,14 +186,14 @@ def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Array) -> A
     return np.asarray(sigmas.values.floats()[place[pick]] * known[column_unit] / known[unit])
 
 
-def _ends(one: Named, form: Form, told: ColumnHints, source: str) -> tuple[str, str | None]:
+def _ends(one: Named, form: Form, hints: ColumnHints, source: str) -> tuple[str, str | None]:
     """Return the stations of a column of a wide table; the second is None for one station."""
     if form.stations == 1 and len(one.ends) == 1:
         return one.ends[0], None
     if form.stations == 2 and len(one.ends) == 2:
         return one.ends
-    if form.stations == 2 and told.reference is not None:
-        return one.ends[0], told.reference
+    if form.stations == 2 and hints.reference is not None:
+        return one.ends[0], hints.reference
     if form.stations == 2:
         advice = "state the other with --reference STATION"
         raise InvalidProblem(f"{form.kind} needs two stations, {one.column!r} names one", source, advice)
@@ -205,12 +205,12 @@ def _ends(one: Named, form: Form, told: ColumnHints, source: str) -> tuple[str, 
 # Long tables: one reading in each row.
 
 
-def read_inline(roles: Roles, told: ColumnHints) -> tuple[ColumnPlaces, Array]:
+def read_inline(roles: Roles, hints: ColumnHints) -> tuple[ColumnPlaces, Array]:
     """Return the stations of a table with station positions in each row, and the station name of each row (m,)."""
     count = roles.table.count
     role = next((role for role in ("station", "name") if roles.find(role)), None)
     names = np.array([str(i + 1) for i in range(count)], dtype=object) if role is None else roles.labels(role)
-    every = placed(roles, told.frame, names)
+    every = placed(roles, hints.frame, names)
     spots: dict[tuple[Any, ...], str] = {}
     seen: dict[str, int] = {}
     station_of_row, first = [], []
@@ -227,7 +227,7 @@ def read_inline(roles: Roles, told: ColumnHints) -> tuple[ColumnPlaces, Array]:
 
 
 def read_long(
-    roles: Roles, form: Form, told: ColumnHints, place: ColumnPlaces, receivers: Array | None, forms: Sequence[Form]
+    roles: Roles, form: Form, hints: ColumnHints, place: ColumnPlaces, receivers: Array | None, forms: Sequence[Form]
 ) -> Readings:
     """Return the readings of one sort of a table with one reading in each row.
 
@@ -235,21 +235,21 @@ def read_long(
     """
     table = roles.table
     if form.value == "sp" and roles.find("sp") is None:
-        return _picks(roles, told, place)
+        return _picks(roles, hints, place)
     column = roles.column(form.value)
     dated = form.quantity == "length" and is_dated(table, column)
-    cells = date_seconds(table, column, told.zone) if dated else numbers(table, column)
-    unit, note = ("s", "") if dated else unit_for(column, form, told, cells.values, table.source)
+    cells = date_seconds(table, column, hints.zone) if dated else numbers(table, column)
+    unit, note = ("s", "") if dated else unit_for(column, form, hints, cells.values, table.source)
     pick = cells.row
     if not len(pick):
         raise InvalidProblem("no cell has a reading", table.where(column), "check the column")
     a = roles.labels("station") if receivers is None else receivers
-    positive, b = ("a-farther", None) if form.stations == 1 else _second_station(roles, told)
+    positive, b = ("a-farther", None) if form.stations == 1 else _second_station(roles, hints)
     found = _of_column(form, unit, cells, column, a)
     found = replace(found, b=None if b is None else b[pick], notes=(note,) if note else ())
-    if (sigma_name := sigma_column(roles, form, told, forms)) is not None:
+    if (sigma_name := sigma_column(roles, form, hints, forms)) is not None:
         found = replace(found, sigma=sigma_of(table, sigma_name, form, unit, pick), errors=(sigma_name,))
-    return _checked(found, roles, told, place, table.count - len(pick), positive)
+    return _checked(found, roles, hints, place, table.count - len(pick), positive)
 
 
 def _of_column(form: Form, unit: str, cells: NumberColumn, column: str, a: Array) -> Readings:
@@ -260,14 +260,14 @@ def _of_column(form: Form, unit: str, cells: NumberColumn, column: str, a: Array
     return Readings(form, unit, cells.values, cells.row, (column,), np.zeros(len(cells.row), dtype=int), a[cells.row])
 
 
-def _second_station(roles: Roles, told: ColumnHints) -> tuple[str | None, Array]:
+def _second_station(roles: Roles, hints: ColumnHints) -> tuple[str | None, Array]:
     """Return the sign of differences, and the second station of each row (n,).
 
     The sign is "a-farther" for a reference station, None if it is unknown.
     """
     column = roles.find("reference")
-    if told.reference is not None:
-        return "a-farther", np.full(roles.table.count, told.reference, dtype=object)
+    if hints.reference is not None:
+        return "a-farther", np.full(roles.table.count, hints.reference, dtype=object)
     if column is None:
         advice = "state it with --reference STATION, or state its column with --column reference=NAME"
         raise InvalidProblem("no column looks like the second station", roles.table.source, advice)
@@ -275,12 +275,12 @@ def _second_station(roles: Roles, told: ColumnHints) -> tuple[str | None, Array]
     return ("a-farther" if is_reference else None), roles.labels("reference")
 
 
-def _picks(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> Readings:
+def _picks(roles: Roles, hints: ColumnHints, place: ColumnPlaces) -> Readings:
     """Return S minus P times, s, of a table with a column for each wave, or with a column of phases.
 
     Stations without both waves are left out. Raise InvalidProblem if S is not after P.
     """
-    table, zone = roles.table, told.zone
+    table, zone = roles.table, hints.zone
 
     def times(role: str) -> list[Decimal | None]:
         """Return the times in the column of a role, s; None for an empty cell."""
@@ -288,7 +288,7 @@ def _picks(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> Readings:
         dated = is_dated(table, column)
         cells = date_seconds(table, column, zone) if dated else numbers(table, column)
         if not dated:
-            unit, _ = unit_for(column, sort_named("sp"), told, cells.values, table.source)
+            unit, _ = unit_for(column, sort_named("sp"), hints, cells.values, table.source)
         out: list[Decimal | None] = [None] * table.count
         for row, value in zip(cells.row.tolist(), cells.values.tolist(), strict=True):
             out[row] = in_unit(value, unit, "s", sort_named("sp"))
@@ -322,14 +322,14 @@ def _picks(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> Readings:
     found = _of_column(sort_named("sp"), "s", held, roles.find("s") or roles.column("time"), station)
     lone = len({*station.tolist()}) - len({*found.a.tolist()})
     found = replace(found, notes=(f"{lone} stations without both P and S are left out",) if lone else ())
-    return _checked(found, roles, told, place, 0, "a-farther")
+    return _checked(found, roles, hints, place, 0, "a-farther")
 
 
 # Checks for both forms: known stations, no missing readings, no repeats, sign and convention.
 
 
 def _checked(
-    found: Readings, roles: Roles, told: ColumnHints, place: ColumnPlaces, empty: int, positive: str | None
+    found: Readings, roles: Roles, hints: ColumnHints, place: ColumnPlaces, empty: int, positive: str | None
 ) -> Readings:
     """Return checked readings.
 
@@ -340,7 +340,7 @@ def _checked(
     for end in (found.a, found.b):
         for name in [] if end is None else numbered(end)[0]:
             if name not in known:
-                where = told.stations.name if told.stations is not None else table.source
+                where = hints.stations.name if hints.stations is not None else table.source
                 column = roles.find("station") if len(found.columns) == 1 else None
                 item = int(np.flatnonzero(end == name)[0])
                 spot = found.where(table, item) if column is None else table.where(column, int(found.row[item]))
@@ -353,21 +353,21 @@ def _checked(
                 f"{found.form.kind} names station {found.a[same[0]]!r} twice", spot, "name two stations"
             )
     found = _with_digits(found, table)
-    columns = [column for key, column in epochs_of(roles, told, [found]).items()]
+    columns = [column for key, column in epochs_of(roles, hints, [found]).items()]
     _, epoch = equal_rows(columns, table.count)
-    found = without_gaps(found, epoch[found.row], told, table, empty)
-    if found.form.kind == "azimuth" and (heading := heading_of(found, roles, told)) is not None:
-        found = from_bow(found, roles, heading, told)
-    if not told.still:
+    found = without_gaps(found, epoch[found.row], hints, table, empty)
+    if found.form.kind == "azimuth" and (heading := heading_of(found, roles, hints)) is not None:
+        found = from_bow(found, roles, heading, hints)
+    if not hints.still:
         label = (lambda row: str(columns[0][row])) if columns else (lambda _: "")
-        found = without_repeats(found, epoch[found.row], told, table, label)
+        found = without_repeats(found, epoch[found.row], hints, table, label)
     signed = found.form.stations > 1 and found.form.kind != "range_sum"
-    if signed and told.positive is None and positive is None:
+    if signed and hints.positive is None and positive is None:
         advice = "use --positive a-farther if the first is farther, else --positive b-farther"
         what = "the sign of differences is unknown: positive values may mean that the first or the second is farther"
         raise InvalidProblem(what, table.source, advice)
-    found = replace(found, positive=told.positive or positive or "a-farther")
-    return _with_convention(found, told, place, table.source) if found.form.kind == "azimuth" else found
+    found = replace(found, positive=hints.positive or positive or "a-farther")
+    return _with_convention(found, hints, place, table.source) if found.form.kind == "azimuth" else found
 
 
 # Significant digits of a recent time in seconds or nanoseconds; rounding, m, that has no effect on a fix.
@@ -392,13 +392,13 @@ def _with_digits(found: Readings, table: Table) -> Readings:
     return replace(found, notes=(*found.notes, note))
 
 
-def _with_convention(found: Readings, told: ColumnHints, place: ColumnPlaces, source: str) -> Readings:
+def _with_convention(found: Readings, hints: ColumnHints, place: ColumnPlaces, source: str) -> Readings:
     """Return azimuths with their convention: from the options, the column name or, on Earth, the compass."""
     named = any(word in stem(found.columns[0]) for word in (BEARING, "brg", "compass", "heading"))
     if found.heading is not None:
         return found
-    if told.azimuth is not None or named:
-        return replace(found, azimuth=told.azimuth or COMPASS)
+    if hints.azimuth is not None or named:
+        return replace(found, azimuth=hints.azimuth or COMPASS)
     if place.frame == "cartesian":
         advice = f"use --azimuth {COMPASS} for a compass, or --azimuth {CARTESIAN} from the x axis"
         raise InvalidProblem("azimuths may count from north or from the x axis", source, advice)
@@ -406,7 +406,7 @@ def _with_convention(found: Readings, told: ColumnHints, place: ColumnPlaces, so
     return replace(found, azimuth=COMPASS, notes=(*found.notes, note))
 
 
-def epochs_of(roles: Roles, told: ColumnHints, found: Sequence[Readings]) -> dict[str, Array]:
+def epochs_of(roles: Roles, hints: ColumnHints, found: Sequence[Readings]) -> dict[str, Array]:
     """Return the available columns epoch, time and target (n,) of the rows of a table, by these names.
 
     Times are in seconds. Columns of readings are left out, as are times that are the readings. With `--still`, the
@@ -423,19 +423,19 @@ def epochs_of(roles: Roles, told: ColumnHints, found: Sequence[Readings]) -> dic
     if target is not None and target not in taken:
         out["target"] = roles.labels("target")
         taken.add(target)
-    if told.still:
+    if hints.still:
         return out
     message, when = (None if (name := roles.find(role)) in taken else name for role in ("message", "time"))
-    if told.window is not None and found[0].form.kind == "toa" and when is None and long:
-        return out | {"epoch": _clusters(found[0], told.window, table.count)}
-    if told.window is not None and when is None:
+    if hints.window is not None and found[0].form.kind == "toa" and when is None and long:
+        return out | {"epoch": _clusters(found[0], hints.window, table.count)}
+    if hints.window is not None and when is None:
         raise _no_times()
-    if message is not None and told.window is None:
+    if message is not None and hints.window is None:
         out["epoch"] = roles.labels("message")
-    time = None if when is None else column_times(roles, when, told.zone, told.time_unit)
+    time = None if when is None else column_times(roles, when, hints.zone, hints.time_unit)
     if time is not None:
         out["time"] = time
-    elif when is not None and told.window is not None:
+    elif when is not None and hints.window is not None:
         advice = "state it with --time-unit, such as --time-unit ns"
         raise InvalidProblem(f"the unit of the times in column {when!r} is unknown", table.source, advice)
     elif when is not None and message is None:

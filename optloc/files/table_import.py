@@ -1,7 +1,7 @@
 """Readings of a measurement table: sort and unit of the readings, missing readings and repeats.
 
 A reading is one measured value of a table. A sort of readings is a measurement kind in one form, such as arrivals. In
-the functions, `told` has the options of the command line. In shapes, m is the number of readings.
+the functions, `hints` has the options of the command line. In shapes, m is the number of readings.
 """
 
 from __future__ import annotations
@@ -319,11 +319,11 @@ def _form_of(word: str, unit: str | None) -> str | None:
     return role if role == "sp" or role in _KINDS_BY_NAME else None
 
 
-def stated_sigma(told: ColumnHints, kind: str) -> str | None:
+def stated_sigma(hints: ColumnHints, kind: str) -> str | None:
     """Return the standard deviation that --sigma states for a kind, or None."""
-    if told.sigma is None or "=" not in told.sigma:
-        return told.sigma
-    return sigmas_by_kind(told.sigma).get(kind)
+    if hints.sigma is None or "=" not in hints.sigma:
+        return hints.sigma
+    return sigmas_by_kind(hints.sigma).get(kind)
 
 
 def sigmas_by_kind(text: str) -> dict[str, str]:
@@ -349,7 +349,7 @@ def without_ignored_columns(table: Table, ignored: Sequence[str]) -> Table:
     return replace(table, columns=columns, others=others)
 
 
-def sorts_of(roles: Roles, told: ColumnHints) -> list[str]:
+def sorts_of(roles: Roles, hints: ColumnHints) -> list[str]:
     """Return the names of the sorts of readings in a table with one reading in each row, such as "range" or "arrivals".
 
     "times" means arrivals in the time column, and "sp" means times between P and S waves. The option `--as` takes
@@ -360,8 +360,8 @@ def sorts_of(roles: Roles, told: ColumnHints) -> list[str]:
     InvalidProblem
         If times may be arrivals, but another column may have readings as well.
     """
-    if told.what is not None:
-        return ["times" if told.what == "arrivals" and roles.find("toa") is None else told.what]
+    if hints.what is not None:
+        return ["times" if hints.what == "arrivals" and roles.find("toa") is None else hints.what]
     if all(roles.find(role) for role in ("station", "time", "phase")) or roles.find("sp"):
         return ["sp"]
     if roles.find("p") and roles.find("s") and roles.find("station"):
@@ -393,17 +393,17 @@ def _kind_within(column: str, unit: str | None) -> str | None:
     return next((role for name in named if (role := role_of(name)) is not None and role in MODELS), None)
 
 
-def as_angles(roles: Roles, told: ColumnHints) -> Roles:
+def as_angles(roles: Roles, hints: ColumnHints) -> Roles:
     """Return roles in which a column `elevation` without a unit is an angle or a height, as stated by the options.
 
     Raise InvalidProblem if no option decides: an elevation may be an angle above the horizon or the height of a
     station.
     """
     column = roles.by_role.get("height")
-    if column is None or "height" in roles.told or stem(column) not in _ANGLE_OR_HEIGHT or any_unit(column):
+    if column is None or "height" in roles.stated or stem(column) not in _ANGLE_OR_HEIGHT or any_unit(column):
         return roles
     rest = {role: name for role, name in roles.by_role.items() if role != "height"}
-    if told.what == "elevation" or told.unit in UNITS["angle"]:
+    if hints.what == "elevation" or hints.unit in UNITS["angle"]:
         return replace(roles, by_role={"elevation": column, **rest})
     name = quoted(column)
     advice = f"use --column elevation={name} with --unit deg, --column height={name}, or --ignore {name}"
@@ -435,17 +435,17 @@ def unused_measurement(column: str, lengths: bool = False) -> str | None:
 # Units, missing readings, repeats.
 
 
-def unit_for(column: str, form: Form, told: ColumnHints, values: Decimals, where: str) -> tuple[str, str]:
+def unit_for(column: str, form: Form, hints: ColumnHints, values: Decimals, where: str) -> tuple[str, str]:
     """Return the unit of a column and a note; raise InvalidProblem if the unit is unknown.
 
     The unit comes from the option `--unit`, from the column name, or for angles from the size of `values`.
     """
     known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
     unit_in_name = unit_of(column, known)
-    if told.unit is not None and told.unit in known:
-        return told.unit, ""
-    if told.unit is not None and (unit_in_name is None or not any(told.unit in table for table in UNITS.values())):
-        raise InvalidProblem(f"{told.unit!r} is not a unit of {form.text}", "--unit", nearest(told.unit, list(known)))
+    if hints.unit is not None and hints.unit in known:
+        return hints.unit, ""
+    if hints.unit is not None and (unit_in_name is None or not any(hints.unit in table for table in UNITS.values())):
+        raise InvalidProblem(f"{hints.unit!r} is not a unit of {form.text}", "--unit", nearest(hints.unit, list(known)))
     if unit_in_name is not None:
         return unit_in_name, ""
     if form.quantity == "angle" and bool((np.abs(values.floats()) > _TURN).any()):
@@ -469,27 +469,27 @@ def in_unit(value: Decimal, unit: str, wanted: str, form: Form) -> Decimal:
     return value * Decimal(repr(known[unit])) / Decimal(repr(known[wanted]))
 
 
-def marks_of(told: ColumnHints) -> frozenset[Decimal] | None:
+def marks_of(hints: ColumnHints) -> frozenset[Decimal] | None:
     """Return the numbers that mean no reading, as the option `--missing` states; None without this option."""
-    if told.missing is None:
+    if hints.missing is None:
         return None
-    if told.missing.strip().lower() == "none":
+    if hints.missing.strip().lower() == "none":
         return frozenset()
     try:
-        words = [word.strip() for word in told.missing.split(",")]
+        words = [word.strip() for word in hints.missing.split(",")]
         return frozenset(Decimal(word) for word in words if word.lower() not in NOTHING)
     except InvalidOperation:
         advice = "write numbers such as --missing 0,-1,9999, or --missing none"
-        raise InvalidProblem(f"{told.missing!r} is not a list of numbers", "--missing", advice) from None
+        raise InvalidProblem(f"{hints.missing!r} is not a list of numbers", "--missing", advice) from None
 
 
-def without_gaps(found: Readings, epoch: Array, told: ColumnHints, table: Table, empty: int) -> Readings:
+def without_gaps(found: Readings, epoch: Array, hints: ColumnHints, table: Table, empty: int) -> Readings:
     """Return the readings without the numbers that mean no reading.
 
     `epoch` (m,) is the epoch number of each reading. `empty` is the number of empty cells, for a note. Raise
     InvalidProblem for a number that may be a reading or mean no reading, unless `--missing` decides.
     """
-    marks = marks_of(told)
+    marks = marks_of(hints)
     if marks is None:
         marks = frozenset()
         doubtful = _suspicious_number(found, epoch)
@@ -505,7 +505,7 @@ def without_gaps(found: Readings, epoch: Array, told: ColumnHints, table: Table,
     if is_missing.all():
         raise InvalidProblem("no cell has a reading", table.source, "check --missing and the columns")
     count = int(is_missing.sum())
-    notes = [f"{_cells(count)} with {told.missing}: no reading"] if count else []
+    notes = [f"{_cells(count)} with {hints.missing}: no reading"] if count else []
     notes += [f"{_cells(empty)} without a number: no reading"] if empty else []
     return replace(found.take(np.flatnonzero(~is_missing)) if count else found, notes=(*found.notes, *notes))
 
@@ -543,7 +543,7 @@ def _is_relative_to_first(found: Readings, epoch: Array) -> bool:
 
 
 def without_repeats(
-    found: Readings, epoch: Array, told: ColumnHints, table: Table, label: Callable[[int], str]
+    found: Readings, epoch: Array, hints: ColumnHints, table: Table, label: Callable[[int], str]
 ) -> Readings:
     """Return the readings with repeats averaged, if the user requests it; else raise InvalidProblem for a repeat.
 
@@ -557,7 +557,7 @@ def without_repeats(
         return found
     extra = len(found.values) - count
     again = np.setdiff1d(np.arange(len(found.values)), first)
-    if not told.average:
+    if not hints.average:
         second = int(again[0])
         one = int(first[group[second]])
         names = " and ".join(repr(str(end[second])) for end in (found.a, found.b) if end is not None)

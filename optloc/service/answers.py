@@ -119,8 +119,8 @@ def proof_records(fix: Fix, events: Sequence[Event], before: Sequence[Record | N
     """
     records = fix_records(fix, events, None)
     out = []
-    told = (column.tolist() for column in (fix.claims.proof, fix.claims.margin, fix.claims.boxes, fix.claims.reason))
-    for new, old, number, margin, boxes, reason in zip(records, before, *told, strict=True):
+    proofs = (column.tolist() for column in (fix.claims.proof, fix.claims.margin, fix.claims.boxes, fix.claims.reason))
+    for new, old, number, margin, boxes, reason in zip(records, before, *proofs, strict=True):
         proof: Record = {"proof": PROOFS[number], "margin": margin, "boxes": boxes}
         if number == UNKNOWN:
             proof["why"] = reason

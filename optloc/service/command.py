@@ -335,12 +335,12 @@ def run_check(file: Path, method: str) -> int:
     from optloc.service.site import read_site
 
     site = read_site(file, method)
-    for line in told(site):
+    for line in input_description(site):
         typer.echo(visible(line))
     return 0
 
 
-def told(site: Site) -> Iterator[str]:
+def input_description(site: Site) -> Iterator[str]:
     """Yield a description of the input of a stream, with an example line of each form."""
     yield f"{site.title}: {len(site.rows)} rows of {len(site.stations)} stations, solved by {site.method}"
     yield "whole events: " + json.dumps({"event": "1", "z": [0.0] * len(site.rows)})
