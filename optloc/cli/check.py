@@ -67,20 +67,20 @@ class CheckOptions:
 def run_check(
     file: Path,
     as_json: bool,
-    asked: CheckOptions | None = None,
+    options: CheckOptions | None = None,
     *,
     quiet: bool = False,
     table: ColumnHints | None = None,
 ) -> int:
     """Print a summary of a file and the health of its stations; return exit code 1 if an epoch has too few rows."""
-    asked = asked or CheckOptions()
+    options = options or CheckOptions()
     # A file without measured values is valid here: you can check the geometry before a campaign.
-    outputs = partial(claim_outputs, table=asked.out, picture=asked.plot, inputs=[file])
+    outputs = partial(claim_outputs, table=options.out, picture=options.plot, inputs=[file])
     outputs()  # check twice: before the reader spends time on a long table, and after it has recorded all input files
     loaded = read_problem(file, table, values=False, quiet=quiet or as_json)
     outputs()
     found = summary(loaded)
-    checked = _health(loaded, asked, quiet or as_json)
+    checked = _health(loaded, options, quiet or as_json)
     advice = _advice(loaded, checked)
     if as_json:
         more = {} if checked is None else {"health": _health_json(checked)}
@@ -99,25 +99,25 @@ def run_check(
     return 1 if found["epochs_with_too_few_rows"] else 0
 
 
-def _health(loaded: Loaded, asked: CheckOptions, quiet: bool) -> Checked | None:
+def _health(loaded: Loaded, options: CheckOptions, quiet: bool) -> Checked | None:
     """Return the health of the stations of a file and write its table and picture; None with --no-solve."""
-    if not asked.solve:
-        if asked.out is not None or asked.plot is not None:
+    if not options.solve:
+        if options.out is not None or options.plot is not None:
             raise InvalidProblem(
                 "table and picture need the fixes", "--no-solve", "remove it, or remove --out and --plot"
             )
         return None
-    by = grouping_of(asked.by, "--by")
+    by = grouping_of(options.by, "--by")
     # Stations may be faulty here, so the default is a loss that reduces the weight of gross errors.
-    method = asked.method or "cauchy"
+    method = options.method or "cauchy"
     Method.parse(method)  # reject a misspelt method before the work starts
     checked = _check_health(loaded, method, by, quiet)
     # If the user requests a table or picture that cannot be made, raise; the summary alone would only print the reason.
-    for path, option in ((asked.out, "--out"), (asked.plot, "--plot")):
+    for path, option in ((options.out, "--out"), (options.plot, "--plot")):
         if path is not None and checked.health is None:
             raise InvalidProblem(checked.why, option, "remove this option")
     if checked.health is not None:
-        _write_health(checked.health, loaded.title, asked)
+        _write_health(checked.health, loaded.title, options)
     return checked
 
 
@@ -150,8 +150,8 @@ def summary(loaded: Loaded) -> dict[str, Any]:
     """Return the summary of a file: names with numbers or words."""
     problem = loaded.problem
     alone = separable(problem)
-    apart = _apart(problem, alone)
-    redundancy = degrees_of_freedom(apart)
+    batch = _apart(problem, alone)
+    redundancy = degrees_of_freedom(batch)
     parts = _components(problem)
     flattest, widest = _spread(_station_positions(problem, alone))
     # If epochs are fixed separately, report the epoch whose stations are closest to a line or plane.
@@ -171,7 +171,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
         "absent_rows": int((problem.weight == 0.0).sum()),
         "constraints": [constraint.name for constraint in problem.constraints],
         "biases": {bias.name: _bias(loaded, bias) for bias in problem.biases},
-        "unknowns": int(present_unknowns(apart).max()),
+        "unknowns": int(present_unknowns(batch).max()),
         "redundancy": {"least": int(redundancy.min()), "median": float(np.median(redundancy))},
         "epochs_with_too_few_rows": int((redundancy < 0).sum()),
         "groups_of_connected_stations": {"most": int(parts.max(initial=0))},
@@ -421,12 +421,12 @@ def _with_sigma_or_dash(value: float, error: float, unit: str) -> str:
     return with_sigma(float(value), float(error), unit).strip()
 
 
-def _write_health(health: Health, title: str, asked: CheckOptions) -> None:
+def _write_health(health: Health, title: str, options: CheckOptions) -> None:
     """Write the requested table and picture of the health: both, or none if one fails."""
     with replace_together():
-        if asked.out is not None:
-            write_table(asked.out, _health_columns(health))
-        if asked.plot is not None:
+        if options.out is not None:
+            write_table(options.out, _health_columns(health))
+        if options.plot is not None:
             from optloc.show.pictures.residuals import plot_health
 
-            write_picture(plot_health(health, title=title), asked.plot)
+            write_picture(plot_health(health, title=title), options.plot)

@@ -246,7 +246,10 @@ def courses(problem: Problem, truth: Array) -> tuple[Course, Course | None] | No
 
 
 def _course_records(course: Course, known: Course | None) -> list[dict[str, Any]]:
-    """Return records of the bound at a few times: epochs, time (s), and sigma by unknown, also with biases known."""
+    """Return records of the bound at about ten times: epochs, time (s), and sigma by unknown (SI).
+
+    `course` is the bound with unknown biases, and `known` the bound with known biases, or None.
+    """
     labels = course.layout.labels()
     return [
         {
@@ -279,7 +282,11 @@ def _shown_unknowns(layout: Layout) -> tuple[str, ...]:
 
 
 def _course_table(course: Course, known: Course | None, loaded: Loaded) -> Table:
-    """Return the table of the bound at a few times: root sum of squares of coordinates, root mean square of members."""
+    """Return the table of the bound at about ten times, in the units of the file.
+
+    The table has the root sum of squares of coordinates, and the root mean square of the members of a bias. `course`
+    and `known` are as in `_course_records`.
+    """
     table = Table(title="Bound after the first epochs", title_justify="left")
     for name in ("epochs", "time, s"):
         table.add_column(name, justify="right")
@@ -328,8 +335,8 @@ def run_map(
 
 def _of_one_epoch(problem: Problem) -> Problem:
     """Return the first epoch if epochs are separate, else the problem; maps show one epoch."""
-    apart = by_epoch(problem) if separable(problem) else problem
-    return apart.flat().take(np.zeros(1, dtype=int)) if apart.batch_shape else apart
+    batch = by_epoch(problem) if separable(problem) else problem
+    return batch.flat().take(np.zeros(1, dtype=int)) if batch.batch_shape else batch
 
 
 def _grid(

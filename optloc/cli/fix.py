@@ -88,7 +88,12 @@ def run_fix(
     allow: tuple[Status, ...] = (),
     table: ColumnHints | None = None,
 ) -> int:
-    """Fix a problem file or a table under more constraints, write and print the result, and return the exit code."""
+    """Fix a problem file or a table under more constraints, write and print the result, and return the exit code.
+
+    `more` has the constraints by the name of their option. `noise`, `rescale`, `late` and `explain` are options that
+    estimate the noise and the causes of misfits. `allow` has the statuses that give exit code 0 as well as ok. `table`
+    has the column hints of a table; None for a problem file.
+    """
     on_output = geojson_path is not None and str(geojson_path) == "-"
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")

@@ -24,7 +24,7 @@ _MAX_WRAPS = 4
 
 
 def run_list(what: str, as_json: bool) -> int:
-    """Print one of the tables, and return the exit code."""
+    """Print the list with the name `what`, and return the exit code."""
     known = lists()
     if what not in known:
         raise InvalidProblem(f"there is no list of {what!r}", "list", nearest(what, known))

@@ -281,7 +281,7 @@ Verbose = Annotated[
 
 
 def complete(what: str) -> Callable[[str], list[str]]:
-    """Return a shell completion with the names in one table of `optloc list`."""
+    """Return a shell completion with the names in the table `what` of `optloc list`."""
 
     def found(incomplete: str) -> list[str]:
         """Return all names of the table; the shell selects the names that fit."""
@@ -294,7 +294,10 @@ def complete(what: str) -> Callable[[str], list[str]]:
 
 
 def name_in(what: str, text: str, *flags: str) -> Any:
-    """Return an option, or an argument without flags, whose value is a name in one table of `optloc list`."""
+    """Return an option, or an argument without flags, whose value is a name in the table `what` of `optloc list`.
+
+    `text` is the help, and `flags` are the spellings of the option.
+    """
     given: dict[str, Any] = {"metavar": "NAME", "autocompletion": complete(what)}
     words = f"{text}; see [bold]optloc list {what}[/bold]."
     return typer.Option(*flags, help=words, **given) if flags else typer.Argument(help=words, **given)

@@ -268,7 +268,7 @@ def track_columns(one: TargetTrack) -> Columns:
 
 
 def _map(loaded: Loaded, ones: list[TargetTrack]) -> str:
-    """Return an HTML page with the map of all tracks."""
+    """Return an HTML page with the map of the tracks `ones`."""
     from optloc.show.map import degrees, sentence, spots
     from optloc.show.page import track_page
 

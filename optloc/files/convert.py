@@ -2,7 +2,7 @@
 
 A `TableProblem` has the sections of the problem file. `optloc convert` writes it, and other commands read it directly.
 In the functions, `hints` has the facts that the table does not contain, as stated by options. `roles` has the table and
-the roles of its columns. `place` has the positions of the stations.
+the roles of its columns. `stations` has the stations with their positions.
 """
 
 from __future__ import annotations
@@ -173,12 +173,12 @@ def _of_table(source: Path, hints: ColumnHints) -> TableProblem:
     hints = hints if hints.what is None else replace(hints, what=_sort(hints.what))
     named: list[Named] = []
     if hints.stations is not None:
-        place = places_of(hints.stations, {k: name for k, name in hints.columns.items() if k in PLACE}, hints.frame)
-        named = _of_receivers(roles, place)
+        stations = places_of(hints.stations, {k: name for k, name in hints.columns.items() if k in PLACE}, hints.frame)
+        named = _of_receivers(roles, stations)
         chosen = [one for one in named if _may_be(one, hints)]
-        if len(chosen) > 1 and not _is_long(roles, hints, place):
+        if len(chosen) > 1 and not _is_long(roles, hints, stations):
             roles = Roles.of(table, stated_columns, [one.column for one in chosen]).without_stations()
-            return _plan(roles, hints, place, source, read_wide(roles, hints, chosen, place), named)
+            return _plan(roles, hints, stations, source, read_wide(roles, hints, chosen, stations), named)
     roles = as_angles(roles, hints)
     sorts, receivers = sorts_of(roles, hints), None
     if not sorts:
@@ -187,14 +187,19 @@ def _of_table(source: Path, hints: ColumnHints) -> TableProblem:
         if roles.find("lat") is None and roles.find("x") is None:
             advice = "give a table or GeoJSON file with --stations"
             raise InvalidProblem("the station positions are unknown", "--stations", advice)
-        place, receivers = read_inline(roles, hints)
+        stations, receivers = read_inline(roles, hints)
     forms = [sort_named(name) for name in sorts]
     return _plan(
-        roles, hints, place, source, [read_long(roles, form, hints, place, receivers, forms) for form in forms], named
+        roles,
+        hints,
+        stations,
+        source,
+        [read_long(roles, form, hints, stations, receivers, forms) for form in forms],
+        named,
     )
 
 
-def _of_receivers(roles: Roles, place: ColumnPlaces) -> list[Named]:
+def _of_receivers(roles: Roles, stations: ColumnPlaces) -> list[Named]:
     """Return the columns that are named after stations, without columns that have another role.
 
     Other roles are stated roles, and columns of station names.
@@ -205,22 +210,22 @@ def _of_receivers(roles: Roles, place: ColumnPlaces) -> list[Named]:
         For a column whose name is both a station and a role, if its cells do not decide.
     """
     taken = {part for role in roles.stated for part in roles.by_role[role].split("+")}
-    found = [one for one in named_columns(list(roles.table.columns), place.names) if one.column not in taken]
+    found = [one for one in named_columns(list(roles.table.columns), stations.names) if one.column not in taken]
     kept = []
     for one in found:
         role = role_of(one.column)
-        if role in ("station", "reference", "name", "id") and holds_names(roles.table, one.column, place.names):
+        if role in ("station", "reference", "name", "id") and holds_names(roles.table, one.column, stations.names):
             continue
         kept.append(one)
     return kept
 
 
-def _is_long(roles: Roles, hints: ColumnHints, place: ColumnPlaces) -> bool:
+def _is_long(roles: Roles, hints: ColumnHints, stations: ColumnPlaces) -> bool:
     """Return whether a table has one reading in each row: a column of stations and a column of readings."""
     if "station" in roles.stated:
         return True
     station = roles.find("station")
-    if station is None or not holds_names(roles.table, station, place.names):
+    if station is None or not holds_names(roles.table, station, stations.names):
         return False
     # If receivers have columns of readings, a time column is the time of these readings, not a reading.
     return bool({*sorts_of(roles, hints)} - {"times"})
@@ -247,7 +252,7 @@ def _may_be(one: Named, hints: ColumnHints) -> bool:
 def _plan(
     roles: Roles,
     hints: ColumnHints,
-    place: ColumnPlaces,
+    stations: ColumnPlaces,
     source: Path,
     found: Sequence[Readings],
     named: Sequence[Named],
@@ -256,17 +261,17 @@ def _plan(
 
     `found` are the sorts of readings in the table. `named` are the columns that are named after stations.
     """
-    place = in_space(place) if any(2 not in MODELS[one.form.kind].dimensions for one in found) else place
-    place, turn = stations_turned(place, found)
+    stations = in_space(stations) if any(2 not in MODELS[one.form.kind].dimensions for one in found) else stations
+    stations, heading_note = stations_turned(stations, found)
     epochs = epochs_of(roles, hints, found)
     sigmas = _sigmas(hints, found)
     uses = uses_of(roles, hints, found, epochs, sigmas)
-    check_receivers(roles.table, uses, named, place.names)
+    check_receivers(roles.table, uses, named, stations.names)
     rest = unused_columns(roles, uses, named)
     parts = zip(found, sigmas, strict=True)
     sections = tuple(_with_declination(_section(one, epochs, sigma), one, hints) for one, sigma in parts)
     notes = [*roles.table.notes, *(one.notes[0] for one in found if one.heading is not None)]
-    notes += [note for note in (turn, place.note) if note]
+    notes += [note for note in (heading_note, stations.note) if note]
     notes += dict.fromkeys(note for one in found for note in one.notes if note not in notes)
     lines: tuple[str, ...] = ()
     if any(one.form.value == "sp" for one in found):
@@ -276,24 +281,24 @@ def _plan(
     after: tuple[str, ...] = ()
     if hints.window is not None and "epoch" not in epochs:
         after = ("", "[epochs]", f"window = {json.dumps(hints.window)}")
-    height, note = _height(found, place)
+    height, note = _height(found, stations)
     notes += [*_few(sections, hints), *([note] if note else [])]
     read = [
-        *reading_lines(roles, hints, place, found, epochs, uses),
+        *reading_lines(roles, hints, stations, found, epochs, uses),
         *([("not used", ", ".join(rest))] if rest else []),
     ]
-    return TableProblem(source, sections, place, tuple(read), tuple(notes), lines, after, height, uses)
+    return TableProblem(source, sections, stations, tuple(read), tuple(notes), lines, after, height, uses)
 
 
-def _height(found: Sequence[Readings], place: ColumnPlaces) -> tuple[str, str]:
+def _height(found: Sequence[Readings], stations: ColumnPlaces) -> tuple[str, str]:
     """Return a height constraint for a target on Earth, as a line of a problem file, and a note; empty texts for none.
 
     Azimuths alone do not determine the height, so the mean height of the stations is assumed. S minus P times are of
     earthquakes, which are below the highest station.
     """
-    if place.frame != "geodetic":
+    if stations.frame != "geodetic":
         return "", ""
-    heights, unit = place.columns["height"], place.unit
+    heights, unit = stations.columns["height"], stations.unit
     if all(one.form.kind == "azimuth" for one in found):
         mean = round(float(heights.mean()), 3)
         remark = (

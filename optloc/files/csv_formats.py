@@ -137,7 +137,7 @@ def _inside(row: Row, key: str, record: Mapping[str, Any]) -> Row:
 
 
 def _put(row: Row, key: str, value: Any, place: str) -> None:
-    """Add a value to a row; raise InvalidProblem if the row already has the key."""
+    """Add a value to a row; raise InvalidProblem, with the place `place`, if the row already has the key."""
     if key in row:
         raise InvalidProblem(f"the value {key!r} is given twice", place, "rename one value")
     row[key] = value

@@ -56,8 +56,8 @@ def from_bow(found: Readings, roles: Roles, column: str, hints: ColumnHints) -> 
         raise InvalidProblem("the bearing has no heading", table.where(column, lacking), advice)
     used = [given[row] for row in found.row.tolist()]
     unit = _unit(column, used, hints, table.where(column))
-    turn = in_unit(Decimal(360), "deg", unit, found.form)
-    wrong = next((i for i, heading in enumerate(used) if abs(heading) > turn * Decimal("1.0001")), None)
+    full_turn = in_unit(Decimal(360), "deg", unit, found.form)
+    wrong = next((i for i, heading in enumerate(used) if abs(heading) > full_turn * Decimal("1.0001")), None)
     if wrong is not None:
         spot = table.where(column, int(found.row[wrong]))
         raise InvalidProblem(f"the heading {used[wrong]:f} {unit} is more than a full turn", spot, "remove the row")
@@ -66,37 +66,37 @@ def from_bow(found: Readings, roles: Roles, column: str, hints: ColumnHints) -> 
         for value, heading in zip(found.values.tolist(), used, strict=True)
     ]
     if found.unit in _FULL_TURN:
-        turn = _FULL_TURN[found.unit]
-        sums = [(value % turn + turn) % turn for value in sums]
+        full_turn = _FULL_TURN[found.unit]
+        sums = [(value % full_turn + full_turn) % full_turn for value in sums]
     note = f"bearings are read as clockwise from the bow of the vehicle; the heading in column {column!r} is added"
     note += "" if hints.azimuth == BOW else f"; --azimuth {COMPASS} reads them as true bearings"
     return replace(found, values=Decimals.of(sums), azimuth=COMPASS, heading=column, notes=(note, *found.notes))
 
 
-def stations_turned(place: ColumnPlaces, found: Sequence[Readings]) -> tuple[ColumnPlaces, str]:
+def stations_turned(stations: ColumnPlaces, found: Sequence[Readings]) -> tuple[ColumnPlaces, str]:
     """Return the stations, with headings if bearings are relative to the headings of stations, and a note.
 
-    `place` may have a column of headings. Raise InvalidProblem for a station that measures a bearing but has no
+    `stations` may have a column of headings. Raise InvalidProblem for a station that measures a bearing but has no
     heading, and for headings of stations and of a vehicle at once.
     """
-    if "heading_deg" not in place.columns:
-        return place, ""
-    headings = place.columns["heading_deg"]
+    if "heading_deg" not in stations.columns:
+        return stations, ""
+    headings = stations.columns["heading_deg"]
     bearings = [one for one in found if one.form.kind == "azimuth"]
     if not bearings:
-        kept = {name: column for name, column in place.columns.items() if name != "heading_deg"}
-        return replace(place, columns=kept), ""
+        kept = {name: column for name, column in stations.columns.items() if name != "heading_deg"}
+        return replace(stations, columns=kept), ""
     if any(one.heading is not None for one in bearings):
         what = "the headings of stations and the headings of a vehicle are both given"
         raise InvalidProblem(what, "--stations", "remove one of the columns")
     used = {str(name) for one in bearings for name in one.a.tolist()}
-    lacking = next((n for n, v in zip(place.names, headings, strict=True) if n in used and np.isnan(v)), None)
+    lacking = next((n for n, v in zip(stations.names, headings, strict=True) if n in used and np.isnan(v)), None)
     if lacking is not None:
         raise InvalidProblem(
             f"station {lacking!r} has no heading", "--stations", "give a heading for each station, 0 for north"
         )
     note = "bearings are relative to the headings of the stations in their table"
-    return replace(place, columns={**place.columns, "heading_deg": np.nan_to_num(headings)}), note
+    return replace(stations, columns={**stations.columns, "heading_deg": np.nan_to_num(headings)}), note
 
 
 def _unit(column: str, headings: list[Decimal], hints: ColumnHints, where: str) -> str:

@@ -226,8 +226,10 @@ def locate(
             raise InvalidProblem(f"{type(text).__name__} is not text", name, "give text, such as 'ns' for a unit")
     north = _North(azimuth, declination)
     _check_north(north, given)
-    own, spread = _speed(speed), _speed_sigma(speed)
-    problem, labels = _problem_of(stations, latlon, given, sigma, unit, reference, height, frame, own, spread, north)
+    through, speed_sigma = _speed(speed), _speed_sigma(speed)
+    problem, labels = _problem_of(
+        stations, latlon, given, sigma, unit, reference, height, frame, through, speed_sigma, north
+    )
     return _labelled(solve(problem, method=method), labels)
 
 
@@ -486,21 +488,21 @@ def _rows(
     return measured(kind, np.where(present, z, 0.0), **columns, **noise)
 
 
-def _from_north(made: Measured, north: _North, unit: str, places: _Receivers) -> Measured:
+def _from_north(measurements: Measured, north: _North, unit: str, places: _Receivers) -> Measured:
     """Return rows of bearings with the declination of magnetic north and the sense of the convention.
 
     `unit` is the unit of a declination without a unit.
     """
-    rows, east = made.rows.clockwise() if north.azimuth == COMPASS else made.rows, north.declination
+    rows, east = measurements.rows.clockwise() if north.azimuth == COMPASS else measurements.rows, north.declination
     if east is None:
-        return replace(made, rows=rows)
+        return replace(measurements, rows=rows)
     if isinstance(east, bool) or not isinstance(east, str | date | float | int | np.number):
         what = f"{type(east).__name__} is not a declination"
         raise InvalidProblem(what, "declination", 'give a number, "4 deg", or a date such as "2026-06-01"')
     angle, day = declination_of(east, north.azimuth, unit, "declination")
     at = places.stations.position[0]
     more = angle if day is None else declinations(at, places.frame, day, "declination")[rows.a]
-    return replace(made, rows=replace(rows, correction=rows.correction + more))
+    return replace(measurements, rows=replace(rows, correction=rows.correction + more))
 
 
 def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:

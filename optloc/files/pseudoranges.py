@@ -169,9 +169,9 @@ def _at_transmission(
         if name not in ephemerides:
             continue
         every = ephemerides[name]
-        apart = np.abs(sent[rows, None] - every.toe) + np.where(every.health == 0.0, 0.0, np.inf)
-        nearest = apart.argmin(1)
-        fresh = np.take_along_axis(apart, nearest[:, None], axis=1)[:, 0] <= _MAX_AGE
+        age = np.abs(sent[rows, None] - every.toe) + np.where(every.health == 0.0, 0.0, np.inf)
+        nearest = age.argmin(1)
+        fresh = np.take_along_axis(age, nearest[:, None], axis=1)[:, 0] <= _MAX_AGE
         rows, elements = rows[fresh], Ephemeris(*(column[nearest[fresh]] for column in every))
         # transmission time = time of the satellite clock minus its error
         _, ahead = orbit(elements, system, sent[rows])
@@ -311,12 +311,12 @@ def read_log(path: Path, system: str) -> Observations:
     clock = whole["TimeNanos"][rows] - whole["FullBiasNanos"][first]  # whole nanoseconds: 19 digits
     rest = more["TimeOffsetNanos"][rows] - more["BiasNanos"][first]
     week = int(WEEK * 1e9)
-    apart = (clock % week - whole["ReceivedSvTimeNanos"][rows]).astype(float) + rest
-    apart -= week * np.round(apart / week)  # at the turn of a week
+    flight_ns = (clock % week - whole["ReceivedSvTimeNanos"][rows]).astype(float) + rest
+    flight_ns -= week * np.round(flight_ns / week)  # at the turn of a week
     names = [f"{system}{int(v) - (_QZSS if system == 'J' else 0):02d}" for v in table.numbers("Svid")[rows]]
     keys = {(t, name): k for k, (t, name) in reversed([*enumerate(zip(clock.tolist(), names, strict=True))])}
     kept = np.array(sorted(keys.values(), key=lambda k: (clock[k], k)))
-    far = apart[kept] * 1e-9 * SPEED_OF_LIGHT
+    far = flight_ns[kept] * 1e-9 * SPEED_OF_LIGHT
     if not ((far > 0.0) & (far < 1e8)).any():
         raise InvalidProblem(
             "the times give no valid distance of a satellite", path.name, "check that the log is complete"

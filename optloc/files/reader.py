@@ -188,7 +188,7 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
 
 
 def draft(path: Path, *, values: bool, more: Mapping[str, ConstraintTable] | None = None) -> Draft:
-    """Return the problem of a file together with its tables; arguments as in `read`."""
+    """Return the problem of a file together with its tables; the arguments are those of `read`."""
     file, source = read_document(path), name_of(path)
     # Read tables before converting anything, so that a missing file is reported before a wrong unit.
     known = places_of(file, path.parent, source)

@@ -105,15 +105,15 @@ def unused_columns(
 def reading_lines(
     roles: Roles,
     hints: ColumnHints,
-    place: ColumnPlaces,
+    stations: ColumnPlaces,
     found: Sequence[Readings],
     epochs: Mapping[str, Array],
     uses: Mapping[str, str],
 ) -> list[tuple[str, str]]:
     """Return the interpretation of a table as lines for the user, each a keyword and a text.
 
-    `place` has the stations and `found` the readings of each sort. `epochs` has the columns epoch, time and target of
-    the rows. `uses` has the role of each used column.
+    `stations` has the stations and `found` the readings of each sort. `epochs` has the columns epoch, time and target
+    of the rows. `uses` has the role of each used column.
     """
     out: list[tuple[str, str]] = []
     for one in found:
@@ -144,8 +144,10 @@ def reading_lines(
     if "target" in epochs:
         out.append(("targets", f"{len(numbered(epochs['target'])[0])} by column {roles.find('target')}"))
     where = hints.stations.name if hints.stations is not None else "the table itself"
-    axes = "latitude and longitude" if place.frame == "geodetic" else f"x and y, {place.frame}, in {place.unit}"
-    out.append(("stations", f"{len(set(place.names))} of {where}, by {axes}"))
+    axes = (
+        "latitude and longitude" if stations.frame == "geodetic" else f"x and y, {stations.frame}, in {stations.unit}"
+    )
+    out.append(("stations", f"{len(set(stations.names))} of {where}, by {axes}"))
     return out
 
 
@@ -200,7 +202,7 @@ def check_receivers(table: Table, uses: Mapping[str, str], named: Sequence[Named
 
 
 def _pattern(one: Named) -> _Pattern:
-    """Return the name pattern of a column that is named after stations."""
+    """Return the name pattern of the column `one`, which is named after stations."""
     words, ends = tokens(without_unit(one.column)), [tokens(end) for end in one.ends]
     places = [_find(words, end) for end in (ends[0], ends[-1])]
     first, last = min(places), max(place + len(end) for place, end in zip(places, (ends[0], ends[-1]), strict=True))

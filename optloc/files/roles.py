@@ -371,7 +371,7 @@ def place_roles(roles: Roles) -> tuple[str, ...]:
 
 
 def check_column_hints(roles: Roles, used: Collection[str]) -> None:
-    """Raise InvalidProblem for a stated role that a table of this form does not use."""
+    """Raise InvalidProblem for a stated role that is not in `used`, since a table of this form does not use it."""
     for role in sorted(roles.stated - set(used)):
         what = f"the role {role} of the column {roles.by_role[role]!r} is not used in {roles.table.source}"
         raise InvalidProblem(what, "--column", "remove it, or state the content of the table with --as")
@@ -404,12 +404,12 @@ def placed(roles: Roles, frame: str | None, names: Array | None = None) -> Colum
     return ColumnPlaces({"name": names} | axes, frame or ("ecef" if "ecef" in stem(x) else "cartesian"), unit)
 
 
-def in_space(place: ColumnPlaces) -> ColumnPlaces:
+def in_space(stations: ColumnPlaces) -> ColumnPlaces:
     """Return stations with a third coordinate, which is 0 if the table has none."""
-    if place.frame == "geodetic" or "z" in place.columns:
-        return place
-    flat = {"z": np.zeros(len(place.names))}
-    return replace(place, columns={**place.columns, **flat}, note=_NO_HEIGHTS.replace("height 0", "z = 0"))
+    if stations.frame == "geodetic" or "z" in stations.columns:
+        return stations
+    flat = {"z": np.zeros(len(stations.names))}
+    return replace(stations, columns={**stations.columns, **flat}, note=_NO_HEIGHTS.replace("height 0", "z = 0"))
 
 
 def scaled(roles: Roles, role: str, quantity: Literal["length", "angle"], unit: str) -> Array:

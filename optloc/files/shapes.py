@@ -1,8 +1,8 @@
 """Long and wide tables of readings: one reading in each row, or a column for each receiver.
 
-In the functions, `roles` has the table and the roles of its columns. `hints` has the options, and `place` the stations.
-A form is a sort of readings, such as arrivals or ranges. In shapes, m is the number of readings, and n the number of
-rows of the table.
+In the functions, `roles` has the table and the roles of its columns. `hints` has the options, and `stations` the
+stations. A form is a sort of readings, such as arrivals or ranges. In shapes, m is the number of readings, and n the
+number of rows of the table.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _SHOWN = 4
 # Wide tables: a column for each receiver, or for each pair.
 
 
-def read_wide(roles: Roles, hints: ColumnHints, columns: Sequence[Named], place: ColumnPlaces) -> list[Readings]:
+def read_wide(roles: Roles, hints: ColumnHints, columns: Sequence[Named], stations: ColumnPlaces) -> list[Readings]:
     """Return the readings of a wide table, one set for each sort; raise InvalidProblem if the sort is unknown.
 
     `columns` are the columns that are named after stations.
@@ -64,7 +64,7 @@ def read_wide(roles: Roles, hints: ColumnHints, columns: Sequence[Named], place:
         sorts.setdefault(name, []).append(one)
     errors = [one for one in columns if one.sigma]
     forms = {name: sort_named(name) for name in sorts}
-    return [_wide_sort(roles, forms[name], hints, chosen, errors, place, forms) for name, chosen in sorts.items()]
+    return [_wide_sort(roles, forms[name], hints, chosen, errors, stations, forms) for name, chosen in sorts.items()]
 
 
 def _wide_sort(
@@ -73,7 +73,7 @@ def _wide_sort(
     hints: ColumnHints,
     columns: Sequence[Named],
     errors: Sequence[Named],
-    place: ColumnPlaces,
+    stations: ColumnPlaces,
     forms: Mapping[str, Form],
 ) -> Readings:
     """Return the readings of one sort of a wide table.
@@ -115,7 +115,7 @@ def _wide_sort(
     )
     if len(deviations) == len(columns):
         found = replace(found, sigma=np.concatenate(deviations), errors=tuple(dict.fromkeys(errors_used)))
-    return _checked(found, roles, hints, place, empty, "a-farther" if minus else None)
+    return _checked(found, roles, hints, stations, empty, "a-farther" if minus else None)
 
 
 def _in_unit(values: Decimals, unit: str, wanted: str, form: Form) -> Decimals:
@@ -126,7 +126,7 @@ def _in_unit(values: Decimals, unit: str, wanted: str, form: Form) -> Decimals:
 
 
 def _is_error_of(error: Named, one: Named, form: Form) -> bool:
-    """Return whether a column has the standard deviations of another column of the same receivers."""
+    """Return whether the column `error` has the standard deviations of the column `one` of the same receivers."""
     kinds = (None, one.form, form.kind)
     return error.ends == one.ends and error.form in kinds and _allows(form, error.column)
 
@@ -187,7 +187,10 @@ def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Array) -> A
 
 
 def _ends(one: Named, form: Form, hints: ColumnHints, source: str) -> tuple[str, str | None]:
-    """Return the stations of a column of a wide table; the second is None for one station."""
+    """Return the stations of the column `one` of a wide table; the second is None for one station.
+
+    Raise InvalidProblem if the name has one station more or less than the sort needs, and no option states a reference.
+    """
     if form.stations == 1 and len(one.ends) == 1:
         return one.ends[0], None
     if form.stations == 2 and len(one.ends) == 2:
@@ -227,7 +230,7 @@ def read_inline(roles: Roles, hints: ColumnHints) -> tuple[ColumnPlaces, Array]:
 
 
 def read_long(
-    roles: Roles, form: Form, hints: ColumnHints, place: ColumnPlaces, receivers: Array | None, forms: Sequence[Form]
+    roles: Roles, form: Form, hints: ColumnHints, stations: ColumnPlaces, receivers: Array | None, forms: Sequence[Form]
 ) -> Readings:
     """Return the readings of one sort of a table with one reading in each row.
 
@@ -235,7 +238,7 @@ def read_long(
     """
     table = roles.table
     if form.value == "sp" and roles.find("sp") is None:
-        return _picks(roles, hints, place)
+        return _picks(roles, hints, stations)
     column = roles.column(form.value)
     dated = form.quantity == "length" and is_dated(table, column)
     cells = date_seconds(table, column, hints.zone) if dated else numbers(table, column)
@@ -249,7 +252,7 @@ def read_long(
     found = replace(found, b=None if b is None else b[pick], notes=(note,) if note else ())
     if (sigma_name := sigma_column(roles, form, hints, forms)) is not None:
         found = replace(found, sigma=sigma_of(table, sigma_name, form, unit, pick), errors=(sigma_name,))
-    return _checked(found, roles, hints, place, table.count - len(pick), positive)
+    return _checked(found, roles, hints, stations, table.count - len(pick), positive)
 
 
 def _of_column(form: Form, unit: str, cells: NumberColumn, column: str, a: Array) -> Readings:
@@ -275,7 +278,7 @@ def _second_station(roles: Roles, hints: ColumnHints) -> tuple[str | None, Array
     return ("a-farther" if is_reference else None), roles.labels("reference")
 
 
-def _picks(roles: Roles, hints: ColumnHints, place: ColumnPlaces) -> Readings:
+def _picks(roles: Roles, hints: ColumnHints, stations: ColumnPlaces) -> Readings:
     """Return S minus P times, s, of a table with a column for each wave, or with a column of phases.
 
     Stations without both waves are left out. Raise InvalidProblem if S is not after P.
@@ -318,25 +321,27 @@ def _picks(roles: Roles, hints: ColumnHints, place: ColumnPlaces) -> Readings:
         raise InvalidProblem("the S wave is not after the P wave", table.at(early), "correct the picks")
     if not both:
         raise InvalidProblem("no station has both P and S", table.source, "state their columns with --column p=, s=")
-    held = NumberColumn(Decimals.of([value for _, value in both]), np.array([row for row, _ in both]))
-    found = _of_column(sort_named("sp"), "s", held, roles.find("s") or roles.column("time"), station)
-    lone = len({*station.tolist()}) - len({*found.a.tolist()})
-    found = replace(found, notes=(f"{lone} stations without both P and S are left out",) if lone else ())
-    return _checked(found, roles, hints, place, 0, "a-farther")
+    differences = NumberColumn(Decimals.of([value for _, value in both]), np.array([row for row, _ in both]))
+    found = _of_column(sort_named("sp"), "s", differences, roles.find("s") or roles.column("time"), station)
+    n_without_pair = len({*station.tolist()}) - len({*found.a.tolist()})
+    found = replace(
+        found, notes=(f"{n_without_pair} stations without both P and S are left out",) if n_without_pair else ()
+    )
+    return _checked(found, roles, hints, stations, 0, "a-farther")
 
 
 # Checks for both forms: known stations, no missing readings, no repeats, sign and convention.
 
 
 def _checked(
-    found: Readings, roles: Roles, hints: ColumnHints, place: ColumnPlaces, empty: int, positive: str | None
+    found: Readings, roles: Roles, hints: ColumnHints, stations: ColumnPlaces, empty: int, positive: str | None
 ) -> Readings:
     """Return checked readings.
 
     Stations are known, missing readings and repeats are removed, sign and convention are set. `empty` is the number of
     empty cells. `positive` is the sign of differences that the table states; None if it is unknown.
     """
-    table, known = roles.table, set(place.names)
+    table, known = roles.table, set(stations.names)
     for end in (found.a, found.b):
         for name in [] if end is None else numbered(end)[0]:
             if name not in known:
@@ -344,7 +349,7 @@ def _checked(
                 column = roles.find("station") if len(found.columns) == 1 else None
                 item = int(np.flatnonzero(end == name)[0])
                 spot = found.where(table, item) if column is None else table.where(column, int(found.row[item]))
-                raise InvalidProblem(f"there is no station {name!r} in {where}", spot, nearest(name, place.names))
+                raise InvalidProblem(f"there is no station {name!r} in {where}", spot, nearest(name, stations.names))
     if found.b is not None:
         same = np.flatnonzero(found.a == found.b)
         if len(same):
@@ -367,7 +372,7 @@ def _checked(
         what = "the sign of differences is unknown: positive values may mean that the first or the second is farther"
         raise InvalidProblem(what, table.source, advice)
     found = replace(found, positive=hints.positive or positive or "a-farther")
-    return _with_convention(found, hints, place, table.source) if found.form.kind == "azimuth" else found
+    return _with_convention(found, hints, stations, table.source) if found.form.kind == "azimuth" else found
 
 
 # Significant digits of a recent time in seconds or nanoseconds; rounding, m, that has no effect on a fix.
@@ -392,14 +397,14 @@ def _with_digits(found: Readings, table: Table) -> Readings:
     return replace(found, notes=(*found.notes, note))
 
 
-def _with_convention(found: Readings, hints: ColumnHints, place: ColumnPlaces, source: str) -> Readings:
+def _with_convention(found: Readings, hints: ColumnHints, stations: ColumnPlaces, source: str) -> Readings:
     """Return azimuths with their convention: from the options, the column name or, on Earth, the compass."""
     named = any(word in stem(found.columns[0]) for word in (BEARING, "brg", "compass", "heading"))
     if found.heading is not None:
         return found
     if hints.azimuth is not None or named:
         return replace(found, azimuth=hints.azimuth or COMPASS)
-    if place.frame == "cartesian":
+    if stations.frame == "cartesian":
         advice = f"use --azimuth {COMPASS} for a compass, or --azimuth {CARTESIAN} from the x axis"
         raise InvalidProblem("azimuths may count from north or from the x axis", source, advice)
     note = f"azimuths are read as compass bearings; --azimuth {CARTESIAN} changes this"
@@ -462,7 +467,7 @@ def _clusters(found: Readings, window: str, count: int) -> Array:
     seconds = seconds if found.unit in UNITS["time"] else seconds / Decimal(repr(SPEED_OF_LIGHT))
     factor = Decimal(repr(Units("time").plain(window, None, "--window"))) / seconds
     values, order = found.values, np.argsort(found.values.units, kind="stable")
-    apart = np.diff(values.units[order]) > int(factor.scaleb(values.places))
+    starts_message = np.diff(values.units[order]) > int(factor.scaleb(values.places))
     out = np.full(count, "", dtype=object)
-    out[found.row[order]] = np.concatenate([[1], 1 + np.cumsum(apart)]).astype(str)
+    out[found.row[order]] = np.concatenate([[1], 1 + np.cumsum(starts_message)]).astype(str)
     return out

@@ -326,8 +326,8 @@ def prior_of(table: PriorTable, dimension: int, source: str) -> Prior:
         raise InvalidProblem(
             f"the mean has {len(table.mean)} coordinates, not {size}", where, "give one number for each coordinate"
         )
-    spread = table.sigma if isinstance(table.sigma, list) else [units.plain(table.sigma, unit, where)] * size
-    sigma = np.array(spread) * (units.conversion(unit, where).factor if isinstance(table.sigma, list) else 1.0)
+    sigmas = table.sigma if isinstance(table.sigma, list) else [units.plain(table.sigma, unit, where)] * size
+    sigma = np.array(sigmas) * (units.conversion(unit, where).factor if isinstance(table.sigma, list) else 1.0)
     if len(sigma) != size or (sigma <= 0.0).any():
         raise InvalidProblem(f"sigma is not {size} positive numbers", where, "give one number for each coordinate")
     return Prior(table.name, units.conversion(unit, where).factor * np.array(table.mean), np.diag(sigma**2))

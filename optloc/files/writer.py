@@ -160,14 +160,14 @@ def _relocate(section: dict[str, Any], folder: Path, out: Path, role: str) -> di
     return {copy: path}
 
 
-def _rows(made: Draft, table: Table, z: Array) -> dict[str, Any]:
+def _rows(original: Draft, table: Table, z: Array) -> dict[str, Any]:
     """Return one table: its standard columns by their standard names, the values of all trials one below the other.
 
     `z` (trials, m) are the values in SI units; the table has the unit of the file.
     """
     trials = len(z)
     values = np.full((trials, table.count), np.nan)
-    for chunk, number in zip(made.chunks, made.numbers, strict=True):
+    for chunk, number in zip(original.chunks, original.numbers, strict=True):
         if chunk.table is table:
             values[:, chunk.row] = chunk.unit.from_si(z[:, number] - chunk.baseline)
     known = {key: table.raw(key) for key in _COLUMNS if key != "z" and table.has(key)}

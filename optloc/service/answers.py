@@ -40,12 +40,12 @@ def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Re
     position, covariance = fix.position, fix.covariance()
     known = np.asarray(np.isfinite(position).all(-1))
     wild = fix.undetermined()
-    spread = np.asarray(known & np.isfinite(covariance).all((-1, -2)) & ~wild.any(-1))
+    has_cov = np.asarray(known & np.isfinite(covariance).all((-1, -2)) & ~wild.any(-1))
     columns: dict[str, list[Any]] = {} if phase is None else {"phase": [phase] * len(events)}
     columns |= {
         "status": [_LABELS[code] for code in fix.code.tolist()],
         "position": _known(position, known),
-        "cov": _known(covariance, spread),
+        "cov": _known(covariance, has_cov),
         "cost": _known(fix.cost, np.isfinite(fix.cost)),
         "dof": fix.dof.tolist(),
     }
@@ -140,15 +140,15 @@ _ROUNDING = 1e-9
 
 
 def _is_same_fix(new: Record, old: Record) -> bool:
-    """Return whether the whole method gives the same fix as the first phase.
+    """Return whether the whole method gives the same fix as the first phase: `new` and `old` are their answers.
 
     Positions may differ by rounding. Both fixes must have a covariance, or both none; the covariances are not compared.
     """
     if new["position"] is None or old["position"] is None:
         return bool(new["position"] == old["position"])
     size = 1.0 + max(map(abs, old["position"]))
-    apart = max(abs(a - b) for a, b in zip(new["position"], old["position"], strict=True))
-    return bool(apart <= _ROUNDING * size and (new["cov"] is None) == (old["cov"] is None))
+    difference = max(abs(a - b) for a, b in zip(new["position"], old["position"], strict=True))
+    return bool(difference <= _ROUNDING * size and (new["cov"] is None) == (old["cov"] is None))
 
 
 def track_record(event: Event, time: float, entry: Entry, problem: Problem) -> Record:
@@ -251,7 +251,7 @@ def to_aircraft(record: Record, seen: float = 0.0) -> Record:
 def to_mark(record: Record, frame: Frame) -> Mark:
     """Return a fix or the state of a track in the form that the export formats need."""
     position, d = np.array(record["position"], dtype=float), len(record["position"])
-    spread = np.full((d, d), np.nan) if record.get("cov") is None else np.array(record["cov"], dtype=float)[:d, :d]
+    covariance = np.full((d, d), np.nan) if record.get("cov") is None else np.array(record["cov"], dtype=float)[:d, :d]
     others = [
         Other(
             x := np.array(each["position"], dtype=float),
@@ -265,7 +265,7 @@ def to_mark(record: Record, frame: Frame) -> Mark:
     return mark_of(
         frame,
         position,
-        spread,
+        covariance,
         record["status"],
         velocity=np.array(record["velocity"], dtype=float) if record.get("velocity") else None,
         name=name,

@@ -91,8 +91,8 @@ def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
         for kind, a, b, value, sigma in entries
     ]
     entries = [_parts(entry, 2, "times") for entry in _typed(each.get("times"), list, "times")]
-    heard = [{"station": station, "time_ps": time} for station, time in entries]
-    rows, sigmas, times = rows_and_arrivals(given, heard, site)
+    arrivals = [{"station": station, "time_ps": time} for station, time in entries]
+    rows, sigmas, times = rows_and_arrivals(given, arrivals, site)
     refused = _typed(each.get("refused", ""), str, "refused")
     if not rows and not times and not refused:
         raise InvalidProblem("an event has no rows", "rows", "remove the event")

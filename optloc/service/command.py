@@ -151,10 +151,10 @@ def live(
     settings |= _tracking(model, filter_, noise, gap, track=track)
     settings["every"] = seconds_of(every, "--every")
     speed = inf if speed is None else speed
-    asked = ServiceOptions(
+    options = ServiceOptions(
         settings, method, replay, speed, shed, quiet, http, mqtt, zmq, adapter, stdin=not (mqtt or zmq)
     )
-    raise typer.Exit(run_live(file, asked))
+    raise typer.Exit(run_live(file, options))
 
 
 SERVED = example(
@@ -198,10 +198,10 @@ def serve(
     settings = _settings(wait, late, "two", deadline, part, "ndjson") | {"state": state, "record": record}
     settings |= _tracking(model, filter_, noise, gap, track=track)
     settings["every"] = seconds_of(every, "--every")
-    asked = ServiceOptions(
+    options = ServiceOptions(
         settings, method, None, inf, True, quiet, http, mqtt, zmq, adapter, stdin=False, stdout=False
     )
-    raise typer.Exit(run_live(file, asked))
+    raise typer.Exit(run_live(file, options))
 
 
 def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str, form: str) -> dict[str, Any]:
@@ -260,41 +260,41 @@ class ServiceOptions:
     stdout: bool = True
 
 
-def run_live(file: Path, asked: ServiceOptions) -> int:
+def run_live(file: Path, options: ServiceOptions) -> int:
     """Run a stream until its source ends or a signal arrives, and return the exit code."""
     from optloc.service.recording import read_recording
     from optloc.service.site import read_site
     from optloc.service.sources import adapter_of
     from optloc.service.stream import Settings, Stream
 
-    if not asked.speed > 0.0:
-        raise InvalidProblem(f"the speed is {asked.speed:g}, not positive", "--speed", "give a positive number")
-    site = read_site(file, asked.method)
-    adapter = None if asked.adapter is None else adapter_of(asked.adapter, site.stations)
-    recording = None if asked.recording is None else read_recording(asked.recording)
+    if not options.speed > 0.0:
+        raise InvalidProblem(f"the speed is {options.speed:g}, not positive", "--speed", "give a positive number")
+    site = read_site(file, options.method)
+    adapter = None if options.adapter is None else adapter_of(options.adapter, site.stations)
+    recording = None if options.recording is None else read_recording(options.recording)
     # lines of a file can wait, so no proof needs to be skipped
-    waits = recording is not None or (asked.stdin and _is_file(sys.stdin))
-    shed = not waits if asked.shed is None else asked.shed
-    given = asked.settings | ({"deadline": inf} if not shed and asked.settings.get("deadline") is None else {})
+    waits = recording is not None or (options.stdin and _is_file(sys.stdin))
+    shed = not waits if options.shed is None else options.shed
+    given = options.settings | ({"deadline": inf} if not shed and options.settings.get("deadline") is None else {})
     settings = Settings(shed=shed, **{key: value for key, value in given.items() if value is not None})
     claim(settings.record, inputs=[file])
-    say = _silent if asked.quiet else _say
-    write = _write(sys.stdout.buffer) if asked.stdout else _silent
+    say = _silent if options.quiet else _say
+    write = _write(sys.stdout.buffer) if options.stdout else _silent
     with _threads(), ExitStack() as stops:
         stream = Stream(site, settings, write, say, again=file, replayed=recording is not None)
         stops.callback(stream.close)  # also if a source cannot be opened
         if settings.track and stream.untracked:
             raise InvalidProblem(stream.untracked, "--track", "remove this option")
         interrupted = stops.enter_context(_signal_handlers(stream))  # before the first line is read
-        places = _open(asked, stream, adapter, stops)
+        places = _open(options, stream, adapter, stops)
         say(f"ready: {site.title!r}, {len(site.rows)} rows of {len(site.stations)} stations{places}")
-        _read(asked, stream, adapter, recording)
+        _read(options, stream, adapter, recording)
         code = wait(stream, interrupted)
     say(json.dumps({"health": stream.health()}))
     return code
 
 
-def _open(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, stops: ExitStack) -> str:
+def _open(options: ServiceOptions, stream: Stream, adapter: Adapter | None, stops: ExitStack) -> str:
     """Open the HTTP, MQTT and ZeroMQ sources, and return a text on them for the ready message.
 
     `stops` receives the functions that stop the sources.
@@ -303,29 +303,29 @@ def _open(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, stops:
     from optloc.service.sources import mqtt, zeromq
 
     opened = ""
-    if asked.http is not None:
-        host, _, port = asked.http.rpartition(":")
+    if options.http is not None:
+        host, _, port = options.http.rpartition(":")
         if not port.isdecimal():
-            raise InvalidProblem(f"{asked.http!r} is not a port", "--http", "write 8200, or 0.0.0.0:8200")
+            raise InvalidProblem(f"{options.http!r} is not a port", "--http", "write 8200, or 0.0.0.0:8200")
         host = host.strip("[]") or requests.HOST
         number, stop = requests.serve(stream, host, int(port))
         stops.callback(stop)
         opened = f", http://{f'[{host}]' if ':' in host else host}:{number}/"
-    for address, begin in ((asked.mqtt, mqtt), (asked.zmq, zeromq)):
+    for address, begin in ((options.mqtt, mqtt), (options.zmq, zeromq)):
         if address is not None:
             stops.callback(begin(stream, address, adapter))
     return opened
 
 
-def _read(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None) -> None:
+def _read(options: ServiceOptions, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None) -> None:
     """Read a recording or standard input in a separate thread, if requested."""
     from optloc.service.recording import replay
     from optloc.service.stream import read_lines
 
     if recording is not None:
         lines = recording if adapter is None else [each._replace(data=adapter(each.data)) for each in recording]
-        _begin(lambda: replay(lines, stream, asked.speed, str(asked.recording)), stream)
-    elif asked.stdin:
+        _begin(lambda: replay(lines, stream, options.speed, str(options.recording)), stream)
+    elif options.stdin:
         read, pending = _reader(sys.stdin)
         _begin(lambda: read_lines(read, stream, "stdin", adapter, pending), stream)
 

@@ -203,12 +203,12 @@ class Engine:
         `key` has the numbers of the stations with arrivals, and the rows with values. Events without a problem are
         answered at once with an error or a status.
         """
-        heard, rows = key
+        receivers, rows = key
         now = self._clock()
-        self._metrics.hear((self.site.stations[i] for i in heard), now)
+        self._metrics.hear((self.site.stations[i] for i in receivers), now)
         self._metrics.hear((name for row in rows for name in (row.a, row.b) if name), now)
         try:
-            ready = self.site.ready(heard, rows)
+            ready = self.site.ready(receivers, rows)
         except InvalidProblem as error:
             for event in events:
                 self._fail(event, str(error))
@@ -218,7 +218,7 @@ class Engine:
                 self._answer(event, unsolved(event, status=Status.TOO_FEW_ROWS.label), last=True)
             return []
         # differences of integers: a float of seconds since 1970 only resolves 70 m
-        arrivals = np.array([_since_first(event, heard) for event in events], dtype=float).reshape(len(events), -1)
+        arrivals = np.array([_since_first(event, receivers) for event in events], dtype=float).reshape(len(events), -1)
         values = np.array([list(event.rows.values()) for event in events], dtype=float).reshape(len(events), -1)
         return [EventGroup(ready, events, ready.si(arrivals, values))]
 
@@ -322,11 +322,11 @@ def _order(key: int | SiteRow) -> tuple[int, tuple[str, ...]]:
     return (key, ()) if isinstance(key, int) else (1 << 30, key[2:5])
 
 
-def _since_first(event: Event, heard: Sequence[int]) -> list[int]:
-    """Return the arrivals at the stations `heard` in picoseconds since the first arrival of the event."""
+def _since_first(event: Event, receivers: Sequence[int]) -> list[int]:
+    """Return the arrivals at the stations `receivers` in picoseconds since the first arrival of the event."""
     times = event.times
     first = min(times.values(), default=0)
-    return [times[i] - first for i in heard]
+    return [times[i] - first for i in receivers]
 
 
 def _pairs(group: EventGroup) -> list[tuple[Event, Array]]:

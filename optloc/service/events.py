@@ -517,11 +517,11 @@ class Events:
             (event.rows, message.rows),
             (event.times, message.times),
         ]
-        for held, new in known:
+        for stored, new in known:
             for key, value in new.items():
-                if key not in held:
-                    held[key] = value
-                elif held[key] == value:
+                if key not in stored:
+                    stored[key] = value
+                elif stored[key] == value:
                     counts["repeated"] += 1
                 else:
                     counts["conflicts"] += 1

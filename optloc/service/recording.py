@@ -90,13 +90,13 @@ def replay(recording: Sequence[Recorded], stream: Stream, speed: float, source: 
     waiting: list[QueuedLine] = []
     for number, (received, data) in enumerate(recording, 1):
         first = received if np.isnan(first) else first
-        left = 0.0 if np.isnan(received) else (received - first) / speed - (stream.clock() - began)
-        if left > 0.0 or len(waiting) >= _MANY:
+        wait = 0.0 if np.isnan(received) else (received - first) / speed - (stream.clock() - began)
+        if wait > 0.0 or len(waiting) >= _MANY:
             stream.inbox.put(waiting)
             waiting = []
-            while left > 0.0 and not stream.inbox.closed:
-                never.wait(min(left, 0.2))
-                left = (received - first) / speed - (stream.clock() - began)
+            while wait > 0.0 and not stream.inbox.closed:
+                never.wait(min(wait, 0.2))
+                wait = (received - first) / speed - (stream.clock() - began)
         if stream.inbox.closed:
             return
         when = when if np.isnan(received) else received

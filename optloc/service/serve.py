@@ -138,12 +138,12 @@ def _line_routes(stream: Stream) -> list[Any]:
             return refused(400, f"send 1 to {WAITING} lines")
         records = await _answers_to(stream, lines, track=track)
         if isinstance(records, int):
-            said = {
+            messages = {
                 429: "the input queue is full",
                 503: "the stream ends",
                 504: "no answer yet; it will be in the stream",
             }
-            return refused(records, said[records], **{"Retry-After": "1"})
+            return refused(records, messages[records], **{"Retry-After": "1"})
         if single:
             return Response(to_line(records[0]), 400 if "error" in records[0] else 200, media_type="application/json")
         return Response(b"".join(map(to_line, records)), media_type="application/x-ndjson")

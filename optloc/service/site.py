@@ -220,23 +220,24 @@ class Site:
         """Return the name of a row for messages."""
         return self.row(key).name
 
-    def ready(self, heard: tuple[int, ...], rows: tuple[SiteRow, ...]) -> Ready | None:
+    def ready(self, receivers: tuple[int, ...], rows: tuple[SiteRow, ...]) -> Ready | None:
         """Return the prepared problem for arrivals and rows; None if they give no row.
 
-        `heard` are the stations with an arrival, ascending. `rows` are the rows with values. Raise InvalidProblem if
-        the file lacks data for a row, such as its noise.
+        `receivers` are the numbers of the stations with an arrival, ascending. `rows` are the rows with values. Raise
+        InvalidProblem if the file lacks data for a row, such as its noise.
         """
-        return _READY.find((self, heard, rows), lambda: self._prepare(heard, rows))
+        return _READY.find((self, receivers, rows), lambda: self._prepare(receivers, rows))
 
-    def between(self, heard: tuple[int, ...]) -> tuple[SiteRow, ...]:
-        """Return the rows that arrivals at the stations `heard` give.
+    def between(self, receivers: tuple[int, ...]) -> tuple[SiteRow, ...]:
+        """Return the rows of a problem that arrivals at the stations `receivers` (numbers, ascending) give.
 
         These are the rows of the template whose stations have arrivals. If they do not connect all stations, a
-        difference to the first station connects each further group.
+        difference to the first station connects each further group. Times of arrival need no connection: each station
+        without a row gets one.
         """
-        if not heard:
+        if not receivers:
             return ()
-        names = [self.stations[i] for i in heard]
+        names = [self.stations[i] for i in receivers]
         kept = [self.rows[i] for i in self.arriving if {self.rows[i].a, self.rows[i].b} - {""} <= set(names)]
         section, kind = self.rows[self.arriving[0]].section, self.rows[self.arriving[0]].kind
         if kind == "toa":
@@ -251,15 +252,15 @@ class Site:
                 group = {other: group[names[0]] if g == group[name] else g for other, g in group.items()}
         return tuple(kept)
 
-    def _prepare(self, heard: tuple[int, ...], rows: tuple[SiteRow, ...]) -> Ready | None:
+    def _prepare(self, receivers: tuple[int, ...], rows: tuple[SiteRow, ...]) -> Ready | None:
         """Return the prepared problem for arrivals and rows, as `ready`, but without the cache."""
-        timed = self.between(heard)
+        timed = self.between(receivers)
         if not (timed or rows):
             return None
         draft, order = self._draft((*timed, *rows))
         problem = draft.loaded.problem
         bare = problem.with_rows(z=np.zeros(problem.count))
-        place, stated, links = {station: i for i, station in enumerate(heard)}, [], []
+        place, stated, links = {station: i for i, station in enumerate(receivers)}, [], []
         for chunk, number in zip(draft.chunks, draft.numbers, strict=True):
             section = next(i for i, table in enumerate(draft.tables) if table is chunk.table)
             column = np.array([order[section][row] for row in chunk.row.tolist()])

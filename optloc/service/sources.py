@@ -41,11 +41,11 @@ class ChirpStack:
         if found is None or not isinstance(found.get("rxInfo"), list):
             return line
         every = [each for each in found["rxInfo"] if isinstance(each, dict) and isinstance(each.get("gatewayId"), str)]
-        heard = [each for each in every if each["gatewayId"] in self._stations]
+        receptions = [each for each in every if each["gatewayId"] in self._stations]
         self._warn({each["gatewayId"] for each in every} - self._stations)
         arrivals = [
             {"station": each["gatewayId"], "time": str(each["fineTimeSinceGpsEpoch"]).removesuffix("s")}
-            for each in heard
+            for each in receptions
             if each.get("fineTimeSinceGpsEpoch") is not None
         ]
         device = found.get("deviceInfo")
@@ -84,21 +84,21 @@ class ModeS:
     def __call__(self, line: bytes) -> bytes:
         """Return a message as a line with one arrival; lines of another form are returned unchanged."""
         found = _object(line)
-        heard = None if found is None else found.get("mlat")
-        if found is None or not isinstance(heard, dict):
+        reception = None if found is None else found.get("mlat")
+        if found is None or not isinstance(reception, dict):
             return line
-        bits, time, station = heard.get("m"), heard.get("t"), found.get("receiver")
+        bits, time, station = reception.get("m"), reception.get("t"), found.get("receiver")
         if not isinstance(bits, str) or type(time) is not int:
             return line
         first, number = self._seen.pop(bits, (time, 0))
-        apart = (time - first + _DAY // 2) % _DAY - _DAY // 2
-        if abs(apart) > _TOGETHER:
-            first, number, apart = time, number + 1, 0
+        delay = (time - first + _DAY // 2) % _DAY - _DAY // 2
+        if abs(delay) > _TOGETHER:
+            first, number, delay = time, number + 1, 0
         self._seen[bits] = first, number
         if len(self._seen) > _MESSAGES:
             del self._seen[next(iter(self._seen))]
         # relative to the midnight of the first receiver, so that midnight does not split an event
-        event = {"event": f"{bits}-{number}", "station": station, "time_ns": first + apart}
+        event = {"event": f"{bits}-{number}", "station": station, "time_ns": first + delay}
         address = _address(bits)
         return json.dumps(event | ({"target": address} if address else {})).encode()
 
@@ -169,12 +169,12 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callab
         else:
             client.subscribe(topic, qos=1)  # again after each reconnection
 
-    def heard(_: Any, __: Any, message: Any) -> None:
+    def receive(_: Any, __: Any, message: Any) -> None:
         """Pass the lines of a message to the stream."""
         nonlocal number
         number = _push(stream, message.payload, "mqtt", number, adapter)
 
-    client.on_connect, client.on_message = connected, heard
+    client.on_connect, client.on_message = connected, receive
     try:
         client.connect(parts.hostname, parts.port or (8883 if parts.scheme == "mqtts" else 1883))
     except (OSError, ValueError) as error:

@@ -229,12 +229,16 @@ def _answer_of(event: Event, when: int, entry: Entry | None, follower: Follower,
     """
     if entry is not None:
         return track_record(event, when * 1e-12, entry, problem)
-    said = {"status": "lost", "reason": follower.lost} if follower.lost else {"status": "starting"}
-    return unsolved(event, phase="track", target=event.target or UNNAMED, time=when * 1e-12, **said)
+    outcome = {"status": "lost", "reason": follower.lost} if follower.lost else {"status": "starting"}
+    return unsolved(event, phase="track", target=event.target or UNNAMED, time=when * 1e-12, **outcome)
 
 
 def _reason_without_tracks(problem: Problem, how: Following) -> str:
-    """Return the reason for which events of a site make no tracks; empty if they do."""
+    """Return the reason for which events of a site make no tracks; empty if they do.
+
+    `how` has the settings of the tracks. A track is started with measurements that are zero, to find errors of the
+    settings.
+    """
     if problem.priors:
         return f"the file has a prior of {problem.priors[0].name!r}; a track cannot use priors"
     if len(problem.motions) > 1 or problem.motions[0].known is not None:
