@@ -225,8 +225,7 @@ def _apart(problem: Problem, alone: bool) -> Problem:
 def _components(problem: Problem) -> Array:
     """Return the number of connected groups of stations in each epoch (k,); 0 without differences.
 
-    Differences and ratios connect the two stations of a row. Two groups without a connection have separate clocks, so
-    the file may lack rows.
+    Differences and ratios connect the two stations of a row. The rows A-B and C-D give two groups, for instance.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -287,7 +286,10 @@ class Checked:
 
 
 def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
-    """Return the health of the stations of a file. Each epoch is fixed separately."""
+    """Return the health of the stations of a file, or the reason for which it cannot be computed.
+
+    Each epoch is fixed separately by `method`, and `by` groups the errors. Raise InvalidProblem for a wrong option.
+    """
     problem = loaded.problem
     if problem.epochs < 2:
         return Checked(None, "station health needs several epochs; the file has one")

@@ -68,7 +68,7 @@ def _simulated(kind: str, count: int, stations: Stations | Array = _STATIONS, **
 
 
 def _fix_ranges() -> None:
-    """Compile the fixes from rows that are sums or differences of ranges."""
+    """Compile the fixes from ranges, and from differences of ranges."""
     problem = _simulated("tdoa", _FEW)
     solve(problem, "gtrs+lsr")
     prepare(problem_of("tdoa"), "gtrs+lsr")(problem.z[0])

@@ -318,7 +318,11 @@ def run_map(
     geodetic: bool,
     dilution: bool,
 ) -> int:
-    """Write the map of the bound of a file. If epochs are separate, the map is of the first epoch."""
+    """Write the map of the bound of a file. If epochs are separate, the map is of the first epoch.
+
+    With `dilution`, the map shows the dilution of precision instead of the bound, m. `height` is the height of the map
+    as text.
+    """
     if out.suffix.lower() not in (*PICTURES, ".html", ".geojson"):
         advice = "use .png, .svg, .pdf, .geojson or .html"
         raise InvalidProblem(f"maps of type {out.suffix or out.name!r} are unknown", str(out), advice)
@@ -480,7 +484,7 @@ def _show_status(found: StatusShares, title: str) -> None:
 
 
 def _map_status(file: Path, loaded: Loaded, wanted: Simulated, out: Path) -> None:
-    """Write the map of the share of fixes with the status `ok`."""
+    """Write the map of the share of fixes with the status `ok` to the file `out`; `wanted` has the options."""
     from optloc.show.pictures import plot_status_map, status_geojson
     from optloc.solvers.shares import status_map
 
@@ -506,7 +510,10 @@ def _map_status(file: Path, loaded: Loaded, wanted: Simulated, out: Path) -> Non
 def run_simulate(
     file: Path, truth: str, velocity: str | None, out: Path, *, geodetic: bool, seed: int, trials: int, quiet: bool
 ) -> int:
-    """Simulate measurements, write them as a problem file, and return the exit code."""
+    """Simulate measurements, write them as a problem file, and return the exit code.
+
+    `truth` is the true position as text. With several `trials`, each trial becomes an epoch.
+    """
     from tempfile import TemporaryDirectory
 
     from optloc.files.writer import write_measured

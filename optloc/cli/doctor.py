@@ -113,7 +113,10 @@ def machine_code() -> dict[str, Any]:
 
 
 def advice(found: list[Package], code: dict[str, Any]) -> list[MissingPackage]:
-    """Return the missing packages with their install commands, packages that all users need first."""
+    """Return the missing packages with their install commands, packages that all users need first.
+
+    `found` are the packages that optloc uses, and `code` is the state of the machine code.
+    """
     missing = [
         MissingPackage(f"{one.name} >= {one.least}", "everything", f"pip install '{one.name}>={one.least}'")
         for one in found

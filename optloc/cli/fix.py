@@ -416,7 +416,10 @@ def show_advice(found: tuple[Advice, ...], console: Console) -> None:
 
 
 def _explain(found: FileFixes, method: str) -> FileFixes | None:
-    """Return the fixes with the most likely error as an additional unknown; None if no error explains the misfit."""
+    """Return the fixes with the most likely error as an additional unknown; None if no error explains the misfit.
+
+    `found` are the fixes without it, and `method` is the method of both.
+    """
     larger = explained_at(found.loaded.problem, found.fix.x)
     return None if larger is None else fix_file(replace(found.loaded, problem=larger), method, True)
 

@@ -137,7 +137,11 @@ def write_picture(figure: Figure, path: Path) -> None:
 
 @contextmanager
 def bar(title: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
-    """Yield a function that advances a progress bar on standard error; only terminals show the bar."""
+    """Yield a function that advances a progress bar on standard error; only terminals show the bar.
+
+    The argument of the function is the number of finished steps since its last call. `total` is the number of all
+    steps.
+    """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     # Standard output may be piped, so the bar is on standard error. One step needs no bar.

@@ -53,7 +53,10 @@ def run_separate(
 
 
 def _count(text: str, rows: int) -> int | None:
-    """Return the number of emitters, at most the number of rows; None for "auto"."""
+    """Return the number of emitters from the text of the option; None for "auto".
+
+    Raise InvalidProblem for another text, or for more emitters than `rows`, the number of rows.
+    """
     if text == "auto":
         return None
     if not (text.isascii() and text.isdigit() and len(text) < _DIGITS and int(text) <= rows):

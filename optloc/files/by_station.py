@@ -160,7 +160,11 @@ def _wide(word: str, frame: Any, names: Sequence[str], reference: str) -> Statio
 
 
 def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> StationValues:
-    """Return the values of a data frame: one column for each station, or one row for each value."""
+    """Return the values of a data frame: one column for each station, or one row for each value.
+
+    With one row for each value, the columns have the station, the value, and optionally the epoch; the result has one
+    row for each epoch. Raise InvalidProblem for a table without these columns, or with two values of one station.
+    """
     columns = list(frame.columns)
     wide = _named(word, columns, names, reference)
     if wide and len(wide) == len(columns):
@@ -222,7 +226,10 @@ def _no_dates(word: str, values: Array) -> Array:
 
 
 def _numbers(word: str, values: Any) -> Array:
-    """Return values as an array of numbers or dates; None becomes NaN."""
+    """Return values as an array of numbers or dates; None becomes NaN.
+
+    Raise InvalidProblem for other values, and for dates that are not times of arrival.
+    """
     try:
         array = np.asarray(values)
         if array.dtype.kind in "OSU":

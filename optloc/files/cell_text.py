@@ -63,7 +63,7 @@ class Decimals:
 
     @classmethod
     def join(cls, parts: Sequence[Decimals]) -> Decimals:
-        """Return the concatenation of columns, in one unit: the smallest unit of all columns."""
+        """Return the concatenation of columns, with the largest number of decimals of all columns."""
         places = max(part.places for part in parts)
         units = [part.at_places(places) for part in parts]
         return cls(np.concatenate(units), places, np.concatenate([part.written for part in parts]))

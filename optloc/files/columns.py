@@ -66,7 +66,10 @@ class Role:
 
 
 def _role(text: str, names: str, units: Iterable[str] = (), with_unit: str = "") -> Role:
-    """Return a role from texts with names that are separated by spaces."""
+    """Return a role from its content `text`, and texts with names that are separated by spaces.
+
+    `units` are the permitted units. `with_unit` are names that need one of the units at the end.
+    """
     return Role(text, tuple(names.split()), tuple(units), tuple(with_unit.split()))
 
 

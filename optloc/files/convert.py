@@ -348,7 +348,7 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
     """Return the section of a problem file for one sort of readings, as the columns and settings of its table.
 
     `epochs` are columns of the source table that determine epochs. `sigma` is the standard deviation as text; None if
-    it is a column.
+    it is a column. Times of arrival are stored relative to the first arrival of each message.
     """
     columns: dict[str, Any] = {name: column[found.row] for name, column in epochs.items()}
     values, text = found.values, found.form.text

@@ -132,7 +132,10 @@ def _flat(record: Mapping[str, Any], place: str, prefix: str = "") -> Iterator[t
 
 
 def _inside(row: Row, key: str, record: Mapping[str, Any]) -> Row:
-    """Return a row of a list; a name that the outer object also has gets the name of the list as a prefix."""
+    """Return a row of the list with the name `key`, with names that do not occur in the outer object `record`.
+
+    A name that the outer object also has gets the name of the list as a prefix.
+    """
     return {f"{key}_{name}" if name in record else name: value for name, value in row.items()}
 
 

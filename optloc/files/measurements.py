@@ -130,6 +130,7 @@ def chunks_of(
     """
 
     def chunk(kind: str, pick: Array) -> RowChunk:
+        """Return the rows `pick` of the table, which have the same kind, in SI units."""
         part_of_table = table if len(pick) == table.count else table.take(pick)
         part = Context(section, part_of_table, stations, where, speed, values)
         return replace(_chunk(part, kind), row=pick, table=table)
@@ -360,7 +361,9 @@ def spread_of(
 ) -> tuple[Array | None, Array | None, Array | None]:
     """Return standard deviations (m,), arrival standard deviations (s,) and covariance (r, r); at most one is not None.
 
-    `unit` is the unit of z and of plain numbers; `z` (m,) are the measured values in SI units.
+    All are None without noise, or if a signal determines the noise (`signal_of`). The covariance is in the square of
+    the unit of the file, the others in SI units. `unit` is the unit of z and of plain numbers; `z` (m,) are the
+    measured values in SI units.
     """
     section = c.section
     column = c.table.has("sigma")
@@ -380,7 +383,11 @@ def spread_of(
 
 
 def sigma_of(c: Context, units: Units, unit: Conversion, z: Array) -> Array | None:
-    """Return the standard deviations (m,) of values z (m,) from the column or the key sigma; None without either."""
+    """Return the standard deviations (m,), SI, from the column or the key sigma; None without either.
+
+    `z` (m,) are the measured values in SI units: the standard deviation of a level in decibels depends on the value.
+    `unit` is the unit of plain numbers.
+    """
     if c.table.has("sigma"):
         return _positive(c, unit.sigma_to_si(c.table.numbers("sigma"), z), column=True)
     if c.section.sigma is None:

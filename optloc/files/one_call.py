@@ -246,7 +246,10 @@ def _labelled(fix: Fix, labels: list[Any] | None) -> Fix:
 
 
 def _check_north(north: _North, given: Mapping[str, Any]) -> None:
-    """Raise InvalidProblem for an unknown convention of azimuths, and for a declination without bearings."""
+    """Raise InvalidProblem for an unknown convention of azimuths, and for a declination without bearings.
+
+    `given` has the measurements by argument.
+    """
     known = get_args(AzimuthConvention)
     if north.azimuth not in known:
         raise InvalidProblem(f"there is no convention {north.azimuth!r}", "azimuth", nearest(north.azimuth, known))
@@ -385,8 +388,9 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
 def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple[Band, ...]:
     """Return the constraint on the height of the target; an empty tuple for a free height.
 
-    `height` is the argument of `locate`: a height, or the least and the greatest height, m. Stations without altitudes
-    give the height 0 m. Raise InvalidProblem if bearings alone leave the height free, or if the height is invalid.
+    `height` is the argument of `locate`: a height, or the least and the greatest height, m. Stations on Earth without
+    altitudes give the height 0 m. Raise InvalidProblem if bearings alone leave the height free, or if the height is
+    invalid.
     """
     d = places.stations.position.shape[-1]
     if height is None and places.level:

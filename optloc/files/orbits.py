@@ -225,7 +225,8 @@ def _propagate_sets(sets: Sequence[_Set], seconds: Array) -> tuple[Array, Array]
 def _propagate(satellite: Any, seconds: Array, where: str) -> tuple[Array, Array]:
     """Return ECEF position (k, 3), m, and velocity (k, 3), m/s, of a satellite object of skyfield.
 
-    `seconds` (k,) are since 1970, UTC. Raise InvalidProblem, with the place `where`, if the orbit cannot be computed.
+    `seconds` (k,) are since 1970, UTC. Velocities are relative to the ground. Raise InvalidProblem, with the place
+    `where`, if the orbit cannot be computed.
     """
     from skyfield.framelib import itrs
 

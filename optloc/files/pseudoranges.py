@@ -252,7 +252,8 @@ def at_reception(source: Path, epoch: Array, place: Array, z: Array) -> Array:
 def _rough_position(source: Path, epoch: Array, place: Array, z: Array, count: int) -> Array:
     """Return the receiver position of a table at each epoch (count, 3), ECEF, m, accurate to some hundred metres.
 
-    Parameters are as in `_first_pass`. If no epoch has four satellites, a receiver on the ground is assumed.
+    Parameters are as in `_first_pass`. If no epoch has four satellites that give a position, a receiver on the ground
+    is assumed.
     """
     try:
         return _first_pass(source, epoch, place, z, count)

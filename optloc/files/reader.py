@@ -430,7 +430,7 @@ def noise_of(
 
 
 def _arrivals(chunk: RowChunk, members: Array) -> Array:
-    """Return the covariances (g, r, r), m^2, of g groups of rows whose noise is the noise of arrivals at stations.
+    """Return the covariances (g, r, r), SI, of g groups of rows whose noise is the noise of arrivals at stations.
 
     `members` (g, r) are the rows of each group. Raise InvalidProblem for a row without noise.
     """

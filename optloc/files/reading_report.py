@@ -256,7 +256,10 @@ def _spelled(text: str, places: Sequence[int]) -> str:
 
 
 def _same_quantity(one: str | None, other: str | None) -> bool:
-    """Return whether two units have the same quantity; None, a name without a unit, matches only None."""
+    """Return whether two units have the same quantity, such as "m" and "km".
+
+    A name without a unit (None) matches only another name without a unit.
+    """
     if one is None or other is None:
         return one is other
     return any(one in units and other in units for units in UNITS.values())

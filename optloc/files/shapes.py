@@ -119,7 +119,7 @@ def _wide_sort(
 
 
 def _in_unit(values: Decimals, unit: str, wanted: str, form: Form) -> Decimals:
-    """Return numbers in another unit of their quantity, with all their digits."""
+    """Return numbers in the unit `wanted` instead of `unit`, with all their digits; `form` determines the quantity."""
     if unit == wanted:
         return values
     return Decimals.of([in_unit(value, unit, wanted, form) for value in values.tolist()])

@@ -275,7 +275,8 @@ def _sigma(section: StationsTable, table: Table, where: str, key: str) -> Array 
 def over_epochs(found: Survey, section: StationsTable, epochs: Epochs, used: Sequence[Array]) -> Stations:
     """Return the stations at the epochs: fixed stations once, moving stations with a position at each epoch.
 
-    `used` has pairs (epoch, station) (u, 2) whose position is required, one array for each chunk of rows.
+    `found` are the stations of a table, and `section` has their settings. `used` has pairs (epoch, station) (u, 2)
+    whose position is required, one array for each chunk of rows.
     """
     if found.moving:
         position, velocity, axes = stations_over_epochs(found, section, epochs, np.concatenate(used))

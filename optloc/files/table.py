@@ -207,7 +207,11 @@ def is_empty(cell: object) -> bool:
 
 
 def table_of(section: DataTable, folder: Path, where: str) -> Table:
-    """Return the rows in a table of a problem file, or in the file that it names."""
+    """Return the rows in a table of a problem file, or in the file that it names.
+
+    `section` is that table, and `folder` the folder of the problem file. Raise InvalidProblem if the table has both or
+    neither.
+    """
     if (section.file is None) == (section.rows is None):
         raise InvalidProblem("the rows must be given once", where, 'write file = "..." or rows = [ ... ]')
     if section.rows is not None:
@@ -337,7 +341,10 @@ def parquet(path: Path, names: Mapping[str, str]) -> Table:
 
 
 def _check_size(about: Any, schema: Any, source: str) -> None:
-    """Check the sizes that a Parquet file declares against the budget."""
+    """Raise InvalidProblem if a Parquet file declares sizes beyond the budget, or sizes that contradict each other.
+
+    `about` has the metadata of the file, and `schema` its columns.
+    """
     check_budget("columns", len(schema), source)
     check_budget("rows", about.num_rows, source)
     check_budget("cells", about.num_rows * len(schema), source)
@@ -349,7 +356,7 @@ def _check_size(about: Any, schema: Any, source: str) -> None:
 
 
 def _fits(pa: Any, kind: Any) -> bool:
-    """Return whether a Parquet column has numbers, dates or text."""
+    """Return whether a Parquet column of the type `kind` has numbers, dates or text; `pa` is the library pyarrow."""
     kind = kind.value_type if pa.types.is_dictionary(kind) else kind
     tests = "is_integer is_floating is_decimal is_timestamp is_date is_string is_large_string is_null"
     return any(getattr(pa.types, test)(kind) for test in tests.split())

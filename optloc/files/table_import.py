@@ -518,7 +518,9 @@ def _cells(count: int) -> str:
 def _suspicious_number(found: Readings, epoch: Array) -> Decimal | None:
     """Return a number that may mean a missing reading, or None.
 
-    A typical number is suspicious if it is the smallest or the largest, or more frequent than all others.
+    The candidates are numbers that programs write for a missing reading, such as 0, -1 or 9999. A candidate is
+    suspicious if it is the smallest or the largest number of the table, or more frequent than each other number.
+    `epoch` (m,) is the epoch number of each reading.
     """
     values, counts = np.unique(found.values.units, return_counts=True)
     for mark in _MISSING_VALUES:

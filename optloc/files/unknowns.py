@@ -113,7 +113,10 @@ def places_of(file: ProblemFile, folder: Path, source: str) -> dict[str | None, 
 def known_of(
     file: ProblemFile, places: Mapping[str | None, Table], epochs: Epochs, frame: Frame, dimension: int
 ) -> dict[str, Array]:
-    """Return the states (k or 1, order + 1, d) of known targets by name; `places` is from `places_of`."""
+    """Return the states (k or 1, order + 1, d) of known targets by name: position, and velocity with the order 1; SI.
+
+    `places` are the tables from `places_of`, and `dimension` is d, the dimension of the stations.
+    """
     states = {}
     for i, name in enumerate(epochs.targets):
         key = name if name in file.targets else None
@@ -249,7 +252,10 @@ def _walk_parameters(table: BiasTable, rows: Sequence[Units], where: str) -> dic
 
 
 def _density(text: str, power: int, units: Units, where: str) -> float:
-    """Return a spectral density such as "4 ns^2/s" in SI units; `power` is the power of the seconds."""
+    """Return a spectral density such as "4 ns^2/s" in SI units.
+
+    `power` is the power of the seconds: 1 for a walk, 3 for its rate. `units` is the quantity of the affected rows.
+    """
     end = "^2/s" if power == 1 else f"^2/s^{power}"
     number, _, unit = text.strip().partition(" ")
     if not unit.endswith(end):

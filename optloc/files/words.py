@@ -99,7 +99,11 @@ def objects(cells: Sequence[Any]) -> Array:
 
 
 def equal_rows(columns: Sequence[Array | Words], count: int) -> tuple[Array, Array]:
-    """Return the first row (n,) of each group of equal rows, and the group of each row (m,)."""
+    """Return the first row (n,) of each group of equal rows, and the group of each row (m,).
+
+    Rows are equal if their cells are equal in all columns (m,). `count` is the number of rows m; without columns, all
+    rows are equal.
+    """
     if not columns:
         return np.zeros(min(count, 1), dtype=np.int64), np.zeros(count, dtype=np.int64)
     return first_rows(*(c.index if isinstance(c, Words) else _numbers(c) for c in columns))

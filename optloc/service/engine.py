@@ -120,7 +120,8 @@ class Engine:
     def settle(self, events: Iterable[Event]) -> None:
         """Answer closed events with fixes and queue their proofs; pass events of tracks to their tracks.
 
-        An event with an error is answered by its error. In the phases "one", the answer follows with the proof.
+        An event with an error is answered by its error. With the phases "one", an event is answered after its proof
+        only.
         """
         closed = []
         for event in events:

@@ -2,7 +2,7 @@
 
 A line has rows, or arrivals at stations, of one event. An event is open until all its rows are present or its waiting
 time is over; then it closes and is answered. Two clocks are used. `now` is a monotonic clock, s. `when` is the clock
-for which events wait, s: it follows recorded times in a replay, and runs slowly while lines of a file wait.
+for which events wait, s. It follows recorded times in a replay, and runs slowly while lines wait to be read.
 """
 
 from __future__ import annotations
@@ -317,7 +317,7 @@ def picoseconds(given: Any, key: str) -> int:
 
 
 def _beyond_clocks(given: Any, key: str) -> InvalidProblem:
-    """Return the error for a time that no clock has; its unit is probably wrong."""
+    """Return the error for a time under `key` that no clock has; its unit is probably wrong."""
     return InvalidProblem(f"the time {str(given)[:40]} is out of range", key, "check its unit")
 
 

@@ -123,6 +123,7 @@ def _line_routes(stream: Stream) -> list[Any]:
     from starlette.routing import Route
 
     def refused(code: int, why: str, **headers: str) -> Any:
+        """Return an error response with the HTTP status `code` and the reason `why`."""
         return JSONResponse({"error": why}, code, headers)
 
     async def answer(request: Any, *, track: bool) -> Any:

@@ -182,6 +182,7 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callab
     client.loop_start()
 
     def stop() -> None:
+        """Disconnect from the broker, and end the thread of the client."""
         client.disconnect()
         client.loop_stop()
 
@@ -254,6 +255,7 @@ def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> Call
     thread.start()
 
     def stop() -> None:
+        """Stop the source, and wait at most 5 s for its end."""
         nonlocal ends
         ends = True
         thread.join(5.0)

@@ -112,7 +112,7 @@ class Tracks:
         return _reason_without_tracks(self._problem, self._how)
 
     def take(self, scans: Sequence[Scan]) -> None:
-        """Add events in the order in which they closed; the caller waits while the queue is full."""
+        """Queue events in the order in which they closed; the caller waits while the queue is full."""
         with self._changed:
             if self._thread is None:
                 self._thread = Thread(target=self._run, name="optloc tracks", daemon=True)
