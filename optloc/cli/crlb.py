@@ -468,7 +468,7 @@ def run_status(file: Path, wanted: Simulated, *, as_json: bool, quiet: bool) -> 
 
 
 def _show_status(found: StatusShares, title: str) -> None:
-    """Print the share of each status as a table, and the share of `ok` fixes whose 95 % region is right."""
+    """Print the share of each status as a table, and how often the 95 % region of `ok` fixes has the true position."""
     table = Table(title=f"{title}: status of {found.trials} simulated fixes", title_justify="left")
     table.add_column("status")
     for name in ("share, %", "standard error, %"):

@@ -157,9 +157,9 @@ def _at_transmission(
 ) -> tuple[Array, Array, Array, tuple[str, ...]]:
     """Return the observations that have a healthy ephemeris, with the positions of their satellites at transmission.
 
-    The result has the indices (n,) of these observations in the order of time, satellite positions (n, 3), ECEF, m,
-    pseudoranges without the satellite clock errors (n,), m, and notes. Positions are in the Earth axes at transmission.
-    `system` is the letter of the satellite system.
+    The result has the indices (n,) of these observations in the order of time, and the satellite positions (n, 3),
+    ECEF, m. It also has the pseudoranges without the satellite clock errors (n,), m, and notes. Positions are in the
+    Earth axes at transmission. `system` is the letter of the satellite system.
     """
     count = len(seen.time)
     place, clock, good = np.full((count, 3), np.nan), np.full(count, np.nan), np.zeros(count, dtype=bool)

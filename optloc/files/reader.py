@@ -1,8 +1,8 @@
 """Reader of problem files: read tables, find epochs, convert to SI units, check, and build the problem.
 
-In shapes, m is the number of rows, k the number of epochs, s the number of stations, d the dimension, and r the number
-of rows of an epoch. A chunk has the rows of one kind in one table. `index` and `target` have the epoch and the target
-of each row, one array (m,) for each chunk.
+In shapes, m is the number of rows, k of epochs, s of stations, d of dimensions, and r of rows in one epoch. A chunk has
+the rows of one kind in one table. `index` and `target` have the epoch and the target of each row, one array (m,) for
+each chunk.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
 
 
 def draft(path: Path, *, values: bool, more: Mapping[str, ConstraintTable] | None = None) -> Draft:
-    """Return the problem of a file together with its tables; the arguments are those of `read`."""
+    """Return the problem of a file together with its tables; the arguments are as in `read`."""
     file, source = read_document(path), name_of(path)
     # Read tables before converting anything, so that a missing file is reported before a wrong unit.
     known = places_of(file, path.parent, source)
@@ -284,7 +284,7 @@ def _problem(
 ) -> Problem:
     """Return the checked problem with the motions, priors, constraints and medium of the file.
 
-    `known` has the positions of known targets by name. `more` has constraints in addition to those of the file.
+    `known` has the positions of known targets by name. `more` has further constraints, by their place for messages.
     """
     speed = speed_of(file, source)
     motions = motions_of(file, epochs, known_of(file, known, epochs, frame, stations.dimension), source)

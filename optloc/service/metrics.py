@@ -42,9 +42,9 @@ COUNTS = {
 class Metrics:
     """Counters and latencies of one stream; thread-safe.
 
-    counts: counts by the names in `COUNTS`. statuses, proofs, tracks: number of last answers by status, by outcome of
-    the proof, and by status of the track. heard: time of the last row of each station, s. gauges: functions that return
-    the present length of each queue.
+    counts: counts by the names in `COUNTS`. statuses: number of last answers by status. proofs: number of proofs by
+    outcome. tracks: number of events of tracks by status. heard: time of the last row of each station by the clock of
+    the stream, s. gauges: functions that return the present length of each queue.
     """
 
     def __init__(self) -> None:
