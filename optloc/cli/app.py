@@ -9,7 +9,7 @@ import typer
 
 from optloc.cli.doctor import doctor
 from optloc.cli.extensions import PictureRequest, extensions
-from optloc.cli.from_table import EXAMPLES as CONVERSIONS, convert, table_told, takes_table
+from optloc.cli.from_table import EXAMPLES as CONVERSIONS, convert, table_hints, takes_table
 from optloc.cli.options import (
     ANSWERS,
     EXIT_CODES,
@@ -75,6 +75,7 @@ def main() -> None:
 
 
 def _print_version(wanted: bool) -> None:
+    """Print the version and end, if `--version` is given."""
     if wanted:
         from importlib.metadata import PackageNotFoundError, version
 
@@ -169,7 +170,7 @@ def fix(
         late=late,
         explain=explain,
         allow=passing,
-        table=table_told(file, given),
+        table=table_hints(file, given),
     )
     raise typer.Exit(code)
 
@@ -228,8 +229,8 @@ def track(
 
     wanted = TrackOptions(model, filter_, noise, memory, rules(gate, gap, loss), start, start_sigma, loss)
     files = {"out": out, "plot": plot, "html": html}
-    told = table_told(file, given)
-    raise typer.Exit(run_track(file, wanted, **files, as_json=as_json, quiet=quiet, table=told))
+    hints = table_hints(file, given)
+    raise typer.Exit(run_track(file, wanted, **files, as_json=as_json, quiet=quiet, table=hints))
 
 
 @app.command(
@@ -369,7 +370,7 @@ def check(
     from optloc.cli.check import CheckOptions, run_check
 
     asked = CheckOptions(not no_solve, method, by, out, plot)
-    raise typer.Exit(run_check(file, as_json, asked, quiet=quiet, table=table_told(file, given)))
+    raise typer.Exit(run_check(file, as_json, asked, quiet=quiet, table=table_hints(file, given)))
 
 
 @app.command(
@@ -460,6 +461,7 @@ app.command(rich_help_panel=FIRST, epilog=example(*CONVERSIONS))(convert)
 
 # The names of the lists are available without computing any list.
 def _lists() -> list[str]:
+    """Return the names of the lists, for the completion of the command line."""
     from optloc.cli.listing import lists
 
     return list(lists())

@@ -1,4 +1,7 @@
-"""The command ``optloc check``: summary of a file, health of its stations, and advice on possible errors."""
+"""The command ``optloc check``: summary of a file, health of its stations, and advice on possible errors.
+
+In shapes, k is the number of epochs, s the number of stations, d the dimension, and size the number of unknowns.
+"""
 
 from __future__ import annotations
 
@@ -64,26 +67,26 @@ class CheckOptions:
 def run_check(
     file: Path,
     as_json: bool,
-    asked: CheckOptions | None = None,
+    options: CheckOptions | None = None,
     *,
     quiet: bool = False,
     table: ColumnHints | None = None,
 ) -> int:
     """Print a summary of a file and the health of its stations; return exit code 1 if an epoch has too few rows."""
-    asked = asked or CheckOptions()
+    options = options or CheckOptions()
     # A file without measured values is valid here: you can check the geometry before a campaign.
-    outputs = partial(claim_outputs, table=asked.out, picture=asked.plot, inputs=[file])
+    outputs = partial(claim_outputs, table=options.out, picture=options.plot, inputs=[file])
     outputs()  # check twice: before the reader spends time on a long table, and after it has recorded all input files
     loaded = read_problem(file, table, values=False, quiet=quiet or as_json)
     outputs()
     found = summary(loaded)
-    checked = _health(loaded, asked, quiet or as_json)
-    told = _advice(loaded, checked)
+    checked = _health(loaded, options, quiet or as_json)
+    advice = _advice(loaded, checked)
     if as_json:
         more = {} if checked is None else {"health": _health_json(checked)}
         more |= {} if checked is None or checked.level is None else {"noise_level": level_json(checked.level)}
         more |= {} if checked is None or checked.late is None else {"late_signals": late_json(checked.late)}
-        write_text(Path("-"), dumps(found | table_json(loaded) | more | {"advice": advice_json(told)}))
+        write_text(Path("-"), dumps(found | table_json(loaded) | more | {"advice": advice_json(advice)}))
     elif not quiet:
         sheet = Table(title=loaded.title, show_header=False, title_justify="left")
         for name, value in found.items():
@@ -92,29 +95,29 @@ def run_check(
         if checked is not None:
             _show_health(checked, Screen())
             say_all(Screen(), tell_level(checked.level, late=checked.late))
-        show_advice(told, Screen())
+        show_advice(advice, Screen())
     return 1 if found["epochs_with_too_few_rows"] else 0
 
 
-def _health(loaded: Loaded, asked: CheckOptions, quiet: bool) -> Checked | None:
+def _health(loaded: Loaded, options: CheckOptions, quiet: bool) -> Checked | None:
     """Return the health of the stations of a file and write its table and picture; None with --no-solve."""
-    if not asked.solve:
-        if asked.out is not None or asked.plot is not None:
+    if not options.solve:
+        if options.out is not None or options.plot is not None:
             raise InvalidProblem(
                 "table and picture need the fixes", "--no-solve", "remove it, or remove --out and --plot"
             )
         return None
-    by = grouping_of(asked.by, "--by")
+    by = grouping_of(options.by, "--by")
     # Stations may be faulty here, so the default is a loss that reduces the weight of gross errors.
-    method = asked.method or "cauchy"
+    method = options.method or "cauchy"
     Method.parse(method)  # reject a misspelt method before the work starts
     checked = _check_health(loaded, method, by, quiet)
     # If the user requests a table or picture that cannot be made, raise; the summary alone would only print the reason.
-    for path, option in ((asked.out, "--out"), (asked.plot, "--plot")):
+    for path, option in ((options.out, "--out"), (options.plot, "--plot")):
         if path is not None and checked.health is None:
             raise InvalidProblem(checked.why, option, "remove this option")
     if checked.health is not None:
-        _write_health(checked.health, loaded.title, asked)
+        _write_health(checked.health, loaded.title, options)
     return checked
 
 
@@ -133,6 +136,7 @@ def _advice(loaded: Loaded, checked: Checked | None) -> tuple[Advice, ...]:
 
 
 def _spell(value: Any) -> str:
+    """Return a value of the summary as text."""
     if isinstance(value, dict):
         return ", ".join(f"{key}: {inner}" for key, inner in value.items()) or "none"
     if isinstance(value, list):
@@ -146,8 +150,8 @@ def summary(loaded: Loaded) -> dict[str, Any]:
     """Return the summary of a file: names with numbers or words."""
     problem = loaded.problem
     alone = separable(problem)
-    apart = _apart(problem, alone)
-    redundancy = degrees_of_freedom(apart)
+    batch = _apart(problem, alone)
+    redundancy = degrees_of_freedom(batch)
     parts = _components(problem)
     flattest, widest = _spread(_station_positions(problem, alone))
     # If epochs are fixed separately, report the epoch whose stations are closest to a line or plane.
@@ -167,7 +171,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
         "absent_rows": int((problem.weight == 0.0).sum()),
         "constraints": [constraint.name for constraint in problem.constraints],
         "biases": {bias.name: _bias(loaded, bias) for bias in problem.biases},
-        "unknowns": int(present_unknowns(apart).max()),
+        "unknowns": int(present_unknowns(batch).max()),
         "redundancy": {"least": int(redundancy.min()), "median": float(np.median(redundancy))},
         "epochs_with_too_few_rows": int((redundancy < 0).sum()),
         "groups_of_connected_stations": {"most": int(parts.max(initial=0))},
@@ -190,8 +194,8 @@ def _errors(problem: Problem) -> str:
         sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
         low, high = sigma.min(), sigma.max()
         sizes.append(f"{low:.4g} {unit}" if low == high else f"{low:.4g} to {high:.4g} {unit}")
-    lasts = f"unknown for each {span}" if span else "noise of each epoch"
-    return f"{' and '.join(sizes)}, {lasts}" if sizes else "none"
+    duration = f"unknown for each {span}" if span else "noise of each epoch"
+    return f"{' and '.join(sizes)}, {duration}" if sizes else "none"
 
 
 def _bias(loaded: Loaded, bias: Bias) -> str:
@@ -214,14 +218,14 @@ def _bias(loaded: Loaded, bias: Bias) -> str:
 
 
 def _apart(problem: Problem, alone: bool) -> Problem:
-    """Return the epochs as a batch if they are fixed separately, else the run as a batch of one."""
+    """Return the epochs as a batch if they are fixed separately (`alone`), else the run as a batch of one."""
     return (by_epoch(problem) if alone else problem).flat()
 
 
 def _components(problem: Problem) -> Array:
     """Return the number of connected groups of stations in each epoch (k,); 0 without differences.
 
-    Differences and ratios connect the two stations of a row.
+    Differences and ratios connect the two stations of a row. The rows A-B and C-D give two groups, for instance.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -244,7 +248,10 @@ def _components(problem: Problem) -> Array:
 
 
 def _station_positions(problem: Problem, alone: bool) -> Array:
-    """Return the station positions of each epoch (k, s, d), or of a whole run (1, k s, d), m."""
+    """Return the station positions, m: of each epoch (k, s, d), or of all epochs of a run together (1, k s, d).
+
+    `alone` is whether the epochs are fixed separately.
+    """
     position = problem.stations.position
     return position if alone else position.reshape(1, -1, position.shape[-1])
 
@@ -266,8 +273,9 @@ def _spread(position: Array) -> tuple[Array, Array]:
 class Checked:
     """Result of the health check.
 
-    health: health of the stations, or None. why: reason for None. vectors: parameters of the solved epochs (k, size).
-    level: common factor of the noise. late: late rows.
+    health: health of the stations, or None. why: reason for None. vectors: parameters of the epochs (k, size), NaN for
+    an epoch without a fix; None if the epochs are not solved. level: common factor of the noise, or None. late: late
+    rows, or None.
     """
 
     health: Health | None
@@ -278,7 +286,10 @@ class Checked:
 
 
 def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
-    """Return the health of the stations of a file. Each epoch is fixed separately."""
+    """Return the health of the stations of a file, or the reason for which it cannot be computed.
+
+    Each epoch is fixed separately by `method`, and `by` groups the errors. Raise InvalidProblem for a wrong option.
+    """
     problem = loaded.problem
     if problem.epochs < 2:
         return Checked(None, "station health needs several epochs; the file has one")
@@ -298,6 +309,10 @@ def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
 
 
 def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
+    """Return the health of the stations from a fix of each epoch.
+
+    `method` is the method of the fixes, and `by` groups the errors. Raise InvalidProblem if no epoch has a fix.
+    """
     batch, alone = batch_of(loaded.problem), separable(loaded.problem)
     if not batch.layout.size:
         count = batch.batch_shape[0]
@@ -378,9 +393,12 @@ def _show_health(checked: Checked, console: Console) -> None:
         table.add_column(name, justify="right")
     seen = health.least_noticed
     for i in _order(health):
-        cells = [str(health.count[i]), _told(health.bias[i], health.bias_error[i], health.units[i])]
-        cells += [_told(1e6 * health.scale[i], 1e6 * health.scale_error[i], "")] if scaled else []
-        cells += [_told(health.noise[i], health.noise_error[i], health.units[i]), f"{health.outliers[i]:.1%}"]
+        cells = [str(health.count[i]), _with_sigma_or_dash(health.bias[i], health.bias_error[i], health.units[i])]
+        cells += [_with_sigma_or_dash(1e6 * health.scale[i], 1e6 * health.scale_error[i], "")] if scaled else []
+        cells += [
+            _with_sigma_or_dash(health.noise[i], health.noise_error[i], health.units[i]),
+            f"{health.outliers[i]:.1%}",
+        ]
         cells += [f"{seen[i]:.3g} {health.units[i]}".strip()]
         cells += [f"{health.suspect[i]:.1%}"] if suspected else []
         table.add_row(health.names[i], *cells)
@@ -392,24 +410,25 @@ def _show_health(checked: Checked, console: Console) -> None:
 
 
 def _order(health: Health) -> Array:
-    """Return the order of the groups: by unit, then by decreasing bias."""
+    """Return the order of the groups of the health table (n,): by unit, then by decreasing bias."""
     bias = np.where(np.isfinite(health.bias), health.bias, np.inf)
     # Only biases with the same unit can be compared.
     return np.lexsort((-bias, np.array(health.units)))
 
 
-def _told(value: float, error: float, unit: str) -> str:
+def _with_sigma_or_dash(value: float, error: float, unit: str) -> str:
+    """Return a value with its standard deviation `error` and unit as text; "-" for a missing value."""
     if not np.isfinite(value):
         return "-"
     return with_sigma(float(value), float(error), unit).strip()
 
 
-def _write_health(health: Health, title: str, asked: CheckOptions) -> None:
+def _write_health(health: Health, title: str, options: CheckOptions) -> None:
     """Write the requested table and picture of the health: both, or none if one fails."""
     with replace_together():
-        if asked.out is not None:
-            write_table(asked.out, _health_columns(health))
-        if asked.plot is not None:
+        if options.out is not None:
+            write_table(options.out, _health_columns(health))
+        if options.plot is not None:
             from optloc.show.pictures.residuals import plot_health
 
-            write_picture(plot_health(health, title=title), asked.plot)
+            write_picture(plot_health(health, title=title), options.plot)

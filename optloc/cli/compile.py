@@ -52,36 +52,44 @@ _FEW, _MANY = 40, 500
 
 
 def problem_of(kind: str, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
-    """Return a problem of one kind with five rows and without measured values."""
+    """Return a problem of one kind with five rows and without measured values.
+
+    `more` are further arguments of `assemble`, such as a frame.
+    """
     rows = {"b": np.zeros(5, dtype=int)} if kind in ("tdoa", "fdoa", "groa") else {}
     return assemble(stations, measured(kind, a=np.arange(1, 6), sigma=1.0, **rows), **more)
 
 
 def _simulated(kind: str, count: int, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
+    """Return `count` simulated problems of one kind as a batch, with the target at `TARGET`."""
     problem = problem_of(kind, stations, **more)
     place = np.append(TARGET, np.zeros(problem.layout.size - 3)) if problem.layout.size > 3 else TARGET
     return simulate(problem, place, 1, count).flat()
 
 
 def _fix_ranges() -> None:
+    """Compile the fixes from ranges, and from differences of ranges."""
     problem = _simulated("tdoa", _FEW)
     solve(problem, "gtrs+lsr")
     prepare(problem_of("tdoa"), "gtrs+lsr")(problem.z[0])
 
 
 def _fix_tapes() -> None:
+    """Compile the fixes from rows of every kind."""
     problem = _simulated("groa", _FEW)
     solve(problem, "gtrs+lsr")
     prepare(problem_of("groa"), "gtrs+lsr")(problem.z[0])
 
 
 def _filter() -> None:
+    """Compile the update of a filter."""
     require_code(filter_scan)
     scan = simulate(assemble(_STATIONS, measured("range", a=np.arange(6), sigma=1.0)), TARGET, 1)
     ekf(scan, TARGET, np.eye(3))
 
 
 def _refine() -> None:
+    """Compile the refinement of single epochs and of runs."""
     solve(_simulated("elevation", _MANY), "lsr", start=np.tile(TARGET, (_MANY, 1)))
     # a run with the emission times of its two epochs as unknowns
     rows = measured("toa", a=np.tile(np.arange(6), 2), epoch=np.repeat([0, 1], 6), sigma=1.0)
@@ -100,11 +108,13 @@ def _solve_without_machine_code(problem: Problem) -> Fix:
 
 
 def _prove() -> None:
+    """Compile the proofs of fixes of single epochs."""
     problem = _simulated("tdoa", _FEW)
     certify(problem, _solve_without_machine_code(problem))
 
 
 def _prove_runs() -> None:
+    """Compile the proofs of runs: a static target with moving stations, and a moving target."""
     speed = np.random.default_rng(1).normal(0.0, 100.0, _STATIONS.shape)  # any velocities serve
     # Longer than the runs whose proof is the same as for one epoch.
     epochs = SHORT // len(_STATIONS) + 1
@@ -118,12 +128,14 @@ def _prove_runs() -> None:
 
 
 def _prove_scaled() -> None:
+    """Compile the proofs with an unknown propagation speed."""
     problem = with_bias(problem_of("toa"), "speed", form="scale", per="kind", sigma=0.05)
     found = simulate(problem, np.append(TARGET, np.zeros(problem.layout.size - 3)), 1, _FEW).flat()
     certify(found, _solve_without_machine_code(found))
 
 
 def _search() -> None:
+    """Compile the searches for starts."""
     velocity = np.broadcast_to([50.0, -30.0, 0.0], _STATIONS.shape)
     moving = Stations(_STATIONS[None], tuple("ABCDEF"), velocity=velocity[None])
     # Three search domains: the whole space, a shell around the Earth at one height, and a bounded enclosure.
@@ -134,6 +146,7 @@ def _search() -> None:
 
 
 def _cover() -> None:
+    """Compile the covering of regions by cells."""
     # a target inside the array, and a target so far outside that infinity is as likely
     for times in (1.0, 1000.0):
         problem = simulate(problem_of("tdoa"), times * TARGET, 1)
@@ -208,12 +221,13 @@ def make(tell: Callable[[int, int], None] = lambda done, total: None) -> list[st
     """Compile all kernels that are not on disk yet, in two processes, and return the kernels that are still missing.
 
     The callback `tell` receives the number of compiled functions and the approximate total. The list is empty if all
-    kernels compile.
+    kernels are on disk at the end.
     """
     names = [name for name, part in parts().items() if part.missing()]
     known, done, lock = dict[str, set[str]](), set[str](), Lock()
 
     def follow(name: str) -> None:
+        """Compile a part in a child process, and count the functions that it reports."""
         for line in _run_part(name, shared):
             word, _, rest = line.partition(" ")
             with lock:
@@ -236,7 +250,10 @@ def environment(**more: str) -> dict[str, str]:
 
 
 def _run_part(name: str, variables: Mapping[str, str]) -> Iterator[str]:
-    """Start a process that compiles a part, and yield the lines that it writes. It ends with this process."""
+    """Start a process that compiles a part, and yield the lines that it writes.
+
+    The process ends with this process. `variables` are added to its environment.
+    """
     # -P: do not import from the current folder.
     command = [sys.executable, "-P", "-m", "optloc.cli.compile", name]
     with subprocess.Popen(  # noqa: S603  (this interpreter, and this module)
@@ -260,6 +277,7 @@ def _compile(part: KernelPart) -> None:
     print("all", *names_in(part.package), flush=True)  # noqa: T201
 
     def tell(name: str, done: bool) -> None:
+        """Write the name of a compiled function."""
         if done:
             try:
                 print("made", name, flush=True)  # noqa: T201
@@ -292,6 +310,10 @@ def run_compile(check: bool, as_json: bool, *, quiet: bool = False) -> int:
 
 
 def _print(found: dict[str, int], place: str | None) -> None:
+    """Print the state of the parts.
+
+    `found` is the number of missing kernels by part, and `place` the folder of the machine code; None without a folder.
+    """
     screen = Screen()
     if place is None:
         reason = "no folder can be written" if enabled() else "numba is not installed, or disabled"

@@ -1,4 +1,8 @@
-"""The commands ``optloc crlb`` and ``optloc simulate``: Cramer-Rao bounds, status shares and simulated data."""
+"""The commands ``optloc crlb`` and ``optloc simulate``: Cramer-Rao bounds, status shares and simulated data.
+
+In the functions, `at` and `velocity` are texts with the true position and velocity of the target. With `geodetic`, the
+position is latitude, longitude and height. `limits` is the extent of a map as text.
+"""
 
 from __future__ import annotations
 
@@ -74,17 +78,17 @@ def run_crlb(
         for slot in problem.layout.shared
     ]
     over_time = courses(problem, truth)
-    told = reliability_of(problem, truth)
+    found = reliability_of(problem, truth)
     if plot is not None:
         _draw(plot, loaded, over_time)
     if as_json:
         course = [] if over_time is None else _course_records(*over_time)
-        made = {"file": loaded.source, "bounds": rows, "reliability": reliability_json(told), "course": course}
+        made = {"file": loaded.source, "bounds": rows, "reliability": reliability_json(found), "course": course}
         write_text(Path("-"), dumps(made))
     elif not quiet:
         console = Screen()
         console.print(_bound_table(loaded, rows))
-        show_reliability(told, console)
+        show_reliability(found, console)
         if over_time is not None:
             console.print(_course_table(*over_time, loaded))
     return 0 if all(np.isfinite(row["sigma"]).all() for row in rows) and rows else 1
@@ -96,7 +100,7 @@ def _has_unknown_position(problem: Problem) -> bool:
 
 
 def _solve(file: Path) -> Array:
-    """Return the estimate of a file that has measured values."""
+    """Return the estimate (..., size) of a file that has measured values."""
     from optloc.solvers.solution import solve
 
     problem = read(file).problem
@@ -104,6 +108,10 @@ def _solve(file: Path) -> Array:
 
 
 def _draw(path: Path, loaded: Loaded, over_time: tuple[Course, Course | None] | None) -> None:
+    """Draw the bound against time; raise InvalidProblem if the epochs share no unknowns.
+
+    `over_time` is the result of `courses`.
+    """
     from optloc.show.pictures import plot_course
 
     if over_time is None:
@@ -114,6 +122,10 @@ def _draw(path: Path, loaded: Loaded, over_time: tuple[Course, Course | None] | 
 
 
 def _record(label: str, slot: Slot, covariance: Array) -> dict[str, Any]:
+    """Return the bound of one unknown as a record: standard deviations, SI, and for positions the 95 % ellipse, m.
+
+    `label` is the epoch, `slot` the unknown, and `covariance` the bound of its entries.
+    """
     record = {"epoch": label, "unknown": slot.name, "entries": slot.entries, "unit": slot.unit}
     record |= {"sigma": np.sqrt(np.diagonal(covariance))}
     if not slot.name.startswith("position"):
@@ -122,6 +134,7 @@ def _record(label: str, slot: Slot, covariance: Array) -> dict[str, Any]:
 
 
 def _bound_table(loaded: Loaded, rows: list[dict[str, Any]]) -> Table:
+    """Return the table of the bounds for the screen, with at most 30 lines."""
     table = Table(title=f"{loaded.title}: Cramer-Rao bound", title_justify="left")
     for name in ("epoch", "unknown", "sigma", "95 % ellipse, m (semi-axes)"):
         table.add_column(name)
@@ -140,8 +153,8 @@ def _sigmas(row: dict[str, Any], loaded: Loaded) -> str:
     unit, size = loaded.bias_unit(row["unknown"], row["unit"])
     named = zip(row["entries"][:_MEMBERS], row["sigma"] / abs(size), strict=False)
     lines = [f"{entry}: {v:.4g} {unit}".strip(": ") for entry, v in named]
-    more = len(row["entries"]) - _MEMBERS
-    return "\n".join([*lines, *([f"... and {more} more"] if more > 0 else [])])
+    n_hidden = len(row["entries"]) - _MEMBERS
+    return "\n".join([*lines, *([f"... and {n_hidden} more"] if n_hidden > 0 else [])])
 
 
 # Unnoticed errors.
@@ -151,11 +164,11 @@ _MAX_EPOCHS = 100
 
 
 def reliability_of(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) -> Reliability | None:
-    """Return the smallest station errors that a search for suspects notices: the worst values over the epochs.
+    """Return the smallest station errors that a search for suspects detects: the worst values over the epochs.
 
     `problem` is one problem, or a batch (...) of separate epochs. `x` (..., size) are the points of linearisation;
-    points that are not finite are left out. `suspects` were left out by the fix. The result is None without a finite
-    point.
+    points that are not finite are left out. At most 100 epochs are evaluated. `suspects` were left out by the fix. The
+    result is None without a finite point.
     """
     flat = problem.flat()
     places = np.broadcast_to(x, (*problem.batch_shape, flat.layout.size)).reshape(-1, flat.layout.size)
@@ -164,8 +177,8 @@ def reliability_of(problem: Problem, x: Array, suspects: Sequence[Suspect] = ())
     items = items[np.unique(np.linspace(0, len(items) - 1, min(len(items), _MAX_EPOCHS)).astype(int))]
     worst: dict[str, tuple[float, float]] = {}
     for i in items:
-        told = reliability(flat.take(np.array([i])), places[i], suspects)
-        for name, least, shift in zip(told.names, told.least, told.shift, strict=True):
+        found = reliability(flat.take(np.array([i])), places[i], suspects)
+        for name, least, shift in zip(found.names, found.least, found.shift, strict=True):
             before = worst.get(name, (0.0, 0.0))
             worst[name] = (max(before[0], float(least)), max(before[1], float(shift)))
     if not worst:
@@ -174,30 +187,31 @@ def reliability_of(problem: Problem, x: Array, suspects: Sequence[Suspect] = ())
     return Reliability(tuple(worst), least, shift)
 
 
-def reliability_json(told: Reliability | None) -> list[dict[str, Any]]:
+def reliability_json(found: Reliability | None) -> list[dict[str, Any]]:
     """Return the smallest noticed errors as records, in SI units and radians; infinite values are null."""
-    if told is None:
+    if found is None:
         return []
-    parts = zip(told.names, told.least, told.shift, strict=True)
+    parts = zip(found.names, found.least, found.shift, strict=True)
     return [{"channel": name, "least_noticed": least, "moves_position": shift} for name, least, shift in parts]
 
 
-def show_reliability(told: Reliability | None, console: Console) -> None:
+def show_reliability(found: Reliability | None, console: Console) -> None:
     """Print the smallest noticed errors, sorted by decreasing displacement of the position."""
-    if told is None:
+    if found is None:
         return
     table = Table(title="Errors that go unnoticed", title_justify="left")
     for name in ("of all rows", "up to", "moves the position, m"):
         table.add_column(name, justify="left" if name == "of all rows" else "right")
-    order = np.argsort(-told.shift, kind="stable")
+    order = np.argsort(-found.shift, kind="stable")
     for i in order[:_MEMBERS]:
-        table.add_row(told.names[i], _size(told.names[i], told.least[i]), _length(told.shift[i]))
+        table.add_row(found.names[i], _size(found.names[i], found.least[i]), _length(found.shift[i]))
     if len(order) > _MEMBERS:
         table.add_row("...", "", f"{len(order) - _MEMBERS} more")
     console.print(table)
 
 
 def _size(name: str, value: float) -> str:
+    """Return an error of the rows `name`, such as "tdoa of A", as text with a unit; `value` is in SI units."""
     if not np.isfinite(value):
         return "any size"
     quantity = MODELS[name.partition(" of ")[0]].quantity
@@ -207,6 +221,7 @@ def _size(name: str, value: float) -> str:
 
 
 def _length(value: float) -> str:
+    """Return a displacement, m, as text; an infinite displacement is "anywhere"."""
     return f"{value:.4g}" if np.isfinite(value) else "anywhere"
 
 
@@ -214,9 +229,10 @@ def _length(value: float) -> str:
 
 
 def courses(problem: Problem, truth: Array) -> tuple[Course, Course | None] | None:
-    """Return the bound against time with biases unknown and, if the problem has biases, known.
+    """Return the bound against time with unknown biases, and with known biases.
 
-    The result is None for a single epoch, a batch, no shared unknowns, or too many.
+    The second is None unless the problem has biases and targets. The result is None for a single epoch, a batch, no
+    shared unknowns, or too many.
     """
     n, k = problem.layout.n_shared, problem.epochs
     if k == 1 or not 0 < n <= _UNKNOWNS or has_correlated_epochs(problem) or problem.batch_shape:
@@ -230,7 +246,10 @@ def courses(problem: Problem, truth: Array) -> tuple[Course, Course | None] | No
 
 
 def _course_records(course: Course, known: Course | None) -> list[dict[str, Any]]:
-    """Return records of the bound at a few times: epochs, time (s), and sigma by unknown, also with biases known."""
+    """Return records of the bound at about ten times: epochs, time (s), and sigma by unknown (SI).
+
+    `course` is the bound with unknown biases, and `known` the bound with known biases, or None.
+    """
     labels = course.layout.labels()
     return [
         {
@@ -244,11 +263,12 @@ def _course_records(course: Course, known: Course | None) -> list[dict[str, Any]
 
 
 def _sigmas_at(course: Course, i: int) -> Array:
+    """Return the standard deviations (n,) of the n shared unknowns at the time with index `i`, SI."""
     return np.asarray(np.sqrt(np.diagonal(course.covariance[i])))
 
 
 def _sparse_indices(course: Course) -> list[int]:
-    """Return the indices of a few times, denser at the start."""
+    """Return the indices of about ten times, denser at the start."""
     wanted = np.geomspace(1, course.counts[-1], _LINES)
     # Geometric spacing, since a bound falls with the root of the number of epochs.
     return [int(i) for i in np.unique(np.searchsorted(course.counts, np.floor(wanted)))]
@@ -262,7 +282,11 @@ def _shown_unknowns(layout: Layout) -> tuple[str, ...]:
 
 
 def _course_table(course: Course, known: Course | None, loaded: Loaded) -> Table:
-    """Return the table of the bound at a few times: root sum of squares of coordinates, root mean square of members."""
+    """Return the table of the bound at about ten times, in the units of the file.
+
+    The table has the root sum of squares of coordinates, and the root mean square of the members of a bias. `course`
+    and `known` are as in `_course_records`.
+    """
     table = Table(title="Bound after the first epochs", title_justify="left")
     for name in ("epochs", "time, s"):
         table.add_column(name, justify="right")
@@ -294,7 +318,11 @@ def run_map(
     geodetic: bool,
     dilution: bool,
 ) -> int:
-    """Write the map of the bound of a file. If epochs are separate, the map is of the first epoch."""
+    """Write the map of the bound of a file. If epochs are separate, the map is of the first epoch.
+
+    With `dilution`, the map shows the dilution of precision instead of the bound, m. `height` is the height of the map
+    as text.
+    """
     if out.suffix.lower() not in (*PICTURES, ".html", ".geojson"):
         advice = "use .png, .svg, .pdf, .geojson or .html"
         raise InvalidProblem(f"maps of type {out.suffix or out.name!r} are unknown", str(out), advice)
@@ -311,25 +339,31 @@ def run_map(
 
 def _of_one_epoch(problem: Problem) -> Problem:
     """Return the first epoch if epochs are separate, else the problem; maps show one epoch."""
-    apart = by_epoch(problem) if separable(problem) else problem
-    return apart.flat().take(np.zeros(1, dtype=int)) if apart.batch_shape else apart
+    batch = by_epoch(problem) if separable(problem) else problem
+    return batch.flat().take(np.zeros(1, dtype=int)) if batch.batch_shape else batch
 
 
 def _grid(
     file: Path, problem: Problem, at: str | None, truth: Array, height: str | None, limits: str | None, points: int
 ) -> tuple[tuple[Array, Array], float]:
-    """Return the coordinates (points,) of a map along both sides, and its height, m."""
+    """Return the coordinates (points,) of a map along both sides, and the height of the map, m.
+
+    The coordinates are in degrees on Earth, else in metres.
+    """
     place = _place(file, problem, at, truth, needed=height is None and problem.dimension == 3)
     x0, x1, y0, y1 = extent(problem, place) if limits is None else _limits(limits, problem)
     return (np.linspace(x0, x1, points), np.linspace(y0, y1, points)), _height(problem, place, height)
 
 
 def _place(file: Path, problem: Problem, at: str | None, truth: Array, *, needed: bool) -> Array | None:
-    """Return the position (1, d) that the user states, or the fix; None if no position is needed."""
+    """Return the position (1, d) that the user states, m, or the fix; None if no position is needed.
+
+    `truth` (size,) has the stated position. Raise InvalidProblem if the file has no fix.
+    """
     sought = [i for i, motion in enumerate(problem.motions) if motion.known is None]
-    names = [slot for slot in problem.layout.shared if slot.name.partition("[")[0] == "position"]
-    if at is not None and len(sought) == 1 and names:
-        return np.asarray(truth[None, names[0].start : names[0].start + names[0].size])
+    positions = [slot for slot in problem.layout.shared if slot.name.partition("[")[0] == "position"]
+    if at is not None and len(sought) == 1 and positions:
+        return np.asarray(truth[None, positions[0].start : positions[0].start + positions[0].size])
     if not needed:
         return None
     from optloc.solvers.solution import solve
@@ -344,6 +378,7 @@ def _place(file: Path, problem: Problem, at: str | None, truth: Array, *, needed
 
 
 def _height(problem: Problem, place: Array | None, height: str | None) -> float:
+    """Return the height of a map, m: stated, else the height of `place` (1, d); 0 in the plane."""
     if problem.dimension == 2:
         return 0.0
     if height is not None:
@@ -353,7 +388,10 @@ def _height(problem: Problem, place: Array | None, height: str | None) -> float:
 
 
 def _limits(text: str, problem: Problem) -> tuple[float, float, float, float]:
-    """Return the limits of a map: least x, greatest x, least y, greatest y. Raise InvalidProblem for invalid limits."""
+    """Return the limits of a map: least x, greatest x, least y, greatest y, in degrees on Earth, else in metres.
+
+    Raise InvalidProblem for invalid limits.
+    """
     earth = problem.frame.geodetic and problem.dimension == 3
     advice = "write west,east,south,north in degrees" if earth else "write least x, greatest x, least y, greatest y"
     values = coordinates(text, "--extent", advice)
@@ -367,6 +405,7 @@ def _limits(text: str, problem: Problem) -> tuple[float, float, float, float]:
 
 
 def _write_map(found: BoundMap, out: Path, title: str, *, dilution: bool) -> None:
+    """Write the map as a picture, GeoJSON or page, by the ending of `out`."""
     from optloc.show.pictures.bound_map import map_geojson, plot_bound_map
 
     ending = out.suffix.lower()
@@ -387,7 +426,12 @@ def _write_map(found: BoundMap, out: Path, title: str, *, dilution: bool) -> Non
 
 
 class Simulated(NamedTuple):
-    """Options of a simulation of fixes: the map, or one position; number of fixes and seed."""
+    """Options of a simulation of fixes.
+
+    out: map to write; None for one position. at, velocity, geodetic: true position and velocity, as options. height,
+    limits: height and extent of the map, as options. trials: number of fixes, None for the default. seed: seed of the
+    random numbers.
+    """
 
     out: Path | None
     at: str | None
@@ -424,6 +468,7 @@ def run_status(file: Path, wanted: Simulated, *, as_json: bool, quiet: bool) -> 
 
 
 def _show_status(found: StatusShares, title: str) -> None:
+    """Print the share of each status as a table, and how often the 95 % region of `ok` fixes has the true position."""
     table = Table(title=f"{title}: status of {found.trials} simulated fixes", title_justify="left")
     table.add_column("status")
     for name in ("share, %", "standard error, %"):
@@ -439,7 +484,7 @@ def _show_status(found: StatusShares, title: str) -> None:
 
 
 def _map_status(file: Path, loaded: Loaded, wanted: Simulated, out: Path) -> None:
-    """Write the map of the share of fixes with the status `ok`."""
+    """Write the map of the share of fixes with the status `ok` to the file `out`; `wanted` has the options."""
     from optloc.show.pictures import plot_status_map, status_geojson
     from optloc.solvers.shares import status_map
 
@@ -465,7 +510,10 @@ def _map_status(file: Path, loaded: Loaded, wanted: Simulated, out: Path) -> Non
 def run_simulate(
     file: Path, truth: str, velocity: str | None, out: Path, *, geodetic: bool, seed: int, trials: int, quiet: bool
 ) -> int:
-    """Simulate measurements, write them as a problem file, and return the exit code."""
+    """Simulate measurements, write them as a problem file, and return the exit code.
+
+    `truth` is the true position as text. With several `trials`, each trial becomes an epoch.
+    """
     from tempfile import TemporaryDirectory
 
     from optloc.files.writer import write_measured
@@ -487,7 +535,11 @@ def run_simulate(
 
 
 def vector(problem: Problem, position: str | None, velocity: str | None, geodetic: bool) -> Array:
-    """Return the true parameters (size,) for a target position; biases have their prior means, the rest is zero."""
+    """Return the true parameters (size,), SI, for a target position; biases have their prior means, the rest is zero.
+
+    `position` and `velocity` are texts with coordinates; None means zero. With `geodetic`, the position is latitude and
+    longitude in degrees, and height. All targets get the same position and velocity.
+    """
     if velocity is not None and all(motion.order == 0 for motion in problem.motions):
         what = "the target of this file does not move"
         raise InvalidProblem(what, "--velocity", 'write motion = "constant_velocity" in the file')

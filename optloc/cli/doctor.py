@@ -73,6 +73,7 @@ def packages() -> list[Package]:
 
 
 def _or_none(of: Any, name: str) -> Any:
+    """Return `of(name)` for an installed package, None for a missing package."""
     try:
         return of(name)
     except PackageNotFoundError:
@@ -112,29 +113,32 @@ def machine_code() -> dict[str, Any]:
 
 
 def advice(found: list[Package], code: dict[str, Any]) -> list[MissingPackage]:
-    """Return the missing packages with their install commands, packages that all users need first."""
-    told = [
+    """Return the missing packages with their install commands, packages that all users need first.
+
+    `found` are the packages that optloc uses, and `code` is the state of the machine code.
+    """
+    missing = [
         MissingPackage(f"{one.name} >= {one.least}", "everything", f"pip install '{one.name}>={one.least}'")
         for one in found
         if not one.extra and one.state != "ok"
     ]
     if not found:
-        told.append(MissingPackage("the installed package", "versions, extras", "pip install ."))
+        missing.append(MissingPackage("the installed package", "versions, extras", "pip install ."))
     if not code["parts"]:
-        told.append(MissingPackage("machine code", "speed, about 1000 times", "unset NUMBA_DISABLE_JIT"))
+        missing.append(MissingPackage("machine code", "speed, about 1000 times", "unset NUMBA_DISABLE_JIT"))
     elif not all(code["parts"].values()):
         lacking = [name for name, there in code["parts"].items() if not there]
-        told.append(MissingPackage("machine code", ", ".join(lacking), "optloc compile"))
+        missing.append(MissingPackage("machine code", ", ".join(lacking), "optloc compile"))
     for extra in dict.fromkeys(one.extra for one in found if one.extra and one.state != "ok"):
         names = [one.name for one in found if one.extra == extra and one.state != "ok"]
-        told.append(MissingPackage(", ".join(names), f"the extra {extra}", f"pip install 'optloc[{extra}]'"))
-    return told
+        missing.append(MissingPackage(", ".join(names), f"the extra {extra}", f"pip install 'optloc[{extra}]'"))
+    return missing
 
 
 def doctor(as_json: Json = False, verbose: Verbose = False) -> None:
     """Print versions, machine, machine code on disk, missing packages and the commands that install them."""
     found, code = packages(), machine_code()
-    told = {
+    report = {
         "optloc": {"version": _or_none(version, "optloc"), "folder": str(Path(__file__).resolve().parents[1])},
         "python": {"version": platform.python_version(), "executable": sys.executable},
         "machine": machine(),
@@ -144,20 +148,21 @@ def doctor(as_json: Json = False, verbose: Verbose = False) -> None:
         "advice": [asdict(one) for one in advice(found, code)],
     }
     if as_json:
-        typer.echo(dumps(told))
+        typer.echo(dumps(report))
     else:
-        _show(told)
+        _show(report)
 
 
-def _show(told: dict[str, Any]) -> None:
-    screen, here, code = Screen(), told["machine"], told["machine_code"]
-    say(screen, f"optloc {told['optloc']['version'] or '(not installed)'} in {told['optloc']['folder']}")
-    say(screen, f"Python {told['python']['version']}: {told['python']['executable']}")
+def _show(report: dict[str, Any]) -> None:
+    """Print the report as lines and a table."""
+    screen, here, code = Screen(), report["machine"], report["machine_code"]
+    say(screen, f"optloc {report['optloc']['version'] or '(not installed)'} in {report['optloc']['folder']}")
+    say(screen, f"Python {report['python']['version']}: {report['python']['executable']}")
     say(screen, f"{here['system']}; {here['usable']} of {here['processors']} processors are usable")
     for name, value in here["settings"].items():
         say(screen, f"{name}={value}")
     table = Table("package", "version", "needed", "for", "state")
-    for one in told["packages"]:
+    for one in report["packages"]:
         needed = f">= {one['least']}" if one["least"] else "any"
         table.add_row(one["name"], one["version"] or "-", needed, one["extra"] or "all", one["state"])
     screen.print(table)
@@ -165,8 +170,8 @@ def _show(told: dict[str, Any]) -> None:
         say(screen, f"Machine code for {code['made_for']} is stored in {code['folder'] or 'no folder'}")
         for name, there in code["parts"].items():
             say(screen, f"  {'yes' if there else 'no ':3} {name}")
-    if told.get("datasets", {}).get("folder"):
-        say(screen, f"Data sets in {told['datasets']['folder']}: {', '.join(told['datasets']['there']) or 'none'}")
-    say(screen, "Nothing is missing." if not told["advice"] else "Missing:")
-    for one in told["advice"]:
+    if report.get("datasets", {}).get("folder"):
+        say(screen, f"Data sets in {report['datasets']['folder']}: {', '.join(report['datasets']['there']) or 'none'}")
+    say(screen, "Nothing is missing." if not report["advice"] else "Missing:")
+    for one in report["advice"]:
         say(screen, f"  {one['missing']} ({one['used_for']}): {one['command']}")

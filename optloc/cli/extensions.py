@@ -94,6 +94,7 @@ def extensions() -> tuple[Extension, ...]:
 
 
 def _found() -> Iterator[Extension]:
+    """Yield the extension of each neighbour that is installed."""
     for name in NEIGHBOURS:
         if find_spec(name) is not None:
             yield import_module(f"{name}.extension").EXTENSION

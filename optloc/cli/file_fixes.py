@@ -21,7 +21,7 @@ from optloc.problem.epochs import separable
 from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
-from optloc.show import columns as told
+from optloc.show import columns as tables
 from optloc.show.columns import Columns, fix_detail, level_covariance, records
 from optloc.show.formats.marks import Results
 
@@ -45,7 +45,7 @@ class FileFixes:
     fix : Fix
         A batch of the epochs in order; one fix without batch axes if the epochs share unknowns.
     columns : dict of str to array
-        Table with one row for each epoch and target.
+        Table with one row for each epoch and target; metres, seconds and degrees.
     reweighted : bool
         Whether the method changed the weights of rows.
     seen : Observability, optional
@@ -95,6 +95,7 @@ def fix_epochs(loaded: Loaded, method: str, quiet: bool) -> tuple[Fix, bool]:
     reweighted, order, stages = False, [], {}
 
     def parts() -> Iterator[Fix]:
+        """Yield the fixes of batches of epochs with equal structure, with their labels."""
         nonlocal reweighted
         groups = epoch_groups(loaded.problem)
         _release_memory()
@@ -133,6 +134,7 @@ def _is_reweighted(fix: Fix, problem: Problem) -> bool:
 
 
 def _log_stages(fix: Fix) -> None:
+    """Log the time of each stage of a method."""
     for stage in fix.stages:
         LOG.info("%s: %.3g ms%s", stage.name, 1e3 * stage.seconds, f", {stage.detail}" if stage.detail else "")
 
@@ -153,7 +155,7 @@ def fix_columns(loaded: Loaded, fix: Fix, first: int | None) -> Columns:
     motions, n = loaded.problem.motions, 1 if first is None else len(fix)
     # A file with known targets only (a calibration) has one row for each target.
     shown = [i for i, m in enumerate(motions) if m.known is None] or range(len(motions))
-    return told.fix_columns(
+    return tables.fix_columns(
         fix,
         targets=[(i, state_names(i, len(motions), motions[i].order)) for i in shown],
         labels=lambda target, spread: _labels(loaded, n, first, target, spread),
@@ -163,7 +165,11 @@ def fix_columns(loaded: Loaded, fix: Fix, first: int | None) -> Columns:
 
 
 def _labels(loaded: Loaded, n: int, first: int | None, target: int, spread: bool) -> Columns:
-    """Return the columns epoch, time and target of all rows."""
+    """Return the columns epoch, time and target of the rows of one target.
+
+    `n` is the number of fixes, and `first` the epoch of the first fix; None for a whole run. `spread` is whether a run
+    has one row for each epoch.
+    """
     k = loaded.problem.epochs
     part = slice(0, k) if first is None else slice(first, first + n)
     if first is None and not spread:
@@ -212,7 +218,10 @@ def fixes_json(found: FileFixes) -> dict[str, Any]:
 
 
 def _unnoticed_errors(fix: Fix, found: FileFixes, groups: Sequence[EpochGroup], item: int) -> dict[str, Any]:
-    """Return the station errors that the search for suspects would not notice; empty without a search."""
+    """Return the station errors that the search for suspects would not detect; empty without a search.
+
+    `groups` are the epochs by structure, and `item` is the number of the fix.
+    """
     if fix.explanations is None or not fix.answered:
         return {}
     from optloc.cli.crlb import reliability_json, reliability_of

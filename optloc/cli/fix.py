@@ -88,7 +88,12 @@ def run_fix(
     allow: tuple[Status, ...] = (),
     table: ColumnHints | None = None,
 ) -> int:
-    """Fix a problem file or a table under more constraints, write and print the result, and return the exit code."""
+    """Fix a problem file or a table under more constraints, write and print the result, and return the exit code.
+
+    `more` has the constraints by the name of their option. `noise`, `rescale`, `late` and `explain` are options that
+    estimate the noise and the causes of misfits. `allow` has the statuses that give exit code 0 as well as ok. `table`
+    has the column hints of a table; None for a problem file.
+    """
     on_output = geojson_path is not None and str(geojson_path) == "-"
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
@@ -111,18 +116,18 @@ def run_fix(
     level = rescaled or _level_of(found)
     used = rescaled is not None or bool(np.any(found.fix.has(Status.RESCALED)))
     signals = signals or _late_of(found)
-    told = advice_for_fixes(found)
+    advice = advice_for_fixes(found)
     other = _explain(found, method) if explain else None
     if as_json:
         noise_found: dict[str, Any] = {} if levels is None else {"noise": _levels_json(levels)}
         noise_found |= {} if level is None else {"noise_level": level_json(level, used)}
         noise_found |= {"explained": explained_json(found, other)} if explain else {}
         noise_found |= {} if signals is None else {"late_signals": late_json(signals, late)}
-        write_text(Path("-"), dumps(fixes_json(found) | {"advice": advice_json(told)} | noise_found))
+        write_text(Path("-"), dumps(fixes_json(found) | {"advice": advice_json(advice)} | noise_found))
     else:
         console = Screen(stderr=on_output)
         show(found, console)
-        show_advice(told, console)
+        show_advice(advice, console)
         if explain:
             _show_explained(found, other, console)
         if level is not None or signals is not None:
@@ -167,6 +172,7 @@ def show(found: FileFixes, console: Console) -> None:
 
 
 def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
+    """Print one fix in full: table, biases, suspects, undetected errors and alternatives."""
     sheet = fix_sheet(fix, found.columns, found.loaded.title)
     rows = [*sheet.rows, *([("azimuths", found.loaded.azimuths)] if found.loaded.azimuths else [])]
     table = Table(title=sheet.title, show_header=False, title_justify="left", min_width=60)
@@ -195,6 +201,7 @@ def _show_sheet(sheet: FixSheet | None, console: Console) -> None:
 
 
 def _colour(verdict: Status) -> str:
+    """Return the colour of a status: green for ok, yellow for other answers, red for no answer."""
     return _GOOD if verdict is Status.OK else _CARE if verdict in ANSWERED else _BAD
 
 
@@ -208,6 +215,7 @@ def _show_unnoticed(found: FileFixes, fix: Fix, console: Console) -> None:
 
 
 def _show_many(found: FileFixes, console: Console) -> None:
+    """Print the number of fixes by status, and the reasons of the first ten fixes that are not ok."""
     columns = found.columns
     sheet = count_sheet(columns, f"{found.loaded.title}: ")
     table = Table(title=sheet.title, title_justify="left")
@@ -232,7 +240,10 @@ _AUTO = "auto"
 
 
 def _estimate_noise(loaded: Loaded, by: str | None) -> Loaded:
-    """Return the file with noise estimated for each station, pair or kind; unchanged if `by` is None."""
+    """Return the file with noise estimated for each station, pair or kind; unchanged if `by` is None.
+
+    `by` is the value of the option: a grouping, a grouping with "+epoch", or "auto".
+    """
     if by is None:
         return loaded
     grouping, plus, more = by.partition("+")
@@ -259,8 +270,12 @@ def _common_level(problem: Problem) -> CommonLevel:
 _BY_CHANCE = 0.01
 
 
-def _are_refuted(fix: Fix) -> bool:
-    """Return whether a batch has more refuted fixes than chance explains, or a search for suspects was requested."""
+def _needs_causes(fix: Fix) -> bool:
+    """Return whether a common cause of the misfits must be searched, such as a wrong noise or late signals.
+
+    The answer is yes if chance does not explain the number of fixes that the data reject. It is also yes if the method
+    searched for suspects. The probability of each rejection by chance is `P_MISFIT`.
+    """
     from scipy.special import bdtrc
 
     refuted = np.isin(fix.code, [Status.MISFIT, Status.CONTRADICTORY])
@@ -269,15 +284,15 @@ def _are_refuted(fix: Fix) -> bool:
 
 
 def _level_of(found: FileFixes) -> CommonLevel | None:
-    """Return the common factor of the stated noise; None for few fixes, and if the fixes are not refuted."""
-    if not found.apart or len(found.fix) < SEVERAL or not _are_refuted(found.fix):
+    """Return the common factor of the stated noise; None for few fixes, or if no cause must be searched."""
+    if not found.apart or len(found.fix) < SEVERAL or not _needs_causes(found.fix):
         return None
     return common_level_at(batch_of(found.loaded.problem), found.fix.x)
 
 
 def _late_of(found: FileFixes) -> LateSignals | None:
-    """Return the late rows of a file at its fixes; None for few fixes, and if the fixes are not refuted."""
-    if not found.apart or len(found.fix) < SEVERAL or not _are_refuted(found.fix):
+    """Return the late rows of a file at its fixes; None for few fixes, or if no cause must be searched."""
+    if not found.apart or len(found.fix) < SEVERAL or not _needs_causes(found.fix):
         return None
     x, answered = found.fix.x, found.fix.answered
     kept = answered & np.isfinite(x).all(-1)
@@ -287,30 +302,33 @@ def _late_of(found: FileFixes) -> LateSignals | None:
 def tell_level(
     level: CommonLevel | None, used: bool = False, late: LateSignals | None = None, late_used: bool = False
 ) -> tuple[str, ...]:
-    """Return sentences on the stated noise and on late rows, each with the option that helps."""
-    said = []
+    """Return sentences on the stated noise and on late rows, each with the option that helps.
+
+    `used` and `late_used` are whether the fixes already use the common factor, and the loss for late rows.
+    """
+    texts = []
     if late is not None and late.sentence:
         # If rows are late, do not report the noise: larger noise explains late rows badly, and no other rows well.
         use = "this is used" if late_used else "--late-from-data fixes with this loss"
-        said.append(late.sentence if late.alike else f"{late.sentence}: {use}")
+        texts.append(late.sentence if late.alike else f"{late.sentence}: {use}")
     elif late_used:
-        said.append("no late rows are found")
-    if level is not None and level.suspect and (used or not said):
-        said.append(f"{level.sentence}: {'this is used' if used else '--rescale-noise uses it'}")
+        texts.append("no late rows are found")
+    if level is not None and level.suspect and (used or not texts):
+        texts.append(f"{level.sentence}: {'this is used' if used else '--rescale-noise uses it'}")
     elif level is not None and level.alone:
-        said.append(f"{level.sentence}: see `optloc check`, or --noise-from-data auto")
+        texts.append(f"{level.sentence}: see `optloc check`, or --noise-from-data auto")
     elif used:
-        said.append("the noise is used as stated: no common factor explains the residuals better")
-    return tuple(said)
+        texts.append("the noise is used as stated: no common factor explains the residuals better")
+    return tuple(texts)
 
 
 def late_json(late: LateSignals, used: bool = False) -> dict[str, Any]:
-    """Return the result for late rows as a JSON value."""
+    """Return the result for late rows as a JSON value; `used` is whether the fixes use the loss for late rows."""
     return asdict(late) | {"method": late.method, "used": used and late.share > 0.0, "sentence": late.sentence}
 
 
 def level_json(level: CommonLevel, used: bool = False) -> dict[str, Any]:
-    """Return the result for the stated noise as a JSON value."""
+    """Return the result for the stated noise as a JSON value; `used` is whether the fixes use the common factor."""
     return asdict(level) | {"used": used and level.suspect, "sentence": level.sentence}
 
 
@@ -398,13 +416,19 @@ def show_advice(found: tuple[Advice, ...], console: Console) -> None:
 
 
 def _explain(found: FileFixes, method: str) -> FileFixes | None:
-    """Return the fixes with the most likely error as an additional unknown; None if no error explains the misfit."""
+    """Return the fixes with the most likely error as an additional unknown; None if no error explains the misfit.
+
+    `found` are the fixes without it, and `method` is the method of both.
+    """
     larger = explained_at(found.loaded.problem, found.fix.x)
     return None if larger is None else fix_file(replace(found.loaded, problem=larger), method, True)
 
 
 def explained_json(found: FileFixes, other: FileFixes | None) -> dict[str, Any] | None:
-    """Return the explaining error and the fixes with it as a JSON value; None without an explanation."""
+    """Return the error that explains the misfit, and the fixes with it as an unknown, as a JSON value.
+
+    `found` are the fixes without this error and `other` the fixes with it; without `other` the result is None.
+    """
     if other is None:
         return None
     moved = {f"change_{axis}": other.columns[axis] - found.columns[axis] for axis in _axes(found)}
@@ -412,7 +436,7 @@ def explained_json(found: FileFixes, other: FileFixes | None) -> dict[str, Any] 
 
 
 def _show_explained(found: FileFixes, other: FileFixes | None, console: Console) -> None:
-    """Print the fix without and with the explaining error as an unknown."""
+    """Print the fixes without the explaining error (`found`), and with it as an unknown (`other`)."""
     if other is None:
         say(console, "No single error explains the misfit.")
         return
@@ -429,8 +453,8 @@ def _show_explained(found: FileFixes, other: FileFixes | None, console: Console)
         for axis in _axes(found):
             one, two = (each.columns[axis][i] for each in (found, other))
             sigmas = [each.columns[f"sigma_{axis}"][i] for each in (found, other)]
-            told = [with_sigma(value, sigma, "m") for value, sigma in zip((one, two), sigmas, strict=True)]
-            table.add_row(f"{axis}{owner}", *told, f"{two - one:+.4g} m")
+            texts = [with_sigma(value, sigma, "m") for value, sigma in zip((one, two), sigmas, strict=True)]
+            table.add_row(f"{axis}{owner}", *texts, f"{two - one:+.4g} m")
     console.print(table)
     if rows < len(found.columns["x"]):
         say(console, f"{len(found.columns['x']) - rows} more positions changed; --json prints all.")
@@ -442,4 +466,5 @@ def _show_explained(found: FileFixes, other: FileFixes | None, console: Console)
 
 
 def _axes(found: FileFixes) -> list[str]:
+    """Return the names of the coordinates in the table of fixes, such as ["x", "y"]."""
     return [axis for axis in "xyz" if axis in found.columns]

@@ -38,10 +38,12 @@ EXAMPLES = (
 
 
 def _option(metavar: str, text: str, *flags: str) -> Any:
+    """Return an option of the panel "A table" with a value; `metavar` is the name of the value in the help."""
     return typer.Option(*flags, metavar=metavar, help=text, rich_help_panel=PANEL)
 
 
 def _flag(text: str, flag: str) -> Any:
+    """Return an option of the panel "A table" without a value."""
     return typer.Option(flag, help=text, rich_help_panel=PANEL)
 
 
@@ -148,21 +150,22 @@ _FLAGS = ("average", "still", "turned")
 
 def takes_table(command: Callable[..., None]) -> Callable[..., None]:
     """Return a command with the table options. The command receives their values as one mapping, `given`."""
-    own = signature(command, eval_str=True)
+    command_signature = signature(command, eval_str=True)
 
     @wraps(command)
     def taking(**values: Any) -> None:
+        """Run the command with the values of the table options as one mapping."""
         given = {name: values.pop(name) for name in _OPTIONS}
         named = {"columns": columns_of(given["columns"]), "ignore": tuple(given["ignore"] or ())}
         command(**values, given=given | named)
 
-    kept = [entry for entry in own.parameters.values() if entry.name != "given"]
-    more = [
+    kept = [entry for entry in command_signature.parameters.values() if entry.name != "given"]
+    table_options = [
         Parameter(name, Parameter.KEYWORD_ONLY, default=False if name in _FLAGS else None, annotation=kind)
         for name, kind in _OPTIONS.items()
     ]
-    taking.__signature__ = own.replace(parameters=[*kept, *more])  # type: ignore[attr-defined]  # what typer reads
-    taking.__annotations__ = {entry.name: entry.annotation for entry in (*kept, *more)}
+    taking.__signature__ = command_signature.replace(parameters=[*kept, *table_options])  # type: ignore[attr-defined]  # what typer reads
+    taking.__annotations__ = {entry.name: entry.annotation for entry in (*kept, *table_options)}
     return taking
 
 
@@ -214,14 +217,17 @@ def columns_of(pairs: Sequence[str] | None) -> dict[str, str]:
 
 
 def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, quiet: bool) -> int:
-    """Convert a file, print its interpretation before writing, and return the exit code."""
+    """Convert a file, print its interpretation before writing, and return the exit code.
+
+    `given` has the values of the table options by field of `ColumnHints`. Without `out`, nothing is written.
+    """
     from optloc.cli.output import Screen, dumps, write_text
     from optloc.files.convert import convert as written, interpret_table
     from optloc.files.table_import import ColumnHints
 
-    told, console = ColumnHints(**given), Screen(quiet=quiet or as_json)
+    hints, console = ColumnHints(**given), Screen(quiet=quiet or as_json)
     if out is None:
-        table_problem = interpret_table(file, told)
+        table_problem = interpret_table(file, hints)
         _print_interpretation(table_problem, console)
         table_problem.read()
         say_next(
@@ -231,7 +237,7 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
         if as_json:
             write_text(Path("-"), dumps(table_problem.as_read))
         return 0
-    found = written(file, out, told, tell=lambda table_problem: _print_interpretation(table_problem, console))
+    found = written(file, out, hints, tell=lambda table_problem: _print_interpretation(table_problem, console))
     if as_json:
         write_text(Path("-"), dumps(_json(found)))
     elif found.loaded is None:
@@ -241,8 +247,8 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
         say_next(console, f'{out} is a table of stations. In a problem file, write [stations] file = "{out.name}".')
     else:
         problem = found.loaded.problem
-        held = f"{problem.count} rows of {problem.epochs} epochs at {problem.stations.count} stations"
-        say_next(console, f"{', '.join(map(str, found.written))}: {held}. Next: optloc check {out}.")
+        summary = f"{problem.count} rows of {problem.epochs} epochs at {problem.stations.count} stations"
+        say_next(console, f"{', '.join(map(str, found.written))}: {summary}. Next: optloc check {out}.")
     return 0
 
 
@@ -265,6 +271,7 @@ def _print_interpretation(table_problem: TableProblem, console: Console) -> None
 
 
 def _json(found: Converted) -> dict[str, Any]:
+    """Return the result of a conversion as a JSON value."""
     about: dict[str, Any] = {"files": [str(path) for path in found.written], "notes": list(found.notes)}
     if found.loaded is None:
         return about
@@ -276,18 +283,18 @@ def _json(found: Converted) -> dict[str, Any]:
 # Tables instead of problem files.
 
 
-def table_told(file: Path, given: Mapping[str, Any]) -> ColumnHints | None:
-    """Return the column hints of a table, None for a problem file.
+def table_hints(file: Path, given: Mapping[str, Any]) -> ColumnHints | None:
+    """Return the column hints of a table; None for a problem file.
 
-    Raise InvalidProblem for a problem file with hints.
+    `given` has the values of the table options. Raise InvalidProblem for a problem file with such options.
     """
     from optloc.files.table_import import ColumnHints
 
     if file.suffix.lower() in _TABLES or _YEAR.fullmatch(file.suffix.lower()):
         return ColumnHints(**given)
-    said = [name for name, value in given.items() if value]
-    if said:
-        flag = {"what": "--as", "columns": "--column"}.get(said[0], f"--{said[0].replace('_', '-')}")
+    stated = [name for name, value in given.items() if value]
+    if stated:
+        flag = {"what": "--as", "columns": "--column"}.get(stated[0], f"--{stated[0].replace('_', '-')}")
         what = f"this option is for a table; {file.name} is a problem file"
         raise InvalidProblem(
             what, flag, "write the setting in the file, or name a table with the ending .csv, .json or .parquet"
@@ -297,7 +304,7 @@ def table_told(file: Path, given: Mapping[str, Any]) -> ColumnHints | None:
 
 def read_problem(
     file: Path,
-    told: ColumnHints | None,
+    hints: ColumnHints | None,
     more: Mapping[str, ConstraintTable] | None = None,
     *,
     values: bool = True,
@@ -307,15 +314,15 @@ def read_problem(
     """Return the content of a problem file with more constraints, or of a table with column hints.
 
     For a table, print its interpretation, unless `quiet`; with `on_error`, print to standard error. `values` requires
-    measured values in a problem file. `told` has the column hints of a table; it is None for a problem file.
+    measured values in a problem file. `hints` has the column hints of a table; it is None for a problem file.
     """
     from optloc.files.reader import read
 
-    if told is None:
+    if hints is None:
         return read(file, values=values, more=more)
     from optloc.cli.output import Screen
     from optloc.files.convert import interpret_table
 
-    table_problem = interpret_table(file, told)
+    table_problem = interpret_table(file, hints)
     _print_interpretation(table_problem, Screen(quiet=quiet, stderr=on_error))
     return table_problem.read(more or {})

@@ -20,11 +20,11 @@ from optloc.cli.output import Screen, dumps
 from optloc.models import MODELS
 
 # A table may wrap over this number of console widths. Longer entries are easier to read as paragraphs.
-_WRAPS = 4
+_MAX_WRAPS = 4
 
 
 def run_list(what: str, as_json: bool) -> int:
-    """Print one of the tables."""
+    """Print the list with the name `what`, and return the exit code."""
     known = lists()
     if what not in known:
         raise InvalidProblem(f"there is no list of {what!r}", "list", nearest(what, known))
@@ -45,7 +45,7 @@ def _print(rows: Rows, console: Console) -> None:
     texts = {name: " ".join([name, *(row.get(name, "") for row in rows)]) for name in names}
     words = {name: max(map(len, text.split())) for name, text in texts.items()}
     least = max(len(row[title]) for row in rows) + sum(words.values()) + 3 * len(names) + 4
-    if sum(widths) > _WRAPS * console.width or least > console.width:
+    if sum(widths) > _MAX_WRAPS * console.width or least > console.width:
         for row in rows:
             console.print(Text.assemble((row[title], "bold"), f": {row['summary']}"), highlight=False)
             for name in (each for each in names if each != "summary" and row.get(each)):
@@ -79,6 +79,7 @@ def describe(title: str, table: Mapping[str, Any]) -> Rows:
 
 
 def _spell(value: Any) -> str | None:
+    """Return a value of an entry as text; None for code and other values that are not text or numbers."""
     if isinstance(value, bool | int | float | str):
         return str(value)
     if isinstance(value, tuple | list | frozenset | set | Mapping) and all(isinstance(v, str | int) for v in value):
@@ -87,6 +88,7 @@ def _spell(value: Any) -> str | None:
 
 
 def _summary(entry: Any) -> str:
+    """Return the summary of an entry: its text, its field `summary`, or the first line of its docstring."""
     if isinstance(entry, str):
         return entry
     return str(
@@ -95,12 +97,13 @@ def _summary(entry: Any) -> str:
 
 
 def registry(title: str, place: str) -> Callable[[], Rows]:
-    """Return a function that lists a table or the result of a function.
+    """Return a function that returns the rows of a list, for a table or the result of a function.
 
-    It imports `place`, "module:name", when called.
+    `title` is the name of the first column. The function imports `place`, "module:name", when it is called.
     """
 
     def rows() -> Rows:
+        """Return the rows of the list."""
         module, _, name = place.partition(":")
         found = getattr(import_module(module), name)
         return describe(title, found() if callable(found) else found)
@@ -109,6 +112,7 @@ def registry(title: str, place: str) -> Callable[[], Rows]:
 
 
 def _kinds() -> Rows:
+    """Return the rows of the list of measurement kinds."""
     return [
         {
             "kind": name,
@@ -123,6 +127,7 @@ def _kinds() -> Rows:
 
 
 def _solvers() -> Rows:
+    """Return the rows of the list of solvers, and of the installed back ends."""
     from optloc.solvers.back_ends import backends
     from optloc.solvers.methods import SOLVERS
 

@@ -178,7 +178,7 @@ def _print_bad_input(sentence: str) -> int:
 
 
 def _usage(error: Any) -> str:
-    """Return a sentence on wrong arguments that refers to the help."""
+    """Return a sentence on wrong arguments that names similar options, or refers to the help."""
     path = error.ctx.command_path if getattr(error, "ctx", None) is not None else "optloc"
     close = ", ".join(getattr(error, "possibilities", None) or ())
     if close:
@@ -192,7 +192,7 @@ def example(*lines: str) -> str:
 
 
 def start_log(wanted: bool) -> bool:
-    """Send the log of optloc to standard error; `wanted` includes all steps."""
+    """Send the log of optloc to standard error, and return `wanted`: whether all steps are logged, or only warnings."""
     log = logging.getLogger("optloc")
     # A process may run several commands (tests), each with a different standard error.
     for old in [handler for handler in log.handlers if handler.name == "command line"]:
@@ -281,9 +281,10 @@ Verbose = Annotated[
 
 
 def complete(what: str) -> Callable[[str], list[str]]:
-    """Return a shell completion with the names in one table of `optloc list`."""
+    """Return a shell completion with the names in the table `what` of `optloc list`."""
 
     def found(incomplete: str) -> list[str]:
+        """Return all names of the table; the shell selects the names that fit."""
         # Each Tab starts a process, so imports wait until a list is needed.
         from optloc.cli.listing import lists
 
@@ -293,7 +294,10 @@ def complete(what: str) -> Callable[[str], list[str]]:
 
 
 def name_in(what: str, text: str, *flags: str) -> Any:
-    """Return an option, or an argument without flags, whose value is a name in one table of `optloc list`."""
+    """Return an option, or an argument without flags, whose value is a name in the table `what` of `optloc list`.
+
+    `text` is the help, and `flags` are the spellings of the option.
+    """
     given: dict[str, Any] = {"metavar": "NAME", "autocompletion": complete(what)}
     words = f"{text}; see [bold]optloc list {what}[/bold]."
     return typer.Option(*flags, help=words, **given) if flags else typer.Argument(help=words, **given)
@@ -356,7 +360,7 @@ def coordinates(
     Raises
     ------
     InvalidProblem
-        The message names the option `where`.
+        For other texts; the message names the option `where` and has the text `advice`.
     """
     try:
         values = [float(part) for part in text.split(",")]

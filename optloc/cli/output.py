@@ -58,7 +58,7 @@ def say_all(console: Console, sentences: Sequence[str]) -> None:
 
 
 def dumps(value: Any) -> str:
-    """Return strict JSON."""
+    """Return a value as strict JSON text; numbers that are not finite become null."""
     # JSON has no NaN or infinity: `plain` replaces them by null, so a remaining one is a programming error.
     return json.dumps(plain(value), allow_nan=False, indent=2)
 
@@ -137,7 +137,11 @@ def write_picture(figure: Figure, path: Path) -> None:
 
 @contextmanager
 def bar(title: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
-    """Yield a function that advances a progress bar on standard error; only terminals show the bar."""
+    """Yield a function that advances a progress bar on standard error; only terminals show the bar.
+
+    The argument of the function is the number of finished steps since its last call. `total` is the number of all
+    steps.
+    """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     # Standard output may be piped, so the bar is on standard error. One step needs no bar.
@@ -162,6 +166,7 @@ def meter(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]]:
         task = progress.add_task(title, total=None)
 
         def tell(done: int, total: int) -> None:
+            """Store the finished and the total steps, and update the bar."""
             known[:] = done, total
             progress.update(task, completed=done, total=total)
 
@@ -185,6 +190,7 @@ def line(quiet: bool) -> Iterator[Callable[[str], None]]:
         task = progress.add_task("", total=None)
 
         def tell(text: str) -> None:
+            """Store the text, and update the line."""
             known[0] = text
             progress.update(task, description=text)
 

@@ -32,7 +32,11 @@ def run_separate(
     as_json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Separate the emitters of each epoch of a file; return exit code 1 if a status is not ok."""
+    """Separate the emitters of each epoch of a file; return exit code 1 if a status is not ok.
+
+    `detection` is the probability that an emitter gives a row in a channel. `false` is the mean number of false rows in
+    a channel and epoch. `emitters` is their number as text, or "auto". `region` is the search region as text.
+    """
     loaded = read(file)
     problem = loaded.problem
     clutter = evenly(problem, detection, false)
@@ -49,7 +53,10 @@ def run_separate(
 
 
 def _count(text: str, rows: int) -> int | None:
-    """Return the number of emitters, at most the number of rows; None for "auto"."""
+    """Return the number of emitters from the text of the option; None for "auto".
+
+    Raise InvalidProblem for another text, or for more emitters than `rows`, the number of rows.
+    """
     if text == "auto":
         return None
     if not (text.isascii() and text.isdigit() and len(text) < _DIGITS and int(text) <= rows):
@@ -59,6 +66,7 @@ def _count(text: str, rows: int) -> int | None:
 
 
 def _region(problem: Problem, text: str | None) -> tuple[Any, Any] | None:
+    """Return the least and the greatest coordinates (d,) of the search region, m; None without a region."""
     if text is None:
         return None
     lower, colon, upper = text.partition(":")
@@ -69,6 +77,7 @@ def _region(problem: Problem, text: str | None) -> tuple[Any, Any] | None:
 
 
 def _record(loaded: Loaded, found: Emitters) -> dict[str, Any]:
+    """Return the emitters of an epoch as a JSON value: metres, costs as chi-square."""
     return {
         "status": found.status.label,
         "reason": found.reason,
@@ -95,7 +104,7 @@ def _record(loaded: Loaded, found: Emitters) -> dict[str, Any]:
 
 
 def _names(loaded: Loaded, wanted: Any) -> list[str]:
-    """Return the rows as text: kind, stations and row number."""
+    """Return the rows with the numbers `wanted` as text: kind, stations and row number."""
     stations, words = loaded.problem.stations.names, list[str]()
     for block, start in zip(loaded.problem.rows, loaded.problem.starts, strict=True):
         for i in np.asarray(wanted)[(np.asarray(wanted) >= start) & (np.asarray(wanted) < start + block.count)]:
@@ -105,6 +114,7 @@ def _names(loaded: Loaded, wanted: Any) -> list[str]:
 
 
 def _show(loaded: Loaded, label: str, found: Emitters) -> None:
+    """Print the emitters of an epoch as a table."""
     table = Table(title=f"{loaded.title} {label}".strip(), title_justify="left", caption_justify="left")
     for heading in ("", "position (m)", "sigma (m)", "rows", "chi-square", "status"):
         table.add_column(heading)
@@ -115,6 +125,7 @@ def _show(loaded: Loaded, label: str, found: Emitters) -> None:
 
 
 def _rows(found: Emitters) -> Iterator[tuple[str, ...]]:
+    """Yield the cells of the table: one row for each emitter, then for each ghost."""
     for i, fix in enumerate(found.fixes):
         rows, status = found.rows(i), Status(int(fix.code)).label
         yield (
@@ -130,4 +141,5 @@ def _rows(found: Emitters) -> Iterator[tuple[str, ...]]:
 
 
 def _numbers(values: Any) -> str:
+    """Return lengths in metres as text with one decimal."""
     return ", ".join(f"{value:.1f}" for value in values)

@@ -113,10 +113,12 @@ def _has_expected_status(found: FileFixes, name: str) -> bool:
 
 
 def _fix(name: str, quiet: bool) -> FileFixes:
+    """Return the fixes of a shipped problem."""
     return fix_file(read(shipped_problems()[name]), "auto", quiet)
 
 
 def _explain(text: str, console: Console) -> None:
+    """Print a text in Markdown."""
     shown: Any = Markdown(text, hyperlinks=False)
     console.print(shown)
     console.print()
@@ -146,7 +148,10 @@ def _draw(found: FileFixes, plot: Path | None, quiet: bool) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Starter:
-    """A starter: a summary of one line, the text of the file, and the commands that accept the file."""
+    """A starter problem file.
+
+    summary: one line. text: text of the file. commands: commands that accept the file.
+    """
 
     summary: str
     text: str
@@ -239,7 +244,7 @@ def _compose(kind: str, model: Model) -> str:
 
 
 def _measurements(block: Rows, sigma: float, names: list[str]) -> list[str]:
-    """Return the lines of a measurement table."""
+    """Return the lines of a measurement table in a problem file; `sigma` is in the SI unit of the kind."""
     model = MODELS[block.kind]
     known = ", ".join(UNITS[model.quantity])  # type: ignore[index]  # models hold known quantities only
     unit = SI_UNIT[model.quantity]  # type: ignore[index]  # as above

@@ -48,7 +48,7 @@ from optloc.tracking.updates import filter_of, reweighted
 
 _CLEAN = {"ok", "started", "starting"}
 # Seconds between two additions to the growing table: each addition takes a millisecond, the time of ten scans.
-_LATE = 0.1
+_MIN_GAP = 0.1
 # Largest number of reasons on the screen; --out has all of them.
 _REASONS = 10
 
@@ -88,7 +88,7 @@ class TargetTrack:
     """The track of one target so far.
 
     name: name of the target. problem: run of the target. labels: labels of the epochs (k). entries: results of the
-    scans.
+    scans until now, at most k.
     """
 
     name: str
@@ -114,8 +114,9 @@ def run_track(
 ) -> int:
     """Track the targets of a file or a table, write the requested files, and return the exit code.
 
-    After an error, the track so far is written first. A killed run leaves a CSV file next to `out`, with ``.partial``
-    appended to its name. At most the rows of the last tenth of a second are missing.
+    `wanted` has the options of the tracks. After an error, the track so far is written first. A killed run leaves a CSV
+    file next to `out`, with ``.partial`` appended to its name. At most the rows of the last tenth of a second are
+    missing.
     """
     dynamics = dynamics_of(wanted)
     # Reject wrong names before reading the file.
@@ -132,7 +133,7 @@ def run_track(
                 start = _start(one.problem, dynamics, wanted)
                 for entry in tracked(one.problem, dynamics, update, start=start, rules=wanted.rules):
                     one.entries.append(entry)
-                    _append_new_rows(growing, ones, _LATE)
+                    _append_new_rows(growing, ones, _MIN_GAP)
                     advance(1)
     # After an interrupt or an error, write the results so far.
     finally:
@@ -149,9 +150,12 @@ def run_track(
     return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
 
 
-def _append_new_rows(table: GrowingTable | None, ones: list[TargetTrack], late: float = 0.0) -> None:
-    """Append the missing entries to the table, unless the last addition is less than `late` seconds ago."""
-    if table is None or monotonic() - table.when < late:
+def _append_new_rows(table: GrowingTable | None, ones: list[TargetTrack], min_gap: float = 0.0) -> None:
+    """Append the missing entries to the table, unless the last addition is less than `min_gap` seconds ago.
+
+    `table` has the rows of all targets one after the other; None means that no table is written. `ones` are the tracks.
+    """
+    if table is None or monotonic() - table.when < min_gap:
         return
     first = table.rows
     for one in ones:
@@ -174,7 +178,8 @@ def dynamics_of(wanted: TrackOptions) -> Dynamics:
 def rules(gate: float, gap: float | None, loss: str | None = None) -> Rules:
     """Return the tracking rules; raise InvalidProblem for a gate or a gap that is not positive.
 
-    A loss expects gross errors, so the starting fixes then use the method `robust`, which finds them too.
+    `gate` is in standard deviations, and `gap` is the longest time without rows, s. A loss expects gross errors, so the
+    starting fixes then use the method `robust`, which finds them too.
     """
     for value, where in ((gate, "--gate"), (gap, "--gap")):
         if value is not None and not value > 0.0:
@@ -183,7 +188,10 @@ def rules(gate: float, gap: float | None, loss: str | None = None) -> Rules:
 
 
 def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
-    """Yield name, run and epoch labels of each unknown target of a file."""
+    """Yield name, run and epoch labels of each unknown target of a file, for one track each.
+
+    Raise InvalidProblem for a file that a track cannot use, such as a file with priors or without times.
+    """
     problem, source = loaded.problem, loaded.source
     if problem.priors:
         what = f"the file has a prior of {problem.priors[0].name!r}; a track cannot use priors"
@@ -193,13 +201,13 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
     if problem.epochs > 1 and not np.isfinite(loaded.times).all():
         raise InvalidProblem("a track needs the time of each epoch", source, "give the measurements a column 'time'")
     # With `own_epochs`, each epoch belongs to one target; otherwise targets share epochs, and rows name their target.
-    own = np.array(loaded.targets)[problem.epoch] if loaded.own_epochs else None
+    target_of_row = np.array(loaded.targets)[problem.epoch] if loaded.own_epochs else None
     names = dict.fromkeys(loaded.targets)
     for i, name in enumerate(names):
         if not loaded.own_epochs and problem.motions[i].known is not None:
             continue
         target = np.concatenate([rows.target for rows in problem.rows])
-        kept = own == name if own is not None else target == i
+        kept = target_of_row == name if target_of_row is not None else target == i
         epochs = np.unique(problem.epoch[kept])
         again = np.flatnonzero(np.diff(loaded.times[epochs]) <= 0.0)
         if len(again):
@@ -217,7 +225,7 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
 
 
 def _start(problem: Problem, dynamics: Dynamics, wanted: TrackOptions) -> State | None:
-    """Return the initial state of the options, or None."""
+    """Return the initial state of the options, SI; None without an initial state."""
     if (wanted.start is None) != (wanted.sigma is None):
         lacking = "--start" if wanted.start is None else "--start-sigma"
         raise InvalidProblem("an initial state needs numbers and standard deviations", lacking, "give both or neither")
@@ -261,7 +269,7 @@ def track_columns(one: TargetTrack) -> Columns:
 
 
 def _map(loaded: Loaded, ones: list[TargetTrack]) -> str:
-    """Return an HTML page with the map of all tracks."""
+    """Return an HTML page with the map of the tracks `ones`."""
     from optloc.show.map import degrees, sentence, spots
     from optloc.show.page import track_page
 
@@ -274,8 +282,8 @@ def _map(loaded: Loaded, ones: list[TargetTrack]) -> str:
     place = degrees(problem, position) if problem.frame.geodetic else position
     names = [f"{name} {label}" if len(ones) > 1 else label for name, label, _ in entries]
     text = [
-        sentence(name, e.label, *told)
-        for name, (_, _, e), told in zip(names, entries, zip(place, sigma, strict=True), strict=True)
+        sentence(name, e.label, *values)
+        for name, (_, _, e), values in zip(names, entries, zip(place, sigma, strict=True), strict=True)
     ]
     return track_page(problem, spots(problem, position, covariance, clean, text), loaded.title)
 
@@ -284,14 +292,15 @@ def _write(
     loaded: Loaded,
     ones: list[TargetTrack],
     columns: Columns,
-    places: tuple[Path | None, Path | None, Path | None],
+    paths: tuple[Path | None, Path | None, Path | None],
     table: GrowingTable | None,
 ) -> None:
     """Write the requested table, picture and page.
 
-    A growing CSV file already has all rows and only gets its final name.
+    `paths` are the files of the table, the picture and the page. A growing CSV file already has all rows and only gets
+    its final name. For another format, the growing file is discarded.
     """
-    out, plot, html = places
+    out, plot, html = paths
     if table is not None and is_csv(table.path):
         table.file.finish()
         LOG.info("wrote %s: %d rows", table.path, table.rows)
@@ -325,10 +334,10 @@ def _show(loaded: Loaded, columns: Columns, console: Console) -> None:
         colour = "green" if label in _CLEAN else "yellow"
         table.add_row(target, Text(label, style=colour), str(count), median, nis)
     console.print(table)
-    told = np.flatnonzero(columns["reason"] != "")
-    for i in told[:_REASONS]:
+    with_reason = np.flatnonzero(columns["reason"] != "")
+    for i in with_reason[:_REASONS]:
         say(
             console, f"{columns['target'][i]}, {columns['time'][i]:g} s: {columns['status'][i]}: {columns['reason'][i]}"
         )
-    if len(told) > _REASONS:
-        say(console, f"... and {len(told) - _REASONS} more; --out writes all")
+    if len(with_reason) > _REASONS:
+        say(console, f"... and {len(with_reason) - _REASONS} more; --out writes all")

@@ -80,7 +80,7 @@ def pack(place: Path, out: Path) -> Path:
         f"Requires-Dist: llvmlite=={manifest.llvmlite}",
     ]
     platform = get_platform().replace("-", "_").replace(".", "_")
-    told = ["Wheel-Version: 1.0", "Generator: optloc", "Root-Is-Purelib: false", f"Tag: {tag}-{tag}-{platform}"]
+    wheel_lines = ["Wheel-Version: 1.0", "Generator: optloc", "Root-Is-Purelib: false", f"Tag: {tag}-{tag}-{platform}"]
     with TemporaryDirectory() as folder_:
         root = Path(folder_)
         inside, info = root / INSTALLED, root / f"optloc_kernels-{number}.dist-info"
@@ -90,7 +90,7 @@ def pack(place: Path, out: Path) -> Path:
             copyfile(file, inside / file.name)
         (inside / FILE).write_text(dumps(manifest._asdict()), encoding="utf-8")
         (info / "METADATA").write_text("\n".join(about) + "\n", encoding="utf-8")
-        (info / "WHEEL").write_text("\n".join(told) + "\n", encoding="utf-8")
+        (info / "WHEEL").write_text("\n".join(wheel_lines) + "\n", encoding="utf-8")
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -94,7 +94,10 @@ def orbit(one: Ephemeris, system: str, t: Array) -> tuple[Array, Array]:
 
 
 def turned(position: Array, seconds: Array) -> Array:
-    """Return positions (n, 3) in ECEF axes that are `seconds` (n,) later (Sagnac correction)."""
+    """Return positions (n, 3), m, in ECEF axes that are `seconds` (n,) later (Sagnac correction).
+
+    The Earth turns while a signal travels, so the axes at the reception differ from the axes at the transmission.
+    """
     angle = EARTH_RATE * seconds
     x, y = position[:, 0], position[:, 1]
     turn_x, turn_y = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)

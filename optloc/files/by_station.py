@@ -1,6 +1,8 @@
 """Measurements of `optloc.locate`, assigned to stations or, for time differences, to pairs of stations.
 
-Accepted forms: mappings, arrays, series, and data frames with a column for each station or a row for each value.
+Accepted forms: mappings, arrays, series, and data frames with a column for each station or a row for each value. In the
+functions, `word` is the name of the argument of `locate`, such as "tdoa". `names` are the names of the stations, and
+`reference` is the station to which time differences refer. In shapes, m is the number of values of an epoch.
 """
 
 from __future__ import annotations
@@ -39,7 +41,11 @@ _ENDS = Cache[list[tuple[int, int]]](256)
 
 
 class StationValues(NamedTuple):
-    """Values (..., m), the key of each value (a station or a pair), the unit in a column name, and row labels."""
+    """Values of an argument.
+
+    values: values (..., m), in the unit given. keys: the station, or the pair of stations, of each value. unit: the
+    unit in a column name, or None. labels: the epochs of the rows, or None.
+    """
 
     values: Array
     keys: list[Any]
@@ -48,7 +54,11 @@ class StationValues(NamedTuple):
 
 
 def station_values(word: str, given: Any, names: Sequence[str], reference: str | None) -> StationValues:
-    """Return values with the station numbers of each: (station, -1), or a pair for time differences."""
+    """Return the values of an argument `given`, with the numbers of the stations of each value as keys.
+
+    A key is (station, -1), or a pair of numbers for time differences. `word` is the name of the argument. Values of the
+    reference station relative to itself are left out. Raise InvalidProblem for other forms of values.
+    """
     if reference is not None and reference not in names:
         raise no_station(reference, "reference", names)
     first = names[0] if reference is None else reference
@@ -99,11 +109,15 @@ def _with_names(given: Any) -> Any:
 
 
 def _all_ends(word: str, keys: Sequence[Any], names: Sequence[str], reference: str) -> list[tuple[int, int]]:
+    """Return the station numbers of each key, as `_ends`."""
     return [_ends(word, key, names, reference) for key in keys]
 
 
 def _ends(word: str, key: Any, names: Sequence[str], reference: str) -> tuple[int, int]:
-    """Return the station numbers of a key; the second number is -1 for a single station."""
+    """Return the station numbers of a key; the second number is -1 for a single station.
+
+    A key of time differences is a pair, text such as "B-A", or one station, which is relative to `reference`.
+    """
     pair = key if isinstance(key, tuple) else (key,)
     if word == "tdoa" and len(pair) == 1 and str(key) not in names:
         cut = [(str(key)[:i], str(key)[i + 1 :]) for i, sign in enumerate(str(key)) if sign == "-"]
@@ -120,7 +134,7 @@ def _ends(word: str, key: Any, names: Sequence[str], reference: str) -> tuple[in
 
 
 def _named(word: str, columns: Sequence[Any], names: Sequence[str], reference: str) -> list[Any]:
-    """Return the columns of a data frame that are named after stations or pairs of stations."""
+    """Return the columns of a data frame that are named after stations or pairs of stations, a part of `columns`."""
     found = []
     for column in columns:
         try:
@@ -132,7 +146,7 @@ def _named(word: str, columns: Sequence[Any], names: Sequence[str], reference: s
 
 
 def _wide(word: str, frame: Any, names: Sequence[str], reference: str) -> StationValues:
-    """Return the values of a data frame with one column for each station or pair; raise for any other column."""
+    """Return the values of a data frame with one column for each station or pair; raise InvalidProblem otherwise."""
     columns = list(frame.columns)
     for column in columns:
         try:
@@ -146,7 +160,11 @@ def _wide(word: str, frame: Any, names: Sequence[str], reference: str) -> Statio
 
 
 def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> StationValues:
-    """Return the values of a data frame: one column for each station, or one row for each value."""
+    """Return the values of a data frame: one column for each station, or one row for each value.
+
+    With one row for each value, the columns have the station, the value, and optionally the epoch; the result has one
+    row for each epoch. Raise InvalidProblem for a table without these columns, or with two values of one station.
+    """
     columns = list(frame.columns)
     wide = _named(word, columns, names, reference)
     if wide and len(wide) == len(columns):
@@ -198,14 +216,20 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
 
 
 def _no_dates(word: str, values: Array) -> Array:
-    """Return missing dates instead of missing numbers; raise InvalidProblem if there are numbers as well as dates."""
+    """Return missing dates instead of missing numbers; raise InvalidProblem if any value is a number.
+
+    The other stations have dates, so a station without dates needs missing dates in its column.
+    """
     if not np.isnan(values).all():
         raise InvalidProblem("some times are dates, and others are numbers", word, "give only dates or only numbers")
     return np.full(values.shape, np.datetime64("NaT", "ns"))
 
 
 def _numbers(word: str, values: Any) -> Array:
-    """Return values as an array of numbers or dates; None becomes NaN."""
+    """Return values as an array of numbers or dates; None becomes NaN.
+
+    Raise InvalidProblem for other values, and for dates that are not times of arrival.
+    """
     try:
         array = np.asarray(values)
         if array.dtype.kind in "OSU":

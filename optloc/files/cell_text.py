@@ -1,4 +1,8 @@
-"""Cells of measurement tables as decimals with all digits, dates with time zones, and empty cells."""
+"""Cells of measurement tables as decimals with all digits, dates with time zones, and empty cells.
+
+Recent times in nanoseconds have 19 digits, and a float has 16. So differences of times are computed from decimals. In
+shapes, m is the number of cells that are not empty.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +48,7 @@ class Decimals:
 
     @classmethod
     def of(cls, values: Sequence[Decimal]) -> Decimals:
-        """Return finite numbers as decimals."""
+        """Return finite numbers (m,) as decimals."""
         written = np.array([-int(value.as_tuple().exponent) for value in values], dtype=np.int64)
         places = max(int(written.max(initial=0)), 0)
         units = np.empty(len(values), dtype=object)
@@ -59,7 +63,7 @@ class Decimals:
 
     @classmethod
     def join(cls, parts: Sequence[Decimals]) -> Decimals:
-        """Return the concatenation of columns."""
+        """Return the concatenation of columns, with the largest number of decimals of all columns."""
         places = max(part.places for part in parts)
         units = [part.at_places(places) for part in parts]
         return cls(np.concatenate(units), places, np.concatenate([part.written for part in parts]))
@@ -73,7 +77,7 @@ class Decimals:
         return Decimal(f"{int(self.units[item]) // 10 ** (self.places - written)}E{-written}")
 
     def take(self, pick: Any) -> Decimals:
-        """Return the selected numbers."""
+        """Return the numbers that an index or a mask, `pick`, selects."""
         return Decimals(self.units[pick], self.places, self.written[pick])
 
     def tolist(self) -> list[Decimal]:
@@ -81,11 +85,14 @@ class Decimals:
         return [self[i] for i in range(len(self))]
 
     def at_places(self, places: int) -> Array:
-        """Return the numbers times ten to the power of `places`, which must not be less than their decimals."""
+        """Return the numbers (m,) times ten to the power of `places`, which must not be less than their decimals."""
         return _times_ten(self.units, np.full(len(self), places - self.places))
 
     def number(self, value: Decimal) -> int | None:
-        """Return a number in the units of the column; None if it has more decimals than the column."""
+        """Return `value` times ten to the power of the decimals of the column; None if it has more decimals.
+
+        The result can be compared with `units`.
+        """
         units = value.scaleb(self.places)
         return int(units) if units == units.to_integral_value() else None
 
@@ -111,13 +118,16 @@ class Decimals:
 
 
 def _smallest(units: Array) -> Array:
-    """Return integers as 64 bits if they fit."""
+    """Return integers (m,) as an array of 64 bits if they fit, else as Python integers."""
     most = max(map(abs, units.tolist()), default=0)
     return units.astype(np.int64) if most < _LARGEST else units
 
 
 def _times_ten(units: Array, power: Array) -> Array:
-    """Return integers times ten to the power of `power`, which is not negative."""
+    """Return integers (m,) times ten to the power of `power` (m,), which is not negative.
+
+    The result has Python integers if 64 bits are too few.
+    """
     most = int(power.max(initial=0))
     if not most:
         return units
@@ -132,8 +142,8 @@ def _times_ten(units: Array, power: Array) -> Array:
 NOTHING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "-", "--", "?"})
 # Largest number of decimals of an instant: clocks have at most 20, and a float written in full has about fifty.
 _DIGITS = 60
-# Share of the largest number above which a cell is checked exactly, since floats round.
-_NEARLY = 0.5
+# Share of the largest permitted number above which a cell is checked exactly, since floats round.
+_EXACT_CHECK_SHARE = 0.5
 _DATE = re.compile(r"\d{4}-\d\d?-\d\d?|\d{4}\d\d\d\dT")
 _ZONE = re.compile(r"(Z|[+-]\d\d:?(\d\d)?)$", re.IGNORECASE)
 _FRACTION = re.compile(r"^(.*:\d\d)[.,](\d+)(.*)$")
@@ -158,6 +168,7 @@ def numbers(table: Table, name: str) -> NumberColumn:
 
 
 def _of_cells(cells: list[Decimal | None]) -> NumberColumn:
+    """Return the numbers of cells as a column; cells that are None are left out."""
     row = np.array([row for row, value in enumerate(cells) if value is not None], dtype=np.int64)
     return NumberColumn(Decimals.of([value for value in cells if value is not None]), row)
 
@@ -167,7 +178,10 @@ _PLAIN = r"^-?([0-9]+(\.[0-9]*)?|\.[0-9]+)$"
 
 
 def _plain_numbers(column: Array) -> NumberColumn | None:
-    """Return a text column with plain numbers of at most 64 bits; None for other columns."""
+    """Return a text column with plain numbers of at most 64 bits; None for other columns.
+
+    This function is fast; other columns are read cell by cell.
+    """
     import pyarrow as pa
     from pyarrow import compute as pc
 
@@ -189,12 +203,16 @@ def _plain_numbers(column: Array) -> NumberColumn | None:
     except pa.ArrowInvalid:  # more digits than 64 bits hold
         return None
     # Read values that may be too large cell by cell, so that the error names the cell.
-    if (np.abs(units / 10.0**written) > _NEARLY * LARGEST).any():
+    if (np.abs(units / 10.0**written) > _EXACT_CHECK_SHARE * LARGEST).any():
         return None
     return NumberColumn(Decimals.scaled(units, written), row)
 
 
 def _number(table: Table, name: str, row: int, cell: Any) -> Decimal | None:
+    """Return a cell as a decimal; None for an empty cell. Raise InvalidProblem for other text.
+
+    `name` and `row` are the column and the row of the cell, for messages.
+    """
     text = "" if cell is None else str(cell).strip()
     if text.lower() in NOTHING:
         return None
@@ -232,17 +250,19 @@ def date_seconds(table: Table, name: str, zone: str | None) -> NumberColumn:
         nanoseconds = column[row].astype("datetime64[ns]").astype(np.int64)
         return NumberColumn(Decimals.scaled(nanoseconds, np.full(len(row), 9)), row)
     cells = ["" if cell is None else str(cell).strip() for cell in column.tolist()]
-    held = [row for row, cell in enumerate(cells) if cell.lower() not in NOTHING]
-    bare_rows = [row for row in held if not _ZONE.search(cells[row].partition("T")[2] or cells[row].partition(" ")[2])]
-    if bare_rows and len(bare_rows) < len(held):
+    filled_rows = [row for row, cell in enumerate(cells) if cell.lower() not in NOTHING]
+    bare_rows = [
+        row for row in filled_rows if not _ZONE.search(cells[row].partition("T")[2] or cells[row].partition(" ")[2])
+    ]
+    if bare_rows and len(bare_rows) < len(filled_rows):
         what = "the date has no time zone, but others have one"
         raise InvalidProblem(what, table.where(name, bare_rows[0]), "write the zone in each date, such as Z for UTC")
     if bare_rows and zone is None:
         advice = "use --zone UTC, or the zone of the clocks such as --zone Europe/Rome"
         raise InvalidProblem("the dates have no time zone", table.where(name), advice)
-    parts = [_FRACTION.match(cells[row]) for row in held]
+    parts = [_FRACTION.match(cells[row]) for row in filled_rows]
     # pandas keeps nine decimals only: it reads the whole seconds, and the fraction is added.
-    whole = [part[1] + part[3] if part else cells[row] for part, row in zip(parts, held, strict=True)]
+    whole = [part[1] + part[3] if part else cells[row] for part, row in zip(parts, filled_rows, strict=True)]
     try:
         read = pd.to_datetime(pd.Series(whole, dtype=object), format="ISO8601", utc=not bare_rows)
         read = read.dt.tz_localize(_zone(str(zone))).dt.tz_convert("UTC") if bare_rows else read
@@ -252,10 +272,11 @@ def date_seconds(table: Table, name: str, zone: str | None) -> NumberColumn:
         raise InvalidProblem(f"a date cannot be read ({what})", table.where(name), "use ISO 8601") from None
     fractions = [part[2][:_DIGITS] if part else "" for part in parts]
     values = [Decimal(second) + Decimal(f"0.{more}") for second, more in zip(seconds.tolist(), fractions, strict=True)]
-    return NumberColumn(Decimals.of(values), np.array(held, dtype=np.int64))
+    return NumberColumn(Decimals.of(values), np.array(filled_rows, dtype=np.int64))
 
 
 def _zone(name: str) -> ZoneInfo:
+    """Return a time zone by name; raise InvalidProblem for an unknown name."""
     try:
         return ZoneInfo(name)
     except (ZoneInfoNotFoundError, ValueError, OSError):
@@ -270,7 +291,7 @@ def column_times(roles: Roles, name: str, zone: str | None, told_unit: str | Non
     """
     table = roles.table
     if is_dated(table, name):
-        held, factor = date_seconds(table, name, zone), 1.0
+        values, factor = date_seconds(table, name, zone), 1.0
     else:
         unit = unit_of(name, UNITS["time"])
         if told_unit is not None and told_unit not in UNITS["time"]:
@@ -283,8 +304,8 @@ def column_times(roles: Roles, name: str, zone: str | None, told_unit: str | Non
         unit = told_unit if unit is None else unit
         if unit is None:
             return None
-        held, factor = numbers(table, name), UNITS["time"][unit]
-    if len(held.row) < table.count:
-        empty = int(np.setdiff1d(np.arange(table.count), held.row)[0])
+        values, factor = numbers(table, name), UNITS["time"][unit]
+    if len(values.row) < table.count:
+        empty = int(np.setdiff1d(np.arange(table.count), values.row)[0])
         raise InvalidProblem("the cell is empty", table.where(name, empty), "give the time, or remove the row")
-    return held.values.floats() * factor
+    return values.values.floats() * factor

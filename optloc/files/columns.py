@@ -66,6 +66,10 @@ class Role:
 
 
 def _role(text: str, names: str, units: Iterable[str] = (), with_unit: str = "") -> Role:
+    """Return a role from its content `text`, and texts with names that are separated by spaces.
+
+    `units` are the permitted units. `with_unit` are names that need one of the units at the end.
+    """
     return Role(text, tuple(names.split()), tuple(units), tuple(with_unit.split()))
 
 
@@ -123,12 +127,17 @@ def roles() -> Mapping[str, Role]:
 
 @lru_cache(maxsize=4)
 def _roles(models: tuple[tuple[str, Model], ...]) -> Mapping[str, Role]:
+    """Return all roles by name, for the measurement kinds in `models`.
+
+    The argument is the key of the cache, so that new kinds are included.
+    """
     kinds = {kind: _of_kind(kind, model) for kind, model in models if model.stations}
     every = dict.fromkeys(unit for units in UNITS.values() for unit in units)
     return _FIXED | {"sigma": _role("standard deviation of the row", _SIGMA, every)} | kinds
 
 
 def _of_kind(kind: str, model: Model) -> Role:
+    """Return the role of a measured column of a kind, with the units of its quantity."""
     units = tuple(UNITS[model.quantity])  # type: ignore[index]  # models hold known quantities only
     by_unit = _ANGLES_BY_UNIT.get(kind, "").split()
     names = dict.fromkeys([*map(stem, (kind, *model.aliases)), *_SHORT.get(kind, "").split()])
@@ -142,7 +151,7 @@ def role_of(column: str) -> str | None:
 
 @lru_cache(maxsize=4)
 def _by_name(models: tuple[tuple[str, Model], ...]) -> Mapping[tuple[str, str | None], str]:
-    """Return the role of each pair of a name and a permitted unit."""
+    """Return the role of each pair of a name and a permitted unit; the unit None is a name without a unit."""
     found: dict[tuple[str, str | None], str] = {}
     for role, entry in _roles(models).items():
         for name in entry.names:
@@ -155,13 +164,19 @@ def _by_name(models: tuple[tuple[str, Model], ...]) -> Mapping[tuple[str, str | 
 
 
 def rank(role: str, column: str) -> int:
-    """Return the index of a column name in the list of its role, where the most likely name is first."""
+    """Return the index of a column name in the list of names of its role, where the most likely name is first.
+
+    If several columns can have the role, the smallest index is the best choice.
+    """
     entry = roles()[role]
     return (*entry.names, *entry.with_unit).index(stem(column))
 
 
 def role_named(word: str) -> str:
-    """Return the role of a word in --column; raise InvalidProblem for an unknown word."""
+    """Return the role of a word in --column, such as a role, a kind or "sigma_" with a kind.
+
+    Raise InvalidProblem for an unknown word.
+    """
     word = word.strip()
     if word in roles() or word in ("epoch", *_OTHER):
         return _OTHER.get(word, word)
@@ -179,9 +194,9 @@ def check_unit(role: str, column: str) -> None:
     entry = roles().get(role)
     unit = any_unit(column)
     if entry is not None and entry.units and not entry.allows(unit):
-        some = ", ".join(entry.units[:4])
+        permitted = ", ".join(entry.units[:4])
         what = f"the column {column!r} is in {unit}, which is not a unit of the role {role}"
-        raise InvalidProblem(what, "--column", f"state a column in {some}, or give this column another role")
+        raise InvalidProblem(what, "--column", f"state a column in {permitted}, or give this column another role")
 
 
 def sigma_kind(column: str) -> str | None:

@@ -1,6 +1,8 @@
 """Conversion of measurement tables to problem files: receiver readings, pseudoranges, stations, satellite orbits.
 
 A `TableProblem` has the sections of the problem file. `optloc convert` writes it, and other commands read it directly.
+In the functions, `hints` has the facts that the table does not contain, as stated by options. `roles` has the table and
+the roles of its columns. `stations` has the stations with their positions.
 """
 
 from __future__ import annotations
@@ -60,7 +62,7 @@ _FEW = 3
 def convert(
     source: Path,
     out: Path,
-    told: ColumnHints | None = None,
+    hints: ColumnHints | None = None,
     *,
     tell: Callable[[TableProblem], object] = lambda _: None,
     **options: Any,
@@ -75,7 +77,7 @@ def convert(
         SP3.
     out : Path
         Problem file to write, .toml; its tables are CSV files in the same folder. For stations alone, the CSV file.
-    told : ColumnHints, optional
+    hints : ColumnHints, optional
         Facts that the table does not contain.
     tell : callable, optional
         Receives the problem of the table before it is written.
@@ -92,38 +94,41 @@ def convert(
     InvalidProblem
         The message names the file, the row and the column.
     """
-    told = replace(told or ColumnHints(), **options)
-    _check_told(told)
-    claim(out, inputs=[source, *(path for path in (told.stations, told.times) if path)])
-    if told.times is not None or source.suffix.lower() in _ORBITS:
-        return write_satellites(source, out, told.columns, told.times, told.stations)
-    if told.what == "stations" or source.suffix.lower() == ".geojson":
-        return _write_stations(source, out, told.columns, told.frame)
+    hints = replace(hints or ColumnHints(), **options)
+    _check_hints(hints)
+    claim(out, inputs=[source, *(path for path in (hints.stations, hints.times) if path)])
+    if hints.times is not None or source.suffix.lower() in _ORBITS:
+        return write_satellites(source, out, hints.columns, hints.times, hints.stations)
+    if hints.what == "stations" or source.suffix.lower() == ".geojson":
+        return _write_stations(source, out, hints.columns, hints.frame)
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("the name of a problem file must end in .toml", str(out), "change the name after --out")
-    table_problem = interpret_table(source, told)
+    table_problem = interpret_table(source, hints)
     tell(table_problem)
-    claim(*table_problem.tables(out), inputs=[source, *(path for path in (told.stations,) if path)])
+    claim(*table_problem.tables(out), inputs=[source, *(path for path in (hints.stations,) if path)])
     # Read before writing, so that an invalid problem is not written.
     loaded = table_problem.read()
     return Converted(table_problem.write(out), loaded, table_problem.notes, table_problem.as_read)
 
 
-def _check_told(told: ColumnHints) -> None:
+def _check_hints(hints: ColumnHints) -> None:
     """Raise InvalidProblem for unknown roles, frames and conventions."""
-    for role in told.columns:
+    for role in hints.columns:
         role_named(role)
     choices = {"frame": ("cartesian", "ecef"), "azimuth": CONVENTIONS, "positive": ("a-farther", "b-farther")}
     for name, known in choices.items():
-        given = getattr(told, name)
+        given = getattr(hints, name)
         if given not in (None, *known):
             raise InvalidProblem(f"there is no {name} {given!r}", f"--{name}", nearest(str(given), known))
-    if told.what is not None and told.what not in INPUTS:
-        _sort(told.what)
+    if hints.what is not None and hints.what not in INPUTS:
+        _sort(hints.what)
 
 
 def _sort(word: str) -> str:
-    """Return the sort of readings for a word of --as."""
+    """Return the sort of readings for a word of --as: "arrivals", "sp", or a measurement kind.
+
+    Raise InvalidProblem for an unknown word, or a kind without stations.
+    """
     if word in ("arrivals", "sp"):
         return word
     try:
@@ -135,99 +140,110 @@ def _sort(word: str) -> str:
     return "arrivals" if kind == "toa" else kind
 
 
-def interpret_table(source: Path, told: ColumnHints) -> TableProblem:
-    """Return the problem of a table of readings or pseudoranges; `told` has the facts that the table does not contain.
+def interpret_table(source: Path, hints: ColumnHints) -> TableProblem:
+    """Return the problem of a table of readings or pseudoranges; `hints` has the facts that the table does not contain.
 
     Raises
     ------
     InvalidProblem
         For errors, and for ambiguous content; then the message names the option that decides.
     """
-    _check_told(told)
-    table_problem = gnss(source, told) if is_gnss(source) else _of_table(source, told)
+    _check_hints(hints)
+    table_problem = gnss(source, hints) if is_gnss(source) else _of_table(source, hints)
     azimuths = any(section.kind == "azimuth" for section in table_problem.sections)
-    if told.declination is not None and not azimuths:
+    if hints.declination is not None and not azimuths:
         raise InvalidProblem("the table has no bearings", "--declination", "remove this option")
-    if told.turned and AT_RECEPTION != table_problem.lines:
+    if hints.turned and AT_RECEPTION != table_problem.lines:
         raise InvalidProblem("the table has no satellites", "--turned", "remove this option")
     return table_problem
 
 
-def _of_table(source: Path, told: ColumnHints) -> TableProblem:
-    """Return the problem of a measurement table."""
-    table = without_ignored_columns(read_table(source), told.ignore)
-    own = {role: name for role, name in told.columns.items() if told.stations is None or role not in PLACE}
-    roles = Roles.of(table, own)
+def _of_table(source: Path, hints: ColumnHints) -> TableProblem:
+    """Return the problem of a measurement table.
+
+    The table has pseudoranges with satellites, or columns that are named after stations, or one reading in each row.
+    Raise InvalidProblem if its content or the positions of its stations are unknown.
+    """
+    table = without_ignored_columns(read_table(source), hints.ignore)
+    stated_columns = {role: name for role, name in hints.columns.items() if hints.stations is None or role not in PLACE}
+    roles = Roles.of(table, stated_columns)
     satellites = all(roles.find(role) for role in ("toa", "satellite", "x"))
-    if (told.what == "pseudoranges" and roles.find("satellite")) or (told.what is None and satellites):
-        return pseudoranges(source, roles, told)
-    told = told if told.what is None else replace(told, what=_sort(told.what))
+    if (hints.what == "pseudoranges" and roles.find("satellite")) or (hints.what is None and satellites):
+        return pseudoranges(source, roles, hints)
+    hints = hints if hints.what is None else replace(hints, what=_sort(hints.what))
     named: list[Named] = []
-    if told.stations is not None:
-        place = places_of(told.stations, {k: name for k, name in told.columns.items() if k in PLACE}, told.frame)
-        named = _of_receivers(roles, place)
-        chosen = [one for one in named if _may_be(one, told)]
-        if len(chosen) > 1 and not _is_long(roles, told, place):
-            roles = Roles.of(table, own, [one.column for one in chosen]).without_stations()
-            return _plan(roles, told, place, source, read_wide(roles, told, chosen, place), named)
-    roles = as_angles(roles, told)
-    sorts, heard = sorts_of(roles, told), None
+    if hints.stations is not None:
+        stations = places_of(hints.stations, {k: name for k, name in hints.columns.items() if k in PLACE}, hints.frame)
+        named = _of_receivers(roles, stations)
+        chosen = [one for one in named if _may_be(one, hints)]
+        if len(chosen) > 1 and not _is_long(roles, hints, stations):
+            roles = Roles.of(table, stated_columns, [one.column for one in chosen]).without_stations()
+            return _plan(roles, hints, stations, source, read_wide(roles, hints, chosen, stations), named)
+    roles = as_angles(roles, hints)
+    sorts, receivers = sorts_of(roles, hints), None
     if not sorts:
-        raise _unknown(roles, told)
-    if told.stations is None:
+        raise _unknown(roles, hints)
+    if hints.stations is None:
         if roles.find("lat") is None and roles.find("x") is None:
             advice = "give a table or GeoJSON file with --stations"
             raise InvalidProblem("the station positions are unknown", "--stations", advice)
-        place, heard = read_inline(roles, told)
+        stations, receivers = read_inline(roles, hints)
     forms = [sort_named(name) for name in sorts]
     return _plan(
-        roles, told, place, source, [read_long(roles, form, told, place, heard, forms) for form in forms], named
+        roles,
+        hints,
+        stations,
+        source,
+        [read_long(roles, form, hints, stations, receivers, forms) for form in forms],
+        named,
     )
 
 
-def _of_receivers(roles: Roles, place: ColumnPlaces) -> list[Named]:
+def _of_receivers(roles: Roles, stations: ColumnPlaces) -> list[Named]:
     """Return the columns that are named after stations, without columns that have another role.
+
+    Other roles are stated roles, and columns of station names.
 
     Raises
     ------
     InvalidProblem
         For a column whose name is both a station and a role, if its cells do not decide.
     """
-    told = {part for role in roles.told for part in roles.by_role[role].split("+")}
-    found = [one for one in named_columns(list(roles.table.columns), place.names) if one.column not in told]
+    taken = {part for role in roles.stated for part in roles.by_role[role].split("+")}
+    found = [one for one in named_columns(list(roles.table.columns), stations.names) if one.column not in taken]
     kept = []
     for one in found:
         role = role_of(one.column)
-        if role in ("station", "reference", "name", "id") and holds_names(roles.table, one.column, place.names):
+        if role in ("station", "reference", "name", "id") and holds_names(roles.table, one.column, stations.names):
             continue
         kept.append(one)
     return kept
 
 
-def _is_long(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> bool:
+def _is_long(roles: Roles, hints: ColumnHints, stations: ColumnPlaces) -> bool:
     """Return whether a table has one reading in each row: a column of stations and a column of readings."""
-    if "station" in roles.told:
+    if "station" in roles.stated:
         return True
     station = roles.find("station")
-    if station is None or not holds_names(roles.table, station, place.names):
+    if station is None or not holds_names(roles.table, station, stations.names):
         return False
     # If receivers have columns of readings, a time column is the time of these readings, not a reading.
-    return bool({*sorts_of(roles, told)} - {"times"})
+    return bool({*sorts_of(roles, hints)} - {"times"})
 
 
-def _unknown(roles: Roles, told: ColumnHints) -> InvalidProblem:
+def _unknown(roles: Roles, hints: ColumnHints) -> InvalidProblem:
     """Return the error for a table whose columns do not identify its content."""
     columns = list(roles.table.columns)
     what = f"the columns {', '.join(columns)} do not identify the content"
     advice = f"state it with --as {', --as '.join(INPUTS)} or a kind, and state columns with --column ROLE=NAME"
-    if told.stations is None:
+    if hints.stations is None:
         advice += "; columns that are named after receivers need --stations"
     return InvalidProblem(what, roles.table.source, advice)
 
 
-def _may_be(one: Named, told: ColumnHints) -> bool:
-    """Return whether a column that is named after stations can have the requested content."""
-    return told.what is None or one.form in (None, told.what)
+def _may_be(one: Named, hints: ColumnHints) -> bool:
+    """Return whether a column that is named after stations can have the sort of readings that `--as` states."""
+    return hints.what is None or one.form in (None, hints.what)
 
 
 # From readings to the tables of a problem file.
@@ -235,47 +251,54 @@ def _may_be(one: Named, told: ColumnHints) -> bool:
 
 def _plan(
     roles: Roles,
-    told: ColumnHints,
-    place: ColumnPlaces,
+    hints: ColumnHints,
+    stations: ColumnPlaces,
     source: Path,
     found: Sequence[Readings],
     named: Sequence[Named],
 ) -> TableProblem:
-    """Return the problem of readings; `named` are the columns that are named after stations."""
-    place = in_space(place) if any(2 not in MODELS[one.form.kind].dimensions for one in found) else place
-    place, turn = stations_turned(place, found)
-    epochs = epochs_of(roles, told, found)
-    sigmas = _sigmas(told, found)
-    uses = uses_of(roles, told, found, epochs, sigmas)
-    check_receivers(roles.table, uses, named, place.names)
+    """Return the problem of readings.
+
+    `found` are the sorts of readings in the table. `named` are the columns that are named after stations.
+    """
+    stations = in_space(stations) if any(2 not in MODELS[one.form.kind].dimensions for one in found) else stations
+    stations, heading_note = stations_turned(stations, found)
+    epochs = epochs_of(roles, hints, found)
+    sigmas = _sigmas(hints, found)
+    uses = uses_of(roles, hints, found, epochs, sigmas)
+    check_receivers(roles.table, uses, named, stations.names)
     rest = unused_columns(roles, uses, named)
     parts = zip(found, sigmas, strict=True)
-    sections = tuple(_with_declination(_section(one, epochs, sigma), one, told) for one, sigma in parts)
+    sections = tuple(_with_declination(_section(one, epochs, sigma), one, hints) for one, sigma in parts)
     notes = [*roles.table.notes, *(one.notes[0] for one in found if one.heading is not None)]
-    notes += [note for note in (turn, place.note) if note]
+    notes += [note for note in (heading_note, stations.note) if note]
     notes += dict.fromkeys(note for one in found for note in one.notes if note not in notes)
     lines: tuple[str, ...] = ()
     if any(one.form.value == "sp" for one in found):
-        speed = _sp_speed(told)
+        speed = _sp_speed(hints)
         lines = (f"propagation_speed = {speed!r}",)
         notes.append(f"S minus P times {speed:.6g} m/s, vp vs / (vp - vs), is a range (straight rays, constant speeds)")
     after: tuple[str, ...] = ()
-    if told.window is not None and "epoch" not in epochs:
-        after = ("", "[epochs]", f"window = {json.dumps(told.window)}")
-    height, note = _height(found, place)
-    notes += [*_few(sections, told), *([note] if note else [])]
-    read = [*reading_lines(roles, told, place, found, epochs, uses), *([("not used", ", ".join(rest))] if rest else [])]
-    return TableProblem(source, sections, place, tuple(read), tuple(notes), lines, after, height, uses)
+    if hints.window is not None and "epoch" not in epochs:
+        after = ("", "[epochs]", f"window = {json.dumps(hints.window)}")
+    height, note = _height(found, stations)
+    notes += [*_few(sections, hints), *([note] if note else [])]
+    read = [
+        *reading_lines(roles, hints, stations, found, epochs, uses),
+        *([("not used", ", ".join(rest))] if rest else []),
+    ]
+    return TableProblem(source, sections, stations, tuple(read), tuple(notes), lines, after, height, uses)
 
 
-def _height(found: Sequence[Readings], place: ColumnPlaces) -> tuple[str, str]:
+def _height(found: Sequence[Readings], stations: ColumnPlaces) -> tuple[str, str]:
     """Return a height constraint for a target on Earth, as a line of a problem file, and a note; empty texts for none.
 
-    Readings of azimuths alone do not determine the height.
+    Azimuths alone do not determine the height, so the mean height of the stations is assumed. S minus P times are of
+    earthquakes, which are below the highest station.
     """
-    if place.frame != "geodetic":
+    if stations.frame != "geodetic":
         return "", ""
-    heights, unit = place.columns["height"], place.unit
+    heights, unit = stations.columns["height"], stations.unit
     if all(one.form.kind == "azimuth" for one in found):
         mean = round(float(heights.mean()), 3)
         remark = (
@@ -288,19 +311,19 @@ def _height(found: Sequence[Readings], place: ColumnPlaces) -> tuple[str, str]:
     return "", ""
 
 
-def _sigmas(told: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
+def _sigmas(hints: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
     """Return the standard deviation of each sort of readings as text; None if the table has a column of them."""
-    if told.sigma is None:
+    if hints.sigma is None:
         for one in found:
             if one.sigma is None:
                 raise no_sigma("20 ns", one.form.kind if len(found) > 1 else "rows")
         return [None] * len(found)
-    if "=" not in told.sigma:
+    if "=" not in hints.sigma:
         if len({one.form.quantity for one in found}) > 1:
             advice = "write --sigma '" + ",".join(f"{one.form.kind}=1 {one.unit}" for one in found) + "'"
             raise InvalidProblem("the readings have several kinds, and each needs a sigma", "--sigma", advice)
-        return [told.sigma] * len(found)
-    given = sigmas_by_kind(told.sigma)
+        return [hints.sigma] * len(found)
+    given = sigmas_by_kind(hints.sigma)
     other = next((kind for kind in given if kind not in {one.form.kind for one in found}), None)
     if other is not None:
         raise InvalidProblem(f"the table has no readings of {other}", "--sigma", f"remove {other}")
@@ -310,18 +333,23 @@ def _sigmas(told: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
     return [given.get(one.form.kind) for one in found]
 
 
-def _sp_speed(told: ColumnHints) -> float:
+def _sp_speed(hints: ColumnHints) -> float:
     """Return the speed vp vs / (vp - vs), m/s, that converts S minus P to a range."""
-    if told.vp is None or told.vs is None:
+    if hints.vp is None or hints.vs is None:
         advice = "state both, such as --vp '6 km/s' --vs '3.5 km/s'"
         raise InvalidProblem("the speeds of the P and S waves are unknown", "--vp", advice)
-    vp, vs = (Units("speed").plain(given, None, where) for given, where in ((told.vp, "--vp"), (told.vs, "--vs")))
+    vp, vs = (Units("speed").plain(given, None, where) for given, where in ((hints.vp, "--vp"), (hints.vs, "--vs")))
     if not 0.0 < vs < vp:
         raise InvalidProblem(f"P waves of {vp:g} m/s are not faster than S waves of {vs:g} m/s", "--vs", "correct it")
     return vp * vs / (vp - vs)
 
 
 def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) -> Section:
+    """Return the section of a problem file for one sort of readings, as the columns and settings of its table.
+
+    `epochs` are columns of the source table that determine epochs. `sigma` is the standard deviation as text; None if
+    it is a column. Times of arrival are stored relative to the first arrival of each message.
+    """
     columns: dict[str, Any] = {name: column[found.row] for name, column in epochs.items()}
     values, text = found.values, found.form.text
     if found.form.kind == "toa":
@@ -333,32 +361,38 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
     lines += [f'positive = "{found.positive}"'] if found.positive != "a-farther" else []
     if found.b is not None and sigma not in (None, ESTIMATE) and MODELS[found.form.kind].signs == (1, -1):
         # As in `optloc.locate`, differences share the errors of their stations, each with half of the variance.
-        lines += [f'arrival_sigma = "{_share(str(sigma), found.unit)}"    # of one station, sigma / sqrt(2)']
+        lines += [
+            f'arrival_sigma = "{_sigma_of_one_station(str(sigma), found.unit)}"    # of one station, sigma / sqrt(2)'
+        ]
         sigma = None
     return Section(found.form.kind, columns, found.unit, sigma, text, tuple(lines))
 
 
-def _with_declination(section: Section, found: Readings, told: ColumnHints) -> Section:
+def _with_declination(section: Section, found: Readings, hints: ColumnHints) -> Section:
     """Return a section of bearings with the stated declination."""
-    if told.declination is None or found.form.kind != "azimuth":
+    if hints.declination is None or found.form.kind != "azimuth":
         return section
-    declination_of(told.declination, found.azimuth, None, "--declination")
-    return replace(section, lines=(*section.lines, f"declination = {json.dumps(told.declination.strip())}"))
+    declination_of(hints.declination, found.azimuth, None, "--declination")
+    return replace(section, lines=(*section.lines, f"declination = {json.dumps(hints.declination.strip())}"))
 
 
-def _share(sigma: str, unit: str) -> str:
-    """Return the standard deviation of one station from the standard deviation of a difference, as text with a unit."""
-    number, own = re.fullmatch(r"\s*([-+.\deE]*)\s*(.*?)\s*", sigma, re.DOTALL).groups()  # type: ignore[union-attr]
+def _sigma_of_one_station(sigma: str, unit: str) -> str:
+    """Return the standard deviation of one station as text with a unit, from `sigma` of a difference: sigma / sqrt(2).
+
+    `unit` applies if `sigma` has no unit. A text that is not a number is returned unchanged.
+    """
+    number, stated_unit = re.fullmatch(r"\s*([-+.\deE]*)\s*(.*?)\s*", sigma, re.DOTALL).groups()  # type: ignore[union-attr]
     try:
-        return f"{float(number) / np.sqrt(2.0):.9g} {own or unit}"
+        return f"{float(number) / np.sqrt(2.0):.9g} {stated_unit or unit}"
     except ValueError:  # the reader of the file reports the error
         return sigma
 
 
 def _from_first(found: Readings, columns: dict[str, Any]) -> Decimals:
-    """Return arrivals relative to the first arrival of their message; add the time of the first as a column if missing.
+    """Return arrivals relative to the first arrival of their message, in the unit of the table.
 
-    Recent times in nanoseconds have 19 digits, a float has 16. So differences are taken before rounding.
+    Recent times in nanoseconds have 19 digits, a float has 16, so differences are taken before rounding. If `columns`
+    has no time, the time of each first arrival, s, is added, unless arrivals are already relative.
     """
     keys = [columns[name] for name in ("epoch", "time", "target") if name in columns]
     _, message = equal_rows(keys, len(found.values))
@@ -373,18 +407,18 @@ def _from_first(found: Readings, columns: dict[str, Any]) -> Decimals:
     return found.values.since(first, message)
 
 
-def _few(sections: Sequence[Section], told: ColumnHints) -> list[str]:
-    """Return notes on epochs with few readings."""
+def _few(sections: Sequence[Section], hints: ColumnHints) -> list[str]:
+    """Return a note on messages with fewer than three receivers, or on times with one reading; empty without either."""
     names = [name for name in ("epoch", "target") if name in sections[0].columns] or ["time"]
-    held = [section.columns for section in sections if set(names) <= set(section.columns)]
-    if not held:
+    columns_of_sections = [section.columns for section in sections if set(names) <= set(section.columns)]
+    if not columns_of_sections:
         return []
-    columns = [np.concatenate([own[name] for own in held]) for name in names]
+    columns = [np.concatenate([part[name] for part in columns_of_sections]) for name in names]
     counts = np.bincount(equal_rows(columns, len(columns[0]))[1])
     few = int((counts < _FEW).sum())
     if sections[0].kind == "toa" and few:
         return [f"{few} of {len(counts)} messages were received by fewer than three stations"]
-    if len(counts) > 1 and counts.max() == 1 and told.window is None:
+    if len(counts) > 1 and counts.max() == 1 and hints.window is None:
         advice = "use --still if the target does not move, or --window '0.1 s' to join readings within 0.1 s"
         return [f"each of the {len(counts)} times has one reading: {advice}"]
     return []
@@ -393,10 +427,14 @@ def _few(sections: Sequence[Section], told: ColumnHints) -> list[str]:
 # Stations alone, and satellites.
 
 
-def _write_stations(source: Path, out: Path, told: Mapping[str, str], frame: str | None) -> Converted:
+def _write_stations(source: Path, out: Path, stated_columns: Mapping[str, str], frame: str | None) -> Converted:
+    """Write a table of stations as CSV, and return its file.
+
+    `stated_columns` has the stated roles of columns. `frame` is the stated frame, or None.
+    """
     if out.suffix.lower() != ".csv":
         what = "stations alone are not a problem; they are written as a CSV table"
         raise InvalidProblem(what, str(out), "use the ending .csv after --out, or convert the measurements")
-    found = places_of(source, told, frame)
+    found = places_of(source, stated_columns, frame)
     write_csv(out, found.columns)
     return Converted((out,), None, (found.note,) if found.note else ())

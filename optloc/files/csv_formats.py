@@ -89,36 +89,42 @@ def _list_of(cell: Any) -> Any:
 
 
 def _rows(record: Mapping[str, Any], place: str) -> list[Row]:
-    """Return the rows of one record: one row, or one row for each item of its lists."""
-    around: Row = {}
+    """Return the rows of one record: one row, or one row for each item of its lists.
+
+    `place` is the place for messages.
+    """
+    shared: Row = {}
     inner: list[Row] = []
     parallel: dict[str, list[Any]] = {}
     for key, value in _flat(record, place):
         if not isinstance(value, list):
-            _put(around, key, value, place)
+            _put(shared, key, value, place)
         elif not value:
             continue
         elif all(isinstance(item, Mapping) for item in value):
             inner += [_inside(row, key, record) for item in value for row in _rows(item, place)]
         elif stem(key) in _POINTS and len(value) in (2, 3) and all(_is_number(item) for item in value):
             for axis, item in zip("xyz", value, strict=False):
-                _put(around, _axis_name(key, axis), _cell(item), place)
+                _put(shared, _axis_name(key, axis), _cell(item), place)
         elif any(isinstance(item, list | Mapping) for item in value):
-            _put(around, key, json.dumps(value, default=str), place)
+            _put(shared, key, json.dumps(value, default=str), place)
         else:
             parallel[key] = [_cell(item) for item in value]
     if len({len(items) for items in parallel.values()}) > 1:
         sizes = ", ".join(f"{key} has {len(items)}" for key, items in parallel.items())
         raise InvalidProblem(f"the lists have different lengths: {sizes}", place, "use equal lengths")
-    beside = [dict(zip(parallel, cells, strict=True)) for cells in zip(*parallel.values(), strict=True)]
-    rows = [*inner, *beside]
-    return [around | row for row in rows] if rows else [around]
+    parallel_rows = [dict(zip(parallel, cells, strict=True)) for cells in zip(*parallel.values(), strict=True)]
+    rows = [*inner, *parallel_rows]
+    return [shared | row for row in rows] if rows else [shared]
 
 
-def _flat(record: Mapping[str, Any], place: str, before: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the names and values of a record; names of nested objects are joined."""
+def _flat(record: Mapping[str, Any], place: str, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the names and values of a record; names of nested objects are joined by "_".
+
+    `prefix` is the joined name of the outer objects.
+    """
     for key, value in record.items():
-        name = f"{before}{key}"
+        name = f"{prefix}{key}"
         if isinstance(value, Mapping):
             yield from _flat(value, place, f"{name}_")
         else:
@@ -126,11 +132,15 @@ def _flat(record: Mapping[str, Any], place: str, before: str = "") -> Iterator[t
 
 
 def _inside(row: Row, key: str, record: Mapping[str, Any]) -> Row:
-    """Return a row of a list; a name that the outer object also has gets the name of the list as a prefix."""
+    """Return a row of the list with the name `key`, with names that do not occur in the outer object `record`.
+
+    A name that the outer object also has gets the name of the list as a prefix.
+    """
     return {f"{key}_{name}" if name in record else name: value for name, value in row.items()}
 
 
 def _put(row: Row, key: str, value: Any, place: str) -> None:
+    """Add a value to a row; raise InvalidProblem, with the place `place`, if the row already has the key."""
     if key in row:
         raise InvalidProblem(f"the value {key!r} is given twice", place, "rename one value")
     row[key] = value
@@ -144,6 +154,7 @@ def _axis_name(key: str, axis: str) -> str:
 
 
 def _is_number(item: Any) -> bool:
+    """Return whether an item of a list is a number; booleans are not numbers."""
     return isinstance(item, int | float | Decimal) and not isinstance(item, bool)
 
 
@@ -157,7 +168,10 @@ def _cell(value: Any) -> Any:
 
 
 def _clusters(data: Sequence[Mapping[str, Any]], source: str) -> Iterator[Row]:
-    """Yield the receptions of an mlat-server dump of pseudoranges, with the ECEF position of each receiver."""
+    """Yield the receptions of an mlat-server dump of pseudoranges, with the ECEF position of each receiver, m.
+
+    The name of a station is its position, since the dump has no names.
+    """
     for i, row in enumerate(data):
         place = f"{source}, row {i + 1}"
         cluster = row.get("cluster")
@@ -249,6 +263,7 @@ _LOGS: tuple[tuple[re.Pattern[bytes], Callable[[str, str], Table]], ...] = ((_KR
 
 
 def _json(path: Path) -> Table:
+    """Return the table of a JSON file: one document, or one document on each line."""
     text = decoded(read_bytes(path, lines=True), path.name)
     lines = [line for line in text.splitlines() if line.strip()]
     # Several lines with an object each are a log; a single line may be either form.

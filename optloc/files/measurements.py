@@ -1,6 +1,7 @@
 """Measurements of one table in SI units, with the labels of their epochs and targets.
 
-A section of a problem file gives one `RowChunk` for each measurement kind. `reader` joins the chunks to a `Problem`.
+A section of a problem file gives one `RowChunk` for each measurement kind. `reader` joins the chunks to a `Problem`. In
+shapes, m is the number of rows of a chunk, s the number of stations, and r the number of rows of an epoch.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ ESTIMATE = "estimate"
 
 # Start of the search for a noise level, in SI units; it only affects the relative weights of kinds in the first fixes.
 _START_SIGMA = {"angle": 1e-2, "ratio": 1e-2, "speed": 0.1}
-# Columns of the table of repeats: chunk number, the values that make rows equal, and the index in the chunk.
+# Column with the index in the chunk, in the table of repeats; columns 1 to 7 are the values that make rows equal.
 _PLACE = 8
 # Asymmetry and negative eigenvalues below this share of a covariance are rounding of the file.
 _ROUNDING = 1e-9
@@ -105,7 +106,11 @@ class RowChunk:
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """Settings of a section and its rows; propagation speed, m/s; and whether measured values are needed."""
+    """Settings of a section and its rows.
+
+    section: settings. table: rows. stations: names of all stations. where: place for messages. speed: propagation
+    speed, m/s. values: whether measured values are needed; otherwise a missing column z is NaN.
+    """
 
     section: MeasurementsTable
     table: Table
@@ -125,8 +130,9 @@ def chunks_of(
     """
 
     def chunk(kind: str, pick: Array) -> RowChunk:
-        own = table if len(pick) == table.count else table.take(pick)
-        part = Context(section, own, stations, where, speed, values)
+        """Return the rows `pick` of the table, which have the same kind, in SI units."""
+        part_of_table = table if len(pick) == table.count else table.take(pick)
+        part = Context(section, part_of_table, stations, where, speed, values)
         return replace(_chunk(part, kind), row=pick, table=table)
 
     if section.kind is not None:
@@ -144,6 +150,7 @@ def chunks_of(
 
 
 def _chunk(c: Context, kind: str) -> RowChunk:
+    """Return the rows of a section that has one kind, in SI units; `c` has its settings and its table."""
     section, table = c.section, c.table
     model = kind_model(kind, join(c.where, "key 'kind'"))
     convention = section.azimuth if kind == "azimuth" else "east-counterclockwise"
@@ -175,6 +182,7 @@ def _chunk(c: Context, kind: str) -> RowChunk:
 
 
 def _check_options(c: Context, kind: str, model: Model) -> None:
+    """Raise InvalidProblem for an option of a section that its kind does not use."""
     section = c.section
     if section.kind is None:
         return  # settings of a table of several kinds apply to the kinds that use them
@@ -202,6 +210,7 @@ def _is_difference(model: Model) -> bool:
 
 
 def _unit(section: MeasurementsTable, kind: str, where: str) -> str | None:
+    """Return the unit of a kind in a section; None if none is stated."""
     if not isinstance(section.unit, dict):
         return section.unit
     if section.kind is None or kind in section.unit:
@@ -212,10 +221,12 @@ def _unit(section: MeasurementsTable, kind: str, where: str) -> str | None:
 
 
 def _numbers(c: Context, key: str, default: float) -> Array:
+    """Return a column of numbers (m,); `default` in each row if the table does not have the column."""
     return c.table.numbers(key) if c.table.has(key) else np.broadcast_to(default, (c.table.count,))
 
 
 def _check_weight(c: Context, weight: Array) -> None:
+    """Raise InvalidProblem for a weight (m,) outside 0 to 1."""
     bad = np.flatnonzero(~((weight >= 0.0) & (weight <= 1.0)))
     if len(bad):
         place = c.table.where("weight", int(bad[0]))
@@ -225,7 +236,10 @@ def _check_weight(c: Context, weight: Array) -> None:
 
 
 def values_of(c: Context, unit: Conversion, weight: Array) -> Array:
-    """Return z (m,) in SI units: zero for absent rows, NaN for values that are missing and not needed."""
+    """Return z (m,) in SI units: zero for absent rows (weight 0), NaN for values that are missing and not needed.
+
+    Raise InvalidProblem for an empty cell, or a value that is too large.
+    """
     if not (c.values or c.table.has("z") or "z" in c.table.names):
         return np.full(c.table.count, np.nan)
     raw = c.table.numbers("z", optional=bool((weight == 0.0).any()) or not c.values)
@@ -243,6 +257,10 @@ def values_of(c: Context, unit: Conversion, weight: Array) -> Array:
 
 
 def _stations(c: Context, key: str, needed: bool) -> Array:
+    """Return the station numbers (m,) of the rows, from the column or the setting `key`, which is "a" or "b".
+
+    The numbers are -1 if the kind does not need this station. Raise InvalidProblem for an unknown station.
+    """
     if not needed:
         return np.broadcast_to(-1, (c.table.count,))
     single = getattr(c.section, key)
@@ -257,7 +275,10 @@ def _stations(c: Context, key: str, needed: bool) -> Array:
 
 
 def ends_of(c: Context, kind: str, count: int) -> tuple[Array, Array]:
-    """Return the station numbers (m,) a and b of rows with `count` stations; -1 for no station."""
+    """Return the station numbers a and b (m,) of rows with `count` stations; -1 for no station.
+
+    Raise InvalidProblem if a row has the same station twice.
+    """
     a, b = (_stations(c, key, count > i) for i, key in enumerate("ab"))
     same = np.flatnonzero(a == b)
     if count > 1 and len(same):
@@ -267,16 +288,23 @@ def ends_of(c: Context, kind: str, count: int) -> tuple[Array, Array]:
 
 
 def _correction(c: Context, units: Units, unit: Conversion) -> Array:
-    """Return the corrections (m,), SI: offsets of rows from the model. Corrections of azimuths are clockwise."""
+    """Return the corrections (m,), SI: offsets of rows from the model. Corrections of azimuths are clockwise.
+
+    `unit` is the unit of a correction without a unit.
+    """
     if c.table.has("correction"):
-        return c.table.numbers("correction") * _size(unit, units, c)
+        return c.table.numbers("correction") * _correction_factor(unit, units, c)
     if c.section.correction is None:
         return np.broadcast_to(0.0, (c.table.count,))
-    number, own = units.amount(c.section.correction, unit, join(c.where, "key 'correction'"))
-    return np.full(c.table.count, number * _size(own, units, c))
+    number, stated_unit = units.amount(c.section.correction, unit, join(c.where, "key 'correction'"))
+    return np.full(c.table.count, number * _correction_factor(stated_unit, units, c))
 
 
-def _size(unit: Conversion, units: Units, c: Context) -> float:
+def _correction_factor(unit: Conversion, units: Units, c: Context) -> float:
+    """Return the SI amount of one unit of a correction; its sign is negative for azimuths, which are clockwise.
+
+    Raise InvalidProblem for a correction in dB, which is not an additive amount.
+    """
     if unit.logarithmic:
         raise InvalidProblem("a correction cannot be in dB", join(c.where, "key 'correction'"), "correct z itself")
     # A correction of 4 deg is added to a compass bearing: the reading is 4 deg anticlockwise of the true direction.
@@ -284,7 +312,10 @@ def _size(unit: Conversion, units: Units, c: Context) -> float:
 
 
 def _declination(c: Context, unit: str) -> tuple[float, date | None]:
-    """Return the declination of a section in radians, or zero and its date."""
+    """Return the declination of a section, radians, and None; or zero and the date that determines it.
+
+    The result is zero and None without a declination. `unit` is the unit of a plain number.
+    """
     if c.section.declination is None:
         return 0.0, None
     place = join(c.where, "key 'declination'")
@@ -330,7 +361,9 @@ def spread_of(
 ) -> tuple[Array | None, Array | None, Array | None]:
     """Return standard deviations (m,), arrival standard deviations (s,) and covariance (r, r); at most one is not None.
 
-    `unit` is the unit of z and of plain numbers; `z` (m,) are the measured values in SI units.
+    All are None without noise, or if a signal determines the noise (`signal_of`). The covariance is in the square of
+    the unit of the file, the others in SI units. `unit` is the unit of z and of plain numbers; `z` (m,) are the
+    measured values in SI units.
     """
     section = c.section
     column = c.table.has("sigma")
@@ -343,20 +376,24 @@ def spread_of(
     if (sigma := sigma_of(c, units, unit, z)) is not None:
         return sigma, None, None
     if section.arrival_sigma is not None:
-        return None, _arrival(c, model, units, unit, section.arrival_sigma), None
+        return None, _arrival_sigmas(c, model, units, unit, section.arrival_sigma), None
     # A matrix stays in the unit of the file until the slope of each row is known.
     covariance = None if section.covariance is None else square(section.covariance, join(c.where, "key 'covariance'"))
     return None, None, covariance
 
 
 def sigma_of(c: Context, units: Units, unit: Conversion, z: Array) -> Array | None:
-    """Return the standard deviations (m,) of values z (m,) from the column or the key sigma; None without either."""
+    """Return the standard deviations (m,), SI, from the column or the key sigma; None without either.
+
+    `z` (m,) are the measured values in SI units: the standard deviation of a level in decibels depends on the value.
+    `unit` is the unit of plain numbers.
+    """
     if c.table.has("sigma"):
         return _positive(c, unit.sigma_to_si(c.table.numbers("sigma"), z), column=True)
     if c.section.sigma is None:
         return None
-    number, own = units.amount(c.section.sigma, unit, join(c.where, "key 'sigma'"))
-    return _positive(c, np.broadcast_to(own.sigma_to_si(number, z), z.shape), column=False)
+    number, stated_unit = units.amount(c.section.sigma, unit, join(c.where, "key 'sigma'"))
+    return _positive(c, np.broadcast_to(stated_unit.sigma_to_si(number, z), z.shape), column=False)
 
 
 def signal_of(c: Context) -> Signal | None:
@@ -380,6 +417,10 @@ def signal_of(c: Context) -> Signal | None:
 
 
 def _positive(c: Context, sigma: Array, *, column: bool) -> Array:
+    """Return standard deviations `sigma` (m,); raise InvalidProblem for values that are not positive, or too large.
+
+    `column` is whether they are from a column, so that the message can name the row.
+    """
     bad = np.flatnonzero(~((sigma > 0.0) & (sigma <= LARGEST)))
     if len(bad):
         place = c.table.where("sigma", int(bad[0])) if column else join(c.where, "key 'sigma'")
@@ -388,9 +429,14 @@ def _positive(c: Context, sigma: Array, *, column: bool) -> Array:
     return sigma
 
 
-def _arrival(
+def _arrival_sigmas(
     c: Context, model: Model, units: Units, unit: Conversion, given: float | str | Mapping[str, float | str]
 ) -> Array:
+    """Return the standard deviation (s,) of the arrivals at each station, SI.
+
+    `given` is one value for all stations, or a mapping from stations to values. Stations without a value have zero.
+    `unit` is the unit of a plain number.
+    """
     place = join(c.where, "key 'arrival_sigma'")
     if model.signs is None:
         raise InvalidProblem("these rows are not sums or differences of arrivals", place, "give sigma or covariance")
@@ -399,8 +445,8 @@ def _arrival(
     # A station without an entry measures exactly; rows without any noise are rejected later.
     sigma = np.zeros(len(c.stations))
     for i, value in zip(numbers_of([*given], c.stations, place), given.values(), strict=True):
-        number, own = units.amount(value, unit, place)
-        sigma[i] = own.sigma_to_si(number)
+        number, stated_unit = units.amount(value, unit, place)
+        sigma[i] = stated_unit.sigma_to_si(number)
         if number <= 0.0:
             raise InvalidProblem("the standard deviation is not positive", place, "give a positive number")
     return sigma
@@ -447,8 +493,8 @@ def check_repeats(
     for kind in dict.fromkeys(chunk.kind for chunk in chunks):
         same = [i for i, chunk in enumerate(chunks) if chunk.kind == kind]
         ends = [(chunks[i].a + 1, chunks[i].b + 1, index[i], target[i]) for i in same]
-        own = [np.concatenate(each) for each in zip(*ends, strict=True)]
-        if len(first_rows(*own)[0]) == len(own[0]):
+        keys_of_rows = [np.concatenate(each) for each in zip(*ends, strict=True)]
+        if len(first_rows(*keys_of_rows)[0]) == len(keys_of_rows[0]):
             continue  # all rows have different stations or epochs
         # Sort by all values that make rows equal. Equal rows are then neighbours, in the order of the file.
         table = np.concatenate([_table(chunks[i], index[i], target[i], i) for i in same], axis=1)
@@ -463,21 +509,30 @@ def check_repeats(
 
 
 def _table(chunk: RowChunk, index: Array, target: Array, number: int) -> Array:
-    """Return columns (9, present): chunk number, the values that make rows equal, and the index in the chunk."""
+    """Return columns (9, m): chunk number, the values that make rows equal, and the index in the chunk.
+
+    Only present rows that could be copies are included. Columns 1 to 7 are the stations a and b, epoch, target, whether
+    the noise of rows is independent, value and time. Rows with equal columns 1 to 7 are copies. `index` and `target`
+    (of each row) are the epoch and the target; `number` is the number of the chunk.
+    """
     # With noise of arrivals, a second row of the same stations has the same noise. So it is a copy with any value.
-    own = chunk.arrival is None and chunk.signal is None
-    time = np.zeros(len(index)) if chunk.time is None or not own else chunk.time
-    value = chunk.z if own else np.zeros(len(index))
-    same = (chunk.a, chunk.b, index, target, np.full(len(index), own), value, time)
+    independent = chunk.arrival is None and chunk.signal is None
+    time = np.zeros(len(index)) if chunk.time is None or not independent else chunk.time
+    value = chunk.z if independent else np.zeros(len(index))
+    same = (chunk.a, chunk.b, index, target, np.full(len(index), independent), value, time)
     table = np.array([np.full(len(index), number), *same, np.arange(len(index))], dtype=float)
     # Rows without time and label may be repeated measurements of a static target.
-    dated = not own or chunk.label is not None or chunk.time is not None
+    dated = not independent or chunk.label is not None or chunk.time is not None
     return table[:, (chunk.weight > 0.0) & ~np.isnan(value) & dated]
 
 
 def _repeated(
     again: tuple[RowChunk, int], first: tuple[RowChunk, int], stations: Sequence[str], epoch: str
 ) -> InvalidProblem:
+    """Return the error for a row that repeats another row; it names both rows.
+
+    `again` and `first` are the later and the earlier row: a chunk and the index of the row in it.
+    """
     (chunk, i), (other, j) = again, first
     names = "-".join(stations[s] for s in (chunk.a[i], chunk.b[i]) if s >= 0)
     row = f"row {other.row[j] + 1}" + ("" if other.table is chunk.table else f" of {other.table.source}")

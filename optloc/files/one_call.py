@@ -59,8 +59,8 @@ _STEP = 0.1
 class _Receivers:
     """Stations with their frame.
 
-    level: whether the stations are on Earth without altitudes. extent: greatest extent of the stations along an axis,
-    m.
+    stations: stations with positions in the frame. frame: frame of the positions. level: whether the stations are on
+    Earth without altitudes. extent: greatest extent of the stations along an axis, m.
     """
 
     stations: Stations
@@ -70,11 +70,12 @@ class _Receivers:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Return the names of the stations."""
         return self.stations.names
 
 
 class _North(NamedTuple):
-    """Convention of bearings, and the declination of magnetic north; None for true north."""
+    """Convention of bearings, such as "north-clockwise", and the declination of magnetic north; None for true north."""
 
     azimuth: str
     declination: Any
@@ -225,22 +226,30 @@ def locate(
             raise InvalidProblem(f"{type(text).__name__} is not text", name, "give text, such as 'ns' for a unit")
     north = _North(azimuth, declination)
     _check_north(north, given)
-    own, spread = _speed(speed), _speed_sigma(speed)
-    problem, labels = _problem_of(stations, latlon, given, sigma, unit, reference, height, frame, own, spread, north)
+    through, speed_sigma = _speed(speed), _speed_sigma(speed)
+    problem, labels = _problem_of(
+        stations, latlon, given, sigma, unit, reference, height, frame, through, speed_sigma, north
+    )
     return _labelled(solve(problem, method=method), labels)
 
 
 def _labelled(fix: Fix, labels: list[Any] | None) -> Fix:
-    """Return fixes with the index of the data frame of the measurements as labels."""
+    """Return fixes with the index of the data frame of the measurements as labels.
+
+    If the number of labels differs from the number of fixes, the fixes are returned unchanged.
+    """
     if labels is None or fix.shape != (len(labels),):
         return fix
-    own = np.empty(len(labels), dtype=object)
-    own[:] = labels
-    return replace(fix, labels=own)
+    as_objects = np.empty(len(labels), dtype=object)
+    as_objects[:] = labels
+    return replace(fix, labels=as_objects)
 
 
 def _check_north(north: _North, given: Mapping[str, Any]) -> None:
-    """Raise InvalidProblem for an unknown convention of azimuths, and for a declination without bearings."""
+    """Raise InvalidProblem for an unknown convention of azimuths, and for a declination without bearings.
+
+    `given` has the measurements by argument.
+    """
     known = get_args(AzimuthConvention)
     if north.azimuth not in known:
         raise InvalidProblem(f"there is no convention {north.azimuth!r}", "azimuth", nearest(north.azimuth, known))
@@ -254,6 +263,10 @@ def _speed_sigma(given: Any) -> float | None:
 
 
 def _speed(given: Any) -> float | Medium:
+    """Return the propagation speed, m/s, or the medium, from the argument `speed` of `locate`.
+
+    Raise InvalidProblem for a value that is not positive, or for a tuple without exactly two numbers.
+    """
     if isinstance(given, Medium):
         return given
     if isinstance(given, tuple | list):
@@ -288,29 +301,38 @@ def _problem_of(
     height: Any,
     frame: str,
     through: float | Medium,
-    spread: float | None,
+    speed_sigma: float | None,
     north: _North,
 ) -> tuple[Problem, list[Any] | None]:
-    """Return the problem of the arguments of `locate`, and the labels of its rows."""
+    """Return the problem of the arguments of `locate`, and the labels of its rows; None without labels.
+
+    `given` has the measurements by the name of their argument. `through` is the propagation speed, m/s, or the medium.
+    `speed_sigma` is the standard deviation of the speed, m/s; None for an exact speed. `north` is the zero direction of
+    bearings. The other parameters are arguments of `locate`.
+    """
     medium, speed = (through, through.unit_speed) if isinstance(through, Medium) else (None, through)
     places = _PLACES.call(_receivers, stations, latlon, frame)
     rows, timed, labels = [], [], None
     for word, values in given.items():
         found = station_values(word, values, places.names, reference)
         labels = found.labels if labels is None else labels
-        own = _per_word(unit, word, given, "unit") or found.unit or ARGUMENTS[word].unit
+        value_unit = _per_word(unit, word, given, "unit") or found.unit or ARGUMENTS[word].unit
         convention = north.azimuth if word == "bearings" else CARTESIAN
-        step, own_sigma = _SCALES.call(_scale, word, own, sigma, list(given), speed, convention)
-        made = _rows(word, found, own_sigma, step, places, speed)
-        timed.append(is_time(Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed), own, "unit"))
-        rows.append(_from_north(made, north, own, places) if word == "bearings" else made)
+        step, sigma_si = _SCALES.call(_scale, word, value_unit, sigma, list(given), speed, convention)
+        made = _rows(word, found, sigma_si, step, places, speed)
+        timed.append(is_time(Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed), value_unit, "unit"))
+        rows.append(_from_north(made, north, value_unit, places) if word == "bearings" else made)
     at = _heights(height, places, given)
     problem = assemble(places.stations, *rows, frame=places.frame, constraints=at, medium=medium)
-    return (problem if spread is None else _with_speed(problem, speed, spread, timed)), labels
+    return (problem if speed_sigma is None else _with_speed(problem, speed, speed_sigma, timed)), labels
 
 
 def _with_speed(problem: Problem, speed: float, sigma: float, timed: Sequence[bool]) -> Problem:
-    """Return a problem with a scale bias of its times, from a speed with a standard deviation."""
+    """Return a problem in which the propagation speed is unknown, as a scale bias of all rows that are times.
+
+    `speed` and `sigma` are the mean and the standard deviation of the speed, m/s. `timed` is whether each group of rows
+    has times.
+    """
     ends = [(start, start + rows.count) for rows, start in zip(problem.rows, problem.starts, strict=True)]
     times = [np.arange(*end) for end, time in zip(ends, timed, strict=True) if time]
     return replace(problem, biases=(*problem.biases, scale_of(speed, sigma, times, "speed")))
@@ -319,7 +341,11 @@ def _with_speed(problem: Problem, speed: float, sigma: float, timed: Sequence[bo
 def _scale(
     word: str, unit: str, sigma: Any, words: Sequence[str], speed: float, convention: AzimuthConvention
 ) -> tuple[Conversion, float]:
-    """Return the conversion of values to SI units, and their standard deviation in SI units."""
+    """Return the conversion of values to SI units, and their standard deviation in SI units.
+
+    `word` is an argument of `locate`, such as "tdoa", and `unit` the unit of its values. `sigma` is the argument of
+    `locate`, and `words` are the arguments with measurements. `convention` is the zero direction of angles.
+    """
     units = Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed)
     step = replace(units, convention=convention).conversion(unit, f"unit of {word}")
     return step, _sigma_si(_per_word(sigma, word, words, "sigma"), word, units, unit)
@@ -332,6 +358,10 @@ _PAIR = 2
 
 
 def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
+    """Return the stations of `locate` with their frame; raise InvalidProblem for invalid stations.
+
+    Stations in degrees get a frame of east, north and up; otherwise `frame` is "cartesian" or "ecef".
+    """
     if (stations is None) == (latlon is None):
         what = "the stations are missing" if stations is None else "the stations are given twice"
         raise InvalidProblem(what, "stations", "give stations= in metres, or latlon= in degrees")
@@ -339,11 +369,11 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
         raise InvalidProblem(f"there is no frame {frame!r}", "frame", 'use "cartesian" or "ecef", or latlon=')
     where, axes = ("stations", "xyz") if latlon is None else ("latlon", ("lat_deg", "lon_deg", "height"))
     table = with_standard_columns(station_table(stations if latlon is None else latlon, where, axes), "m")
-    globe = table.has("lat_deg") or table.has("lon_deg")
-    if latlon is not None and not globe:
+    geodetic = table.has("lat_deg") or table.has("lon_deg")
+    if latlon is not None and not geodetic:
         raise InvalidProblem("there are no latitudes", "latlon", "name the columns lat and lon, or use stations=")
-    kind = "enu" if globe else frame
-    found, own = survey(StationsTable(), table, FrameTable(kind=cast("Any", kind)), where)
+    kind = "enu" if geodetic else frame
+    found, frame_of_stations = survey(StationsTable(), table, FrameTable(kind=cast("Any", kind)), where)
     if len(found.position) > len(found.names):
         raise InvalidProblem(
             "a station has several positions", where, "give one for each station, or use optloc.from_table"
@@ -352,11 +382,16 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
     axes_of = None if found.axes is None else found.axes[order]
     made = station_array(found.position[order], found.names, axes=axes_of)
     extent = float(np.ptp(made.position, axis=-2).max())
-    return _Receivers(made, own, globe and not table.has("height"), extent)
+    return _Receivers(made, frame_of_stations, geodetic and not table.has("height"), extent)
 
 
 def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple[Band, ...]:
-    """Return the constraint on the height of the target, or an empty tuple."""
+    """Return the constraint on the height of the target; an empty tuple for a free height.
+
+    `height` is the argument of `locate`: a height, or the least and the greatest height, m. Stations on Earth without
+    altitudes give the height 0 m. Raise InvalidProblem if bearings alone leave the height free, or if the height is
+    invalid.
+    """
     d = places.stations.position.shape[-1]
     if height is None and places.level:
         height = 0.0
@@ -390,7 +425,11 @@ def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple
 
 
 def _per_word(given: Any, word: str, words: Collection[str], name: str) -> Any:
-    """Return the value of an argument for one kind; the argument may be a mapping by kind."""
+    """Return the value of an argument for one kind of measurements; None if a mapping does not have the kind.
+
+    `given` is the value or a mapping by kind. `word` is the kind, `words` are the kinds with measurements, and `name`
+    is the name of the argument.
+    """
     if isinstance(given, Mapping):
         unknown = [key for key in given if key not in words]
         if unknown:
@@ -404,7 +443,10 @@ def _per_word(given: Any, word: str, words: Collection[str], name: str) -> Any:
 
 
 def _sigma_si(sigma: Any, word: str, units: Units, unit: str) -> float:
-    """Return the standard deviation of one value, SI."""
+    """Return the standard deviation of one value, SI; raise InvalidProblem if it is missing or not positive.
+
+    `sigma` is in `unit`, or text with a unit. `word` is the kind of measurements.
+    """
     noun, default = ARGUMENTS[word].noun, units.conversion(unit, f"unit of {word}")
     if sigma is None:
         advice = f"give their standard deviation in {unit}, such as sigma=..., or as text with a unit"
@@ -413,8 +455,8 @@ def _sigma_si(sigma: Any, word: str, units: Units, unit: str) -> float:
         raise InvalidProblem(
             f"{type(sigma).__name__} is not a standard deviation", "sigma", "give a number, or optloc.measured"
         )
-    number, own = units.amount(sigma if isinstance(sigma, str) else float(sigma), default, "sigma")
-    value = float(own.sigma_to_si(number))
+    number, stated_unit = units.amount(sigma if isinstance(sigma, str) else float(sigma), default, "sigma")
+    value = float(stated_unit.sigma_to_si(number))
     if not value > 0.0:
         raise InvalidProblem(
             f"the standard deviation {sigma} of the {noun} is not positive", "sigma", "give a positive number"
@@ -425,7 +467,11 @@ def _sigma_si(sigma: Any, word: str, units: Units, unit: str) -> float:
 def _rows(
     word: str, found: StationValues, sigma: float, unit: Conversion, places: _Receivers, speed: float
 ) -> Measured:
-    """Return measurements in SI units as rows."""
+    """Return measurements in SI units as rows; missing values have the weight 0.
+
+    `word` is the kind, `sigma` the standard deviation in SI units, `unit` the unit of the values, and `speed` the
+    propagation speed, m/s. Raise InvalidProblem for infinite values, or for times in a wrong unit.
+    """
     kind = ARGUMENTS[word].kind
     a, b = np.array(found.keys, dtype=np.int64).T
     values = found.values
@@ -434,34 +480,41 @@ def _rows(
         unit = conversion("s", "length", propagation_speed=speed) if values.dtype.kind == "M" else unit
         values = _since_first(values, sigma, unit)
     z = np.asarray(unit.to_si(values), dtype=float)
-    heard = np.isfinite(z)
+    present = np.isfinite(z)
     if np.isinf(z).any():
         raise InvalidProblem("a value is infinite", word, "use NaN for missing values")
     if word in ("toa", "tdoa"):
         _check_time_unit(word, z, sigma, places)
-    own = {"weight": heard.astype(float), "a": a, "b": None if word != "tdoa" else b}
+    columns = {"weight": present.astype(float), "a": a, "b": None if word != "tdoa" else b}
     # Differences to one station share its error, and each arrival has half of the variance of a difference. If pairs
     # form loops, this is the cautious choice: a difference that follows from others adds no information.
     noise = {"arrival_sigma": sigma / np.sqrt(2.0)} if word == "tdoa" else {"sigma": sigma}
-    return measured(kind, np.where(heard, z, 0.0), **own, **noise)
+    return measured(kind, np.where(present, z, 0.0), **columns, **noise)
 
 
-def _from_north(made: Measured, north: _North, unit: str, places: _Receivers) -> Measured:
-    """Return rows of bearings with the declination of magnetic north and the sense of the convention."""
-    rows, east = made.rows.clockwise() if north.azimuth == COMPASS else made.rows, north.declination
+def _from_north(measurements: Measured, north: _North, unit: str, places: _Receivers) -> Measured:
+    """Return rows of bearings with the declination of magnetic north and the sense of the convention.
+
+    `unit` is the unit of a declination without a unit.
+    """
+    rows, east = measurements.rows.clockwise() if north.azimuth == COMPASS else measurements.rows, north.declination
     if east is None:
-        return replace(made, rows=rows)
+        return replace(measurements, rows=rows)
     if isinstance(east, bool) or not isinstance(east, str | date | float | int | np.number):
         what = f"{type(east).__name__} is not a declination"
         raise InvalidProblem(what, "declination", 'give a number, "4 deg", or a date such as "2026-06-01"')
     angle, day = declination_of(east, north.azimuth, unit, "declination")
     at = places.stations.position[0]
     more = angle if day is None else declinations(at, places.frame, day, "declination")[rows.a]
-    return replace(made, rows=replace(rows, correction=rows.correction + more))
+    return replace(measurements, rows=replace(rows, correction=rows.correction + more))
 
 
 def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:
-    """Return times relative to the first arrival, in their unit (dates in seconds), before digits are lost."""
+    """Return times (..., m) relative to the first arrival, in their unit (dates in seconds), before digits are lost.
+
+    `sigma` is the standard deviation of an arrival, m. Raise InvalidProblem for floats whose rounding is too coarse for
+    it.
+    """
     if times.dtype.kind == "M":
         known = ~np.isnat(times)
         counted = times.astype("datetime64[ns]").astype(np.int64)
@@ -481,7 +534,11 @@ def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:
 
 
 def _check_time_unit(word: str, z: Array, sigma: float, places: _Receivers) -> None:
-    """Raise InvalidProblem for times longer than any path between stations: their unit is wrong."""
+    """Raise InvalidProblem for times that are much longer than the paths between stations: their unit is wrong.
+
+    `z` (..., m) are the times as lengths, m, and `sigma` is their standard deviation, m. The limit is 100 times the
+    greater of the extent of the stations and `sigma`.
+    """
     most = float(np.fmax.reduce(np.abs(z), axis=None, initial=0.0))
     if most > _TOO_FAR * max(places.extent, sigma):
         what = f"the arrivals are {most / 1e3:.3g} km apart, but the stations {places.extent / 1e3:.3g} km"

@@ -137,7 +137,12 @@ def read_orbits(path: Path) -> Orbits:
 
 @dataclass(frozen=True, slots=True)
 class _Set:
-    """An element set, two lines or the fields of an OMM; `made` creates the satellite when it is needed."""
+    """An element set of a satellite.
+
+    name: name of the satellite, or empty. number: catalogue number. where: place in the file for messages. made:
+    function that creates the satellite object of skyfield from the two lines or the fields of an OMM, when it is
+    needed.
+    """
 
     name: str
     number: str
@@ -154,6 +159,7 @@ class _Set:
 
 
 def _no_elements(where: str) -> InvalidProblem:
+    """Return the error for elements that the library rejects."""
     return InvalidProblem("these are not valid elements of an orbit", where, "download them again, unchanged")
 
 
@@ -173,6 +179,7 @@ def _as_invalid_problem(where: str) -> Iterator[None]:
 
 
 def _of_elements(sets: Sequence[_Set], source: str) -> Orbits:
+    """Return the satellites of element sets; satellites that share a name get their catalogue numbers as names."""
     if not sets:
         what = "the file has no orbits"
         raise InvalidProblem(what, source, "give two-line elements, OMM as JSON or CSV, or SP3")
@@ -181,15 +188,22 @@ def _of_elements(sets: Sequence[_Set], source: str) -> Orbits:
         if has_controls(found.name):
             raise InvalidProblem(f"the name {found.name!r} has control characters", found.where, "use another name")
         by_number.setdefault(found.number, []).append(found)
-    held = {number: own[-1].name or number for number, own in by_number.items()}
+    name_by_number = {number: sets_of_satellite[-1].name or number for number, sets_of_satellite in by_number.items()}
     # Pieces of one launch share names such as OBJECT A; use their catalogue numbers instead.
-    shared = {name for name, count in Counter(held.values()).items() if count > 1}
-    names = {number: number if name in shared else name for number, name in held.items()}
-    return Orbits(source, {names[number]: partial(_propagate_sets, own) for number, own in by_number.items()}, names)
+    shared = {name for name, count in Counter(name_by_number.values()).items() if count > 1}
+    names = {number: number if name in shared else name for number, name in name_by_number.items()}
+    return Orbits(
+        source,
+        {names[number]: partial(_propagate_sets, sets_of_satellite) for number, sets_of_satellite in by_number.items()},
+        names,
+    )
 
 
 def _propagate_sets(sets: Sequence[_Set], seconds: Array) -> tuple[Array, Array]:
-    """Return position and velocity (k, 3) at each time from the element set with the nearest epoch."""
+    """Return ECEF positions (k, 3), m, and velocities (k, 3), m/s, from the element set with the nearest epoch.
+
+    `seconds` (k,) are since 1970, UTC. Raise InvalidProblem for a time that is more than 30 days from all epochs.
+    """
     found = [one.satellite() for one in sets]
     epochs = np.array([sat.model.jdsatepoch + sat.model.jdsatepochF for sat in found])
     age = np.abs(seconds[:, None] / _DAY + _EPOCH_1970 - epochs)
@@ -209,6 +223,11 @@ def _propagate_sets(sets: Sequence[_Set], seconds: Array) -> tuple[Array, Array]
 
 
 def _propagate(satellite: Any, seconds: Array, where: str) -> tuple[Array, Array]:
+    """Return ECEF position (k, 3), m, and velocity (k, 3), m/s, of a satellite object of skyfield.
+
+    `seconds` (k,) are since 1970, UTC. Velocities are relative to the ground. Raise InvalidProblem, with the place
+    `where`, if the orbit cannot be computed.
+    """
     from skyfield.framelib import itrs
 
     found = satellite.at(_instants(seconds))
@@ -223,6 +242,7 @@ def _propagate(satellite: Any, seconds: Array, where: str) -> tuple[Array, Array
 
 
 def _date(seconds: float) -> str:
+    """Return a time in seconds since 1970 as text, such as 2026-06-01T12:00:00 UTC."""
     return str(np.datetime64(int(seconds), "s")) + " UTC"
 
 
@@ -239,6 +259,7 @@ def _library() -> Any:
 
 
 def _instants(seconds: Array) -> Any:
+    """Return times in seconds since 1970, UTC, as a time object of skyfield."""
     day = np.floor(seconds / _DAY)
     return _library().utc(1970, 1, 1 + day.astype(np.int64), 0, 0, seconds - day * _DAY)
 
@@ -265,6 +286,10 @@ def _line_sets(text: str, source: str) -> list[_Set]:
 
 
 def _from_lines(name: str, one: str, two: str, where: str) -> Any:
+    """Return the satellite object of skyfield for two lines of elements, `one` and `two`.
+
+    Raise InvalidProblem for a wrong check digit, ValueError for columns that are not numbers.
+    """
     _library()
     from sgp4.earth_gravity import wgs72
     from sgp4.io import twoline2rv, verify_checksum
@@ -281,6 +306,7 @@ def _from_lines(name: str, one: str, two: str, where: str) -> Any:
 
 
 def _json_sets(text: str, source: str) -> list[_Set]:
+    """Return the element sets of an OMM file in JSON: one message, or a list of messages."""
     data = json_of(text, source)
     messages = data if isinstance(data, list) else [data]
     check_budget("rows", len(messages), source)
@@ -292,6 +318,7 @@ def _json_sets(text: str, source: str) -> list[_Set]:
 
 
 def _csv_sets(path: Path) -> list[_Set]:
+    """Return the element sets of an OMM file in CSV: one message in each row."""
     table = csv(path, None, {})
     rows = zip(*(table.columns[name] for name in table.columns), strict=True)
     found = (dict(zip(table.columns, row, strict=True)) for row in rows)
@@ -303,6 +330,7 @@ _CONVENTIONS = {"REF_FRAME": "TEME", "TIME_SYSTEM": "UTC", "MEAN_ELEMENT_THEORY"
 
 
 def _of_fields(fields: Mapping[str, Any], where: str) -> _Set:
+    """Return the element set of the fields of an OMM; raise InvalidProblem for conventions that SGP4 does not use."""
     for key, meant in _CONVENTIONS.items():
         if fields.get(key) not in (None, "", meant):
             what = f"{key} is {str(fields[key])[:40]!r}"
@@ -315,6 +343,10 @@ def _of_fields(fields: Mapping[str, Any], where: str) -> _Set:
 
 
 def _from_fields(fields: Mapping[str, Any]) -> Any:
+    """Return the satellite object of skyfield for the fields of an OMM.
+
+    The library accepts only an epoch with a fraction of a second and without a Z.
+    """
     load = _library()
     from skyfield.api import EarthSatellite
 
@@ -360,6 +392,7 @@ def _sp3(text: str, source: str) -> Orbits:
 
 
 def _number(text: str, where: str) -> float:
+    """Return a number of an SP3 file; raise InvalidProblem, with the line `where`, for other text."""
     try:
         value = float(text)
     except ValueError:
@@ -371,7 +404,11 @@ def _number(text: str, where: str) -> float:
 
 
 def _calendar(line: str, where: str) -> float:
-    """Return a time of the clock of the file as seconds since 1970."""
+    """Return the time of an SP3 epoch line as seconds since 1970, in the clock of the file.
+
+    The line has year, month, day, hour, minute and second after "*". Leap seconds are not removed: `_interpolate`
+    converts UTC to the clock of the file. Raise InvalidProblem, with the line `where`, for an invalid date.
+    """
     parts = line[1:].split()
     try:
         date = datetime(*(int(part) for part in parts[:5]), tzinfo=UTC)  # type: ignore[misc,arg-type]  # five integers
@@ -383,9 +420,11 @@ def _calendar(line: str, where: str) -> float:
 def _interpolate(
     nodes: Array, places: Array, ahead: float | None, name: str, source: str, seconds: Array
 ) -> tuple[Array, Array]:
-    """Return interpolated position and velocity (k, 3), from positions (n, 3) at the clock times `nodes` (n,).
+    """Return ECEF position (k, 3), m, and velocity (k, 3), m/s, at `seconds` (k,) since 1970, UTC.
 
-    `ahead` is the offset of the clock from TAI, s; None for UTC.
+    They are interpolated from the positions `places` (n, 3), m, at the clock times `nodes` (n,), s. `ahead` is the
+    clock of the file minus TAI, s; None for UTC. Raise InvalidProblem for times outside the file, or positions that are
+    too far apart in time.
     """
     at = seconds + (0.0 if ahead is None else ahead + _leap_seconds(seconds))
     where = f"{source}, satellite {name}"
@@ -405,25 +444,30 @@ def _interpolate(
 
 
 def _polynomial(nodes: Array, places: Array, at: Array, count: int, where: str) -> tuple[Array, Array]:
-    """Return values and derivatives of polynomials through the `count` nearest points of each time."""
+    """Return positions (k, 3), m, and velocities (k, 3), m/s, of polynomials through the nearest points of each time.
+
+    `nodes` (n,) are the times of the points, s, and `places` (n, 3) their positions, m. `at` (k,) are the times of the
+    result, and `count` is the number of points of a polynomial. Raise InvalidProblem if positions are missing between
+    the points.
+    """
     from scipy.interpolate import KroghInterpolator
 
     start = (np.searchsorted(nodes, at) - count // 2).clip(0, len(nodes) - count)
     position, velocity = np.empty((len(at), 3)), np.empty((len(at), 3))
     for first in np.unique(start).tolist():
-        mine, own = start == first, nodes[first : first + count]
-        steps = np.diff(own)
+        mine, times_of_points = start == first, nodes[first : first + count]
+        steps = np.diff(times_of_points)
         if np.ptp(steps) > _UNEVEN * steps.min():
             raise InvalidProblem(f"positions are missing around {_date(at[mine][0])}", where, "use another file")
         # Scale time to steps from the first point: powers of seconds would lose digits.
         step = float(steps.mean())
-        through = KroghInterpolator((own - own[0]) / step, places[first : first + count])
-        position[mine], velocity[mine] = through.derivatives((at[mine] - own[0]) / step, 2)
+        through = KroghInterpolator((times_of_points - times_of_points[0]) / step, places[first : first + count])
+        position[mine], velocity[mine] = through.derivatives((at[mine] - times_of_points[0]) / step, 2)
         velocity[mine] /= step
     return position, velocity
 
 
 def _leap_seconds(seconds: Array) -> Array:
-    """Return the leap seconds (k,) of atomic time over UTC."""
+    """Return TAI minus UTC (k,), s, at times `seconds` (k,) since 1970, UTC."""
     ahead = np.concatenate([_instants(part).tai for part in np.split(seconds, range(_AT_ONCE, len(seconds), _AT_ONCE))])
     return np.asarray(np.round((ahead - (seconds / _DAY + _EPOCH_1970)) * _DAY))

@@ -32,13 +32,22 @@ def speed_of(file: ProblemFile, source: str) -> float:
 
 
 def _medium(table: MediumTable, reference: float | None, source: str) -> Medium:
-    """Return the medium of a table; `reference` is the propagation speed of the file, if stated."""
+    """Return the medium of a table; raise InvalidProblem for missing or superfluous keys.
+
+    `reference` is the propagation speed of the file, m/s; None if it states none. It converts times to lengths in
+    layers.
+    """
     place = join(source, "[medium]")
-    own = _MEDIA[table.kind]
+    permitted_keys = _MEDIA[table.kind]
     given = {key for key in table.model_fields_set - {"kind"} if getattr(table, key) is not None}
-    wrong, lacking = sorted(given - set(own)), [key for key in ("depths", "speeds") if key in own and key not in given]
+    wrong, lacking = (
+        sorted(given - set(permitted_keys)),
+        [key for key in ("depths", "speeds") if key in permitted_keys and key not in given],
+    )
     if wrong:
-        raise InvalidProblem(f"the kind {table.kind!r} has no {wrong[0]!r}", place, f"use the keys {', '.join(own)}")
+        raise InvalidProblem(
+            f"the kind {table.kind!r} has no {wrong[0]!r}", place, f"use the keys {', '.join(permitted_keys)}"
+        )
     if lacking:
         raise InvalidProblem(f"the kind {table.kind!r} needs {lacking[0]}", place, "give a list of numbers")
     if table.kind == "atmosphere" and reference is not None:
@@ -62,7 +71,7 @@ def _medium(table: MediumTable, reference: float | None, source: str) -> Medium:
 
 
 def _stated_speed(file: ProblemFile, source: str) -> float | None:
-    """Return the propagation speed that a file states, m/s."""
+    """Return the propagation speed that a file states, m/s; None if it states none."""
     given, place = file.propagation_speed, join(source, "key 'propagation_speed'")
     if isinstance(given, SoundTable):
         water = given.medium != "air"
@@ -79,7 +88,10 @@ def _stated_speed(file: ProblemFile, source: str) -> float | None:
 
 
 def positive_speed(given: float | str, what: str, place: str) -> float:
-    """Return a speed or its sigma, m/s; raise InvalidProblem for zero or negative values."""
+    """Return a speed or its standard deviation, m/s; raise InvalidProblem for zero or negative values.
+
+    `what` is the noun and `place` the place for the message.
+    """
     speed = Units("speed").plain(given, "m/s", place)
     if not speed > 0.0:
         raise InvalidProblem(f"the {what} {given} is not positive", place, 'write it as 340.0 or "340 m/s"')
@@ -90,7 +102,7 @@ def positive_speed(given: float | str, what: str, place: str) -> float:
 
 
 def is_time(units: Units, unit: str | None, place: str) -> bool:
-    """Return whether lengths are given as times, so that they depend on the propagation speed."""
+    """Return whether values in `unit` are times for a quantity that is a length, so that they depend on the speed."""
     if units.quantity != "length":
         return False
     once, twice = (Units("length", speed=factor * units.speed).conversion(unit, place).factor for factor in (1.0, 2.0))

@@ -53,9 +53,11 @@ class Received:
     satellite : object array (m,)
         Names.
     place : array (m, 3)
-        Position of each satellite at transmission, ECEF, metres.
-    z, sigma : array (m,)
-        Pseudoranges without satellite clock errors and modelled delays of the atmosphere, and their errors, metres.
+        Position of each satellite at transmission, in the ECEF axes at reception, metres.
+    z : array (m,)
+        Pseudoranges without satellite clock errors and modelled delays of the atmosphere, metres.
+    sigma : array (m,)
+        Standard deviations of the pseudoranges, metres.
     about : tuple of (str, str)
         Interpretation of the file.
     notes : tuple of str
@@ -109,8 +111,8 @@ def received(
     """
     letter = (system or "G").upper()
     if letter not in SYSTEMS:
-        told = ", ".join(f"{key} ({name})" for key, name in SYSTEMS.items())
-        raise InvalidProblem(f"there is no system {system!r}", "--system", f"write one of {told}")
+        choices = ", ".join(f"{key} ({name})" for key, name in SYSTEMS.items())
+        raise InvalidProblem(f"there is no system {system!r}", "--system", f"write one of {choices}")
     if navigation is None:
         advice = "give the RINEX navigation file of that day with --navigation"
         raise InvalidProblem("the satellite positions are unknown", "--navigation", advice)
@@ -153,9 +155,11 @@ def received(
 def _at_transmission(
     seen: Observations, ephemerides: Mapping[str, Ephemeris], system: str
 ) -> tuple[Array, Array, Array, tuple[str, ...]]:
-    """Return the indices (n,) of observations with an ephemeris, satellite positions (n, 3), ranges (n,), and notes.
+    """Return the observations that have a healthy ephemeris, with the positions of their satellites at transmission.
 
-    Observations are in the order of time. Positions are at transmission, m.
+    The result has the indices (n,) of these observations in the order of time, and the satellite positions (n, 3),
+    ECEF, m. It also has the pseudoranges without the satellite clock errors (n,), m, and notes. Positions are in the
+    Earth axes at transmission. `system` is the letter of the satellite system.
     """
     count = len(seen.time)
     place, clock, good = np.full((count, 3), np.nan), np.full(count, np.nan), np.zeros(count, dtype=bool)
@@ -165,19 +169,19 @@ def _at_transmission(
         if name not in ephemerides:
             continue
         every = ephemerides[name]
-        apart = np.abs(sent[rows, None] - every.toe) + np.where(every.health == 0.0, 0.0, np.inf)
-        nearest = apart.argmin(1)
-        fresh = np.take_along_axis(apart, nearest[:, None], axis=1)[:, 0] <= _MAX_AGE
-        rows, own = rows[fresh], Ephemeris(*(column[nearest[fresh]] for column in every))
+        age = np.abs(sent[rows, None] - every.toe) + np.where(every.health == 0.0, 0.0, np.inf)
+        nearest = age.argmin(1)
+        fresh = np.take_along_axis(age, nearest[:, None], axis=1)[:, 0] <= _MAX_AGE
+        rows, elements = rows[fresh], Ephemeris(*(column[nearest[fresh]] for column in every))
         # transmission time = time of the satellite clock minus its error
-        _, ahead = orbit(own, system, sent[rows])
-        place[rows], clock[rows] = orbit(own, system, sent[rows] - ahead)
+        _, ahead = orbit(elements, system, sent[rows])
+        place[rows], clock[rows] = orbit(elements, system, sent[rows] - ahead)
         good[rows] = True
     if not good.any():
         what = f"no satellite has a healthy ephemeris within {_MAX_AGE / 3600.0:g} hours"
         raise InvalidProblem(what, "--navigation", "use the navigation file of that day")
-    left = int((~good).sum())
-    notes = (f"{left} pseudoranges of satellites without a healthy ephemeris are left out",) if left else ()
+    left_out = int((~good).sum())
+    notes = (f"{left_out} pseudoranges of satellites without a healthy ephemeris are left out",) if left_out else ()
     chosen = np.flatnonzero(good)
     chosen = chosen[np.argsort(seen.time[chosen], kind="stable")]
     twice = {*zip(seen.time[chosen].tolist(), seen.satellite[chosen], strict=True)}
@@ -190,7 +194,9 @@ def _at_transmission(
 def _first_pass(source: Path, epoch: Array, place: Array, z: Array, count: int, *, level: bool = False) -> Array:
     """Return the receiver position at each epoch (count, 3), ECEF, m, accurate to some hundred metres.
 
-    No first guess is needed. With `level`, the receiver is on the ground, and three satellites are enough.
+    `epoch` (n,) are the epoch numbers, sorted. `place` (n, 3) are the satellite positions, and `z` (n,) the
+    pseudoranges, m. No first guess is needed. With `level`, the receiver is on the ground, and three satellites are
+    enough. An epoch without a fix gets the position of the nearest epoch.
     """
     from optloc.linear.constraints import height
     from optloc.solvers.solution import solve
@@ -200,12 +206,12 @@ def _first_pass(source: Path, epoch: Array, place: Array, z: Array, count: int, 
     stations, ranges, weight = np.zeros((count, width, 3)), np.zeros((count, width)), np.zeros((count, width))
     stations[:] = place[0]
     stations[epoch, slot], ranges[epoch, slot], weight[epoch, slot] = place, z, 1.0
-    least, held = (_MIN_SATELLITES - 1, height(0.0, 0.0)) if level else (_MIN_SATELLITES, ())
+    least, on_ground = (_MIN_SATELLITES - 1, height(0.0, 0.0)) if level else (_MIN_SATELLITES, ())
     enough = np.flatnonzero(weight.sum(1) >= least)
     found = np.full((count, 3), np.nan)
     if len(enough):
         rows = measured("toa", ranges[enough], a=np.arange(width), sigma=10.0, weight=weight[enough])
-        problem = assemble(station_array(stations[enough, None]), rows, frame=ECEF, constraints=held)
+        problem = assemble(station_array(stations[enough, None]), rows, frame=ECEF, constraints=on_ground)
         fix = solve(problem, "auto" if level else "gtrs+lsr")
         found[enough] = np.where(np.linalg.norm(fix.position, axis=-1)[:, None] < _MAX_RADIUS, fix.position, np.nan)
     good = np.flatnonzero(np.isfinite(found).all(-1))
@@ -244,7 +250,11 @@ def at_reception(source: Path, epoch: Array, place: Array, z: Array) -> Array:
 
 
 def _rough_position(source: Path, epoch: Array, place: Array, z: Array, count: int) -> Array:
-    """Return the receiver position of a table at each epoch (count, 3), ECEF, accurate to some hundred metres."""
+    """Return the receiver position of a table at each epoch (count, 3), ECEF, m, accurate to some hundred metres.
+
+    Parameters are as in `_first_pass`. If no epoch has four satellites that give a position, a receiver on the ground
+    is assumed.
+    """
     try:
         return _first_pass(source, epoch, place, z, count)
     except InvalidProblem:
@@ -259,22 +269,29 @@ def _rough_position(source: Path, epoch: Array, place: Array, z: Array, count: i
 
 
 def _sky(rough: Array, place: Array) -> tuple[tuple[Array, Array, Array], Array, Array]:
-    """Return latitude, longitude, height (n,) of receivers (n, 3); elevation and azimuth (n,) of satellites (n, 3)."""
+    """Return the geodetic positions of receivers, and the directions of satellites as seen from them.
+
+    The result is ((latitude, longitude, height), elevation, azimuth), arrays (n,), rad and m; azimuths are clockwise
+    from north. `rough` (n, 3) are the receivers and `place` (n, 3) the satellites, ECEF, m.
+    """
     lat, lon, height = ECEF.to_geodetic(rough)
-    way = place - rough
-    way = way / np.linalg.norm(way, axis=-1, keepdims=True)
+    direction = place - rough
+    direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     up = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
     east = np.stack([-np.sin(lon), np.cos(lon), np.zeros_like(lon)], axis=-1)
     north = np.cross(up, east)
-    elevation = np.arcsin((way * up).sum(-1))
-    return (lat, lon, height), elevation, np.arctan2((way * east).sum(-1), (way * north).sum(-1))
+    elevation = np.arcsin((direction * up).sum(-1))
+    return (lat, lon, height), elevation, np.arctan2((direction * east).sum(-1), (direction * north).sum(-1))
 
 
 # Android.
 
 
 def read_log(path: Path, system: str) -> Observations:
-    """Return the pseudoranges of one system in a GnssLogger log; raise InvalidProblem if required data are missing."""
+    """Return the pseudoranges of one system in a GnssLogger log; raise InvalidProblem if required data are missing.
+
+    `system` is the letter of the satellite system.
+    """
     table = _raw(path)
     more = {name: _or_zero(table, name) for name in ("BiasNanos", "TimeOffsetNanos", "HardwareClockDiscontinuityCount")}
     whole = {name: _whole(table, name) for name in ("TimeNanos", "FullBiasNanos", "ReceivedSvTimeNanos")}
@@ -295,26 +312,28 @@ def read_log(path: Path, system: str) -> Observations:
     clock = whole["TimeNanos"][rows] - whole["FullBiasNanos"][first]  # whole nanoseconds: 19 digits
     rest = more["TimeOffsetNanos"][rows] - more["BiasNanos"][first]
     week = int(WEEK * 1e9)
-    apart = (clock % week - whole["ReceivedSvTimeNanos"][rows]).astype(float) + rest
-    apart -= week * np.round(apart / week)  # at the turn of a week
+    flight_ns = (clock % week - whole["ReceivedSvTimeNanos"][rows]).astype(float) + rest
+    flight_ns -= week * np.round(flight_ns / week)  # at the turn of a week
     names = [f"{system}{int(v) - (_QZSS if system == 'J' else 0):02d}" for v in table.numbers("Svid")[rows]]
     keys = {(t, name): k for k, (t, name) in reversed([*enumerate(zip(clock.tolist(), names, strict=True))])}
     kept = np.array(sorted(keys.values(), key=lambda k: (clock[k], k)))
-    far = apart[kept] * 1e-9 * SPEED_OF_LIGHT
+    far = flight_ns[kept] * 1e-9 * SPEED_OF_LIGHT
     if not ((far > 0.0) & (far < 1e8)).any():
         raise InvalidProblem(
             "the times give no valid distance of a satellite", path.name, "check that the log is complete"
         )
     kept, far = kept[(far > 0.0) & (far < 1e8)], far[(far > 0.0) & (far < 1e8)]
-    left = table.count - len(kept)
-    notes = (f"{left} rows of other systems, frequencies, or without a known time are left out",) if left else ()
+    left_out = table.count - len(kept)
+    notes = (
+        (f"{left_out} rows of other systems, frequencies, or without a known time are left out",) if left_out else ()
+    )
     return Observations(
         path.name, clock[kept] * 1e-9, np.array(names, dtype=object)[kept], far, "raw times of Android", notes
     )
 
 
 def _raw(path: Path) -> Table:
-    """Return the rows "Raw" of a log as a table."""
+    """Return the rows "Raw" of a log as a table; raise InvalidProblem for a log without them."""
     lines = decoded(read_bytes(path, lines=True), path.name).splitlines()
     head = next((line for line in lines if line.startswith("# Raw,")), None)
     rows = [line.removeprefix("Raw,") for line in lines if line.startswith("Raw,")]

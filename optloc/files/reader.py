@@ -1,4 +1,9 @@
-"""Reader of problem files: read tables, find epochs, convert to SI units, check, and build the problem."""
+"""Reader of problem files: read tables, find epochs, convert to SI units, check, and build the problem.
+
+In shapes, m is the number of rows, k of epochs, s of stations, d of dimensions, and r of rows in one epoch. A chunk has
+the rows of one kind in one table. `index` and `target` have the epoch and the target of each row, one array (m,) for
+each chunk.
+"""
 
 from __future__ import annotations
 
@@ -183,7 +188,7 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
 
 
 def draft(path: Path, *, values: bool, more: Mapping[str, ConstraintTable] | None = None) -> Draft:
-    """Return the problem of a file together with its tables; arguments as in `read`."""
+    """Return the problem of a file together with its tables; the arguments are as in `read`."""
     file, source = read_document(path), name_of(path)
     # Read tables before converting anything, so that a missing file is reported before a wrong unit.
     known = places_of(file, path.parent, source)
@@ -252,15 +257,17 @@ def assemble(
     written = [(number, chunk.units, chunk.written_unit) for number, chunk in zip(numbers, chunks, strict=True)]
     biases = [bias_of(b, rows, stations.names, epochs, stations.dimension, written, source) for b in file.biases]
     units = {bias.name: unit for bias, unit in biases if unit[0]}
-    own = tuple(bias for bias, _ in biases)
-    own += speed_bias(file, written, own, source)
-    problem = _problem(file, epochs, stations, rows, noise, own, frame, source, known or {}, more or {})
+    all_biases = tuple(bias for bias, _ in biases)
+    all_biases += speed_bias(file, written, all_biases, source)
+    problem = _problem(file, epochs, stations, rows, noise, all_biases, frame, source, known or {}, more or {})
     # The estimation of noise needs fixes, and so the whole problem: do it last.
     problem, levels = with_noise(file, problem, source)
     title = file.title or source
     named = (epochs.labels, epochs.times, epochs.targets, epochs.own)
     loaded = Loaded(problem, source, title, *named, levels, units, azimuths)
-    return Draft(loaded, file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _follows(problem))
+    return Draft(
+        loaded, file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _has_moving_target(problem)
+    )
 
 
 def _problem(
@@ -275,6 +282,10 @@ def _problem(
     known: Mapping[str | None, Table],
     more: Mapping[str, ConstraintTable],
 ) -> Problem:
+    """Return the checked problem with the motions, priors, constraints and medium of the file.
+
+    `known` has the positions of known targets by name. `more` has further constraints, by their place for messages.
+    """
     speed = speed_of(file, source)
     motions = motions_of(file, epochs, known_of(file, known, epochs, frame, stations.dimension), source)
     # Times matter for motions and drifts; other files may omit times, or repeat them.
@@ -290,6 +301,7 @@ def _problem(
 
 
 def _epochs(file: ProblemFile, chunks: Sequence[RowChunk], source: str) -> Epochs:
+    """Return the epochs of the rows of all chunks; raise InvalidProblem if only some tables have times or labels."""
     columns: dict[str, Array | None] = {}
     for key in ("label", "time", "written", "target"):
         parts = [getattr(chunk, key) for chunk in chunks]
@@ -315,11 +327,13 @@ def _epochs(file: ProblemFile, chunks: Sequence[RowChunk], source: str) -> Epoch
 
 
 def _stations_used(chunk: RowChunk, epoch: Array) -> Array:
+    """Return the pairs (epoch, station) (u, 2) whose position the present rows of a chunk need."""
     pairs = [np.stack([epoch, station], axis=-1)[(station >= 0) & (chunk.weight > 0)] for station in (chunk.a, chunk.b)]
     return np.concatenate(pairs)
 
 
 def _add_baseline(chunk: RowChunk, epoch: Array, stations: Stations) -> RowChunk:
+    """Return a chunk with excess paths converted to path sums: the distance of the stations is added."""
     if not chunk.excess:
         return chunk
     place = stations.position[epoch if len(stations.position) > 1 else np.zeros_like(epoch)]
@@ -330,7 +344,10 @@ def _add_baseline(chunk: RowChunk, epoch: Array, stations: Stations) -> RowChunk
 def _rows(
     chunks: Sequence[RowChunk], index: Sequence[Array], target: Sequence[Array]
 ) -> tuple[tuple[Rows, ...], list[Array]]:
-    """Return the rows of each kind, and the global number of each row of each chunk."""
+    """Return the rows of each kind, and the global number of each row of each chunk.
+
+    `index` and `target` are the epoch and the target of each row (m,), for each chunk.
+    """
     # A problem has one block of rows for each kind, in the order of appearance; numbers refer to the chunks. Compass
     # bearings have a separate block from other azimuths, since their errors are clockwise.
     order = list(dict.fromkeys(chunk.kind for chunk in chunks))
@@ -356,6 +373,7 @@ def _rows(
 
 
 def _concatenate(parts: Sequence[Array]) -> Array:
+    """Return the concatenation of arrays; a single array is returned unchanged."""
     # Do not copy a single part: constant columns of millions of rows use no memory.
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
@@ -371,6 +389,10 @@ def _noise(
     target: Sequence[Array],
     source: str,
 ) -> Noise:
+    """Return the noise of all rows: from the chunks, or from the covariance of the whole file.
+
+    `numbers`, `index` and `target` are the global number, the epoch and the target of each row (m,), for each chunk.
+    """
     if file.covariance is None:
         return noise_of(chunks, numbers, index, target)
     place = join(source, "key 'covariance'")
@@ -408,7 +430,10 @@ def noise_of(
 
 
 def _arrivals(chunk: RowChunk, members: Array) -> Array:
-    """Return the covariance (g, r, r) of groups of rows (g, r) that combine independent arrivals of stations."""
+    """Return the covariances (g, r, r), SI, of g groups of rows whose noise is the noise of arrivals at stations.
+
+    `members` (g, r) are the rows of each group. Raise InvalidProblem for a row without noise.
+    """
     signs = MODELS[chunk.kind].signs
     assert signs is not None
     assert chunk.arrival is not None
@@ -422,6 +447,7 @@ def _arrivals(chunk: RowChunk, members: Array) -> Array:
 
 
 def _by_signal(chunk: RowChunk, signal: Signal, members: Array) -> Array:
+    """Return the covariances (g, r, r), SI, of groups of rows `members` (g, r) from the signal-to-noise ratio."""
     try:
         return signal.covariance(chunk.kind, chunk.a[members], chunk.b[members])
     except InvalidProblem as error:
@@ -429,14 +455,19 @@ def _by_signal(chunk: RowChunk, signal: Signal, members: Array) -> Array:
 
 
 def _per_epoch_block(chunk: RowChunk, number: Array, epoch: Array, matrix: Array) -> Block:
+    """Return the covariance block of a chunk with a covariance (r, r), in units of the file, for each epoch.
+
+    `number` and `epoch` (m,) are the global number and the epoch of each row.
+    """
     return per_epoch(number, epoch, chunk.slope, matrix, join(chunk.table.source, "covariance"), int(chunk.row[0]))
 
 
 def per_epoch(number: Array, epoch: Array, slope: Array, matrix: Array, where: str, first: int = 0) -> Block:
-    """Return the covariance block of a matrix (r, r), in units of the file, that holds for the r rows of each epoch.
+    """Return the covariance block of a matrix (r, r), in units of the file, that applies to the r rows of each epoch.
 
-    `number` and `epoch` (m,) are the global number and epoch of each row; `slope` (m,) are the SI units in one unit of
-    the file. `first` is the row number of the first row, for messages.
+    `number` and `epoch` (m,) are the global number and the epoch of each row. `slope` (m,) are the SI units in one unit
+    of the file. `where` is the place for messages, and `first` the row number of the first row. Raise InvalidProblem if
+    an epoch does not have r rows.
     """
     groups = group_members(epoch)
     # The matrix is the same for each epoch: absent rows keep their place with weight 0.
@@ -470,6 +501,7 @@ def with_noise(file: ProblemFile, problem: Problem, source: str) -> tuple[Proble
 
 
 def _check(problem: Problem, source: str, medium: Medium | None = None) -> Problem:
+    """Return the problem in its medium after all checks; an error names the file."""
     try:
         return checked(problem if medium is None else problem.in_medium(medium))
     # Add the name of the file to an error of the problem.
@@ -477,7 +509,8 @@ def _check(problem: Problem, source: str, medium: Medium | None = None) -> Probl
         raise InvalidProblem(error.what, join(source, error.where), error.advice) from None
 
 
-def _follows(problem: Problem) -> bool:
+def _has_moving_target(problem: Problem) -> bool:
+    """Return whether a known target moves: it has several positions."""
     return any(motion.known is not None and len(motion.known) > 1 for motion in problem.motions)
 
 
@@ -546,16 +579,16 @@ def from_table(
         The message names the row and column.
     """
     names = dict(columns or {})
-    own: Any = station_options or {}
+    settings_of_stations: Any = station_options or {}
     place: dict[str, Any] = {"kind": frame} if isinstance(frame, str) else dict(frame)
-    places = station_table(stations, "stations", names=own.get("columns"))
+    places = station_table(stations, "stations", names=settings_of_stations.get("columns"))
     measured = {"kind": kind, "unit": dict(unit) if isinstance(unit, Mapping) else unit, "sigma": sigma, **options}
     # Arguments are read like a problem file with the name "arguments", so both use one reader.
     settings = {
         "format": 1,  # keeps the convention of azimuths of this function
         "propagation_speed": propagation_speed,
         "frame": place,
-        "stations": dict(own),
+        "stations": dict(settings_of_stations),
         "measurements": [{key: value for key, value in measured.items() if value is not None}],
         "epochs": {"window": window},
         "target": {"motion": motion},

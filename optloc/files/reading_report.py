@@ -1,4 +1,7 @@
-"""Report on how a table was read: the role of each column, and errors for unused columns that may be measurements."""
+"""Report on how a table was read: the role of each column, and errors for unused columns that may be measurements.
+
+A sort of readings is a measurement kind in one form, such as arrivals or S minus P times. `hints` has the options.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,7 @@ _ORIENTED = {
 
 def uses_of(
     roles: Roles,
-    told: ColumnHints,
+    hints: ColumnHints,
     found: Sequence[Readings],
     epochs: Mapping[str, Array],
     sigmas: Sequence[str | None],
@@ -59,12 +62,12 @@ def uses_of(
     wanted = wanted if picks else []
     if long:
         wanted += ["station"]
-        wanted += ["reference"] if told.reference is None and any(one.b is not None for one in found) else []
+        wanted += ["reference"] if hints.reference is None and any(one.b is not None for one in found) else []
     wanted += ["target"] if "target" in epochs else []
-    timed = "time" in epochs or (not told.still and roles.find("message") is None)
-    wanted += ["message"] if "epoch" in epochs and told.window is None else []
+    timed = "time" in epochs or (not hints.still and roles.find("message") is None)
+    wanted += ["message"] if "epoch" in epochs and hints.window is None else []
     wanted += ["time"] if timed or by_phase else []
-    if told.stations is None:
+    if hints.stations is None:
         wanted += ["name", *place_roles(roles)]
     for role in wanted:
         column = roles.find(role)
@@ -101,13 +104,17 @@ def unused_columns(
 
 def reading_lines(
     roles: Roles,
-    told: ColumnHints,
-    place: ColumnPlaces,
+    hints: ColumnHints,
+    stations: ColumnPlaces,
     found: Sequence[Readings],
     epochs: Mapping[str, Array],
     uses: Mapping[str, str],
 ) -> list[tuple[str, str]]:
-    """Return the interpretation of a table as lines for the user: a keyword and a text."""
+    """Return the interpretation of a table as lines for the user, each a keyword and a text.
+
+    `stations` has the stations and `found` the readings of each sort. `epochs` has the columns epoch, time and target
+    of the rows. `uses` has the role of each used column.
+    """
     out: list[tuple[str, str]] = []
     for one in found:
         cells = one.columns
@@ -126,19 +133,21 @@ def reading_lines(
     errors = {name: role.removeprefix("sigma_") for name, role in uses.items() if role.startswith("sigma_")}
     out += [("sigma", f"of {kind}, from column {name}") for name, kind in errors.items()]
     if "epoch" in epochs:
-        names = [roles.find(role) for role in (("message", "time") if told.window is None else ("time",))]
+        names = [roles.find(role) for role in (("message", "time") if hints.window is None else ("time",))]
         label = next(
             (f"column {name}" for name in names if name is not None and set(name.split("+")) <= set(uses)), "row"
         )
         out.append(("epochs", f"{len(set(numbered(epochs['epoch'])[0]) - {''})} by {label}"))
     elif "time" in epochs:
-        each = f"{told.window} each" if told.window else f"{len(np.unique(epochs['time']))}"
+        each = f"{hints.window} each" if hints.window else f"{len(np.unique(epochs['time']))}"
         out.append(("epochs", f"{each} by column {roles.find('time')}"))
     if "target" in epochs:
         out.append(("targets", f"{len(numbered(epochs['target'])[0])} by column {roles.find('target')}"))
-    where = told.stations.name if told.stations is not None else "the table itself"
-    axes = "latitude and longitude" if place.frame == "geodetic" else f"x and y, {place.frame}, in {place.unit}"
-    out.append(("stations", f"{len(set(place.names))} of {where}, by {axes}"))
+    where = hints.stations.name if hints.stations is not None else "the table itself"
+    axes = (
+        "latitude and longitude" if stations.frame == "geodetic" else f"x and y, {stations.frame}, in {stations.unit}"
+    )
+    out.append(("stations", f"{len(set(stations.names))} of {where}, by {axes}"))
     return out
 
 
@@ -160,7 +169,10 @@ _CLOSE = 0.75
 
 
 class _Pattern(NamedTuple):
-    """Name pattern of receiver columns: words before and behind the stations, number of stations, and unit."""
+    """Name pattern of receiver columns.
+
+    before, behind: words before and behind the stations. stations: number of stations. unit: unit at the end, or None.
+    """
 
     before: tuple[str, ...]
     behind: tuple[str, ...]
@@ -190,6 +202,7 @@ def check_receivers(table: Table, uses: Mapping[str, str], named: Sequence[Named
 
 
 def _pattern(one: Named) -> _Pattern:
+    """Return the name pattern of the column `one`, which is named after stations."""
     words, ends = tokens(without_unit(one.column)), [tokens(end) for end in one.ends]
     places = [_find(words, end) for end in (ends[0], ends[-1])]
     first, last = min(places), max(place + len(end) for place, end in zip(places, (ends[0], ends[-1]), strict=True))
@@ -202,45 +215,51 @@ def _find(words: Sequence[str], part: Sequence[str]) -> int:
 
 
 def _name_in(column: str, pattern: _Pattern, stations: Sequence[str]) -> str | None:
-    """Return the part of a column name at the place of a station; None if the name does not match the pattern."""
+    """Return the part of a column name at the place of a station; None if the name does not match the pattern.
+
+    None also means another column of a known station, or a name that is only by chance at this place.
+    """
     text = without_unit(column)
-    words, around = tokens(text), len(pattern.before) + len(pattern.behind)
+    words, n_around = tokens(text), len(pattern.before) + len(pattern.behind)
     inner = range(len(pattern.before), len(words) - len(pattern.behind))
-    if len(words) <= around or words[: inner.start] != pattern.before or words[inner.stop :] != pattern.behind:
+    if len(words) <= n_around or words[: inner.start] != pattern.before or words[inner.stop :] != pattern.behind:
         return None
-    left = _without_stations(words, inner, stations)
-    name = _spelled(text, left)
+    unknown_words = _without_stations(words, inner, stations)
+    name = _spelled(text, unknown_words)
     same = _same_quantity(any_unit(column), pattern.unit)
-    if not left or (pattern.stations == 1 and len(left) < len(inner) and not (same and pattern.unit)):
+    if not unknown_words or (pattern.stations == 1 and len(unknown_words) < len(inner) and not (same and pattern.unit)):
         return None  # another column of a known receiver, such as its signal level
     if _is_like(name, stations):
         return name
-    if not around and (pattern.unit is None or role_of(column) in _AUXILIARY_ROLES):
+    if not n_around and (pattern.unit is None or role_of(column) in _AUXILIARY_ROLES):
         return None
     # A single name may lack the unit.
-    forgotten = around > 0 and any_unit(column) is None and role_of(name) not in _AUXILIARY_ROLES
-    return name if same or forgotten else None
+    unit_omitted = n_around > 0 and any_unit(column) is None and role_of(name) not in _AUXILIARY_ROLES
+    return name if same or unit_omitted else None
 
 
 def _without_stations(words: Sequence[str], inner: range, stations: Sequence[str]) -> list[int]:
-    """Return the indices of words that belong to no known station."""
+    """Return the indices of the words in the range `inner` that belong to no known station."""
     known = sorted((tokens(name) for name in stations if tokens(name)), key=len, reverse=True)
-    left, at = [], inner.start
+    unknown_words, at = [], inner.start
     while at < inner.stop:
         size = next((len(name) for name in known if tuple(words[at : at + len(name)]) == name), 0)
-        left += [] if size else [at]
+        unknown_words += [] if size else [at]
         at += max(size, 1)
-    return left
+    return unknown_words
 
 
 def _spelled(text: str, places: Sequence[int]) -> str:
-    """Return the part of a text from the first to the last of the words with these indices."""
+    """Return the part of a text from the first to the last of the words with the indices `places`; empty for none."""
     spans = [match.span() for match in re.finditer(r"[^\W\d_]+|\d+", text.lower())]
     return text[spans[places[0]][0] : spans[places[-1]][1]] if places else ""
 
 
 def _same_quantity(one: str | None, other: str | None) -> bool:
-    """Return whether two units have the same quantity; no unit only matches no unit."""
+    """Return whether two units have the same quantity, such as "m" and "km".
+
+    A name without a unit (None) matches only another name without a unit.
+    """
     if one is None or other is None:
         return one is other
     return any(one in units and other in units for units in UNITS.values())

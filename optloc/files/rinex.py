@@ -74,9 +74,10 @@ class Navigation:
 
 @dataclass(frozen=True, slots=True)
 class _File:
-    """A RINEX file: header lines as (label, text), and the lines after the header.
+    """A RINEX file: its header lines as (label, text), and the lines after the header.
 
-    first: number of the first line after the header, for messages.
+    version: version of the format. letter: type of the file, O for observations. first: number of the first line after
+    the header, for messages.
     """
 
     source: str
@@ -87,9 +88,11 @@ class _File:
     first: int
 
     def at(self, i: int) -> str:
+        """Return the place of a line, counted from 0 after the header, for messages."""
         return f"{self.source}, line {self.first + i}"
 
     def line(self, i: int) -> str:
+        """Return a line, counted from 0 after the header; raise InvalidProblem beyond the end of the file."""
         if i >= len(self.lines):
             raise InvalidProblem("the file ends within a record", self.source, "copy the file again")
         return self.lines[i]
@@ -105,6 +108,10 @@ def is_rinex(path: Path) -> bool:
 
 
 def _read(path: Path, kind: str, letters: str) -> _File:
+    """Return a RINEX file; raise InvalidProblem for another version or type.
+
+    `kind` is "observation" or "navigation", and `letters` are the permitted types of files.
+    """
     source = path.name
     lines = read_bytes(path, lines=True).decode("ascii", errors="replace").splitlines()
     if not lines or "RINEX VERSION" not in lines[0]:
@@ -128,6 +135,10 @@ def _read(path: Path, kind: str, letters: str) -> _File:
 
 
 def _number(file: _File, i: int, text: str, what: str) -> float:
+    """Return a number, which may have a Fortran exponent (1.5D-3).
+
+    `i` is its line, and `what` the noun for the message of InvalidProblem.
+    """
     try:
         return float(text.replace("D", "E").replace("d", "e"))
     except ValueError:
@@ -135,7 +146,7 @@ def _number(file: _File, i: int, text: str, what: str) -> float:
 
 
 def _seconds(file: _File, i: int, text: str) -> float:
-    """Return a calendar time in seconds since 1980; years may have two digits."""
+    """Return a calendar time as seconds since 1980-01-06; years may have two digits. `i` is the line for messages."""
     parts = text.split()
     try:
         year, month, day, hour, minute = map(int, parts[:5])
@@ -146,7 +157,7 @@ def _seconds(file: _File, i: int, text: str) -> float:
         raise InvalidProblem(f"{text.strip()[:40]!r} is not a time", file.at(i), "correct the line") from None
 
 
-def _named(text: str) -> str:
+def _satellite_name(text: str) -> str:
     """Return the name of a satellite; version 2 may omit the letter of GPS."""
     text = text.ljust(3)
     return f"{text[0] if text[0] != ' ' else 'G'}{text[1:3].strip().zfill(2)}"
@@ -161,7 +172,7 @@ def read_observations(path: Path, system: str) -> Observations:
     scale = next((text[48:51].strip() for label, text in file.header if label == "TIME OF FIRST OBS"), "")
     if scale not in _SCALES:
         raise InvalidProblem(f"the time scale is {scale}", file.source, "convert them to GPS time")
-    types = _types(file, system)
+    types = _observation_codes(file, system)
     code = next((each for each in _CODES[system] if each in types), None)
     if code is None:
         what = f"there are no {SYSTEMS[system]} pseudoranges of the first frequency"
@@ -185,20 +196,23 @@ def read_observations(path: Path, system: str) -> Observations:
     return Observations(file.source, np.array(time), np.array(satellite, dtype=object), np.array(z), code, notes)
 
 
-def _types(file: _File, system: str) -> list[str]:
-    """Return the observation codes of a system, in order."""
+def _observation_codes(file: _File, system: str) -> list[str]:
+    """Return the observation codes of a system, such as "C1C", in the order of the columns of a record."""
     if file.version < 3.0:  # RINEX version
         return [word for label, text in file.header if label == "# / TYPES OF OBSERV" for word in text[6:].split()]
-    found, whose = [], ""
+    found, system_of_line = [], ""
     for label, text in file.header:
         if label == "SYS / # / OBS TYPES":
-            whose = text[0].strip() or whose
-            found += text[6:].split() if whose == system else []
+            system_of_line = text[0].strip() or system_of_line
+            found += text[6:].split() if system_of_line == system else []
     return found
 
 
 def _records_of_3(file: _File) -> Iterator[tuple[int, float, str, str]]:
-    """Yield line, time, satellite and observations of each record of version 3."""
+    """Yield the line number, the time (s since 1980), the satellite and the text of the observations of each record.
+
+    The file has version 3. Events and other records without observations are skipped.
+    """
     i = 0
     while i < len(file.lines):
         line = file.lines[i]
@@ -211,12 +225,15 @@ def _records_of_3(file: _File) -> Iterator[tuple[int, float, str, str]]:
         if flag < _EVENTS:
             seconds = _seconds(file, i, line[1:29])
             for k in range(i + 1, i + 1 + count):
-                yield k, seconds, _named(file.line(k)), file.line(k)[3:]
+                yield k, seconds, _satellite_name(file.line(k)), file.line(k)[3:]
         i += 1 + count
 
 
 def _records_of_2(file: _File, types: int) -> Iterator[tuple[int, float, str, str]]:
-    """Yield line, time, satellite and observations of each record of version 2, with lines of at most 80 columns."""
+    """Yield records as `_records_of_3` for a file of version 2, whose lines have at most 80 columns.
+
+    `types` is the number of observations of a satellite, which determines the number of lines of a record.
+    """
     each, i = -(-types // _WRAPPED["observations"]), 0
     while i < len(file.lines):
         line = file.lines[i]
@@ -235,7 +252,7 @@ def _records_of_2(file: _File, types: int) -> Iterator[tuple[int, float, str, st
         for k in range(count):
             wide = 16 * _WRAPPED["observations"]
             text = "".join(file.line(i + row)[:wide].ljust(wide) for row in range(each))
-            yield i, seconds, _named(names[3 * k : 3 * k + 3]), text
+            yield i, seconds, _satellite_name(names[3 * k : 3 * k + 3]), text
             i += each
 
 
@@ -262,7 +279,7 @@ def read_navigation(path: Path) -> Navigation:
         if not file.lines[i].strip():
             i += 1
             continue
-        name = _named(f"G{file.lines[i][:2]}" if old else file.lines[i][:3])
+        name = _satellite_name(f"G{file.lines[i][:2]}" if old else file.lines[i][:3])
         if not re.fullmatch(r"[A-Z]\d\d", name):
             raise InvalidProblem(
                 "an ephemeris must begin with a satellite such as G07", file.at(i), "copy the file again"
@@ -278,7 +295,11 @@ def read_navigation(path: Path) -> Navigation:
 
 
 def _elements(file: _File, i: int, system: str, *, old: bool) -> list[float]:
-    """Return the numbers of one ephemeris in the order of `Ephemeris`."""
+    """Return the numbers of one ephemeris in the order of `Ephemeris`.
+
+    `i` is the first of its eight lines. `old` is whether the file has version 2. Raise InvalidProblem for invalid or
+    missing numbers.
+    """
     indent = 3 if old else 4
     first = file.line(i)
     toc = _seconds(file, i, first[2:22] if old else first[3:23])
@@ -290,22 +311,22 @@ def _elements(file: _File, i: int, system: str, *, old: bool) -> list[float]:
     if lacking is not None:
         raise InvalidProblem("a number is missing in the ephemeris", file.at(lacking), "remove its eight lines")
     values = [_number(file, k, text, "the element") if text.strip() else 0.0 for k, text in cells]
-    own = {name: values[place] for name, place in _PLACES.items()}
-    own |= {"toc": toc, "tgd": values[_DELAY[system]]} | dict(zip(("af0", "af1", "af2"), values, strict=False))
+    by_name = {name: values[place] for name, place in _PLACES.items()}
+    by_name |= {"toc": toc, "tgd": values[_DELAY[system]]} | dict(zip(("af0", "af1", "af2"), values, strict=False))
     # week numbers of old files may have overflowed at 1024: use the week of the clock reference time
-    own["week"] = WEEK * np.round((toc - own["toe"]) / WEEK)
-    own["toe"] += own["week"]
-    if not (0.0 <= own["e"] < 1.0 and own["root_a"] > 0.0):
+    by_name["week"] = WEEK * np.round((toc - by_name["toe"]) / WEEK)
+    by_name["toe"] += by_name["week"]
+    if not (0.0 <= by_name["e"] < 1.0 and by_name["root_a"] > 0.0):
         raise InvalidProblem("the elements are not an orbit", file.at(i), "remove its eight lines")
-    return [own[name] for name in Ephemeris._fields]
+    return [by_name[name] for name in Ephemeris._fields]
 
 
 def _ionosphere(file: _File) -> Array | None:
-    """Return the ionosphere coefficients alpha and beta (8,), or None."""
-    held = {"ION ALPHA": (2, ""), "ION BETA": (2, "")}
+    """Return the coefficients alpha and beta (8,) of Klobuchar's ionosphere; None if the header does not have both."""
+    labels_of_2 = {"ION ALPHA": (2, ""), "ION BETA": (2, "")}
     parts: dict[str, list[float]] = {}
     for label, text in file.header:
-        if label in held:
+        if label in labels_of_2:
             parts[label[4]] = [float(text[2 + 12 * k : 14 + 12 * k].replace("D", "E")) for k in range(4)]
         elif label == "IONOSPHERIC CORR" and text[:4] in ("GPSA", "GPSB"):
             parts[text[3]] = [float(text[5 + 12 * k : 17 + 12 * k].replace("D", "E")) for k in range(4)]

@@ -54,23 +54,23 @@ class Roles:
         The table.
     by_role : mapping of str to str
         Column of each role; "+" joins several columns to one label.
-    told : frozenset of str
+    stated : frozenset of str
         Roles that the user stated.
     """
 
     table: Table
     by_role: Mapping[str, str]
-    told: frozenset[str] = frozenset()
+    stated: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, table: Table, told: Mapping[str, str], readings: Collection[str] = ()) -> Roles:
+    def of(cls, table: Table, stated: Mapping[str, str], readings: Collection[str] = ()) -> Roles:
         """Return the roles of a table: stated by the user, then suggested by column names.
 
-        `told` has columns by role, or by another word for the role. `readings` are the columns of receiver readings,
+        `stated` has columns by role, or by another word for the role. `readings` are the columns of receiver readings,
         which have no other role. Raise InvalidProblem for an unknown role or column, a unit that does not fit, and a
         column with two roles.
         """
-        given = _stated_columns(table, told)
+        given = _stated_columns(table, stated)
         used = {part for name in given.values() for part in name.split("+")} | set(readings)
         found: dict[str, str] = {}
         for column in table.columns:
@@ -80,8 +80,11 @@ class Roles:
         return cls(table, found | given, frozenset(given))
 
     def find(self, role: str) -> str | None:
-        """Return the column of a role, or None."""
-        if role == "name" and stem(self.by_role.get("name", "")) != "name" and "name" not in self.told:
+        """Return the column of a role, or None.
+
+        A column of another role may replace it: a station can be named in the column `id`, for instance.
+        """
+        if role == "name" and stem(self.by_role.get("name", "")) != "name" and "name" not in self.stated:
             role = "station"  # a callsign names a station only if no other column does
         if role in self.by_role:
             return self.by_role[role]
@@ -129,14 +132,14 @@ class Roles:
 _NAMES_STATION = ("station", "name", "id")
 
 
-def _stated_columns(table: Table, told: Mapping[str, str]) -> dict[str, str]:
+def _stated_columns(table: Table, stated: Mapping[str, str]) -> dict[str, str]:
     """Return the columns that the user states, by role.
 
     Raise InvalidProblem for a column that does not fit its role.
     """
     given: dict[str, str] = {}
     owner: dict[str, str] = {}
-    for word, name in told.items():
+    for word, name in stated.items():
         role = role_named(word)
         role = _epoch_role(name) if role == "epoch" else role
         if role in given:
@@ -177,7 +180,7 @@ def with_standard_names(
     compass = file.format > 1 and frame.kind != "cartesian"
     places = [join(source, f"[[measurements]] {i + 1}") for i in range(len(tables))]
     read = [
-        _rows_in_our_words(section, table, place, compass)
+        _with_standard_rows(section, table, place, compass)
         for section, table, place in zip(file.measurements, tables, places, strict=True)
     ]
     biases = [
@@ -202,16 +205,19 @@ def with_standard_columns(table: Table, unit: str) -> Table:
     columns = dict(table.columns)
     for key in ("height", *"xyz"):
         name = named.get(key, "")
-        own = unit_of(name, UNITS["length"])
-        if own is not None and own != unit and unit in UNITS["length"]:
-            columns[name] = table.numbers(name, optional=True) * (UNITS["length"][own] / UNITS["length"][unit])
+        unit_in_name = unit_of(name, UNITS["length"])
+        if unit_in_name is not None and unit_in_name != unit and unit in UNITS["length"]:
+            columns[name] = table.numbers(name, optional=True) * (UNITS["length"][unit_in_name] / UNITS["length"][unit])
     return replace(table, columns=columns, names={**table.names, **named})
 
 
-def _rows_in_our_words(
+def _with_standard_rows(
     section: MeasurementsTable, table: Table, where: str, compass: bool
 ) -> tuple[MeasurementsTable, Table]:
-    """Return measurements with standard names and an explicit azimuth convention; `compass` is the format default."""
+    """Return measurements with standard names of kinds and columns, and with an explicit azimuth convention.
+
+    `where` is the place for messages. `compass` is whether azimuths without a stated convention are compass bearings.
+    """
     words = [] if section.kind is None else [section.kind]
     if section.kind is None and table.has("kind"):
         words = sorted(numbered(table.labels("kind"))[0])
@@ -245,6 +251,7 @@ def _rows_in_our_words(
 
 
 def _units_by_kind(section: MeasurementsTable) -> MeasurementsTable:
+    """Return a section whose units by kind have standard names of the kinds."""
     if not isinstance(section.unit, dict):
         return section
     return section.model_copy(update={"unit": {kind_named(kind): unit for kind, unit in section.unit.items()}})
@@ -264,7 +271,10 @@ def _ends(section: MeasurementsTable, table: Table) -> Table:
 
 
 def _value(table: Table, kind: str, where: str) -> tuple[Table, str | None]:
-    """Return a table whose values have the name z, and the unit at the end of the original column name."""
+    """Return a table whose values have the name z, and the unit at the end of the original column name.
+
+    The unit is None if the column already has the name z, or has no unit.
+    """
     if table.has("z") or "z" in table.names:
         return table, None
     model = MODELS[kind]
@@ -300,13 +310,13 @@ def azimuths_of(written: ProblemFile, read: ProblemFile) -> str:
 
     `written` are the settings of the file; `read` are the settings that `with_standard_names` returns.
     """
-    said: dict[str, None] = {}
+    texts: dict[str, None] = {}
     for before, after in zip(written.measurements, read.measurements, strict=True):
         if after.azimuth is not None:
             assumed = before.azimuth is None and str(before.kind).lower() != BEARING
             why = ASSUMED if assumed and written.format == 1 else ""
-            said[f'{_CONVENTION_TEXT[after.azimuth]}{why}; otherwise write azimuth = "{_OTHER[after.azimuth]}"'] = None
-    return "; ".join(said)
+            texts[f'{_CONVENTION_TEXT[after.azimuth]}{why}; otherwise write azimuth = "{_OTHER[after.azimuth]}"'] = None
+    return "; ".join(texts)
 
 
 # Stations from a table or from GeoJSON points.
@@ -314,7 +324,11 @@ def azimuths_of(written: ProblemFile, read: ProblemFile) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ColumnPlaces:
-    """Stations: the columns of a stations table (s,), their frame, the unit of lengths, and a note."""
+    """Stations of a table.
+
+    columns: columns of a stations table (s,), such as name, x, y, z or name, lat_deg, lon_deg, height. frame:
+    "cartesian", "ecef" or "geodetic". unit: unit of lengths. note: assumption about the heights, or empty.
+    """
 
     columns: Mapping[str, Array]
     frame: str
@@ -327,17 +341,17 @@ class ColumnPlaces:
         return [str(name) for name in self.columns["name"]]
 
 
-def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> ColumnPlaces:
-    """Return the stations of a file; `frame` applies to x, y, z."""
+def places_of(path: Path, stated: Mapping[str, str], frame: str | None) -> ColumnPlaces:
+    """Return the stations of a file; `stated` has the stated columns by role, and `frame` applies to x, y, z."""
     if path.suffix.lower() == ".geojson":
         return _of_geojson(json_of(read_text(path), path.name), path.name)
     if path.suffix.lower() == ".json":
         data = json_of(read_text(path), path.name)
         if isinstance(data, list) or (isinstance(data, dict) and "features" in data):
             return _of_geojson(data, path.name)
-        roles = Roles.of(records(data, path.name), told)
+        roles = Roles.of(records(data, path.name), stated)
     else:
-        roles = Roles.of(read_table(path), told)
+        roles = Roles.of(read_table(path), stated)
     found = placed(roles, frame)
     column = roles.find("heading")
     if column is not None:
@@ -349,7 +363,7 @@ def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> ColumnP
 
 
 def place_roles(roles: Roles) -> tuple[str, ...]:
-    """Return the roles of the position columns that `placed` reads."""
+    """Return the roles of the position columns that `placed` reads, such as "lat", "lon" and "height"."""
     across, ups = (
         (("lat", "lon"), _HEIGHT_ROLES["height"]) if roles.find("lat") is not None else (("x", "y"), _HEIGHT_ROLES["z"])
     )
@@ -357,14 +371,18 @@ def place_roles(roles: Roles) -> tuple[str, ...]:
 
 
 def check_column_hints(roles: Roles, used: Collection[str]) -> None:
-    """Raise InvalidProblem for a stated role that a table of this form does not use."""
-    for role in sorted(roles.told - set(used)):
+    """Raise InvalidProblem for a stated role that is not in `used`, since a table of this form does not use it."""
+    for role in sorted(roles.stated - set(used)):
         what = f"the role {role} of the column {roles.by_role[role]!r} is not used in {roles.table.source}"
         raise InvalidProblem(what, "--column", "remove it, or state the content of the table with --as")
 
 
 def placed(roles: Roles, frame: str | None, names: Array | None = None) -> ColumnPlaces:
-    """Return the stations of a table; `names` (s,) are used if no column has names, `frame` applies to x, y, z."""
+    """Return the stations of a table; raise InvalidProblem if no columns look like coordinates.
+
+    `names` (s,) are the names of the stations; None reads them from the table. `frame` applies to x, y, z; None means
+    "ecef" if the column names contain it, else "cartesian".
+    """
     names = roles.labels("name") if names is None else names
     lat, x = roles.find("lat"), roles.find("x")
     if lat is None and x is None:
@@ -386,19 +404,19 @@ def placed(roles: Roles, frame: str | None, names: Array | None = None) -> Colum
     return ColumnPlaces({"name": names} | axes, frame or ("ecef" if "ecef" in stem(x) else "cartesian"), unit)
 
 
-def in_space(place: ColumnPlaces) -> ColumnPlaces:
+def in_space(stations: ColumnPlaces) -> ColumnPlaces:
     """Return stations with a third coordinate, which is 0 if the table has none."""
-    if place.frame == "geodetic" or "z" in place.columns:
-        return place
-    flat = {"z": np.zeros(len(place.names))}
-    return replace(place, columns={**place.columns, **flat}, note=_NO_HEIGHTS.replace("height 0", "z = 0"))
+    if stations.frame == "geodetic" or "z" in stations.columns:
+        return stations
+    flat = {"z": np.zeros(len(stations.names))}
+    return replace(stations, columns={**stations.columns, **flat}, note=_NO_HEIGHTS.replace("height 0", "z = 0"))
 
 
 def scaled(roles: Roles, role: str, quantity: Literal["length", "angle"], unit: str) -> Array:
-    """Return the numbers of a role in a unit; this is also the unit of a column name without a unit."""
-    own = unit_of(roles.column(role), UNITS[quantity]) or unit
+    """Return the numbers (m,) of a role in `unit`, which is also the unit of a column name without a unit."""
+    unit_in_name = unit_of(roles.column(role), UNITS[quantity]) or unit
     values = roles.numbers(role)
-    return values if own == unit else values * UNITS[quantity][own] / UNITS[quantity][unit]
+    return values if unit_in_name == unit else values * UNITS[quantity][unit_in_name] / UNITS[quantity][unit]
 
 
 # Roles of the third coordinate, the most likely first: with latitude and longitude, and with x and y.
@@ -406,7 +424,11 @@ _HEIGHT_ROLES = {"height": ("height", "depth"), "z": ("z", "height", "depth")}
 
 
 def _heights(roles: Roles, role: Literal["height", "z"], unit: str | None = None) -> tuple[Any, str]:
-    """Return heights or None, and their unit; depths become negative heights."""
+    """Return heights (m,) and their unit; depths become negative heights.
+
+    The heights are None without a column. `role` is "height" with latitudes and "z" with x and y. `unit` is the unit of
+    the result; None means the unit of the column, else metres.
+    """
     found = next((one for one in _HEIGHT_ROLES[role] if roles.find(one) is not None), None)
     if found is None:
         return None, unit or "m"
@@ -423,7 +445,7 @@ def _of_geojson(data: Any, source: str) -> ColumnPlaces:
     points = [
         _point(feature, f"{source}, feature {i + 1}")
         for i, feature in enumerate(features)
-        if isinstance(feature, dict) and _kind(feature) == "Point"
+        if isinstance(feature, dict) and _geometry_type(feature) == "Point"
     ]
     if not points:
         raise InvalidProblem("there is no point among the features", source, "give each station as a Point")
@@ -435,13 +457,14 @@ def _of_geojson(data: Any, source: str) -> ColumnPlaces:
     return ColumnPlaces(columns, "geodetic", "m", _NO_HEIGHTS if not any(known) else lacking)
 
 
-def _kind(feature: Mapping[str, Any]) -> Any:
+def _geometry_type(feature: Mapping[str, Any]) -> Any:
+    """Return the type of the geometry of a GeoJSON feature, such as "Point"; None without a geometry."""
     geometry = feature.get("geometry")
     return geometry.get("type") if isinstance(geometry, dict) else None
 
 
 def _point(feature: Mapping[str, Any], where: str) -> tuple[str, float, float, float | None]:
-    """Return name, longitude, latitude and height of a point; degrees, metres."""
+    """Return name, longitude, latitude (degrees) and height (m) of a GeoJSON point; the height is None if missing."""
     about = feature.get("properties") or {}
     if not isinstance(about, dict):
         raise InvalidProblem("the properties are not an object", where, 'write "properties": {"name": "..."}')

@@ -33,56 +33,60 @@ AT_RECEPTION = ("# Satellite positions are at transmission, in the Earth axes at
 _ROTATED_NOTE = "satellite positions are rotated with the Earth during the signal flight; --turned uses them unchanged"
 
 
-def pseudoranges(source: Path, roles: Roles, told: ColumnHints) -> TableProblem:
-    """Return the problem of a pseudorange table: arrivals with a clock error per epoch, moving satellites in ECEF."""
+def pseudoranges(source: Path, roles: Roles, hints: ColumnHints) -> TableProblem:
+    """Return the problem of a pseudorange table: arrivals with a clock error per epoch, moving satellites in ECEF.
+
+    `roles` has the table and the roles of its columns. `hints` has the options: unless `--turned` is stated, satellite
+    positions are rotated with the Earth during the signal flight.
+    """
     form = sort_named("arrivals")
-    own = sigma_column(roles, form, told, [form])
-    if told.sigma is None and own is None:
+    sigma_of_rows = sigma_column(roles, form, hints, [form])
+    if hints.sigma is None and sigma_of_rows is None:
         raise no_sigma("2 m")
     by = "message" if roles.find("message") is not None else "time"
     epoch, satellite, z = roles.labels(by), roles.labels("satellite"), roles.numbers("toa")
-    unit = told.unit or unit_of(roles.column("toa"), UNITS["length"]) or "m"
+    unit = hints.unit or unit_of(roles.column("toa"), UNITS["length"]) or "m"
     Units("length").conversion(unit, "--unit")
     length = unit_of(roles.column("x"), UNITS["length"]) or "m"
     place = np.stack([scaled(roles, axis, "length", length) for axis in "xyz"], axis=-1)
     _check_far(roles, place * UNITS["length"][length])
     _check_once(roles, epoch, satellite)
     notes = roles.table.notes
-    if not told.turned:
+    if not hints.turned:
         metres, ranges = place * UNITS["length"][length], Units("length").conversion(unit, "--unit").to_si(z)
         place = at_reception(source, epoch, metres, ranges) / UNITS["length"][length]
         notes += (_ROTATED_NOTE,)
     columns = {"epoch": epoch, "a": satellite, "z": z}
     when = roles.find("time")
     if when is not None:
-        seconds = column_times(roles, when, told.zone, told.time_unit)
+        seconds = column_times(roles, when, hints.zone, hints.time_unit)
         columns["time"] = roles.numbers("time") if seconds is None else seconds
     uses = {roles.column(role): role for role in ("satellite", "toa", *"xyz")}
     uses |= dict.fromkeys(roles.column(by).split("+"), by) | ({} if when is None else {when: "time"})
-    if own is not None:
-        columns["sigma"] = sigma_of(roles.table, own, form, unit, np.arange(len(z)))
-        uses[own] = "sigma_toa"
+    if sigma_of_rows is not None:
+        columns["sigma"] = sigma_of(roles.table, sigma_of_rows, form, unit, np.arange(len(z)))
+        uses[sigma_of_rows] = "sigma_toa"
     rest = unused_columns(roles, uses, (), lengths=True)
     satellites = {"name": satellite, "epoch": epoch} | dict(zip("xyz", place.T, strict=True))
-    section = Section("toa", columns, unit, told.sigma, "the range and the receiver's clock")
-    when_ = "reception" if told.turned else "transmission"
+    section = Section("toa", columns, unit, hints.sigma, "the range and the receiver's clock")
+    when_ = "reception" if hints.turned else "transmission"
     read = [
         ("pseudoranges", f"{len(z)} readings in {unit} from {roles.column('toa')}, with a clock of each epoch"),
         ("epochs", f"{len(set(epoch.tolist()))} by column {roles.column(by)}"),
         ("satellites", f"{len(set(satellite.tolist()))} at x, y, z in {length}, in ECEF axes at {when_}"),
     ]
-    read += [("sigma", f"of pseudoranges, from column {own}")] if "sigma" in columns else []
+    read += [("sigma", f"of pseudoranges, from column {sigma_of_rows}")] if "sigma" in columns else []
     read += [("not used", ", ".join(rest))] if rest else []
     places = ColumnPlaces(satellites, "ecef", length)
     return TableProblem(source, (section,), places, tuple(read), notes, AT_RECEPTION, uses=uses)
 
 
-def gnss(source: Path, told: ColumnHints) -> TableProblem:
+def gnss(source: Path, hints: ColumnHints) -> TableProblem:
     """Return the problem of a GNSS receiver file, in the same form as for a pseudorange table."""
-    if told.columns or told.ignore:
-        flag = "--column" if told.columns else "--ignore"
+    if hints.columns or hints.ignore:
+        flag = "--column" if hints.columns else "--ignore"
         raise InvalidProblem(f"{source.name} has no column names", flag, "remove this option")
-    found = received(source, told.navigation, told.sigma, system=told.system, mask=told.mask)
+    found = received(source, hints.navigation, hints.sigma, system=hints.system, mask=hints.mask)
     columns = {"epoch": found.epoch, "time": found.time, "a": found.satellite, "z": np.round(found.z, 4)}
     columns["sigma"] = np.round(found.sigma, 3)
     places = {"name": found.satellite, "epoch": found.epoch} | dict(zip("xyz", np.round(found.place, 4).T, strict=True))
@@ -101,7 +105,10 @@ def _check_once(roles: Roles, epoch: Array, satellite: Array) -> None:
 
 
 def _check_far(roles: Roles, place: np.ndarray) -> None:
-    """Raise InvalidProblem for a satellite inside the Earth, which means a wrong unit or wrong columns."""
+    """Raise InvalidProblem for a satellite inside the Earth, which means a wrong unit or wrong columns.
+
+    `place` (m, 3) are the positions in ECEF, m.
+    """
     near = np.flatnonzero(np.linalg.norm(place, axis=-1) < _SURFACE)
     if len(near):
         where = roles.table.where(roles.column("x"), int(near[0]))
@@ -116,29 +123,33 @@ def _check_far(roles: Roles, place: np.ndarray) -> None:
 
 
 def write_satellites(
-    source: Path, out: Path, told: Mapping[str, str], times: Path | None, stations: Path | None
+    source: Path, out: Path, stated: Mapping[str, str], times: Path | None, stations: Path | None
 ) -> Converted:
-    """Write positions and velocities of satellites at the times of measurements, as a table of stations."""
+    """Write positions and velocities of satellites at the times of measurements, as a table of stations in ECEF.
+
+    `source` has the orbits and `times` the measurements. `stated` has the stated columns by role. `stations` has fixed
+    stations, which are added at each time.
+    """
     if times is None:
         advice = "give the table of the measurements with --times; it needs times, and may have satellites"
         raise InvalidProblem("the times of the satellite positions are unknown", "--times", advice)
     if out.suffix.lower() != ".csv":
         what = "satellites are moving stations, which are written as a CSV table"
         raise InvalidProblem(what, str(out), "use the ending .csv after --out")
-    own = {role: name for role, name in told.items() if stations is None or role not in PLACE}
-    orbits, roles = read_orbits(source), Roles.of(read_table(times), own)
+    stated_columns = {role: name for role, name in stated.items() if stations is None or role not in PLACE}
+    orbits, roles = read_orbits(source), Roles.of(read_table(times), stated_columns)
     check_column_hints(roles, ("time", "satellite"))
     written, seconds = roles.table.raw(roles.column("time")), roles.table.times(roles.column("time"), 1.0)
-    whose = roles.labels("satellite") if roles.find("satellite") is not None else None
-    wanted = distinct(whose)[0] if whose is not None else list(orbits.courses)
+    satellite_of_row = roles.labels("satellite") if roles.find("satellite") is not None else None
+    wanted = distinct(satellite_of_row)[0] if satellite_of_row is not None else list(orbits.courses)
     check_budget("cells", 7 * len(wanted) * len(seconds), roles.table.source)
     parts: list[tuple[Array, ...]] = []
     for name in wanted:
-        rows = np.arange(len(seconds)) if whose is None else np.flatnonzero(whose == name)
+        rows = np.arange(len(seconds)) if satellite_of_row is None else np.flatnonzero(satellite_of_row == name)
         rows = rows[np.unique(seconds[rows], return_index=True)[1]]
         parts.append((np.full(len(rows), name, dtype=object), rows, *orbits.at(name, seconds[rows])))
     rows = np.unique(seconds, return_index=True)[1]
-    for name, place in _fixed_stations(stations, told).items():
+    for name, place in _fixed_stations(stations, stated).items():
         still = np.zeros((len(rows), 3))
         parts.append((np.full(len(rows), name, dtype=object), rows, place + still, still))
     names, rows, position, velocity = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -147,18 +158,18 @@ def write_satellites(
     return Converted((out,), None, ('positions are in ECEF: write kind = "ecef" in [frame]',))
 
 
-def _fixed_stations(path: Path | None, told: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """Return the ECEF positions of fixed stations by name, m."""
+def _fixed_stations(path: Path | None, stated: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Return the ECEF positions (3,) of fixed stations by name, m; empty without a file."""
     if path is None:
         return {}
-    own = {role: name for role, name in told.items() if role in PLACE}
-    place = places_of(path, own, "ecef")
-    held, scale = place.columns, UNITS["length"][place.unit]
+    stated_columns = {role: name for role, name in stated.items() if role in PLACE}
+    place = places_of(path, stated_columns, "ecef")
+    columns, scale = place.columns, UNITS["length"][place.unit]
     if place.frame == "geodetic":
-        lat, lon = np.radians(held["lat_deg"]), np.radians(held["lon_deg"])
-        found = ECEF.from_geodetic(lat, lon, scale * held["height"], where=path.name, first_row=1)
-    elif "z" in held:
-        found = scale * np.stack([held[axis] for axis in "xyz"], axis=-1)
+        lat, lon = np.radians(columns["lat_deg"]), np.radians(columns["lon_deg"])
+        found = ECEF.from_geodetic(lat, lon, scale * columns["height"], where=path.name, first_row=1)
+    elif "z" in columns:
+        found = scale * np.stack([columns[axis] for axis in "xyz"], axis=-1)
     else:
         raise InvalidProblem(
             "stations have no z, which satellites need", path.name, "give x, y and z, or latitude and longitude"

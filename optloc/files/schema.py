@@ -71,11 +71,11 @@ class Units:
         return self.convention == "north-clockwise"
 
     def name(self, unit: str | None) -> str:
-        """Return the unit; None becomes the SI unit."""
+        """Return the unit; None becomes the SI unit of the quantity."""
         return SI_UNIT[self.quantity] if unit is None else unit
 
     def conversion(self, unit: str | None, where: str) -> Conversion:
-        """Return the conversion of a unit to SI; None is the SI unit."""
+        """Return the conversion of a unit to SI; None is the SI unit. `where` is the place for messages."""
         return conversion(
             self.name(unit),
             self.quantity,
@@ -203,6 +203,7 @@ class DeclinationTable(_FileTable):
 
 
 def _kind_words() -> list[str]:
+    """Return all names of measurement kinds: standard names, then alternative names."""
     return [*sorted(MODELS), *sorted(alias for model in MODELS.values() for alias in model.aliases)]
 
 
@@ -504,6 +505,10 @@ def validated(model: type[_Model], data: dict[str, Any], source: str) -> _Model:
 
 
 def _sentence(error: ValidationError, source: str, data: dict[str, Any], model: type[BaseModel]) -> InvalidProblem:
+    """Return the error of a file as one sentence with its place, from the errors that pydantic found.
+
+    `source` is the place of the data, `data` the content of the file, and `model` its schema.
+    """
     # Each alternative of a union reports errors. Use the table with the fewest errors, and its deepest error.
     found = error.errors()
     counts = Counter(e["loc"][:2] for e in found if _is_alternative(e["loc"]))
@@ -541,7 +546,10 @@ _IN_TABLE = 2
 
 
 def _path(loc: tuple[int | str, ...], data: Any) -> tuple[list[int | str], str]:
-    """Return the path of the table and the key of an error, without the names of union members."""
+    """Return the path of the table and the key of an error, without the names of union members.
+
+    `loc` is the place that pydantic reports, and `data` the content of the file.
+    """
     path: list[int | str] = []
     at: Any = data
     # pydantic inserts the names of union members between keys: skip parts that are not in the data.

@@ -1,4 +1,9 @@
-"""Long and wide tables of readings: one reading in each row, or a column for each receiver."""
+"""Long and wide tables of readings: one reading in each row, or a column for each receiver.
+
+In the functions, `roles` has the table and the roles of its columns. `hints` has the options, and `stations` the
+stations. A form is a sort of readings, such as arrivals or ranges. In shapes, m is the number of readings, and n the
+number of rows of the table.
+"""
 
 from __future__ import annotations
 
@@ -42,13 +47,16 @@ _SHOWN = 4
 # Wide tables: a column for each receiver, or for each pair.
 
 
-def read_wide(roles: Roles, told: ColumnHints, columns: Sequence[Named], place: ColumnPlaces) -> list[Readings]:
-    """Return the readings of a wide table, one set for each sort."""
+def read_wide(roles: Roles, hints: ColumnHints, columns: Sequence[Named], stations: ColumnPlaces) -> list[Readings]:
+    """Return the readings of a wide table, one set for each sort; raise InvalidProblem if the sort is unknown.
+
+    `columns` are the columns that are named after stations.
+    """
     sorts: dict[str, list[Named]] = {}
     for one in columns:
         if one.sigma:
             continue
-        name = one.form or told.what or ("tdoa" if one.minus else None)
+        name = one.form or hints.what or ("tdoa" if one.minus else None)
         if name is None:
             shown = ", ".join(repr(each.column) for each in columns[:_SHOWN])
             advice = "state it with --as arrivals, --as range, --as tdoa or another kind"
@@ -56,19 +64,23 @@ def read_wide(roles: Roles, told: ColumnHints, columns: Sequence[Named], place: 
         sorts.setdefault(name, []).append(one)
     errors = [one for one in columns if one.sigma]
     forms = {name: sort_named(name) for name in sorts}
-    return [_wide_sort(roles, forms[name], told, chosen, errors, place, forms) for name, chosen in sorts.items()]
+    return [_wide_sort(roles, forms[name], hints, chosen, errors, stations, forms) for name, chosen in sorts.items()]
 
 
 def _wide_sort(
     roles: Roles,
     form: Form,
-    told: ColumnHints,
+    hints: ColumnHints,
     columns: Sequence[Named],
     errors: Sequence[Named],
-    place: ColumnPlaces,
+    stations: ColumnPlaces,
     forms: Mapping[str, Form],
 ) -> Readings:
-    """Return the readings of one sort; `errors` are the columns of standard deviations, `forms` all sorts by name."""
+    """Return the readings of one sort of a wide table.
+
+    `columns` are the columns of this sort. `errors` are the columns of standard deviations, and `forms` all sorts of
+    the table by name.
+    """
     table = roles.table
     values: list[Decimals] = []
     rows, ends, notes = [], [], []
@@ -77,20 +89,20 @@ def _wide_sort(
     first, empty = "", 0
     for one in columns:
         dated = form.quantity == "length" and is_dated(table, one.column)
-        held = date_seconds(table, one.column, told.zone) if dated else numbers(table, one.column)
-        unit, note = ("s", "") if dated else unit_for(one.column, form, told, held.values, table.source)
+        cells = date_seconds(table, one.column, hints.zone) if dated else numbers(table, one.column)
+        unit, note = ("s", "") if dated else unit_for(one.column, form, hints, cells.values, table.source)
         first = first or unit
         notes += [note] if note else []
-        empty += table.count - len(held.row)
-        values.append(_in_unit(held.values, unit, first, form))
-        rows.append(held.row)
-        ends.append(_ends(one, form, told, table.source))
-        own = next((each.column for each in errors if _is_error_of(each, one, form)), None)
-        own = None if stated_sigma(told, form.kind) is not None else own
-        own = own or sigma_column(roles, form, told, list(forms.values()))
-        if own is not None:
-            deviations.append(sigma_of(table, own, form, first, held.row))
-            errors_used.append(own)
+        empty += table.count - len(cells.row)
+        values.append(_in_unit(cells.values, unit, first, form))
+        rows.append(cells.row)
+        ends.append(_ends(one, form, hints, table.source))
+        sigma_name = next((each.column for each in errors if _is_error_of(each, one, form)), None)
+        sigma_name = None if stated_sigma(hints, form.kind) is not None else sigma_name
+        sigma_name = sigma_name or sigma_column(roles, form, hints, list(forms.values()))
+        if sigma_name is not None:
+            deviations.append(sigma_of(table, sigma_name, form, first, cells.row))
+            errors_used.append(sigma_name)
     if not any(map(len, values)):
         raise InvalidProblem("no cell has a reading", table.source, "check the columns of the receivers")
     pairs = form.stations > 1
@@ -103,18 +115,18 @@ def _wide_sort(
     )
     if len(deviations) == len(columns):
         found = replace(found, sigma=np.concatenate(deviations), errors=tuple(dict.fromkeys(errors_used)))
-    return _checked(found, roles, told, place, empty, "a-farther" if minus else None)
+    return _checked(found, roles, hints, stations, empty, "a-farther" if minus else None)
 
 
 def _in_unit(values: Decimals, unit: str, wanted: str, form: Form) -> Decimals:
-    """Return numbers in another unit of their quantity, with all their digits."""
+    """Return numbers in the unit `wanted` instead of `unit`, with all their digits; `form` determines the quantity."""
     if unit == wanted:
         return values
     return Decimals.of([in_unit(value, unit, wanted, form) for value in values.tolist()])
 
 
 def _is_error_of(error: Named, one: Named, form: Form) -> bool:
-    """Return whether a column has the standard deviations of another column of the same receivers."""
+    """Return whether the column `error` has the standard deviations of the column `one` of the same receivers."""
     kinds = (None, one.form, form.kind)
     return error.ends == one.ends and error.form in kinds and _allows(form, error.column)
 
@@ -125,12 +137,12 @@ def _allows(form: Form, column: str) -> bool:
     return unit is None or unit in UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
 
 
-def sigma_column(roles: Roles, form: Form, told: ColumnHints, forms: Sequence[Form]) -> str | None:
+def sigma_column(roles: Roles, form: Form, hints: ColumnHints, forms: Sequence[Form]) -> str | None:
     """Return the column of standard deviations of a sort of readings; None with --sigma, or without a column.
 
     `forms` are all sorts of the table. Raise InvalidProblem if the column may belong to several sorts.
     """
-    if stated_sigma(told, form.kind) is not None:
+    if stated_sigma(hints, form.kind) is not None:
         return None
     named = roles.by_role.get(f"sigma_{form.kind}")
     named = named or next((name for name in roles.table.columns if sigma_kind(name) == form.kind), None)
@@ -148,30 +160,43 @@ def sigma_column(roles: Roles, form: Form, told: ColumnHints, forms: Sequence[Fo
 
 
 def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Array) -> Array:
-    """Return the standard deviations of the rows `pick`, in the unit of their values."""
+    """Return the standard deviations (m,) of the readings in the rows `pick` (m,), in the unit of the readings.
+
+    `column` has the standard deviations, and `unit` is the unit of the readings. Raise InvalidProblem for a reading
+    without a standard deviation, or for a time in one column and a length in the other.
+    """
     known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
-    own = unit_of(column, known) or unit
-    if {own, unit} & set(UNITS["time"]) and not {own, unit} <= set(UNITS["time"]) and form.quantity == "length":
+    column_unit = unit_of(column, known) or unit
+    if (
+        {column_unit, unit} & set(UNITS["time"])
+        and not {column_unit, unit} <= set(UNITS["time"])
+        and form.quantity == "length"
+    ):
         advice = "give both in one unit, or use --sigma"
-        raise InvalidProblem(f"the column is in {own}, but the readings are in {unit}", table.where(column), advice)
-    held = numbers(table, column)
+        raise InvalidProblem(
+            f"the column is in {column_unit}, but the readings are in {unit}", table.where(column), advice
+        )
+    sigmas = numbers(table, column)
     place = np.full(table.count, -1)
-    place[held.row] = np.arange(len(held.row))
+    place[sigmas.row] = np.arange(len(sigmas.row))
     lacking = pick[place[pick] < 0]
     if len(lacking):
         advice = "give a number, or remove the row"
         raise InvalidProblem("the reading has no standard deviation", table.where(column, int(lacking[0])), advice)
-    return np.asarray(held.values.floats()[place[pick]] * known[own] / known[unit])
+    return np.asarray(sigmas.values.floats()[place[pick]] * known[column_unit] / known[unit])
 
 
-def _ends(one: Named, form: Form, told: ColumnHints, source: str) -> tuple[str, str | None]:
-    """Return the stations of a column of a wide table; the second is None for one station."""
+def _ends(one: Named, form: Form, hints: ColumnHints, source: str) -> tuple[str, str | None]:
+    """Return the stations of the column `one` of a wide table; the second is None for one station.
+
+    Raise InvalidProblem if the name has one station more or less than the sort needs, and no option states a reference.
+    """
     if form.stations == 1 and len(one.ends) == 1:
         return one.ends[0], None
     if form.stations == 2 and len(one.ends) == 2:
         return one.ends
-    if form.stations == 2 and told.reference is not None:
-        return one.ends[0], told.reference
+    if form.stations == 2 and hints.reference is not None:
+        return one.ends[0], hints.reference
     if form.stations == 2:
         advice = "state the other with --reference STATION"
         raise InvalidProblem(f"{form.kind} needs two stations, {one.column!r} names one", source, advice)
@@ -183,82 +208,92 @@ def _ends(one: Named, form: Form, told: ColumnHints, source: str) -> tuple[str, 
 # Long tables: one reading in each row.
 
 
-def read_inline(roles: Roles, told: ColumnHints) -> tuple[ColumnPlaces, Array]:
+def read_inline(roles: Roles, hints: ColumnHints) -> tuple[ColumnPlaces, Array]:
     """Return the stations of a table with station positions in each row, and the station name of each row (m,)."""
     count = roles.table.count
     role = next((role for role in ("station", "name") if roles.find(role)), None)
     names = np.array([str(i + 1) for i in range(count)], dtype=object) if role is None else roles.labels(role)
-    every = placed(roles, told.frame, names)
+    every = placed(roles, hints.frame, names)
     spots: dict[tuple[Any, ...], str] = {}
     seen: dict[str, int] = {}
-    heard, first = [], []
+    station_of_row, first = [], []
     for row, key in enumerate(zip(*(column.tolist() for column in every.columns.values()), strict=True)):
         if key not in spots:
             # A station with another position in another row becomes a new station: positions matter, not names.
             seen[key[0]] = seen.get(key[0], 0) + 1
             spots[key] = key[0] if seen[key[0]] == 1 else f"{key[0]} ({seen[key[0]]})"
             first.append(row)
-        heard.append(spots[key])
+        station_of_row.append(spots[key])
     columns = {key: column[first] for key, column in every.columns.items()}
-    columns["name"] = np.array([heard[row] for row in first], dtype=object)
-    return replace(every, columns=columns), np.array(heard, dtype=object)
+    columns["name"] = np.array([station_of_row[row] for row in first], dtype=object)
+    return replace(every, columns=columns), np.array(station_of_row, dtype=object)
 
 
 def read_long(
-    roles: Roles, form: Form, told: ColumnHints, place: ColumnPlaces, heard: Array | None, forms: Sequence[Form]
+    roles: Roles, form: Form, hints: ColumnHints, stations: ColumnPlaces, receivers: Array | None, forms: Sequence[Form]
 ) -> Readings:
     """Return the readings of one sort of a table with one reading in each row.
 
-    `heard` (m,) has the stations of the rows if no column has them. `forms` are all sorts of the table.
+    `receivers` has the station of each row (n,) if no column has them. `forms` are all sorts of the table.
     """
     table = roles.table
     if form.value == "sp" and roles.find("sp") is None:
-        return _picks(roles, told, place)
+        return _picks(roles, hints, stations)
     column = roles.column(form.value)
     dated = form.quantity == "length" and is_dated(table, column)
-    held = date_seconds(table, column, told.zone) if dated else numbers(table, column)
-    unit, note = ("s", "") if dated else unit_for(column, form, told, held.values, table.source)
-    pick = held.row
+    cells = date_seconds(table, column, hints.zone) if dated else numbers(table, column)
+    unit, note = ("s", "") if dated else unit_for(column, form, hints, cells.values, table.source)
+    pick = cells.row
     if not len(pick):
         raise InvalidProblem("no cell has a reading", table.where(column), "check the column")
-    a = roles.labels("station") if heard is None else heard
-    positive, b = ("a-farther", None) if form.stations == 1 else _second_station(roles, told)
-    found = _of_column(form, unit, held, column, a)
+    a = roles.labels("station") if receivers is None else receivers
+    positive, b = ("a-farther", None) if form.stations == 1 else _second_station(roles, hints)
+    found = _of_column(form, unit, cells, column, a)
     found = replace(found, b=None if b is None else b[pick], notes=(note,) if note else ())
-    if (own := sigma_column(roles, form, told, forms)) is not None:
-        found = replace(found, sigma=sigma_of(table, own, form, unit, pick), errors=(own,))
-    return _checked(found, roles, told, place, table.count - len(pick), positive)
+    if (sigma_name := sigma_column(roles, form, hints, forms)) is not None:
+        found = replace(found, sigma=sigma_of(table, sigma_name, form, unit, pick), errors=(sigma_name,))
+    return _checked(found, roles, hints, stations, table.count - len(pick), positive)
 
 
-def _of_column(form: Form, unit: str, held: NumberColumn, column: str, a: Array) -> Readings:
-    """Return the readings of one column; `a` has the station of each row of the table."""
-    return Readings(form, unit, held.values, held.row, (column,), np.zeros(len(held.row), dtype=int), a[held.row])
+def _of_column(form: Form, unit: str, cells: NumberColumn, column: str, a: Array) -> Readings:
+    """Return the readings of one column.
+
+    `cells` are its numbers, in `unit`. `a` has the station of each row of the table.
+    """
+    return Readings(form, unit, cells.values, cells.row, (column,), np.zeros(len(cells.row), dtype=int), a[cells.row])
 
 
-def _second_station(roles: Roles, told: ColumnHints) -> tuple[str | None, Array]:
-    """Return the sign of differences, None if unknown, and the second station of each row."""
+def _second_station(roles: Roles, hints: ColumnHints) -> tuple[str | None, Array]:
+    """Return the sign of differences, and the second station of each row (n,).
+
+    The sign is "a-farther" for a reference station, None if it is unknown.
+    """
     column = roles.find("reference")
-    if told.reference is not None:
-        return "a-farther", np.full(roles.table.count, told.reference, dtype=object)
+    if hints.reference is not None:
+        return "a-farther", np.full(roles.table.count, hints.reference, dtype=object)
     if column is None:
         advice = "state it with --reference STATION, or state its column with --column reference=NAME"
         raise InvalidProblem("no column looks like the second station", roles.table.source, advice)
-    against = stem(column) in ("reference", "ref", "refstation", "b")
-    return ("a-farther" if against else None), roles.labels("reference")
+    is_reference = stem(column) in ("reference", "ref", "refstation", "b")
+    return ("a-farther" if is_reference else None), roles.labels("reference")
 
 
-def _picks(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> Readings:
-    """Return S minus P times of a table with a column for each wave, or with a column of phases."""
-    table, zone = roles.table, told.zone
+def _picks(roles: Roles, hints: ColumnHints, stations: ColumnPlaces) -> Readings:
+    """Return S minus P times, s, of a table with a column for each wave, or with a column of phases.
+
+    Stations without both waves are left out. Raise InvalidProblem if S is not after P.
+    """
+    table, zone = roles.table, hints.zone
 
     def times(role: str) -> list[Decimal | None]:
+        """Return the times in the column of a role, s; None for an empty cell."""
         column, unit = roles.column(role), "s"
         dated = is_dated(table, column)
-        held = date_seconds(table, column, zone) if dated else numbers(table, column)
+        cells = date_seconds(table, column, zone) if dated else numbers(table, column)
         if not dated:
-            unit, _ = unit_for(column, sort_named("sp"), told, held.values, table.source)
+            unit, _ = unit_for(column, sort_named("sp"), hints, cells.values, table.source)
         out: list[Decimal | None] = [None] * table.count
-        for row, value in zip(held.row.tolist(), held.values.tolist(), strict=True):
+        for row, value in zip(cells.row.tolist(), cells.values.tolist(), strict=True):
             out[row] = in_unit(value, unit, "s", sort_named("sp"))
         return out
 
@@ -286,32 +321,35 @@ def _picks(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> Readings:
         raise InvalidProblem("the S wave is not after the P wave", table.at(early), "correct the picks")
     if not both:
         raise InvalidProblem("no station has both P and S", table.source, "state their columns with --column p=, s=")
-    held = NumberColumn(Decimals.of([value for _, value in both]), np.array([row for row, _ in both]))
-    found = _of_column(sort_named("sp"), "s", held, roles.find("s") or roles.column("time"), station)
-    lone = len({*station.tolist()}) - len({*found.a.tolist()})
-    found = replace(found, notes=(f"{lone} stations without both P and S are left out",) if lone else ())
-    return _checked(found, roles, told, place, 0, "a-farther")
+    differences = NumberColumn(Decimals.of([value for _, value in both]), np.array([row for row, _ in both]))
+    found = _of_column(sort_named("sp"), "s", differences, roles.find("s") or roles.column("time"), station)
+    n_without_pair = len({*station.tolist()}) - len({*found.a.tolist()})
+    found = replace(
+        found, notes=(f"{n_without_pair} stations without both P and S are left out",) if n_without_pair else ()
+    )
+    return _checked(found, roles, hints, stations, 0, "a-farther")
 
 
 # Checks for both forms: known stations, no missing readings, no repeats, sign and convention.
 
 
 def _checked(
-    found: Readings, roles: Roles, told: ColumnHints, place: ColumnPlaces, empty: int, positive: str | None
+    found: Readings, roles: Roles, hints: ColumnHints, stations: ColumnPlaces, empty: int, positive: str | None
 ) -> Readings:
     """Return checked readings.
 
-    Stations are known, missing readings and repeats are removed, sign and convention are set.
+    Stations are known, missing readings and repeats are removed, sign and convention are set. `empty` is the number of
+    empty cells. `positive` is the sign of differences that the table states; None if it is unknown.
     """
-    table, known = roles.table, set(place.names)
+    table, known = roles.table, set(stations.names)
     for end in (found.a, found.b):
         for name in [] if end is None else numbered(end)[0]:
             if name not in known:
-                where = told.stations.name if told.stations is not None else table.source
+                where = hints.stations.name if hints.stations is not None else table.source
                 column = roles.find("station") if len(found.columns) == 1 else None
                 item = int(np.flatnonzero(end == name)[0])
                 spot = found.where(table, item) if column is None else table.where(column, int(found.row[item]))
-                raise InvalidProblem(f"there is no station {name!r} in {where}", spot, nearest(name, place.names))
+                raise InvalidProblem(f"there is no station {name!r} in {where}", spot, nearest(name, stations.names))
     if found.b is not None:
         same = np.flatnonzero(found.a == found.b)
         if len(same):
@@ -320,21 +358,21 @@ def _checked(
                 f"{found.form.kind} names station {found.a[same[0]]!r} twice", spot, "name two stations"
             )
     found = _with_digits(found, table)
-    columns = [column for key, column in epochs_of(roles, told, [found]).items()]
+    columns = [column for key, column in epochs_of(roles, hints, [found]).items()]
     _, epoch = equal_rows(columns, table.count)
-    found = without_gaps(found, epoch[found.row], told, table, empty)
-    if found.form.kind == "azimuth" and (heading := heading_of(found, roles, told)) is not None:
-        found = from_bow(found, roles, heading, told)
-    if not told.still:
+    found = without_gaps(found, epoch[found.row], hints, table, empty)
+    if found.form.kind == "azimuth" and (heading := heading_of(found, roles, hints)) is not None:
+        found = from_bow(found, roles, heading, hints)
+    if not hints.still:
         label = (lambda row: str(columns[0][row])) if columns else (lambda _: "")
-        found = without_repeats(found, epoch[found.row], told, table, label)
+        found = without_repeats(found, epoch[found.row], hints, table, label)
     signed = found.form.stations > 1 and found.form.kind != "range_sum"
-    if signed and told.positive is None and positive is None:
+    if signed and hints.positive is None and positive is None:
         advice = "use --positive a-farther if the first is farther, else --positive b-farther"
         what = "the sign of differences is unknown: positive values may mean that the first or the second is farther"
         raise InvalidProblem(what, table.source, advice)
-    found = replace(found, positive=told.positive or positive or "a-farther")
-    return _with_convention(found, told, place, table.source) if found.form.kind == "azimuth" else found
+    found = replace(found, positive=hints.positive or positive or "a-farther")
+    return _with_convention(found, hints, stations, table.source) if found.form.kind == "azimuth" else found
 
 
 # Significant digits of a recent time in seconds or nanoseconds; rounding, m, that has no effect on a fix.
@@ -359,22 +397,26 @@ def _with_digits(found: Readings, table: Table) -> Readings:
     return replace(found, notes=(*found.notes, note))
 
 
-def _with_convention(found: Readings, told: ColumnHints, place: ColumnPlaces, source: str) -> Readings:
+def _with_convention(found: Readings, hints: ColumnHints, stations: ColumnPlaces, source: str) -> Readings:
     """Return azimuths with their convention: from the options, the column name or, on Earth, the compass."""
     named = any(word in stem(found.columns[0]) for word in (BEARING, "brg", "compass", "heading"))
     if found.heading is not None:
         return found
-    if told.azimuth is not None or named:
-        return replace(found, azimuth=told.azimuth or COMPASS)
-    if place.frame == "cartesian":
+    if hints.azimuth is not None or named:
+        return replace(found, azimuth=hints.azimuth or COMPASS)
+    if stations.frame == "cartesian":
         advice = f"use --azimuth {COMPASS} for a compass, or --azimuth {CARTESIAN} from the x axis"
         raise InvalidProblem("azimuths may count from north or from the x axis", source, advice)
     note = f"azimuths are read as compass bearings; --azimuth {CARTESIAN} changes this"
     return replace(found, azimuth=COMPASS, notes=(*found.notes, note))
 
 
-def epochs_of(roles: Roles, told: ColumnHints, found: Sequence[Readings]) -> dict[str, Array]:
-    """Return the available columns epoch, time and target (n,) of the rows of a table."""
+def epochs_of(roles: Roles, hints: ColumnHints, found: Sequence[Readings]) -> dict[str, Array]:
+    """Return the available columns epoch, time and target (n,) of the rows of a table, by these names.
+
+    Times are in seconds. Columns of readings are left out, as are times that are the readings. With `--still`, the
+    result has at most the target: all rows are one epoch.
+    """
     table, taken = roles.table, {name for one in found for name in one.columns}
     out: dict[str, Array] = {}
     long = len(taken) == len(found)
@@ -386,19 +428,19 @@ def epochs_of(roles: Roles, told: ColumnHints, found: Sequence[Readings]) -> dic
     if target is not None and target not in taken:
         out["target"] = roles.labels("target")
         taken.add(target)
-    if told.still:
+    if hints.still:
         return out
     message, when = (None if (name := roles.find(role)) in taken else name for role in ("message", "time"))
-    if told.window is not None and found[0].form.kind == "toa" and when is None and long:
-        return out | {"epoch": _clusters(found[0], told.window, table.count)}
-    if told.window is not None and when is None:
+    if hints.window is not None and found[0].form.kind == "toa" and when is None and long:
+        return out | {"epoch": _clusters(found[0], hints.window, table.count)}
+    if hints.window is not None and when is None:
         raise _no_times()
-    if message is not None and told.window is None:
+    if message is not None and hints.window is None:
         out["epoch"] = roles.labels("message")
-    time = None if when is None else column_times(roles, when, told.zone, told.time_unit)
+    time = None if when is None else column_times(roles, when, hints.zone, hints.time_unit)
     if time is not None:
         out["time"] = time
-    elif when is not None and told.window is not None:
+    elif when is not None and hints.window is not None:
         advice = "state it with --time-unit, such as --time-unit ns"
         raise InvalidProblem(f"the unit of the times in column {when!r} is unknown", table.source, advice)
     elif when is not None and message is None:
@@ -409,18 +451,23 @@ def epochs_of(roles: Roles, told: ColumnHints, found: Sequence[Readings]) -> dic
 
 
 def _no_times() -> InvalidProblem:
+    """Return the error for the option --window without a column of times."""
     advice = "state the time column with --column time=NAME, and its unit with --time-unit"
     return InvalidProblem("a window needs a column of times", "--window", advice)
 
 
 def _clusters(found: Readings, window: str, count: int) -> Array:
-    """Return the message (n,) of each row of arrivals; arrivals less than a window apart belong to one message."""
+    """Return the message of each row (n,) as text, from 1; empty for a row without an arrival.
+
+    Arrivals that are less than a window apart belong to one message. `window` is text such as "0.1 s", and `count` the
+    number of rows n.
+    """
     # Arrivals in metres are times multiplied by the speed of light.
     seconds = Decimal(repr(UNITS["length"][found.unit]))
     seconds = seconds if found.unit in UNITS["time"] else seconds / Decimal(repr(SPEED_OF_LIGHT))
     factor = Decimal(repr(Units("time").plain(window, None, "--window"))) / seconds
     values, order = found.values, np.argsort(found.values.units, kind="stable")
-    apart = np.diff(values.units[order]) > int(factor.scaleb(values.places))
+    starts_message = np.diff(values.units[order]) > int(factor.scaleb(values.places))
     out = np.full(count, "", dtype=object)
-    out[found.row[order]] = np.concatenate([[1], 1 + np.cumsum(apart)]).astype(str)
+    out[found.row[order]] = np.concatenate([[1], 1 + np.cumsum(starts_message)]).astype(str)
     return out

@@ -1,4 +1,7 @@
-"""Stations and frame from a table: lengths in any unit, latitudes and longitudes, moving stations."""
+"""Stations and frame from a table: lengths in any unit, latitudes and longitudes, moving stations.
+
+In shapes, n is the number of rows of the table, s the number of stations, k the number of epochs, d the dimension.
+"""
 
 from __future__ import annotations
 
@@ -120,7 +123,11 @@ def station_table(
 
 
 def survey(section: StationsTable, table: Table, frame_table: FrameTable, where: str) -> tuple[Survey, Frame]:
-    """Return the stations of a table and the frame of the problem."""
+    """Return the stations of a table, and the frame of the problem.
+
+    `section` has the settings of the stations, `frame_table` the stated frame. Raise InvalidProblem for invalid
+    columns, or for a name that occurs twice unless the stations move.
+    """
     table = with_standard_columns(table, section.unit)
     labels = table.labels("name")
     found, first, index = distinct(labels)
@@ -148,6 +155,11 @@ def survey(section: StationsTable, table: Table, frame_table: FrameTable, where:
 
 
 def _positions(table: Table, wanted: FrameTable, factor: float, where: str) -> tuple[Array, Frame]:
+    """Return the positions (n, d) of the rows, m, and their frame.
+
+    `wanted` is the frame in the file, and `factor` the metres in one unit of the table. Raise InvalidProblem if the
+    columns do not fit the frame.
+    """
     plane, globe = table.has("x") or table.has("y"), table.has("lat_deg") or table.has("lon_deg")
     if plane and globe:
         advice = "give x, y, z in all rows, or lat_deg, lon_deg, height"
@@ -178,6 +190,7 @@ def _positions(table: Table, wanted: FrameTable, factor: float, where: str) -> t
 
 
 def _dimension(wanted: FrameTable, frame: Frame, where: str) -> int:
+    """Return the dimension of positions with latitude and longitude, 2 or 3; only an ENU frame may have two."""
     if wanted.dimension == 2 and frame.kind != "enu":
         raise InvalidProblem(
             "only a cartesian or enu frame has two dimensions", join(where, "[frame]"), 'use kind = "enu"'
@@ -186,6 +199,7 @@ def _dimension(wanted: FrameTable, frame: Frame, where: str) -> int:
 
 
 def _frame(wanted: FrameTable, where: str) -> Frame:
+    """Return the frame that a file states; raise InvalidProblem for a missing or superfluous origin."""
     place = wanted.origin
     if wanted.kind == "enu" and place is not None:
         return Frame.enu(lat_deg=place.lat_deg, lon_deg=place.lon_deg, height=place.height)
@@ -200,7 +214,7 @@ def _frame(wanted: FrameTable, where: str) -> Frame:
 
 
 def _axes(section: StationsTable, table: Table, frame: Frame, position: Array) -> Array | None:
-    """Return the axes (n, d, d) of each row; None if they are the axes of the frame."""
+    """Return the axes of each row as unit vectors (n, d, d) in rows; None if they are the axes of the frame."""
     n, d = position.shape
     local = section.axes == "enu" or (section.axes is None and frame.geodetic)
     base = frame.enu_axes(position) if local else np.broadcast_to(np.eye(d), (n, d, d))
@@ -237,10 +251,13 @@ def _turn(table: Table, d: int) -> Array | None:
 
 
 def _sigma(section: StationsTable, table: Table, where: str, key: str) -> Array | None:
-    """Return the standard deviations (n,) of positions or velocities, from the column or the key with this name."""
+    """Return the standard deviations (n,) of positions, m, or velocities, m/s; None if the file states none.
+
+    `key` is "sigma" or "velocity_sigma": a column, or a setting of the section.
+    """
     stated, place = getattr(section, key), join(where, "[stations]", f"key {key!r}")
-    units, own = (Units("length"), section.unit) if key == "sigma" else (Units("speed"), section.speed_unit)
-    unit = units.conversion(own, where)
+    units, plain_unit = (Units("length"), section.unit) if key == "sigma" else (Units("speed"), section.speed_unit)
+    unit = units.conversion(plain_unit, where)
     if table.has(key):
         sigma = unit.sigma_to_si(table.numbers(key))
     elif stated is not None:
@@ -256,9 +273,10 @@ def _sigma(section: StationsTable, table: Table, where: str, key: str) -> Array 
 
 
 def over_epochs(found: Survey, section: StationsTable, epochs: Epochs, used: Sequence[Array]) -> Stations:
-    """Return the stations at the epochs.
+    """Return the stations at the epochs: fixed stations once, moving stations with a position at each epoch.
 
-    `used` has pairs (epoch, station) (u, 2) whose position is required, one array for each chunk of rows.
+    `found` are the stations of a table, and `section` has their settings. `used` has pairs (epoch, station) (u, 2)
+    whose position is required, one array for each chunk of rows.
     """
     if found.moving:
         position, velocity, axes = stations_over_epochs(found, section, epochs, np.concatenate(used))
@@ -280,9 +298,11 @@ def over_epochs(found: Survey, section: StationsTable, epochs: Epochs, used: Seq
 def stations_over_epochs(
     found: Survey, section: StationsTable, epochs: Epochs, used: Array
 ) -> tuple[Array, Array | None, Array | None]:
-    """Return position (k, s, d), velocity (k, s, d) and axes (k, s, d, d) of stations at the epochs.
+    """Return position (k, s, d), m, velocity (k, s, d), m/s, and axes (k, s, d, d) of moving stations at the epochs.
 
-    At an epoch without rows of a station, its position has no effect: the first known position is used.
+    Rows of the table belong to epochs by their labels, or are interpolated in time. `used` (u, 2) are the pairs (epoch,
+    station) whose position is required. At an epoch without rows of a station, its position has no effect: the first
+    known position is used. Velocity and axes are None if the table has none.
     """
     low, high, share = _by_label(found, epochs) if found.table.has("epoch") else _by_time(found, section, epochs)
     missing = low[used[:, 0], used[:, 1]] < 0
@@ -295,6 +315,7 @@ def stations_over_epochs(
     low, high = np.where(low < 0, first, low), np.where(high < 0, first, high)
 
     def between(values: Array) -> Array:
+        """Return values of rows (n, ...) interpolated to the epochs (k, s, ...)."""
         weight = share.reshape(*share.shape, *[1] * (values.ndim - 1))
         return np.asarray(np.where(weight == 0.0, values[low], (1.0 - weight) * values[low] + weight * values[high]))
 
@@ -315,10 +336,15 @@ def _first(found: Survey) -> Array:
 
 
 def _turning(found: Survey) -> bool:
+    """Return whether the stations have columns of rotations, which may change in time."""
     return any(found.table.has(key) for key in ("yaw_deg", "heading_deg", "qw"))
 
 
 def _by_label(found: Survey, epochs: Epochs) -> tuple[Array, Array, Array]:
+    """Return the rows of the stations at the epochs with the same label, in the form of `_by_time`.
+
+    Both rows are the same, and the weights are zero.
+    """
     labels = found.table.labels("epoch")
     known, _, place = distinct(labels)
     number = {label: i for i, label in enumerate(known)}
@@ -337,6 +363,10 @@ def _by_label(found: Survey, epochs: Epochs) -> tuple[Array, Array, Array]:
 
 
 def _by_time(found: Survey, section: StationsTable, epochs: Epochs) -> tuple[Array, Array, Array]:
+    """Return the rows before and after each epoch (k, s), and the weight of the row after (k, s), from 0 to 1.
+
+    Positions are interpolated between the two rows. The rows are -1 outside the times of a station.
+    """
     unit = Units("time").conversion(section.time_unit, found.table.source)
     times, k = found.table.times("time", unit.factor), epochs.count
     if not np.isfinite(epochs.times).all():
@@ -350,18 +380,18 @@ def _by_time(found: Survey, section: StationsTable, epochs: Epochs) -> tuple[Arr
     high, share = low.copy(), np.zeros(low.shape)
     order = np.lexsort((times, found.index))
     for station, rows in enumerate(np.split(order, np.cumsum(np.bincount(found.index))[:-1])):
-        own = times[rows]
-        again = np.flatnonzero(np.diff(own) == 0.0)
+        times_of_station = times[rows]
+        again = np.flatnonzero(np.diff(times_of_station) == 0.0)
         if len(again):
             row = int(rows[again[0] + 1])
-            what = f"{found.noun} {found.names[station]!r} occurs twice at time {own[again[0]]:.10g} s"
+            what = f"{found.noun} {found.names[station]!r} occurs twice at time {times_of_station[again[0]]:.10g} s"
             raise InvalidProblem(what, found.table.where("name", row), "remove one of them")
-        inside = (epochs.times >= own[0]) & (epochs.times <= own[-1])
+        inside = (epochs.times >= times_of_station[0]) & (epochs.times <= times_of_station[-1])
         # Outside the times of its rows, the position of a station is unknown; do not extrapolate.
-        before = np.searchsorted(own, epochs.times, side="right").clip(1, len(own)) - 1
-        after = (before + 1).clip(max=len(own) - 1)
-        gap = np.where(after > before, own[after] - own[before], 1.0)
+        before = np.searchsorted(times_of_station, epochs.times, side="right").clip(1, len(times_of_station)) - 1
+        after = (before + 1).clip(max=len(times_of_station) - 1)
+        gap = np.where(after > before, times_of_station[after] - times_of_station[before], 1.0)
         low[:, station] = np.where(inside, rows[before], -1)
         high[:, station] = np.where(inside, rows[after], -1)
-        share[:, station] = np.where(inside, (epochs.times - own[before]) / gap, 0.0).clip(0.0, 1.0)
+        share[:, station] = np.where(inside, (epochs.times - times_of_station[before]) / gap, 0.0).clip(0.0, 1.0)
     return low, high, share

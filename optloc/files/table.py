@@ -57,7 +57,7 @@ class Table:
     notes: tuple[str, ...] = ()
 
     def take(self, pick: Array) -> Table:
-        """Return the selected rows."""
+        """Return the rows with the indices `pick`."""
         columns = {name: column[pick] for name, column in self.columns.items()}
         return Table(self.source, columns, len(pick), self.names, pick, self.others)
 
@@ -144,6 +144,7 @@ class Table:
         return self.numbers(key) * factor
 
     def _dates(self, key: str, column: Array) -> Array:
+        """Return a column of ISO 8601 text as dates (m,), UTC; raise InvalidProblem for other cells."""
         import pandas as pd
 
         # pandas would read a number as nanoseconds, so reject cells without text.
@@ -159,6 +160,7 @@ class Table:
             raise InvalidProblem(f"a date cannot be read ({what})", self.where(key), "use ISO 8601") from None
 
     def _parse(self, key: str, column: Array) -> Array:
+        """Return a column of text as numbers (m,); an empty cell is NaN. Raise InvalidProblem for other text."""
         # numpy converts dates and booleans to numbers without a meaning, so reject them.
         if column.dtype.kind not in "OSU":
             raise InvalidProblem(
@@ -172,6 +174,7 @@ class Table:
         return np.array([np.nan if is_empty(cell) else self._number(key, row, cell) for row, cell in enumerate(cells)])
 
     def _number(self, key: str, row: int, cell: Any) -> float:
+        """Return one cell as a number; raise InvalidProblem for other cells."""
         # Python reads 1_000 as a thousand and True as 1; in a table these are typing errors.
         if not isinstance(cell, bool) and "_" not in str(cell):
             with suppress(TypeError, ValueError, OverflowError):
@@ -204,7 +207,11 @@ def is_empty(cell: object) -> bool:
 
 
 def table_of(section: DataTable, folder: Path, where: str) -> Table:
-    """Return the rows in a table of a problem file, or in the file that it names."""
+    """Return the rows in a table of a problem file, or in the file that it names.
+
+    `section` is that table, and `folder` the folder of the problem file. Raise InvalidProblem if the table has both or
+    neither.
+    """
     if (section.file is None) == (section.rows is None):
         raise InvalidProblem("the rows must be given once", where, 'write file = "..." or rows = [ ... ]')
     if section.rows is not None:
@@ -241,7 +248,7 @@ def of_frame(frame: Any, where: str, names: Mapping[str, str]) -> Table:
 def csv(path: Path, separator: str | None, names: Mapping[str, str]) -> Table:
     """Return the table of a CSV file with a header, all cells as text.
 
-    Without `separator`, the header determines it.
+    Without `separator`, the header determines it. `names` has the names in this table of the standard columns.
     """
     import pyarrow as pa
     from pyarrow import csv as reader
@@ -274,7 +281,10 @@ def csv(path: Path, separator: str | None, names: Mapping[str, str]) -> Table:
 
 
 def _header(line: str, separator: str, source: str) -> list[str]:
-    """Return the names of the columns; pyarrow does not reject empty or repeated names."""
+    """Return the names of the columns; raise InvalidProblem for an empty header or repeated names.
+
+    The library pyarrow does not reject them.
+    """
     check_budget("columns", line.count(separator) + 1, source)
     try:
         header = [name.strip() for name in next(lines_of([line], delimiter=separator, strict=True), [])]
@@ -289,6 +299,7 @@ def _header(line: str, separator: str, source: str) -> list[str]:
 
 
 def _no_csv(complaint: str, source: str) -> InvalidProblem:
+    """Return the error for a text that is not a CSV table, from the complaint of the library."""
     # pyarrow counts rows from the line after the header.
     what = (complaint.partition("CSV parse error: ")[2] or complaint).splitlines()[0]
     line, found, rest = what.rpartition(": Expected")
@@ -330,7 +341,10 @@ def parquet(path: Path, names: Mapping[str, str]) -> Table:
 
 
 def _check_size(about: Any, schema: Any, source: str) -> None:
-    """Check the sizes that a Parquet file declares against the budget."""
+    """Raise InvalidProblem if a Parquet file declares sizes beyond the budget, or sizes that contradict each other.
+
+    `about` has the metadata of the file, and `schema` its columns.
+    """
     check_budget("columns", len(schema), source)
     check_budget("rows", about.num_rows, source)
     check_budget("cells", about.num_rows * len(schema), source)
@@ -342,7 +356,7 @@ def _check_size(about: Any, schema: Any, source: str) -> None:
 
 
 def _fits(pa: Any, kind: Any) -> bool:
-    """Return whether a Parquet column has numbers, dates or text."""
+    """Return whether a Parquet column of the type `kind` has numbers, dates or text; `pa` is the library pyarrow."""
     kind = kind.value_type if pa.types.is_dictionary(kind) else kind
     tests = "is_integer is_floating is_decimal is_timestamp is_date is_string is_large_string is_null"
     return any(getattr(pa.types, test)(kind) for test in tests.split())
@@ -360,6 +374,7 @@ def _text_column(pa: Any, column: Any) -> Array | Words:
 
 
 def _column_of(pa: Any, column: Any) -> Array | Words:
+    """Return a column of pyarrow as an array; text with repeated words is stored as distinct words and indices."""
     if not pa.types.is_dictionary(column.type):
         return np.asarray(column.to_numpy(zero_copy_only=False))
     column = column.unify_dictionaries().combine_chunks()  # each group of rows has a separate dictionary
@@ -372,6 +387,7 @@ def _column_of(pa: Any, column: Any) -> Array | Words:
 
 
 def _to_column(cells: list[Any]) -> Array:
+    """Return cells as a column (m,): numbers as floats or integers, other cells unchanged."""
     # Numbers become an array if floats keep all their digits; other cells are kept unchanged.
     if all(isinstance(cell, float) or (type(cell) is int and abs(cell) < 2**53) for cell in cells):
         return np.array(cells)
@@ -419,15 +435,16 @@ class Epochs:
     index : int array (m,)
         Epoch of each row.
     target : int array (m,)
-        Target of each row.
+        Target of each row; 0 with `own`.
     labels : tuple of k str
         Labels of the epochs.
     times : array (k,)
         Times of the epochs in the file, s; NaN if missing.
     targets : tuple of str
-        Names of the targets; with `own`, of the target of each epoch.
+        Names of the targets; with `own`, the name of the target of each epoch.
     own : bool
-        Whether each epoch belongs to one target: free targets share nothing.
+        Whether each epoch belongs to one target. Targets that are free at each epoch share no unknowns, so rows of two
+        targets at one time become two epochs.
     """
 
     index: Array
@@ -453,12 +470,14 @@ class Epochs:
 
 
 def epochs_of(keys: Keys, count: int, window: float | None, free: bool | None, source: str = "") -> Epochs:
-    """Return the epochs of rows.
+    """Return the epochs of rows, and the target of each row, from the columns that determine them.
 
-    `count` is the number of rows m. `window` is the length of an epoch, s; None joins rows of exactly equal time.
-    `free` states whether targets are free at each epoch; None means free if there are several epochs. `source` is the
-    place for messages. Raise InvalidProblem if an epoch has times before and after another epoch, or windows are too
-    short to count.
+    `keys` has these columns (m,), and `count` is the number of rows m. `window` is the length of an epoch, s; None
+    joins rows of exactly equal time. `free` is whether a target has an independent position at each epoch; None means
+    independent if there are several epochs. With several free targets, each pair of an epoch and a target becomes an
+    epoch. `source` is the place for messages.
+
+    Raise InvalidProblem if an epoch has times before and after another epoch, or windows are too short to count.
     """
     if window is not None and keys.time is not None and np.ptp(keys.time) > _COUNTED * window:
         what = f"windows of {window:g} s are too short to be counted over {np.ptp(keys.time):g} s"
@@ -480,7 +499,10 @@ def epochs_of(keys: Keys, count: int, window: float | None, free: bool | None, s
 
 
 def _group(keys: Keys, count: int, window: float | None) -> tuple[Array, tuple[str, ...], Array]:
-    """Return index (m,), labels and times (k,) of epochs, sorted by time, else by number, else by appearance."""
+    """Return the epoch of each row (m,), the labels of the k epochs, and their times (k,), s, NaN if missing.
+
+    Epochs are sorted by time, else by number, else by appearance. Parameters are as in `epochs_of`.
+    """
     if keys.label is None and keys.time is None:
         return np.zeros(count, dtype=np.int64), ("0",), np.full(1, np.nan)
     if keys.label is not None:
@@ -508,7 +530,10 @@ def _group(keys: Keys, count: int, window: float | None) -> tuple[Array, tuple[s
 
 
 def _check_instants(keys: Keys, labels: Sequence[str], index: Array, source: str) -> None:
-    """Raise InvalidProblem for a label with times before and after all times of another label."""
+    """Raise InvalidProblem for a label with times before and after all times of another label.
+
+    `labels` are the labels of the epochs, and `index` (m,) is the epoch of each row.
+    """
     if keys.label is None or keys.time is None or len(labels) < 2:
         return
     first, last = np.full(len(labels), np.inf), np.full(len(labels), -np.inf)
@@ -517,15 +542,16 @@ def _check_instants(keys: Keys, labels: Sequence[str], index: Array, source: str
     # Comparing neighbours in the order of first times is enough: an epoch that encloses another encloses the next.
     order = np.argsort(first, kind="stable")
     outer, inner = order[:-1], order[1:]
-    held = np.flatnonzero((first[outer] < first[inner]) & (last[inner] < last[outer]))
-    if len(held):
-        one, two = outer[held[0]], inner[held[0]]
+    enclosing = np.flatnonzero((first[outer] < first[inner]) & (last[inner] < last[outer]))
+    if len(enclosing):
+        one, two = outer[enclosing[0]], inner[enclosing[0]]
         what = f"epoch {labels[one]!r} has the times {first[one]:.10g} s and {last[one]:.10g} s"
         advice = "give each instant a different label"
         raise InvalidProblem(f"{what}, and epoch {labels[two]!r} is between them", source, advice)
 
 
 def _numbers(values: Sequence[str]) -> Array | None:
+    """Return texts as numbers (m,); None if one of them is not a number."""
     try:
         return np.array([float(value) for value in values])
     except ValueError:
@@ -533,7 +559,10 @@ def _numbers(values: Sequence[str]) -> Array | None:
 
 
 def need_clock(epochs: Epochs, why: str, source: str) -> Array:
-    """Return strictly increasing times (k,), s; raise InvalidProblem if the file has none."""
+    """Return strictly increasing times of the epochs (k,), s; raise InvalidProblem if the file has none.
+
+    `why` is the reason for which times are needed, for messages.
+    """
     if epochs.count > 1 and not np.isfinite(epochs.times).all():
         raise InvalidProblem(f"{why} needs the time of each epoch", source, "give the measurements a column 'time'")
     twice = np.flatnonzero(np.diff(epochs.times) <= 0.0)

@@ -1,4 +1,8 @@
-"""Readings of a measurement table: sort and unit of the readings, missing readings and repeats."""
+"""Readings of a measurement table: sort and unit of the readings, missing readings and repeats.
+
+A reading is one measured value of a table. A sort of readings is a measurement kind in one form, such as arrivals. In
+the functions, `hints` has the options of the command line. In shapes, m is the number of readings.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +29,7 @@ from optloc.models import MODELS, kind_named
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """A sort of reading in tables.
+    """A sort of readings in tables.
 
     Parameters
     ----------
@@ -212,7 +216,7 @@ class Readings:
     notes: tuple[str, ...] = ()
 
     def take(self, pick: Array) -> Readings:
-        """Return the selected readings."""
+        """Return the readings with the indices `pick`."""
         return replace(
             self,
             values=self.values.take(pick),
@@ -263,7 +267,10 @@ class Named:
 
 
 def named_columns(columns: Sequence[str], stations: Sequence[str]) -> list[Named]:
-    """Return the columns of a wide table: their names have one or two stations and no unknown word."""
+    """Return the columns of a wide table that are named after stations.
+
+    Their names have one or two names of stations, and otherwise only words with a known meaning.
+    """
     known = sorted({tokens(name): name for name in stations if tokens(name)}.items(), key=lambda item: -len(item[0]))
     exact = {name.strip(): name for name in stations}
     found = []
@@ -273,9 +280,9 @@ def named_columns(columns: Sequence[str], stations: Sequence[str]) -> list[Named
         words = [word for word in rest if word not in _ENDS and not is_sigma(word)]
         form = _form_of("".join(words), any_unit(column))
         if ends and len(ends) <= 2 and form is not None:
-            between = re.search(r"[-\u2212\u2013]|minus", text) is not None
+            has_minus = re.search(r"[-\u2212\u2013]|minus", text) is not None
             deviation = any(map(is_sigma, rest))
-            found.append(Named(column, form or None, tuple(ends), len(ends) == 2 and between, deviation))
+            found.append(Named(column, form or None, tuple(ends), len(ends) == 2 and has_minus, deviation))
     return found
 
 
@@ -284,7 +291,10 @@ _ENDS = frozenset("receiver rx sensor anchor node site station beacon minus at t
 
 
 def _stations_in(words: tuple[str, ...], known: Sequence[tuple[tuple[str, ...], str]]) -> tuple[list[str], list[str]]:
-    """Return the stations among the words, in their order, and the remaining words."""
+    """Return the stations among the words of a column name, in their order, and the remaining words.
+
+    `known` has the words and the name of each station, long names first.
+    """
     ends, rest, at = [], [], 0
     while at < len(words):
         hit = next(((key, name) for key, name in known if words[at : at + len(key)] == key), None)
@@ -309,11 +319,11 @@ def _form_of(word: str, unit: str | None) -> str | None:
     return role if role == "sp" or role in _KINDS_BY_NAME else None
 
 
-def stated_sigma(told: ColumnHints, kind: str) -> str | None:
+def stated_sigma(hints: ColumnHints, kind: str) -> str | None:
     """Return the standard deviation that --sigma states for a kind, or None."""
-    if told.sigma is None or "=" not in told.sigma:
-        return told.sigma
-    return sigmas_by_kind(told.sigma).get(kind)
+    if hints.sigma is None or "=" not in hints.sigma:
+        return hints.sigma
+    return sigmas_by_kind(hints.sigma).get(kind)
 
 
 def sigmas_by_kind(text: str) -> dict[str, str]:
@@ -339,13 +349,19 @@ def without_ignored_columns(table: Table, ignored: Sequence[str]) -> Table:
     return replace(table, columns=columns, others=others)
 
 
-def sorts_of(roles: Roles, told: ColumnHints) -> list[str]:
-    """Return the sorts of readings of a table with one reading in each row.
+def sorts_of(roles: Roles, hints: ColumnHints) -> list[str]:
+    """Return the names of the sorts of readings in a table with one reading in each row, such as "range" or "arrivals".
 
-    Empty if the columns do not identify them.
+    "times" means arrivals in the time column, and "sp" means times between P and S waves. The option `--as` takes
+    precedence over the names of the columns. The list is empty if the columns do not identify a sort.
+
+    Raises
+    ------
+    InvalidProblem
+        If times may be arrivals, but another column may have readings as well.
     """
-    if told.what is not None:
-        return ["times" if told.what == "arrivals" and roles.find("toa") is None else told.what]
+    if hints.what is not None:
+        return ["times" if hints.what == "arrivals" and roles.find("toa") is None else hints.what]
     if all(roles.find(role) for role in ("station", "time", "phase")) or roles.find("sp"):
         return ["sp"]
     if roles.find("p") and roles.find("s") and roles.find("station"):
@@ -377,17 +393,17 @@ def _kind_within(column: str, unit: str | None) -> str | None:
     return next((role for name in named if (role := role_of(name)) is not None and role in MODELS), None)
 
 
-def as_angles(roles: Roles, told: ColumnHints) -> Roles:
+def as_angles(roles: Roles, hints: ColumnHints) -> Roles:
     """Return roles in which a column `elevation` without a unit is an angle or a height, as stated by the options.
 
     Raise InvalidProblem if no option decides: an elevation may be an angle above the horizon or the height of a
     station.
     """
     column = roles.by_role.get("height")
-    if column is None or "height" in roles.told or stem(column) not in _ANGLE_OR_HEIGHT or any_unit(column):
+    if column is None or "height" in roles.stated or stem(column) not in _ANGLE_OR_HEIGHT or any_unit(column):
         return roles
     rest = {role: name for role, name in roles.by_role.items() if role != "height"}
-    if told.what == "elevation" or told.unit in UNITS["angle"]:
+    if hints.what == "elevation" or hints.unit in UNITS["angle"]:
         return replace(roles, by_role={"elevation": column, **rest})
     name = quoted(column)
     advice = f"use --column elevation={name} with --unit deg, --column height={name}, or --ignore {name}"
@@ -419,24 +435,30 @@ def unused_measurement(column: str, lengths: bool = False) -> str | None:
 # Units, missing readings, repeats.
 
 
-def unit_for(column: str, form: Form, told: ColumnHints, held: Decimals, where: str) -> tuple[str, str]:
-    """Return the unit of a column and a note; raise InvalidProblem if the unit is unknown."""
+def unit_for(column: str, form: Form, hints: ColumnHints, values: Decimals, where: str) -> tuple[str, str]:
+    """Return the unit of a column and a note; raise InvalidProblem if the unit is unknown.
+
+    The unit comes from the option `--unit`, from the column name, or for angles from the size of `values`.
+    """
     known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
-    own = unit_of(column, known)
-    if told.unit is not None and told.unit in known:
-        return told.unit, ""
-    if told.unit is not None and (own is None or not any(told.unit in table for table in UNITS.values())):
-        raise InvalidProblem(f"{told.unit!r} is not a unit of {form.text}", "--unit", nearest(told.unit, list(known)))
-    if own is not None:
-        return own, ""
-    if form.quantity == "angle" and bool((np.abs(held.floats()) > _TURN).any()):
+    unit_in_name = unit_of(column, known)
+    if hints.unit is not None and hints.unit in known:
+        return hints.unit, ""
+    if hints.unit is not None and (unit_in_name is None or not any(hints.unit in table for table in UNITS.values())):
+        raise InvalidProblem(f"{hints.unit!r} is not a unit of {form.text}", "--unit", nearest(hints.unit, list(known)))
+    if unit_in_name is not None:
+        return unit_in_name, ""
+    if form.quantity == "angle" and bool((np.abs(values.floats()) > _TURN).any()):
         return "deg", f"{column!r} is in degrees, because some values exceed a full turn in radians"
-    some = {"length": "ns, or --unit m", "angle": "deg, or --unit rad", "speed": "m/s"}.get(form.quantity, "1")
-    raise InvalidProblem(f"the unit of the column {column!r} is unknown", where, f"state it with --unit {some}")
+    examples = {"length": "ns, or --unit m", "angle": "deg, or --unit rad", "speed": "m/s"}.get(form.quantity, "1")
+    raise InvalidProblem(f"the unit of the column {column!r} is unknown", where, f"state it with --unit {examples}")
 
 
 def in_unit(value: Decimal, unit: str, wanted: str, form: Form) -> Decimal:
-    """Return a value in another unit of its quantity, with all its digits."""
+    """Return a value in another unit of its quantity, with all its digits.
+
+    Raise InvalidProblem for a time and a length, since the conversion needs a propagation speed.
+    """
     known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
     times = {unit, wanted} <= set(UNITS["time"])
     if unit == wanted:
@@ -447,54 +469,58 @@ def in_unit(value: Decimal, unit: str, wanted: str, form: Form) -> Decimal:
     return value * Decimal(repr(known[unit])) / Decimal(repr(known[wanted]))
 
 
-def marks_of(told: ColumnHints) -> frozenset[Decimal] | None:
-    """Return the numbers that mean no reading; None without the option --missing."""
-    if told.missing is None:
+def marks_of(hints: ColumnHints) -> frozenset[Decimal] | None:
+    """Return the numbers that mean no reading, as the option `--missing` states; None without this option."""
+    if hints.missing is None:
         return None
-    if told.missing.strip().lower() == "none":
+    if hints.missing.strip().lower() == "none":
         return frozenset()
     try:
-        words = [word.strip() for word in told.missing.split(",")]
+        words = [word.strip() for word in hints.missing.split(",")]
         return frozenset(Decimal(word) for word in words if word.lower() not in NOTHING)
     except InvalidOperation:
         advice = "write numbers such as --missing 0,-1,9999, or --missing none"
-        raise InvalidProblem(f"{told.missing!r} is not a list of numbers", "--missing", advice) from None
+        raise InvalidProblem(f"{hints.missing!r} is not a list of numbers", "--missing", advice) from None
 
 
-def without_gaps(found: Readings, epoch: Array, told: ColumnHints, table: Table, empty: int) -> Readings:
-    """Return the readings without numbers that mean no reading; raise InvalidProblem for a number that may mean so.
+def without_gaps(found: Readings, epoch: Array, hints: ColumnHints, table: Table, empty: int) -> Readings:
+    """Return the readings without the numbers that mean no reading.
 
-    `epoch` (m,) is the epoch number of each reading. `empty` is the number of empty cells, for a note.
+    `epoch` (m,) is the epoch number of each reading. `empty` is the number of empty cells, for a note. Raise
+    InvalidProblem for a number that may be a reading or mean no reading, unless `--missing` decides.
     """
-    marks = marks_of(told)
+    marks = marks_of(hints)
     if marks is None:
         marks = frozenset()
         doubtful = _suspicious_number(found, epoch)
         if doubtful is not None:
-            own = np.flatnonzero(found.values.units == found.values.number(doubtful))
-            times = f"{len(own)} times, first here" if len(own) > 1 else "once"
+            occurrences = np.flatnonzero(found.values.units == found.values.number(doubtful))
+            times = f"{len(occurrences)} times, first here" if len(occurrences) > 1 else "once"
             advice = f"use --missing {doubtful}, or --missing none if it is a reading"
             what = f"{doubtful} occurs {times}, and may be a reading or mean no reading"
-            raise InvalidProblem(what, found.where(table, int(own[0])), advice)
-    gone = np.zeros(len(found.values), dtype=bool)
+            raise InvalidProblem(what, found.where(table, int(occurrences[0])), advice)
+    is_missing = np.zeros(len(found.values), dtype=bool)
     for number in (found.values.number(mark) for mark in marks):
-        gone |= False if number is None else found.values.units == number
-    if gone.all():
+        is_missing |= False if number is None else found.values.units == number
+    if is_missing.all():
         raise InvalidProblem("no cell has a reading", table.source, "check --missing and the columns")
-    count = int(gone.sum())
-    notes = [f"{_cells(count)} with {told.missing}: no reading"] if count else []
+    count = int(is_missing.sum())
+    notes = [f"{_cells(count)} with {hints.missing}: no reading"] if count else []
     notes += [f"{_cells(empty)} without a number: no reading"] if empty else []
-    return replace(found.take(np.flatnonzero(~gone)) if count else found, notes=(*found.notes, *notes))
+    return replace(found.take(np.flatnonzero(~is_missing)) if count else found, notes=(*found.notes, *notes))
 
 
 def _cells(count: int) -> str:
+    """Return a number of cells as text."""
     return "1 cell" if count == 1 else f"{count} cells"
 
 
 def _suspicious_number(found: Readings, epoch: Array) -> Decimal | None:
     """Return a number that may mean a missing reading, or None.
 
-    A typical number is suspicious if it is the smallest or the largest, or more frequent than all others.
+    The candidates are numbers that programs write for a missing reading, such as 0, -1 or 9999. A candidate is
+    suspicious if it is the smallest or the largest number of the table, or more frequent than each other number.
+    `epoch` (m,) is the epoch number of each reading.
     """
     values, counts = np.unique(found.values.units, return_counts=True)
     for mark in _MISSING_VALUES:
@@ -519,11 +545,12 @@ def _is_relative_to_first(found: Readings, epoch: Array) -> bool:
 
 
 def without_repeats(
-    found: Readings, epoch: Array, told: ColumnHints, table: Table, label: Callable[[int], str]
+    found: Readings, epoch: Array, hints: ColumnHints, table: Table, label: Callable[[int], str]
 ) -> Readings:
     """Return the readings with repeats averaged, if the user requests it; else raise InvalidProblem for a repeat.
 
-    `epoch` (m,) is the number of epoch and target of each reading. `label` returns the epoch label of a table row.
+    A repeat is a second reading of the same stations in one epoch. `epoch` (m,) is the number of epoch and target of
+    each reading. `label` returns the epoch label of a table row.
     """
     ends = [numbered(end)[1] for end in (found.a, found.b) if end is not None]
     first, group = first_rows(epoch, *ends)
@@ -532,7 +559,7 @@ def without_repeats(
         return found
     extra = len(found.values) - count
     again = np.setdiff1d(np.arange(len(found.values)), first)
-    if not told.average:
+    if not hints.average:
         second = int(again[0])
         one = int(first[group[second]])
         names = " and ".join(repr(str(end[second])) for end in (found.a, found.b) if end is not None)
@@ -552,9 +579,10 @@ def without_repeats(
 
 
 def _mean(values: Sequence[Decimal], found: Readings) -> Decimal:
+    """Return the mean of values; the mean of angles is the direction of the mean unit vector."""
     if found.form.quantity != "angle":
         return sum(values, Decimal(0)) / len(values)
     # The mean of 359 and 1 degrees is 0: average unit vectors, not angles.
-    turn = [float(value) if found.unit == "rad" else radians(float(value)) for value in values]
-    mean = atan2(sum(map(sin, turn)), sum(map(cos, turn)))
+    radians_ = [float(value) if found.unit == "rad" else radians(float(value)) for value in values]
+    mean = atan2(sum(map(sin, radians_)), sum(map(cos, radians_)))
     return Decimal(repr(mean if found.unit == "rad" else degrees(mean) % 360.0))

@@ -31,7 +31,8 @@ _LETTERS = 40
 class Section:
     """One table of measurements in a problem file.
 
-    It has kind, columns (m,), unit, sigma, description, and further lines.
+    kind: measurement kind. columns: columns (m,) by name. unit: unit of the values. sigma: standard deviation as text,
+    or None if it is a column. text: description of the readings. lines: further lines of the section.
     """
 
     kind: str
@@ -85,14 +86,17 @@ class TableProblem:
         return {"understood": pairs, "notes": list(self.notes), "columns": dict(self.uses)}
 
     def read(self, more: Mapping[str, ConstraintTable] | None = None) -> Loaded:
-        """Return the problem with more constraints, equal to the problem that `read` returns for the written files."""
+        """Return the problem, equal to the problem that `read` returns for the written files.
+
+        `more` has constraints by their place for messages, such as "--height".
+        """
         # Use the name of the table, limited to characters that are valid on all systems.
         out = Path(f"{re.sub(r'[^A-Za-z0-9_-]', '_', self.source.stem)[:_LETTERS]}.toml")
         names = [path.name for path in self.tables(out)]
         # A stated height replaces an assumed one.
-        told = replace(self, height="") if "--height" in (more or {}) else self
+        chosen = replace(self, height="") if "--height" in (more or {}) else self
         # As in a file, replace characters that are not valid Unicode.
-        text = told.text(names).encode("utf-8", "replace").decode("utf-8")
+        text = chosen.text(names).encode("utf-8", "replace").decode("utf-8")
         file = document_of(text, out.name)
         sheets = (self.places.columns, *(section.columns for section in self.sections))
         stations, *tables = (_table(name, columns) for name, columns in zip(names, sheets, strict=True))
@@ -130,7 +134,7 @@ class TableProblem:
 
 
 def _written(column: Any) -> Any:
-    """Return a column in the form for a file."""
+    """Return a column in the form for a file: decimals as text with all their digits."""
     return column.texts() if isinstance(column, Decimals) else column
 
 
@@ -142,6 +146,7 @@ def _table(name: str, columns: Mapping[str, Any]) -> Table:
     import pyarrow as pa
 
     def read(key: str, column: Any) -> Array | Words:
+        """Return a column as the reader of a CSV file would return it."""
         if isinstance(column, Decimals):
             return column.floats()
         if key == "time":
@@ -154,7 +159,11 @@ def _table(name: str, columns: Mapping[str, Any]) -> Table:
 
 @dataclass(frozen=True, slots=True)
 class Converted:
-    """The written files, the problem that they contain (None for stations alone), notes, and the interpretation."""
+    """The result of a conversion.
+
+    written: written files. loaded: problem that they contain, None for stations alone. notes: assumptions, and data
+    that were left out. as_read: interpretation of the table as a JSON value.
+    """
 
     written: tuple[Path, ...]
     loaded: Loaded | None
@@ -163,7 +172,10 @@ class Converted:
 
 
 def no_sigma(example: str, rows: str = "rows") -> InvalidProblem:
-    """Return the error for a table without standard deviations; `example` is a value for --sigma."""
+    """Return the error for a table without standard deviations.
+
+    `example` is a value for --sigma, and `rows` is the kind of the readings; "rows" if there is one kind.
+    """
     advice = f"state it with --sigma '{example}' (or metres); --sigma estimate finds it from many epochs"
     what = "the rows" if rows == "rows" else f"the readings of {rows}"
     return InvalidProblem(f"the accuracy of {what} is unknown", "--sigma", advice)

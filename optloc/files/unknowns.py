@@ -1,4 +1,8 @@
-"""Unknowns of a problem file: motions, known targets, biases, priors, constraints."""
+"""Unknowns of a problem file: motions, known targets, biases, priors, constraints.
+
+In shapes, k is the number of epochs, and d the dimension. `where` is the place for messages, and `c` is the propagation
+speed, m/s, which converts bounds that are given as times.
+"""
 
 from __future__ import annotations
 
@@ -72,6 +76,10 @@ def motions_of(file: ProblemFile, epochs: Epochs, known: Mapping[str, Array], so
 
 
 def _motion(table: TargetTable, count: int, known: Array | None) -> Motion:
+    """Return the motion of a target; by default static for one epoch, else a free position at each epoch.
+
+    `count` is the number of epochs. `known` (k or 1, order + 1, d) are the states of a known target, or None.
+    """
     if known is not None:
         return Motion(known.shape[-2] - 1, "epoch" if count > 1 else "run", known)
     motion = table.motion or ("static" if count == 1 else "free")
@@ -105,7 +113,10 @@ def places_of(file: ProblemFile, folder: Path, source: str) -> dict[str | None, 
 def known_of(
     file: ProblemFile, places: Mapping[str | None, Table], epochs: Epochs, frame: Frame, dimension: int
 ) -> dict[str, Array]:
-    """Return the states (k or 1, order + 1, d) of known targets by name; `places` is from `places_of`."""
+    """Return the states (k or 1, order + 1, d) of known targets by name: position, and velocity with the order 1; SI.
+
+    `places` are the tables from `places_of`, and `dimension` is d, the dimension of the stations.
+    """
     states = {}
     for i, name in enumerate(epochs.targets):
         key = name if name in file.targets else None
@@ -118,18 +129,24 @@ def known_of(
     return states
 
 
-def _states(section: TargetTable, table: Table, name: str, epochs: Epochs, heard: Array, wanted: FrameTable) -> Array:
+def _states(
+    section: TargetTable, table: Table, name: str, epochs: Epochs, needed_epochs: Array, wanted: FrameTable
+) -> Array:
+    """Return the states (k or 1, order + 1, d) of a known target from its table: position, and velocity if given.
+
+    `needed_epochs` are the epochs with rows of the target. `wanted` is the frame of the stations. SI units.
+    """
     dated = table.has("time") or table.has("epoch")
     if table.count > 1 and not dated:
         raise InvalidProblem(f"target {name!r} has several positions", table.source, "give a column 'time' or 'epoch'")
-    own = {key: value for key, value in table.names.items() if key != "name"}
+    names = {key: value for key, value in table.names.items() if key != "name"}
     # Read a known target like a station with its name.
-    named = Table(table.source, {**table.columns, "name": np.full(table.count, name, dtype=object)}, table.count, own)
+    named = Table(table.source, {**table.columns, "name": np.full(table.count, name, dtype=object)}, table.count, names)
     units = StationsTable(unit=section.unit, speed_unit=section.speed_unit, time_unit=section.time_unit)
     found = replace(survey(units, named, wanted, table.source)[0], noun="target")
     position, velocity = found.position[:, None], None if found.velocity is None else found.velocity[:, None]
     if dated:
-        used = np.stack([heard, np.zeros_like(heard)], axis=-1)
+        used = np.stack([needed_epochs, np.zeros_like(needed_epochs)], axis=-1)
         position, velocity, _ = stations_over_epochs(found, units, epochs, used)
     return position if velocity is None else np.concatenate([position, velocity], axis=-2)
 
@@ -156,7 +173,7 @@ def bias_of(
     written: Sequence[tuple[Array, Units, str]],
     source: str,
 ) -> tuple[Bias, tuple[str, float]]:
-    """Return a family of biases over the rows of a problem, and its display unit with the size in SI units.
+    """Return a family of biases over the rows of a problem, and its display unit with the size of the unit in SI units.
 
     `written` has the global row numbers (m,), the quantity and the unit of each set of values. The display unit is the
     unit of the rows, per second for a drift; it is empty if the rows have several units.
@@ -191,7 +208,10 @@ def bias_of(
 
 
 def _check_sense(bias: Bias, rows: Sequence[Rows], written: Sequence[tuple[Array, Units, str]], where: str) -> None:
-    """Raise InvalidProblem for a bias of azimuths with both senses, and for a scale of azimuths from north."""
+    """Raise InvalidProblem for a bias of azimuths with both senses, and for a scale of azimuths from north.
+
+    `written` is as in `bias_of`.
+    """
     ends = np.cumsum([block.count for block in rows])
     touched = {int(i) for i in np.unique(np.searchsorted(ends, bias.row, side="right"))}
     senses = {rows[i].sense for i in touched if rows[i].kind == "azimuth"}
@@ -206,7 +226,10 @@ def _check_sense(bias: Bias, rows: Sequence[Rows], written: Sequence[tuple[Array
 
 
 def _walk_parameters(table: BiasTable, rows: Sequence[Units], where: str) -> dict[str, Any]:
-    """Return the parameters of the change of a bias in time, SI units."""
+    """Return the parameters of the change of a bias in time by name, SI units: densities and knots.
+
+    `rows` are the quantities and settings of the affected rows.
+    """
     found: dict[str, Any] = {}
     for key, power in (("density", 1), ("rate_density", 3)):
         text = getattr(table, key)
@@ -229,7 +252,10 @@ def _walk_parameters(table: BiasTable, rows: Sequence[Units], where: str) -> dic
 
 
 def _density(text: str, power: int, units: Units, where: str) -> float:
-    """Return a spectral density such as "4 ns^2/s" in SI units; `power` is the power of the seconds."""
+    """Return a spectral density such as "4 ns^2/s" in SI units.
+
+    `power` is the power of the seconds: 1 for a walk, 3 for its rate. `units` is the quantity of the affected rows.
+    """
     end = "^2/s" if power == 1 else f"^2/s^{power}"
     number, _, unit = text.strip().partition(" ")
     if not unit.endswith(end):
@@ -240,7 +266,10 @@ def _density(text: str, power: int, units: Units, where: str) -> float:
 
 
 def _unit_to_read(form: BiasForm, spelled: Iterable[tuple[Units, str]], where: str) -> tuple[str, float]:
-    """Return the common unit of the rows of an offset or drift, and its SI size; else an empty text."""
+    """Return the common unit of the rows of an offset or drift, and its size in SI units; else an empty text and 1.
+
+    `spelled` has the quantity and the unit of each set of affected rows.
+    """
     sizes = {(name, units.conversion(name, where)) for units, name in spelled}
     (name, size), *more = sizes
     if more or form.quantity is not None or size.logarithmic or size.factor == 1.0:
@@ -251,11 +280,16 @@ def _unit_to_read(form: BiasForm, spelled: Iterable[tuple[Units, str]], where: s
 def _prior(
     table: BiasTable, form: BiasForm, rows: Sequence[Units], shape: tuple[int, ...], where: str
 ) -> tuple[Array, Array | None]:
+    """Return the mean and the standard deviation of the prior of a bias, arrays of `shape`, SI.
+
+    The standard deviation is None without a prior. `rows` are the quantities of the affected rows.
+    """
     # All rows of a bias have one quantity; carriers may differ between tables.
     carriers = {units.carrier for units in rows}
     units = replace(rows[0], quantity=form.quantity or rows[0].quantity)
 
     def si(value: float | str, key: str) -> tuple[float, Conversion]:
+        """Return the number of an amount under `key`, and the conversion of its unit to SI."""
         place, text = join(where, f"key {key!r}"), value
         bare = "1" if units.quantity in {"plain", "ratio"} and not form.rate else None
         # A drift has the unit of its rows per second, or per second squared for a drift of a rate.
@@ -284,7 +318,7 @@ def _prior(
 
 
 def prior_of(table: PriorTable, dimension: int, source: str) -> Prior:
-    """Return the prior of a state."""
+    """Return the prior of a state, SI; raise InvalidProblem for an unknown name or a wrong number of coordinates."""
     where = join(source, f"[[priors]] {table.name!r}")
     base = table.name.partition("[")[0]
     if base not in _STATES:
@@ -298,8 +332,8 @@ def prior_of(table: PriorTable, dimension: int, source: str) -> Prior:
         raise InvalidProblem(
             f"the mean has {len(table.mean)} coordinates, not {size}", where, "give one number for each coordinate"
         )
-    spread = table.sigma if isinstance(table.sigma, list) else [units.plain(table.sigma, unit, where)] * size
-    sigma = np.array(spread) * (units.conversion(unit, where).factor if isinstance(table.sigma, list) else 1.0)
+    sigmas = table.sigma if isinstance(table.sigma, list) else [units.plain(table.sigma, unit, where)] * size
+    sigma = np.array(sigmas) * (units.conversion(unit, where).factor if isinstance(table.sigma, list) else 1.0)
     if len(sigma) != size or (sigma <= 0.0).any():
         raise InvalidProblem(f"sigma is not {size} positive numbers", where, "give one number for each coordinate")
     return Prior(table.name, units.conversion(unit, where).factor * np.array(table.mean), np.diag(sigma**2))
@@ -341,13 +375,17 @@ def constraints_of(
 
 
 def _moves(motion: Motion) -> bool:
+    """Return whether a target has an unknown course over several epochs, with a velocity."""
     return motion.order > 0 and motion.span == "run" and motion.known is None
 
 
 def _level(
     table: ConstraintTable, motion: Motion, times: Array, where: str, c: float
 ) -> tuple[Motion, Sequence[Constraint]]:
-    """Return the motion that can keep a height, and the constraint on the height."""
+    """Return the motion that can keep a height, and the constraint on the height.
+
+    A moving target with a height along its course follows the Earth.
+    """
     if table.kind == "above-ground":
         low, high = 0.0, np.inf
     elif table.exactly is not None and (table.min is not None or table.max is not None):
@@ -374,7 +412,10 @@ def _level(
 def _reported(
     table: ConstraintTable, motion: Motion, times: Array, within: float, where: str, c: float
 ) -> tuple[Motion, Sequence[Constraint]]:
-    """Return motion and constraint for heights that are stated for each epoch."""
+    """Return motion and constraint for heights that are stated for each epoch.
+
+    `times` (k,) are the seconds of the epochs. `within` is the half width of the band around each height, m.
+    """
     assert isinstance(table.exactly, list)
     place = join(where, "key 'exactly'")
     if motion.span == "run" and not motion.order:
@@ -392,6 +433,7 @@ def _reported(
 
 
 def _check_keys(table: ConstraintTable, where: str) -> None:
+    """Raise InvalidProblem for a key that the kind of the constraint does not use, or for a missing bound."""
     known = _KEYS[table.kind]
     foreign = sorted(table.model_fields_set - {"kind", "target", *known})
     if foreign:
@@ -403,6 +445,10 @@ def _check_keys(table: ConstraintTable, where: str) -> None:
 
 
 def _targets(table: ConstraintTable, motions: Sequence[Motion], names: Sequence[str], where: str) -> list[int]:
+    """Return the numbers of the targets that a constraint applies to; by default all targets with unknown positions.
+
+    `names` are the names of the targets.
+    """
     if table.target is None:
         free = [i for i, motion in enumerate(motions) if motion.known is None]
         if not free:
@@ -420,6 +466,7 @@ def _targets(table: ConstraintTable, motions: Sequence[Motion], names: Sequence[
 
 
 def _make(table: ConstraintTable, stations: Stations, frame: Frame, where: str, c: float) -> Sequence[Constraint]:
+    """Return the constraints of a table of the kind box, speed, polygon or visible."""
     if table.kind == "box":
         low, high = (_corner(table, key, stations.dimension, where, c) for key in ("min", "max"))
         return box(low.tolist(), high.tolist())
@@ -430,11 +477,13 @@ def _make(table: ConstraintTable, stations: Stations, frame: Frame, where: str, 
 
 
 def _bounds(table: ConstraintTable, quantity: Quantity, where: str, c: float) -> tuple[float, float]:
+    """Return the least and the greatest value of a constraint, SI; infinite without a bound."""
     low, high = (_amount(table, key, quantity, where, c) for key in ("min", "max"))
     return -np.inf if low is None else low, np.inf if high is None else high
 
 
 def _amount(table: ConstraintTable, key: str, quantity: Quantity, where: str, c: float) -> float | None:
+    """Return the bound under a key, SI; None without the key. Raise InvalidProblem for a list."""
     value: Amount | list[float] | None = getattr(table, key)
     place = join(where, f"key {key!r}")
     if isinstance(value, list):
@@ -460,6 +509,7 @@ def _corner(table: ConstraintTable, key: str, dimension: int, where: str, c: flo
 
 
 def _region(table: ConstraintTable, frame: Frame, where: str, c: float) -> Sequence[Constraint]:
+    """Return the constraint to a polygon in the plan, with corners in x and y, or in latitude and longitude."""
     key = "corners" if table.corners is not None else "corners_deg"
     place = join(where, f"key {key!r}")
     if table.corners is not None and table.corners_deg is not None:
@@ -486,6 +536,7 @@ def _region(table: ConstraintTable, frame: Frame, where: str, c: float) -> Seque
 
 
 def _visibility(table: ConstraintTable, stations: Stations, frame: Frame, where: str) -> Sequence[Constraint]:
+    """Return one constraint for each named station: the station is above the horizon of the target."""
     if not frame.geodetic or stations.dimension != 3:
         raise InvalidProblem("a horizon needs a geodetic frame", where, "use frame ecef or enu with 3-D stations")
     if stations.position.shape[-3] > 1:

@@ -53,12 +53,13 @@ class Words:
     __hash__ = None  # type: ignore[assignment]  # like arrays, which are compared entry by entry
 
     def __arrow_array__(self, type: Any = None) -> Any:  # noqa: A002  (its name in the protocol)
+        """Return the column as an array of pyarrow, by the protocol of that library."""
         import pyarrow as pa
 
         return pa.array(np.asarray(self), type)
 
     def renamed(self, cells: Sequence[Any]) -> Words:
-        """Return the column with other cells (n,); equal cells are joined."""
+        """Return the column with new cells (n,) instead of its distinct cells; equal new cells are joined."""
         names, number = numbered(objects(cells))
         return Words(objects(names), number[self.index])
 
@@ -98,13 +99,18 @@ def objects(cells: Sequence[Any]) -> Array:
 
 
 def equal_rows(columns: Sequence[Array | Words], count: int) -> tuple[Array, Array]:
-    """Return the first row (n,) of each group of equal rows, and the group of each row (m,)."""
+    """Return the first row (n,) of each group of equal rows, and the group of each row (m,).
+
+    Rows are equal if their cells are equal in all columns (m,). `count` is the number of rows m; without columns, all
+    rows are equal.
+    """
     if not columns:
         return np.zeros(min(count, 1), dtype=np.int64), np.zeros(count, dtype=np.int64)
     return first_rows(*(c.index if isinstance(c, Words) else _numbers(c) for c in columns))
 
 
 def _numbers(column: Array) -> Array:
+    """Return the number (m,) of the distinct cell of each row."""
     return np.unique(column, return_inverse=True)[1] if column.dtype.kind == "f" else numbered(column)[1]
 
 

@@ -41,11 +41,13 @@ def write_csv(path: Path, columns: Mapping[str, Any], *, for_people: bool = Fals
 
 
 def _table(columns: Mapping[str, Any], for_people: bool) -> Any:
+    """Return columns as a table of pyarrow; with `for_people`, texts are harmless in a spreadsheet."""
     import pyarrow as pa
 
     cells = {name: harmless_column(values) for name, values in columns.items()} if for_people else columns
 
     def column(values: Any) -> Any:
+        """Return values as a column of pyarrow; mixed types become text."""
         try:
             return pa.array(values, from_pandas=True)
         except (pa.ArrowException, OverflowError):
@@ -77,12 +79,19 @@ def harmless_column(values: Any) -> Any:
 
 
 class GrowingTable:
-    """A CSV file for people that grows row by row; each added row is complete on disk. `when` is the last addition, s.
+    """A CSV file for people that grows row by row; each added row is complete on disk.
 
     Parameters
     ----------
     path : Path
         The table; see `optloc.base.outputs.GrowingFile`.
+
+    Attributes
+    ----------
+    rows : int
+        Number of rows in the file.
+    when : float
+        Time of the last addition by the monotonic clock, s.
     """
 
     def __init__(self, path: Path) -> None:
@@ -136,7 +145,11 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
 
 
 def _relocate(section: dict[str, Any], folder: Path, out: Path, role: str) -> dict[Path, Path]:
-    """Update the path of a table that is not written again; return its copy and its original if a copy is needed."""
+    """Update the path of a table that is not written again, so that it is relative to the folder of the new file.
+
+    `section` is the section that names the table, `folder` the folder of the old problem file, and `out` the new file.
+    Return the copy and its original if the table is outside the new folder and must be copied; else an empty mapping.
+    """
     path = folder / section["file"]
     section["file"] = os.path.relpath(path, out.parent)
     if Path(os.path.realpath(path)).is_relative_to(os.path.realpath(out.parent)):
@@ -147,11 +160,14 @@ def _relocate(section: dict[str, Any], folder: Path, out: Path, role: str) -> di
     return {copy: path}
 
 
-def _rows(made: Draft, table: Table, z: Array) -> dict[str, Any]:
-    """Return one table: its standard columns by their standard names, the values of all trials one below the other."""
+def _rows(original: Draft, table: Table, z: Array) -> dict[str, Any]:
+    """Return one table: its standard columns by their standard names, the values of all trials one below the other.
+
+    `z` (trials, m) are the values in SI units; the table has the unit of the file.
+    """
     trials = len(z)
     values = np.full((trials, table.count), np.nan)
-    for chunk, number in zip(made.chunks, made.numbers, strict=True):
+    for chunk, number in zip(original.chunks, original.numbers, strict=True):
         if chunk.table is table:
             values[:, chunk.row] = chunk.unit.from_si(z[:, number] - chunk.baseline)
     known = {key: table.raw(key) for key in _COLUMNS if key != "z" and table.has(key)}
@@ -163,7 +179,10 @@ def _rows(made: Draft, table: Table, z: Array) -> dict[str, Any]:
 
 
 def toml_text(settings: dict[str, Any], path: tuple[str, ...] = ()) -> str:
-    """Return TOML text: numbers and lists first, then tables."""
+    """Return TOML text of settings: numbers and lists first, then tables.
+
+    `path` has the names of the tables around these settings.
+    """
     plain, tables = [], []
     for key, value in settings.items():
         name = (*path, key)
@@ -178,10 +197,12 @@ def toml_text(settings: dict[str, Any], path: tuple[str, ...] = ()) -> str:
 
 
 def _key(name: str) -> str:
+    """Return a key of TOML, in quotes if needed."""
     return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else json.dumps(name)
 
 
 def _value(value: Any) -> str:
+    """Return a value of TOML on one line; numbers keep all their digits."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items() if v is not None) + " }"
     if isinstance(value, list):

@@ -1,1 +1,6 @@
-"""Live service: a stream of events with lines of rows or arrivals as input, and fixes and proofs as output."""
+"""Live service: it reads events of measurements from a stream, and writes fixes and proofs.
+
+An event is the set of rows (measurements) of one transmission of a target. `site` has the template of an event, and
+`events` collects rows into events. `engine` computes fixes and proofs, `tracks` computes tracks, and `stream` connects
+the threads.
+"""

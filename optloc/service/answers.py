@@ -1,4 +1,8 @@
-"""Answers of a stream: records of fixes, proofs and tracks, and their conversion to other formats."""
+"""Answers of a stream: records of fixes, proofs and tracks, and their conversion to other formats.
+
+A record is a dictionary that is written as one JSON line. An event has up to two answers: the first phase gives the
+fix, the second phase gives the proof.
+"""
 
 from __future__ import annotations
 
@@ -36,12 +40,12 @@ def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Re
     position, covariance = fix.position, fix.covariance()
     known = np.asarray(np.isfinite(position).all(-1))
     wild = fix.undetermined()
-    spread = np.asarray(known & np.isfinite(covariance).all((-1, -2)) & ~wild.any(-1))
+    has_cov = np.asarray(known & np.isfinite(covariance).all((-1, -2)) & ~wild.any(-1))
     columns: dict[str, list[Any]] = {} if phase is None else {"phase": [phase] * len(events)}
     columns |= {
         "status": [_LABELS[code] for code in fix.code.tolist()],
         "position": _known(position, known),
-        "cov": _known(covariance, spread),
+        "cov": _known(covariance, has_cov),
         "cost": _known(fix.cost, np.isfinite(fix.cost)),
         "dof": fix.dof.tolist(),
     }
@@ -72,6 +76,7 @@ def unsolved(event: Event, phase: str = "fix", **why: Any) -> Record:
 
 
 def _known(values: Array, known: Array) -> list[Any]:
+    """Return `values` (n, ...) as a list with one entry for each event, None where `known` (n,) is false."""
     given: list[Any] = values.tolist()
     return (
         given if known.all() else [value if good else None for value, good in zip(given, known.tolist(), strict=True)]
@@ -79,7 +84,10 @@ def _known(values: Array, known: Array) -> list[Any]:
 
 
 def _alternatives(fix: Fix) -> dict[int, list[Record]]:
-    """Return the other positions of the events of a batch, by event number."""
+    """Return the other positions of the events of a batch, by event number; events without any are absent.
+
+    Each entry has the position in metres and the gap, which is its cost (chi-square) minus the cost of the fix.
+    """
     gap = fix.alternatives.gap
     if not gap.shape[-1]:
         return {}
@@ -104,15 +112,15 @@ def _add_exceptions(record: Record, event: Event) -> None:
 
 
 def proof_records(fix: Fix, events: Sequence[Event], before: Sequence[Record | None]) -> list[Record]:
-    """Return the answers of the second phase: the proof alone, or a better fix with its proof.
+    """Return the answers of the second phase (n): the proof alone, or a better fix with its proof.
 
-    `fix` has the fixes (n,) of the whole method. `before` has the answers of the first phase; after None, the answer
-    includes the fix.
+    `fix` has the fixes (n,) of the whole method. `before` has the answers of the first phase. If an entry is None, or
+    the fix has changed, the answer includes the fix.
     """
     records = fix_records(fix, events, None)
     out = []
-    told = (column.tolist() for column in (fix.claims.proof, fix.claims.margin, fix.claims.boxes, fix.claims.reason))
-    for new, old, number, margin, boxes, reason in zip(records, before, *told, strict=True):
+    proofs = (column.tolist() for column in (fix.claims.proof, fix.claims.margin, fix.claims.boxes, fix.claims.reason))
+    for new, old, number, margin, boxes, reason in zip(records, before, *proofs, strict=True):
         proof: Record = {"proof": PROOFS[number], "margin": margin, "boxes": boxes}
         if number == UNKNOWN:
             proof["why"] = reason
@@ -132,19 +140,23 @@ _ROUNDING = 1e-9
 
 
 def _is_same_fix(new: Record, old: Record) -> bool:
-    """Return whether the whole method gives the same fix as the first phase."""
+    """Return whether the whole method gives the same fix as the first phase: `new` and `old` are their answers.
+
+    Positions may differ by rounding. Both fixes must have a covariance, or both none; the covariances are not compared.
+    """
     if new["position"] is None or old["position"] is None:
         return bool(new["position"] == old["position"])
     size = 1.0 + max(map(abs, old["position"]))
-    apart = max(abs(a - b) for a, b in zip(new["position"], old["position"], strict=True))
-    return bool(apart <= _ROUNDING * size and (new["cov"] is None) == (old["cov"] is None))
+    difference = max(abs(a - b) for a, b in zip(new["position"], old["position"], strict=True))
+    return bool(difference <= _ROUNDING * size and (new["cov"] is None) == (old["cov"] is None))
 
 
 def track_record(event: Event, time: float, entry: Entry, problem: Problem) -> Record:
-    """Return the answer to an event of a track: metres and seconds in the frame of the site.
+    """Return the answer to an event of a track: metres and seconds in the frame of the site, angles in degrees.
 
-    `time` is the time of the event, s. `entry` is the result of the scan. `problem` has the dimension and the frame.
-    The value `cov` is the covariance of position, velocity and acceleration.
+    `time` is the time of the event, s. `entry` is the result of the scan, with a state of position, velocity and
+    acceleration, or fewer of them. `problem` gives the dimension and the frame. The value `cov` is the covariance of
+    the state. `nis` is the normalised innovation squared of the scan.
     """
     d, mean = problem.dimension, entry.updated.mean
     known = bool(np.isfinite(mean).all())
@@ -164,7 +176,10 @@ def track_record(event: Event, time: float, entry: Entry, problem: Problem) -> R
 
 
 def unproven(event: Event, why: str, before: Record | None) -> Record:
-    """Return the answer to an event whose proof was not finished; `why` is "deadline" or "skipped: load"."""
+    """Return the answer to an event whose proof was not finished.
+
+    `why` is "deadline" or "skipped: load". `before` is the answer of the first phase; None if it was not written yet.
+    """
     proof = {"proof": "unknown", "margin": 0.0, "boxes": 0, "why": why}
     proof |= {"target": event.target} if event.target else {}
     if before is not None:
@@ -173,7 +188,11 @@ def unproven(event: Event, why: str, before: Record | None) -> Record:
 
 
 def join(first: Record | None, then: Record) -> Record:
-    """Return the answers of both phases of an event as one record."""
+    """Return the answers of both phases of an event as one record.
+
+    `first` is the answer of the first phase, or None. Its values are replaced by the values of `then`, the later
+    answer.
+    """
     left_out = ("phase", "reason")  # the second phase replaces the reason of the first
     kept = {} if first is None else {key: value for key, value in first.items() if key not in left_out}
     return kept | {key: value for key, value in then.items() if key != "phase"}
@@ -188,6 +207,7 @@ def to_line(record: Record) -> bytes:
 
 
 def _finite(value: Any) -> Any:
+    """Return a value of JSON with null (None) instead of each number that is not finite, at all depths."""
     if isinstance(value, dict):
         return {key: _finite(inner) for key, inner in value.items()}
     if isinstance(value, list):
@@ -209,7 +229,10 @@ def to_feature(record: Record) -> Record:
 
 
 def to_aircraft(record: Record, seen: float = 0.0) -> Record:
-    """Return a fix on Earth as an entry of readsb's ``aircraft.json``: heights in feet, the target as `hex`."""
+    """Return a fix on Earth as an entry of readsb's ``aircraft.json``: heights in feet, the target as `hex`.
+
+    `seen` is the age of the fix, s.
+    """
     return {
         "hex": record.get("target") or record["event"],
         "type": "mlat",
@@ -228,7 +251,7 @@ def to_aircraft(record: Record, seen: float = 0.0) -> Record:
 def to_mark(record: Record, frame: Frame) -> Mark:
     """Return a fix or the state of a track in the form that the export formats need."""
     position, d = np.array(record["position"], dtype=float), len(record["position"])
-    spread = np.full((d, d), np.nan) if record.get("cov") is None else np.array(record["cov"], dtype=float)[:d, :d]
+    covariance = np.full((d, d), np.nan) if record.get("cov") is None else np.array(record["cov"], dtype=float)[:d, :d]
     others = [
         Other(
             x := np.array(each["position"], dtype=float),
@@ -242,7 +265,7 @@ def to_mark(record: Record, frame: Frame) -> Mark:
     return mark_of(
         frame,
         position,
-        spread,
+        covariance,
         record["status"],
         velocity=np.array(record["velocity"], dtype=float) if record.get("velocity") else None,
         name=name,
@@ -254,14 +277,21 @@ def to_mark(record: Record, frame: Frame) -> Mark:
 
 
 def _probability(each: Record) -> float:
-    """Return the probability of an alternative, as `optloc.problem.fix.Alternatives` does."""
+    """Return the probability of an alternative relative to the fix, from its gap (difference of chi-square).
+
+    The formula is the formula of `optloc.problem.fix.Alternatives`.
+    """
     return float(1.0 / (1.0 + np.exp(min(each["gap"] / 2.0, 700.0))))  # exp overflows beyond 700
 
 
 def _of_file(each: Callable[[Mark], str]) -> Callable[[Record, Frame], bytes | None]:
-    """Return a function that writes a record in a file format; its result is None without a position on Earth."""
+    """Return a function that writes a record as a line of a file format, from `each`, which formats one mark.
+
+    The result of the function is None for a record without a position on Earth.
+    """
 
     def line(record: Record, frame: Frame) -> bytes | None:
+        """Return a record in the file format, ending in a line break; None without a position on Earth."""
         if record.get("lat_deg") is None:
             return None
         text = each(to_mark(record, frame))
@@ -293,7 +323,10 @@ class Latest:
         self._held: dict[str, tuple[float, Record]] = {}
 
     def __call__(self, record: Record) -> None:
-        """Store a record if it has a position, or adds to a stored record."""
+        """Store a record if it has a position, or add it to the stored record of the same event.
+
+        If there are too many targets, the target whose event is oldest is removed. Notes and errors are ignored.
+        """
         if "event" not in record or "note" in record:
             return
         name = record.get("target") or record["event"]
@@ -311,6 +344,7 @@ class Latest:
             self._held.pop(next(iter(self._held)), None)
 
     def _present(self) -> list[tuple[float, Record]]:
+        """Return the age (s) and the record of each target with a fix in the last minute."""
         now = time()
         return [(now - when, record) for when, record in list(self._held.values()) if now - when < _MAX_AGE]
 

@@ -31,6 +31,7 @@ def state_of(events: Events, unwritten: dict[str, Event]) -> Record:
     site = events.site
 
     def spelled(event: Event) -> Record:
+        """Return an event as JSON values: rows by kind and stations, arrivals by station in picoseconds as text."""
         rows = [[*site.row(key)[2:5], value, event.sigmas.get(key)] for key, value in event.rows.items()]
         times = [[site.stations[i], str(value)] for i, value in event.times.items()]
         about = {"target": event.target, "revision": event.revision, "conflict": event.conflict}
@@ -78,7 +79,11 @@ def restore(path: Path, events: Events, now: float) -> None:
 
 
 def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
-    """Return an open event whose name is not in `taken`; raise InvalidProblem with a key as its place."""
+    """Return an open event from its record in a checkpoint.
+
+    `now` is the time from which the event waits, s. Raise InvalidProblem with a key as its place if a value is invalid,
+    or if the name of the event is in `taken`.
+    """
     each = _typed(found, dict, "open")
     entries = [_parts(entry, 5, "rows") for entry in _typed(each.get("rows"), list, "rows")]
     given = [
@@ -86,8 +91,8 @@ def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
         for kind, a, b, value, sigma in entries
     ]
     entries = [_parts(entry, 2, "times") for entry in _typed(each.get("times"), list, "times")]
-    heard = [{"station": station, "time_ps": time} for station, time in entries]
-    rows, sigmas, times = rows_and_arrivals(given, heard, site)
+    arrivals = [{"station": station, "time_ps": time} for station, time in entries]
+    rows, sigmas, times = rows_and_arrivals(given, arrivals, site)
     refused = _typed(each.get("refused", ""), str, "refused")
     if not rows and not times and not refused:
         raise InvalidProblem("an event has no rows", "rows", "remove the event")
@@ -112,6 +117,7 @@ def _typed(found: Any, kind: type[T], where: str) -> T:
 
 
 def _parts(found: Any, count: int, where: str) -> list[Any]:
+    """Return a value as a list of `count` entries; raise InvalidProblem with the key `where` otherwise."""
     entry = _typed(found, list, where)
     if len(entry) != count:
         raise InvalidProblem(f"an entry has {len(entry)} values, {count} are needed", where, "remove it")
@@ -119,7 +125,7 @@ def _parts(found: Any, count: int, where: str) -> list[Any]:
 
 
 def _count(found: Any, where: str) -> int:
-    """Return a valid count."""
+    """Return a count from 0 to 2^60; raise InvalidProblem with the key `where` for another value."""
     number = _typed(found, int, where)
     if not 0 <= number <= _MAX_COUNT:
         raise InvalidProblem(f"{str(number)[:_SHOWN]} is not a count", where, "remove it")

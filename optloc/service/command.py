@@ -151,10 +151,10 @@ def live(
     settings |= _tracking(model, filter_, noise, gap, track=track)
     settings["every"] = seconds_of(every, "--every")
     speed = inf if speed is None else speed
-    asked = ServiceOptions(
+    options = ServiceOptions(
         settings, method, replay, speed, shed, quiet, http, mqtt, zmq, adapter, stdin=not (mqtt or zmq)
     )
-    raise typer.Exit(run_live(file, asked))
+    raise typer.Exit(run_live(file, options))
 
 
 SERVED = example(
@@ -198,14 +198,14 @@ def serve(
     settings = _settings(wait, late, "two", deadline, part, "ndjson") | {"state": state, "record": record}
     settings |= _tracking(model, filter_, noise, gap, track=track)
     settings["every"] = seconds_of(every, "--every")
-    asked = ServiceOptions(
+    options = ServiceOptions(
         settings, method, None, inf, True, quiet, http, mqtt, zmq, adapter, stdin=False, stdout=False
     )
-    raise typer.Exit(run_live(file, asked))
+    raise typer.Exit(run_live(file, options))
 
 
 def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str, form: str) -> dict[str, Any]:
-    """Return the values of options as arguments of `optloc.service.stream.Settings`."""
+    """Return the values of options as arguments of `optloc.service.stream.Settings`; times in seconds."""
     from optloc.service.answers import FORMATS
     from optloc.service.engine import PHASES
 
@@ -220,7 +220,11 @@ def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str
 
 
 def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, track: bool) -> dict[str, Any]:
-    """Return the tracking options as arguments of `optloc.service.stream.Settings`."""
+    """Return the tracking options as arguments of `optloc.service.stream.Settings`.
+
+    `model` is the motion model and `name` the filter. `noise` is the process noise and `gap` the longest time without
+    rows, s; None for the default. The tracker is imported only if an option differs from its default.
+    """
     if (model, name, noise, gap) == ("cv", "iekf", None, None):
         return {"track": track}
     from optloc.cli import TrackOptions, dynamics_of, rules
@@ -235,11 +239,11 @@ def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, 
 class ServiceOptions:
     """Options of the commands `live` and `serve`.
 
-    settings: arguments of the stream settings; the source decides on shedding. method: method of the fixes. recording:
-    file to read instead of standard input. speed: replay speed relative to the recording. shed: whether proofs are
-    skipped under load; None means yes, unless the source can wait. quiet: whether health is not printed. http, mqtt,
-    zmq, adapter: as the options. stdin: whether lines come from standard input without a recording. stdout: whether
-    answers go to standard output.
+    settings: arguments of the stream settings except `shed`, which depends on the source. method: method of the fixes.
+    recording: file to read instead of standard input. speed: replay speed relative to the recording. shed: whether
+    proofs are skipped under load; None means yes, unless the source can wait. quiet: whether messages and health are
+    not printed. http, mqtt, zmq, adapter: as the options. stdin: whether lines come from standard input if there is no
+    recording. stdout: whether answers go to standard output.
     """
 
     settings: dict[str, Any]
@@ -256,84 +260,87 @@ class ServiceOptions:
     stdout: bool = True
 
 
-def run_live(file: Path, asked: ServiceOptions) -> int:
+def run_live(file: Path, options: ServiceOptions) -> int:
     """Run a stream until its source ends or a signal arrives, and return the exit code."""
     from optloc.service.recording import read_recording
     from optloc.service.site import read_site
     from optloc.service.sources import adapter_of
     from optloc.service.stream import Settings, Stream
 
-    if not asked.speed > 0.0:
-        raise InvalidProblem(f"the speed is {asked.speed:g}, not positive", "--speed", "give a positive number")
-    site = read_site(file, asked.method)
-    adapter = None if asked.adapter is None else adapter_of(asked.adapter, site.stations)
-    recording = None if asked.recording is None else read_recording(asked.recording)
+    if not options.speed > 0.0:
+        raise InvalidProblem(f"the speed is {options.speed:g}, not positive", "--speed", "give a positive number")
+    site = read_site(file, options.method)
+    adapter = None if options.adapter is None else adapter_of(options.adapter, site.stations)
+    recording = None if options.recording is None else read_recording(options.recording)
     # lines of a file can wait, so no proof needs to be skipped
-    waits = recording is not None or (asked.stdin and _is_file(sys.stdin))
-    shed = not waits if asked.shed is None else asked.shed
-    given = asked.settings | ({"deadline": inf} if not shed and asked.settings.get("deadline") is None else {})
+    waits = recording is not None or (options.stdin and _is_file(sys.stdin))
+    shed = not waits if options.shed is None else options.shed
+    given = options.settings | ({"deadline": inf} if not shed and options.settings.get("deadline") is None else {})
     settings = Settings(shed=shed, **{key: value for key, value in given.items() if value is not None})
     claim(settings.record, inputs=[file])
-    say = _silent if asked.quiet else _say
-    write = _write(sys.stdout.buffer) if asked.stdout else _silent
+    say = _silent if options.quiet else _say
+    write = _write(sys.stdout.buffer) if options.stdout else _silent
     with _threads(), ExitStack() as stops:
         stream = Stream(site, settings, write, say, again=file, replayed=recording is not None)
         stops.callback(stream.close)  # also if a source cannot be opened
         if settings.track and stream.untracked:
             raise InvalidProblem(stream.untracked, "--track", "remove this option")
         interrupted = stops.enter_context(_signal_handlers(stream))  # before the first line is read
-        places = _open(asked, stream, adapter, stops)
+        places = _open(options, stream, adapter, stops)
         say(f"ready: {site.title!r}, {len(site.rows)} rows of {len(site.stations)} stations{places}")
-        _read(asked, stream, adapter, recording)
+        _read(options, stream, adapter, recording)
         code = wait(stream, interrupted)
     say(json.dumps({"health": stream.health()}))
     return code
 
 
-def _open(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, stops: ExitStack) -> str:
-    """Open the HTTP, MQTT and ZeroMQ sources, and return a text on them for the ready message."""
+def _open(options: ServiceOptions, stream: Stream, adapter: Adapter | None, stops: ExitStack) -> str:
+    """Open the HTTP, MQTT and ZeroMQ sources, and return a text on them for the ready message.
+
+    `stops` receives the functions that stop the sources.
+    """
     from optloc.service import serve as requests
     from optloc.service.sources import mqtt, zeromq
 
-    said = ""
-    if asked.http is not None:
-        host, _, port = asked.http.rpartition(":")
+    opened = ""
+    if options.http is not None:
+        host, _, port = options.http.rpartition(":")
         if not port.isdecimal():
-            raise InvalidProblem(f"{asked.http!r} is not a port", "--http", "write 8200, or 0.0.0.0:8200")
+            raise InvalidProblem(f"{options.http!r} is not a port", "--http", "write 8200, or 0.0.0.0:8200")
         host = host.strip("[]") or requests.HOST
         number, stop = requests.serve(stream, host, int(port))
         stops.callback(stop)
-        said = f", http://{f'[{host}]' if ':' in host else host}:{number}/"
-    for address, begin in ((asked.mqtt, mqtt), (asked.zmq, zeromq)):
+        opened = f", http://{f'[{host}]' if ':' in host else host}:{number}/"
+    for address, begin in ((options.mqtt, mqtt), (options.zmq, zeromq)):
         if address is not None:
             stops.callback(begin(stream, address, adapter))
-    return said
+    return opened
 
 
-def _read(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None) -> None:
+def _read(options: ServiceOptions, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None) -> None:
     """Read a recording or standard input in a separate thread, if requested."""
     from optloc.service.recording import replay
     from optloc.service.stream import read_lines
 
     if recording is not None:
         lines = recording if adapter is None else [each._replace(data=adapter(each.data)) for each in recording]
-        _begin(lambda: replay(lines, stream, asked.speed, str(asked.recording)), stream)
-    elif asked.stdin:
+        _begin(lambda: replay(lines, stream, options.speed, str(options.recording)), stream)
+    elif options.stdin:
         read, pending = _reader(sys.stdin)
         _begin(lambda: read_lines(read, stream, "stdin", adapter, pending), stream)
 
 
 def run_check(file: Path, method: str) -> int:
-    """Print the input lines that a stream of a site accepts."""
+    """Print the input lines that a stream of a site accepts, and return the exit code 0."""
     from optloc.service.site import read_site
 
     site = read_site(file, method)
-    for line in told(site):
+    for line in input_description(site):
         typer.echo(visible(line))
     return 0
 
 
-def told(site: Site) -> Iterator[str]:
+def input_description(site: Site) -> Iterator[str]:
     """Yield a description of the input of a stream, with an example line of each form."""
     yield f"{site.title}: {len(site.rows)} rows of {len(site.stations)} stations, solved by {site.method}"
     yield "whole events: " + json.dumps({"event": "1", "z": [0.0] * len(site.rows)})
@@ -354,7 +361,10 @@ def told(site: Site) -> Iterator[str]:
 
 
 def wait(stream: Stream, interrupted: Event) -> int:
-    """Wait for the end of a stream and return its exit code."""
+    """Wait for the end of a stream and return its exit code; raise the error that ended the stream, if any.
+
+    The code is `STOPPED` after Ctrl-C (`interrupted` is set), `READER_GONE` if the output was closed, 0 otherwise.
+    """
     # on Windows, a wait without a timeout blocks signals
     while not stream.ended.wait(1.0):
         pass
@@ -365,10 +375,14 @@ def wait(stream: Stream, interrupted: Event) -> int:
 
 @contextmanager
 def _signal_handlers(stream: Stream) -> Iterator[Event]:
-    """Let signals end a stream or reload its site; Ctrl-C sets the event that is yielded."""
+    """End a stream at SIGTERM or SIGINT, and reload its site at SIGHUP, within the block.
+
+    Yield an event that SIGINT (Ctrl-C) sets, since the exit code then differs.
+    """
     interrupted = Event()
 
     def stop(number: int, _: Any) -> None:
+        """End the stream at a signal."""
         if number == signal.SIGINT:
             interrupted.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)  # a second Ctrl-C interrupts at once
@@ -379,12 +393,16 @@ def _signal_handlers(stream: Stream) -> Iterator[Event]:
 
 
 @contextmanager
-def _signals(wanted: dict[str, Callable[[int, Any], None]]) -> Iterator[None]:
-    """Handle the available signals within the block."""
+def _signals(handlers: dict[str, Callable[[int, Any], None]]) -> Iterator[None]:
+    """Handle signals by functions within the block: `handlers` has the functions by the name of the signal.
+
+    Signals that the operating system lacks are left out. Python allows handlers in the main thread only, so another
+    thread sets none.
+    """
     if current_thread() is not main_thread():
         yield
         return
-    old = {name: signal.signal(getattr(signal, name), how) for name, how in wanted.items() if hasattr(signal, name)}
+    old = {name: signal.signal(getattr(signal, name), how) for name, how in handlers.items() if hasattr(signal, name)}
     try:
         yield
     finally:
@@ -400,14 +418,14 @@ _ENVIRONMENT = {"OPTLOC_THREADS": "1", "OPTLOC_COMPILE": "child"}
 @contextmanager
 def _threads() -> Iterator[None]:
     """Set a short thread switch interval, and the environment of a stream unless variables are already set."""
-    old, own = sys.getswitchinterval(), {name: _ENVIRONMENT[name] for name in _ENVIRONMENT.keys() - os.environ.keys()}
+    old, added = sys.getswitchinterval(), {name: _ENVIRONMENT[name] for name in _ENVIRONMENT.keys() - os.environ.keys()}
     sys.setswitchinterval(_SWITCH)
-    os.environ.update(own)
+    os.environ.update(added)
     try:
         yield
     finally:
         sys.setswitchinterval(old)
-        for name in own:
+        for name in added:
             os.environ.pop(name, None)
 
 
@@ -415,6 +433,7 @@ def _begin(source: Callable[[], None], stream: Stream) -> None:
     """Read a source in a separate thread, and close the stream at its end."""
 
     def run() -> None:
+        """Read the source, then close the stream, also after an error."""
         try:
             source()
         finally:
@@ -424,6 +443,8 @@ def _begin(source: Callable[[], None], stream: Stream) -> None:
 
 
 def _write(file: Any) -> Callable[[bytes], None]:
+    """Return a function that writes bytes to a binary file at once, without a buffer that delays answers."""
+
     def write(data: bytes) -> None:
         file.write(data)
         file.flush()
@@ -434,32 +455,36 @@ def _write(file: Any) -> Callable[[bytes], None]:
 def _reader(file: Any) -> tuple[Callable[[int], bytes], Callable[[], bool]]:
     """Return a function that reads available bytes, and a function that returns whether bytes are available.
 
-    The read takes no lock, since the end of the process would wait for the lock.
+    The first function takes the largest number of bytes. It reads the file descriptor without the lock of Python's
+    buffer, since the end of the process would wait for this lock. Files in memory have no descriptor: their second
+    function returns False.
     """
     try:
-        number = file.fileno()
+        descriptor = file.fileno()
     except (OSError, AttributeError, ValueError):
         return file.buffer.read1, bool  # in memory, as in tests
 
     def pending() -> bool:
+        """Return whether the file has bytes that can be read without waiting."""
         try:
-            return bool(select.select([number], [], [], 0.0)[0])
+            return bool(select.select([descriptor], [], [], 0.0)[0])
         except (OSError, ValueError):
             return False  # on Windows, select works for sockets only
 
-    return lambda count: os.read(number, count), pending
+    return lambda count: os.read(descriptor, count), pending
 
 
 def _say(line: str) -> None:
+    """Print a line for people to standard error."""
     typer.echo(visible(line), err=True)
 
 
 def _silent(_: str | bytes) -> None:
-    pass
+    """Ignore a line: the output of `--quiet`, and of a command without standard output."""
 
 
 def _is_file(file: Any) -> bool:
-    """Return whether a stream is a file, which waits for its reader."""
+    """Return whether an input is a regular file, or in memory: its data can wait, unlike the data of a pipe."""
     try:
         return stat.S_ISREG(os.fstat(file.fileno()).st_mode)
     except (OSError, AttributeError, ValueError):

@@ -1,6 +1,7 @@
 """Engine of a stream: fixes at once, and proofs under a deadline, in small batches of events.
 
-Each set of rows has a prepared problem. The calling thread computes fixes; a second thread computes proofs.
+Each set of rows has a prepared problem. The calling thread computes fixes (first phase); a second thread computes
+proofs (second phase). In shapes, n is the number of events of a batch, and m the number of rows.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ Emit = Callable[[Event, Record, bool], None]
 
 
 class EventGroup(NamedTuple):
-    """Events of a batch with the same rows: their prepared problem, and their measurements (n, m)."""
+    """Events of a batch with the same rows: their prepared problem, and their measurements `z` (n, m), SI."""
 
     ready: Ready
     events: list[Event]
@@ -49,8 +50,8 @@ class EventGroup(NamedTuple):
 class Pending:
     """A proof that is not finished.
 
-    event: its event. ready: prepared problem. z: measurements (m,). before: answer of the first phase, or None. until:
-    deadline by the clock of the stream, s. done: whether the event has its last answer.
+    event: its event. ready: prepared problem. z: measurements (m,), SI. before: answer of the first phase, or None if
+    no answer was written. until: deadline by the clock of the stream, s. done: whether the event has its last answer.
     """
 
     event: Event
@@ -117,7 +118,11 @@ class Engine:
             return self._open[0].until if self._open else inf
 
     def settle(self, events: Iterable[Event]) -> None:
-        """Answer closed events and queue their proofs, or pass the events to their tracks."""
+        """Answer closed events with fixes and queue their proofs; pass events of tracks to their tracks.
+
+        An event with an error is answered by its error. With the phases "one", an event is answered after its proof
+        only.
+        """
         closed = []
         for event in events:
             if event.refused:
@@ -178,8 +183,8 @@ class Engine:
     def _groups(self, events: Iterable[Event]) -> list[EventGroup]:
         """Return events grouped by rows; answer events whose rows give no problem at once."""
         found: dict[tuple[tuple[int, ...], tuple[SiteRow, ...]], list[Event]] = {}
-        everything = tuple(range(len(self.site.rows)))
-        names: dict[tuple[Any, ...], tuple[SiteRow, ...]] = {everything: self.site.rows}
+        all_rows = tuple(range(len(self.site.rows)))
+        names: dict[tuple[Any, ...], tuple[SiteRow, ...]] = {all_rows: self.site.rows}
         for event in events:
             keys = tuple(event.rows)
             if event.sigmas or keys not in names:
@@ -194,12 +199,17 @@ class Engine:
         return [group for key, some in found.items() for group in self._group(key, some)]
 
     def _group(self, key: tuple[tuple[int, ...], tuple[SiteRow, ...]], events: list[Event]) -> list[EventGroup]:
-        heard, rows = key
+        """Return events with equal rows as one group; the result is empty if their rows give no problem.
+
+        `key` has the numbers of the stations with arrivals, and the rows with values. Events without a problem are
+        answered at once with an error or a status.
+        """
+        receivers, rows = key
         now = self._clock()
-        self._metrics.hear((self.site.stations[i] for i in heard), now)
+        self._metrics.hear((self.site.stations[i] for i in receivers), now)
         self._metrics.hear((name for row in rows for name in (row.a, row.b) if name), now)
         try:
-            ready = self.site.ready(heard, rows)
+            ready = self.site.ready(receivers, rows)
         except InvalidProblem as error:
             for event in events:
                 self._fail(event, str(error))
@@ -209,18 +219,19 @@ class Engine:
                 self._answer(event, unsolved(event, status=Status.TOO_FEW_ROWS.label), last=True)
             return []
         # differences of integers: a float of seconds since 1970 only resolves 70 m
-        arrivals = np.array([_since_first(event, heard) for event in events], dtype=float).reshape(len(events), -1)
+        arrivals = np.array([_since_first(event, receivers) for event in events], dtype=float).reshape(len(events), -1)
         values = np.array([list(event.rows.values()) for event in events], dtype=float).reshape(len(events), -1)
         return [EventGroup(ready, events, ready.si(arrivals, values))]
 
     def _fixed(self, group: EventGroup, phase: str | None) -> list[Record]:
-        """Return the answers of the first phase."""
+        """Return the answers of the first phase (n); if the solver fails, each answer has the error."""
         try:
             return fix_records(group.ready.fast(group.z), group.events, phase)
         except Exception as error:  # noqa: BLE001  # an error of one event must not end the stream
             return self._failed(group, error)
 
     def _failed(self, group: EventGroup, error: Exception) -> list[Record]:
+        """Return answers with an error for all events of a group, and log errors that are not errors of the input."""
         if not isinstance(error, InvalidProblem):
             LOG.error("events failed, from %s on", group.events[0].name, exc_info=error)
         why = str(error) if isinstance(error, InvalidProblem) else f"{type(error).__name__}: {error}"
@@ -228,33 +239,41 @@ class Engine:
         return [unsolved(event, error=why) for event in group.events]
 
     def _fail(self, event: Event, why: str) -> None:
+        """Answer an event with the error `why`, and count it."""
         self._metrics.add("unsolvable")
         self._answer(event, unsolved(event, phase="track" if event.track else "fix", error=why), last=True)
 
     def _answer(self, event: Event, record: Record, last: bool) -> None:
+        """Send an answer of an event; with `last`, count its status and its proof."""
         if last:
             self._metrics.concluded(record.get("status", "error"), record.get("proof"))
         self._emit(event, record, last)
 
     def _followed(self, event: Event, record: Record) -> None:
+        """Send the answer of a track, which is the only answer of its event."""
         self._emit(event, record, True)
 
     # Proofs, in a separate thread.
 
     def _offer(self, items: Sequence[Pending]) -> None:
-        left: Sequence[Pending] = ()
+        """Queue proofs; if the queue is full, wait, or answer without a proof with `shed`."""
+        rejected: Sequence[Pending] = ()
         with self._changed:
             if self._shed:
-                room = max(PENDING - len(self._waiting), 0)
-                items, left = items[:room], items[room:]
+                free_places = max(PENDING - len(self._waiting), 0)
+                items, rejected = items[:free_places], items[free_places:]
             else:
                 self._changed.wait_for(lambda: len(self._waiting) < PENDING)
             self._waiting.extend(items)
             self._open.extend(items)
             self._changed.notify_all()
-        self._give_up(left, "skipped: load")
+        self._give_up(rejected, "skipped: load")
 
     def _give_up(self, items: Sequence[Pending], why: str) -> None:
+        """Answer events without their proofs; `why` is "deadline" or "skipped: load".
+
+        Events without an answer of the first phase are fixed now.
+        """
         for group in _grouped([item for item in items if item.before is None]):
             for event, record in zip(group.events, self._fixed(group, None), strict=True):
                 self._answer(event, record if "error" in record else record | unproven(event, why, None), last=True)
@@ -263,6 +282,7 @@ class Engine:
                 self._answer(item.event, unproven(item.event, why, item.before), last=True)
 
     def _prove(self) -> None:
+        """Compute the waiting proofs in batches until the engine ends (the second thread)."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._ends)
@@ -274,23 +294,27 @@ class Engine:
                 self._conclude(group, {item.event.name: item for item in taken})
 
     def _conclude(self, group: EventGroup, items: dict[str, Pending]) -> None:
-        """Prove the fixes of events, and answer the events that are still open."""
-        whose = [items[event.name] for event in group.events]
+        """Prove the fixes of events, and answer the events that are still open.
+
+        `items` has the pending proofs by the name of the event. Events that passed their deadline meanwhile have their
+        last answer, so their proofs are dropped.
+        """
+        pending = [items[event.name] for event in group.events]
         try:
             fix = group.ready.full(group.z)
-            records = proof_records(fix, group.events, [item.before for item in whose])
+            records = proof_records(fix, group.events, [item.before for item in pending])
         except Exception as error:  # noqa: BLE001  # as in the first phase
             records = self._failed(group, error)
-        kept = []
+        answered = []
         with self._changed:
-            for item, record in zip(whose, records, strict=True):
+            for item, record in zip(pending, records, strict=True):
                 if not item.done:
                     item.done = True
-                    kept.append((item.event, record))
+                    answered.append((item.event, record))
             while self._open and self._open[0].done:
                 self._open.popleft()
-        self._metrics.took("proof", [self._clock() - event.stamp for event, _ in kept])
-        for event, record in kept:
+        self._metrics.took("proof", [self._clock() - event.stamp for event, _ in answered])
+        for event, record in answered:
             self._answer(event, record, last=True)
 
 
@@ -299,13 +323,15 @@ def _order(key: int | SiteRow) -> tuple[int, tuple[str, ...]]:
     return (key, ()) if isinstance(key, int) else (1 << 30, key[2:5])
 
 
-def _since_first(event: Event, heard: Sequence[int]) -> list[int]:
+def _since_first(event: Event, receivers: Sequence[int]) -> list[int]:
+    """Return the arrivals at the stations `receivers` in picoseconds since the first arrival of the event."""
     times = event.times
     first = min(times.values(), default=0)
-    return [times[i] - first for i in heard]
+    return [times[i] - first for i in receivers]
 
 
 def _pairs(group: EventGroup) -> list[tuple[Event, Array]]:
+    """Return each event of a group with its measurements (m,), SI."""
     return list(zip(group.events, group.z, strict=True))
 
 

@@ -1,4 +1,9 @@
-"""Lines and events of a stream: parsing of lines, closing of events, and rows that are late or repeated."""
+"""Lines and events of a stream: parsing of lines, closing of events, and rows that are late or repeated.
+
+A line has rows, or arrivals at stations, of one event. An event is open until all its rows are present or its waiting
+time is over; then it closes and is answered. Two clocks are used. `now` is a monotonic clock, s. `when` is the clock
+for which events wait, s. It follows recorded times in a replay, and runs slowly while lines wait to be read.
+"""
 
 from __future__ import annotations
 
@@ -39,6 +44,7 @@ Key = int | SiteRow
 
 
 def _refuse(word: str) -> Any:
+    """Raise ValueError for a constant that JSON does not permit, such as NaN."""
     raise ValueError(f"{word} is not a number")
 
 
@@ -110,6 +116,7 @@ def parse(line: bytes, site: Site) -> Message:
 
 
 def _general(found: dict[str, Any], site: Site) -> Message:
+    """Return the content of a line with any permitted keys; errors as in `parse`."""
     unknown = found.keys() - _KEYS
     if unknown:
         name = min(unknown)
@@ -121,43 +128,48 @@ def _general(found: dict[str, Any], site: Site) -> Message:
         return Message("", {}, {}, whole=False, command=command)
     event = _event(found)
     target = _text(found["target"], "target") if "target" in found else ""
-    ways: list[str] = [key for key in ("rows", "arrivals", "station", "kind") if key in found]
-    ways += ["z"] if "z" in found and "kind" not in found else []
-    if len(ways) != 1 and ways != ["rows", "arrivals"]:
-        what = f"the line has {' and '.join(ways)}" if ways else "the line has no rows"
+    forms: list[str] = [key for key in ("rows", "arrivals", "station", "kind") if key in found]
+    forms += ["z"] if "z" in found and "kind" not in found else []
+    if len(forms) != 1 and forms != ["rows", "arrivals"]:
+        what = f"the line has {' and '.join(forms)}" if forms else "the line has no rows"
         raise InvalidProblem(what, None, "give one of z, rows, arrivals, station, kind")
-    more = found.get("more", ways[0] in ("station", "kind"))
+    more = found.get("more", forms[0] in ("station", "kind"))
     if type(more) is not bool:
         raise InvalidProblem("the value is neither true nor false", "more", "send true if more rows will come")
     try:
-        rows, sigmas, times = _named(found, ways, site)
+        rows, sigmas, times = _named(found, forms, site)
     except UnknownName as error:
         error.event, error.whole = event, not more
         raise
-    return Message(event, rows, times, not more, sigmas or None, target, when=_when(found, ways))
+    return Message(event, rows, times, not more, sigmas or None, target, when=_when(found, forms))
 
 
 def _named(
-    found: dict[str, Any], ways: list[str], site: Site
+    found: dict[str, Any], forms: list[str], site: Site
 ) -> tuple[dict[Key, float], dict[Key, float], dict[int, int]]:
-    """Return the values, the standard deviations and the arrivals of a line, by row or station."""
+    """Return the values, the standard deviations and the arrivals of a line, by row or station.
+
+    `found` is the line. `forms` are the keys under which the line has data: "rows", "arrivals", "z", "station" or
+    "kind". Values and standard deviations are in the units of the site, arrivals in picoseconds.
+    """
     rows, sigmas, times = dict[Key, float](), dict[Key, float](), dict[int, int]()
-    if "rows" in ways:
+    if "rows" in forms:
         for entry in _list(found["rows"], "rows"):
             _row(_object(entry, _ROW_KEYS, "rows"), site, rows, sigmas)
-    if "arrivals" in ways:
+    if "arrivals" in forms:
         for entry in _list(found["arrivals"], "arrivals"):
             _arrival(_object(entry, {"station", *_DIGITS}, "arrivals"), site, times)
-    if "z" in ways:
+    if "z" in forms:
         rows = _values(_list(found["z"], "z"), site)
-    elif "station" in ways:
+    elif "station" in forms:
         _arrival(found, site, times)
-    elif "kind" in ways:
+    elif "kind" in forms:
         _row(found, site, rows, sigmas)
     return rows, sigmas, times
 
 
 def _event(found: Mapping[str, Any]) -> str:
+    """Return the id of the event of a line; a whole number becomes text."""
     if "event" not in found:
         raise InvalidProblem("the line has no event", None, 'give each line an id: "event": "1"')
     name = found["event"]
@@ -165,15 +177,16 @@ def _event(found: Mapping[str, Any]) -> str:
 
 
 def _text(given: Any, key: str) -> str:
+    """Return a name under `key`; raise InvalidProblem for other values, such as text with control characters."""
     if type(given) is not str or not given or len(given) > _NAME or has_controls(given):
         raise InvalidProblem(f"{str(given)[:40]!r} is not a name", key, f"give 1 to {_NAME} printable characters")
     return given
 
 
-def _when(found: Mapping[str, Any], ways: list[str]) -> int | None:
+def _when(found: Mapping[str, Any], forms: list[str]) -> int | None:
     """Return the time of an event in picoseconds; None if the line has no time, or only the time of its arrival."""
     given = [key for key in _DIGITS if key in found]
-    if ways == ["station"] or not given:
+    if forms == ["station"] or not given:
         return None
     if len(given) > 1:
         raise InvalidProblem(f"the line has {' and '.join(given)}", given[0], "give one of them")
@@ -187,12 +200,14 @@ def _when(found: Mapping[str, Any], ways: list[str]) -> int | None:
 
 
 def _list(given: Any, key: str) -> list[Any]:
+    """Return a list of 1 to 4096 entries under `key`; raise InvalidProblem for other values."""
     if type(given) is not list or not 0 < len(given) <= _ROWS:
         raise InvalidProblem(f"the value is not a list of 1 to {_ROWS} entries", key, "give a list")
     return given
 
 
 def _object(given: Any, keys: set[str], where: str) -> dict[str, Any]:
+    """Return an entry as an object that has only the permitted `keys`; raise InvalidProblem with `where` otherwise."""
     if type(given) is not dict:
         raise InvalidProblem(
             "an entry is not an object", where, f"give objects with the keys {', '.join(sorted(keys))}"
@@ -205,6 +220,7 @@ def _object(given: Any, keys: set[str], where: str) -> dict[str, Any]:
 
 
 def _number(given: Any, where: str) -> float:
+    """Return a finite number of permitted size as a float; raise InvalidProblem with the key `where` otherwise."""
     # in Python, true is an integer, and an integer of 400 digits is not a float
     if type(given) is float or (type(given) is int and abs(given) <= LARGEST):
         value = float(given)
@@ -214,6 +230,7 @@ def _number(given: Any, where: str) -> float:
 
 
 def _values(given: list[Any], site: Site) -> dict[Key, float]:
+    """Return the values of the key "z" by row of the template; null values are left out."""
     if len(given) != len(site.rows):
         what = f"there are {len(given)} values, but the site has {len(site.rows)} rows"
         raise InvalidProblem(what, "z", "give values in the order of the file, null for missing values")
@@ -221,6 +238,11 @@ def _values(given: list[Any], site: Site) -> dict[Key, float]:
 
 
 def _row(found: Mapping[str, Any], site: Site, rows: dict[Key, float], sigmas: dict[Key, float]) -> None:
+    """Add the value of one row to `rows`, and the standard deviation, if given, to `sigmas`.
+
+    `found` is the entry of the row, with the keys kind, a, b, z and sigma. Raise InvalidProblem for an invalid entry,
+    or for a second value of a row.
+    """
     if "z" not in found:
         raise InvalidProblem("a row has no value", "z", "give a number")
     words = [found.get(key, "") for key in ("kind", "a", "b")]
@@ -238,6 +260,10 @@ def _row(found: Mapping[str, Any], site: Site, rows: dict[Key, float], sigmas: d
 
 
 def _arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) -> None:
+    """Add one arrival to `times`, picoseconds by station number.
+
+    `found` is the entry of the arrival. Raise InvalidProblem for an invalid entry, or for a second time of a station.
+    """
     station = found.get("station")
     if not site.arriving:
         what = "the site has neither toa nor tdoa rows, so it cannot use arrivals"
@@ -291,6 +317,7 @@ def picoseconds(given: Any, key: str) -> int:
 
 
 def _beyond_clocks(given: Any, key: str) -> InvalidProblem:
+    """Return the error for a time under `key` that no clock has; its unit is probably wrong."""
     return InvalidProblem(f"the time {str(given)[:40]} is out of range", key, "check its unit")
 
 
@@ -304,7 +331,7 @@ REMEMBERED = 65_536
 
 
 class Reply(Protocol):
-    """Receiver of the answers of an event, in addition to the output."""
+    """Receiver of the answers of an event, in addition to the output: the client that sent its lines."""
 
     def expect(self) -> None:
         """Register one more event to be answered."""
@@ -398,11 +425,12 @@ class Events:
     def take(
         self, message: Message, now: float, when: float, reply: Reply | None = None, *, track: bool = False
     ) -> None:
-        """Add the content of a line to its event, which may close.
+        """Add the rows of a line to its event, and close the event if it is whole.
 
-        `now` and `when` are the time of reading by the clock, and by the time for which events wait, s. `reply`
-        receives the answers unless the event already has a receiver. With `track`, a new event is answered by its
-        track.
+        `now` is the time of reading by the monotonic clock, s; `when` is the time of reading by the clock for which
+        events wait, s. `reply` receives the answers unless the event already has a receiver. With `track`, a new event
+        is answered by the state of its track. If another process answers the event, the rows are only counted. If the
+        event is already closed, the rows are late or repeated.
         """
         counts = self.metrics.counts
         size = len(message.rows) + len(message.times)
@@ -449,6 +477,7 @@ class Events:
             self._close(self.open.pop(event.name), "whole", now)
 
     def _open(self, event: Event, now: float) -> None:
+        """Add a new event to the open events; if there are too many, close the oldest."""
         self.open[event.name] = event
         if len(self.open) > self.most:
             self.metrics.counts["early"] += 1
@@ -456,7 +485,7 @@ class Events:
             self._close(self.open.pop(oldest), "early", now)
 
     def due(self, when: float, now: float) -> None:
-        """Close the events that have waited long enough; times as in `take`."""
+        """Close the events whose waiting time is over; `when` and `now` are as in `take`."""
         while self.open:
             event = next(iter(self.open.values()))
             if when < event.first + self.wait:
@@ -467,11 +496,11 @@ class Events:
 
     @property
     def next_due(self) -> float:
-        """Return the time at which the next event closes; infinity without open events."""
+        """Return the time at which the next event closes, by the clock for which events wait, s; infinity if none."""
         return next(iter(self.open.values())).first + self.wait if self.open else float("inf")
 
     def flush(self, now: float) -> None:
-        """Close all events."""
+        """Close all open events; `now` is as in `take`."""
         for event in self.open.values():
             self._close(event, "flush", now)
         self.open.clear()
@@ -482,17 +511,17 @@ class Events:
             yield self.ready.popleft()
 
     def _join(self, event: Event, message: Message) -> None:
-        """Add rows to an event; the first value of a row is kept."""
+        """Add rows to an open event; if a row occurs twice, the first value is kept."""
         counts = self.metrics.counts
         known: list[tuple[dict[Any, Any], dict[Any, Any]]] = [
             (event.rows, message.rows),
             (event.times, message.times),
         ]
-        for held, new in known:
+        for stored, new in known:
             for key, value in new.items():
-                if key not in held:
-                    held[key] = value
-                elif held[key] == value:
+                if key not in stored:
+                    stored[key] = value
+                elif stored[key] == value:
                     counts["repeated"] += 1
                 else:
                     counts["conflicts"] += 1
@@ -503,7 +532,10 @@ class Events:
         event.when = message.when if event.when is None else event.when
 
     def _is_whole(self, event: Event) -> bool:
-        """Return whether all rows and stations of the site are present."""
+        """Return whether an event has all its rows, so that it need not wait.
+
+        With arrivals, these are the arrivals at all stations of the template, and the rows that arrivals do not give.
+        """
         site = self.site
         if event.times:
             if len(event.times) < len(site.hearing):
@@ -512,18 +544,23 @@ class Events:
         return len(event.rows) >= len(site.rows) and all(i in event.rows for i in range(len(site.rows)))
 
     def _wait_for(self, event: Event, reply: Reply | None) -> None:
+        """Give the event a receiver of its answers, if it has none."""
         if reply is not None and event.reply is None:
             event.reply = reply
             reply.expect()
 
     def _close(self, event: Event, why: str, now: float) -> None:
+        """Close an event for the reason `why`, and queue it for its answer."""
         event.closed, event.stamp = why, now
         self.metrics.counts["events"] += 1
         self.remember(event.name, event)
         self.ready.append(event)
 
     def remember(self, name: str, event: Event | None) -> None:
-        """Register an answered event, and forget the oldest event if there are too many."""
+        """Store a closed event, so that late rows are recognised; forget the oldest event if there are too many.
+
+        `event` is None if only the name is known, as from a checkpoint.
+        """
         self.closed[name] = event
         self._order.append(name)
         if len(self._order) > REMEMBERED:
@@ -559,5 +596,5 @@ class Events:
 
 
 def share_of(event: str, count: int) -> int:
-    """Return the number of the process that answers an event; it is the same on all machines."""
+    """Return the number from 0 to `count` - 1 of the process that answers an event; it is the same on all machines."""
     return crc32(event.encode("utf-8", "surrogatepass")) % count

@@ -9,6 +9,7 @@ from optloc.service.command import EXAMPLES, SERVED, live, serve
 
 
 def _commands(app: typer.Typer) -> None:
+    """Add the commands `live` and `serve` to the command line."""
     app.command(rich_help_panel=ANSWERS, epilog=EXAMPLES)(live)
     app.command(rich_help_panel=ANSWERS, epilog=SERVED)(serve)
 

@@ -40,7 +40,12 @@ COUNTS = {
 
 
 class Metrics:
-    """Counters of one stream; thread-safe."""
+    """Counters and latencies of one stream; thread-safe.
+
+    counts: counts by the names in `COUNTS`. statuses: number of last answers by status. proofs: number of proofs by
+    outcome. tracks: number of events of tracks by status. heard: time of the last row of each station by the clock of
+    the stream, s. gauges: functions that return the present length of each queue.
+    """
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -148,6 +153,7 @@ class Metrics:
 
 
 def _ms(seconds: float) -> float:
+    """Return seconds in milliseconds, rounded to microseconds."""
     return round(1e3 * float(seconds), 3)
 
 

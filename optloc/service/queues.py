@@ -1,4 +1,8 @@
-"""Bounded queues between the threads of a stream: input lines and output lines."""
+"""Bounded queues between the threads of a stream: input lines and output lines.
+
+`Inbox` passes lines from all sources to the thread that answers. `Outbox` writes the answers in a separate thread.
+`Ticket` collects the answers for one client.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +34,7 @@ class Ticket:
             self._open += 1
 
     def handled(self, refused: Record | None = None) -> None:
-        """Register a line as read; `refused` is its error, if any."""
+        """Register a line as read; `refused` is an error or the result of a command, which answers the line."""
         with self._lock:
             self._lines -= 1
             if refused is not None:
@@ -50,6 +54,7 @@ class Ticket:
             self._finish()
 
     def _finish(self) -> None:
+        """Pass the collected answers to the client."""
         self._done(list(self._records.values()))
 
 
@@ -104,7 +109,7 @@ class Inbox:
                 self._changed.notify_all()
 
     def offer(self, lines: Sequence[QueuedLine]) -> bool:
-        """Add lines if there is room for all, and return whether they were added."""
+        """Add lines if all of them fit, and return whether they were added; the caller never waits."""
         with self._changed:
             if self.closed or len(self._lines) + len(lines) > self._most:
                 return False
@@ -124,7 +129,10 @@ class Inbox:
             return dropped
 
     def take(self, most: int, seconds: float) -> list[QueuedLine] | None:
-        """Return the next lines; empty if none arrives within `seconds`, None after the end."""
+        """Return up to `most` lines; an empty list if none arrives within `seconds`, None after the end.
+
+        The list is also empty after a call of `wake`.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._lines or self.closed or self._woken, max(seconds, 0.0))
             self._woken = False
@@ -150,11 +158,25 @@ class Inbox:
 class Outbox:
     """Bounded queue of output lines, with a thread that writes them.
 
-    `write` writes bytes; an OSError ends the stream. `gone` is called if writing fails.
+    Parameters
+    ----------
+    write : callable
+        Writes bytes to the output; an OSError means that the reader of the output has closed it.
+    on_failure : callable
+        Called once without arguments if writing fails; it ends the stream.
+    most : int
+        Largest number of waiting lines.
+
+    Attributes
+    ----------
+    failed : bool
+        Whether writing has failed; further lines are dropped.
+    written : deque of str
+        Names of the events whose last answer was written.
     """
 
-    def __init__(self, write: Callable[[bytes], None], gone: Callable[[], None], most: int = WAITING) -> None:
-        self._write, self._gone, self._most = write, gone, most
+    def __init__(self, write: Callable[[bytes], None], on_failure: Callable[[], None], most: int = WAITING) -> None:
+        self._write, self._on_failure, self._most = write, on_failure, most
         self._lines, self._changed = deque[tuple[bytes, str | None]](), Condition()
         self._closed = self.failed = False
         self.written = deque[str]()
@@ -164,11 +186,14 @@ class Outbox:
     def __len__(self) -> int:
         return len(self._lines)
 
-    def put(self, line: bytes, whole: str | None = None) -> None:
-        """Add a line, and the name of the event that it completes; the caller waits while the queue is full."""
+    def put(self, line: bytes, completed: str | None = None) -> None:
+        """Add a line to be written; the caller waits while the queue is full.
+
+        `completed` is the name of the event whose last answer this line is; None for other lines.
+        """
         with self._changed:
             self._changed.wait_for(lambda: len(self._lines) < self._most or self.failed)
-            self._lines.append((line, whole))
+            self._lines.append((line, completed))
             self._changed.notify_all()
 
     def close(self) -> None:
@@ -179,6 +204,7 @@ class Outbox:
         self._thread.join()
 
     def _run(self) -> None:
+        """Write the waiting lines until the queue is closed (the thread of the output)."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._lines or self._closed)
@@ -194,6 +220,6 @@ class Outbox:
                 with self._changed:
                     self.failed = True
                     self._changed.notify_all()
-                self._gone()
+                self._on_failure()
                 continue
             self.written.extend(name for _, name in taken if name is not None)

@@ -38,6 +38,7 @@ def read_recording(path: Path) -> list[Recorded]:
 
 
 def _received(line: bytes) -> float:
+    """Return the time of reading under the key ``received`` of a line, s; NaN if the line has none."""
     if b'"received"' not in line:
         return np.nan
     try:
@@ -48,7 +49,11 @@ def _received(line: bytes) -> float:
 
 
 def _epochs(made: Draft) -> Iterator[Recorded]:
-    """Yield the epochs of a problem file as events, in the order of their times."""
+    """Yield the epochs of a problem file as events, in the order of their times.
+
+    `made` is the problem with the tables of the file. Its rows refer to entries of these tables, whose values are in
+    the units of the file.
+    """
     loaded = made.loaded
     rows: list[list[dict[str, object]]] = [[] for _ in loaded.epochs]
     names = loaded.problem.stations.names
@@ -85,13 +90,13 @@ def replay(recording: Sequence[Recorded], stream: Stream, speed: float, source: 
     waiting: list[QueuedLine] = []
     for number, (received, data) in enumerate(recording, 1):
         first = received if np.isnan(first) else first
-        left = 0.0 if np.isnan(received) else (received - first) / speed - (stream.clock() - began)
-        if left > 0.0 or len(waiting) >= _MANY:
+        wait = 0.0 if np.isnan(received) else (received - first) / speed - (stream.clock() - began)
+        if wait > 0.0 or len(waiting) >= _MANY:
             stream.inbox.put(waiting)
             waiting = []
-            while left > 0.0 and not stream.inbox.closed:
-                never.wait(min(left, 0.2))
-                left = (received - first) / speed - (stream.clock() - began)
+            while wait > 0.0 and not stream.inbox.closed:
+                never.wait(min(wait, 0.2))
+                wait = (received - first) / speed - (stream.clock() - began)
         if stream.inbox.closed:
             return
         when = when if np.isnan(received) else received

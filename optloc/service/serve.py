@@ -66,6 +66,7 @@ def serve(stream: Stream, host: str = HOST, port: int = PORT) -> tuple[int, Call
     thread.start()
 
     def stop() -> None:
+        """Stop the server, and wait at most 5 s for its end."""
         server.should_exit = True
         thread.join(5.0)
 
@@ -94,6 +95,7 @@ def application(stream: Stream, *, local: bool = True) -> Any:
         return JSONResponse(stream.latest.aircraft())
 
     async def page(_: Any) -> Any:
+        """Return the page with the map; status 404 for a site that is not on Earth."""
         try:
             return HTMLResponse(await asyncio.to_thread(page_of, stream.site))
         except InvalidProblem as error:
@@ -121,9 +123,11 @@ def _line_routes(stream: Stream) -> list[Any]:
     from starlette.routing import Route
 
     def refused(code: int, why: str, **headers: str) -> Any:
+        """Return an error response with the HTTP status `code` and the reason `why`."""
         return JSONResponse({"error": why}, code, headers)
 
     async def answer(request: Any, *, track: bool) -> Any:
+        """Return the response to a request with lines: fixes, or states of tracks with `track`."""
         if not _is_same_origin(request):
             return refused(403, "requests from pages of other sites are refused")
         body = await _body(request)
@@ -135,12 +139,12 @@ def _line_routes(stream: Stream) -> list[Any]:
             return refused(400, f"send 1 to {WAITING} lines")
         records = await _answers_to(stream, lines, track=track)
         if isinstance(records, int):
-            said = {
+            messages = {
                 429: "the input queue is full",
                 503: "the stream ends",
                 504: "no answer yet; it will be in the stream",
             }
-            return refused(records, said[records], **{"Retry-After": "1"})
+            return refused(records, messages[records], **{"Retry-After": "1"})
         if single:
             return Response(to_line(records[0]), 400 if "error" in records[0] else 200, media_type="application/json")
         return Response(b"".join(map(to_line, records)), media_type="application/x-ndjson")
@@ -149,13 +153,15 @@ def _line_routes(stream: Stream) -> list[Any]:
         return await answer(request, track=False)
 
     async def track(request: Any) -> Any:
+        """Return the response to /track: answers to lines (POST), or the last states of all tracks (GET)."""
         if stream.untracked:
             return refused(400, stream.untracked)
         if request.method == "POST":
             return await answer(request, track=True)
         return JSONResponse({"tracks": stream.tracks.records()})
 
-    async def one(request: Any) -> Any:
+    async def one_track(request: Any) -> Any:
+        """Return the response to /track/NAME: the last state of one track; status 404 without a track."""
         name = request.path_params["name"]
         found = next((each for each in stream.tracks.records() if each["target"] == name), None)
         return refused(404, f"there is no track of {name[:40]!r}") if found is None else JSONResponse(found)
@@ -163,7 +169,7 @@ def _line_routes(stream: Stream) -> list[Any]:
     return [
         Route("/fix", fix, methods=["POST"]),
         Route("/track", track, methods=["GET", "POST"]),
-        Route("/track/{name:path}", one),
+        Route("/track/{name:path}", one_track),
     ]
 
 
@@ -194,7 +200,11 @@ async def _body(request: Any) -> bytes | None:
 
 
 async def _answers_to(stream: Stream, lines: list[bytes], *, track: bool) -> list[Record] | int:
-    """Return the answers to lines, or an HTTP status code if there are none."""
+    """Return the answers to lines, or an HTTP status code if there are no answers.
+
+    The codes are 429 (queue full), 503 (the stream ends) and 504 (no answer in time). With `track`, the answers are
+    states of tracks.
+    """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[list[Record]] = loop.create_future()
 
@@ -229,7 +239,8 @@ async def _listen(stream: Stream, socket: Any) -> None:
     await socket.accept()
     loop, queue = asyncio.get_running_loop(), asyncio.Queue[Record | None](_QUEUE)
 
-    def keep(record: Record | None) -> None:
+    def enqueue(record: Record | None) -> None:
+        """Queue a record for the websocket; if the queue is full, replace it by None, which closes the websocket."""
         with suppress(asyncio.QueueFull):
             queue.put_nowait(record)
             return
@@ -237,16 +248,18 @@ async def _listen(stream: Stream, socket: Any) -> None:
             queue.get_nowait()
         queue.put_nowait(None)
 
-    def hear(record: Record) -> None:
+    def receive(record: Record) -> None:
+        """Pass a record from a thread of the stream to the event loop of the server."""
         with suppress(RuntimeError):  # the server has ended
-            loop.call_soon_threadsafe(keep, record)
+            loop.call_soon_threadsafe(enqueue, record)
 
     async def send() -> None:
+        """Send queued records until None arrives, then close the websocket with the code 1013."""
         while (record := await queue.get()) is not None:
             await socket.send_text(to_line(record).decode())
         await socket.close(1013, "the client reads too slowly")
 
-    stream.listeners = (*stream.listeners, hear)
+    stream.listeners = (*stream.listeners, receive)
     sending = asyncio.create_task(send())
     number = 0
     try:
@@ -261,5 +274,5 @@ async def _listen(stream: Stream, socket: Any) -> None:
     except (WebSocketDisconnect, RuntimeError, KeyError):
         pass  # the client has disconnected, or sends data that is not text
     finally:
-        stream.listeners = tuple(each for each in stream.listeners if each is not hear)
+        stream.listeners = tuple(each for each in stream.listeners if each is not receive)
         sending.cancel()

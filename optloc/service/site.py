@@ -38,7 +38,7 @@ FAST = "gtrs+lsr"
 # frequent.
 _KEPT = 64
 # Columns of a row in a table of the site, in addition to its stations.
-_OWN = ("sigma", "weight", "correction")
+_ROW_SETTINGS = ("sigma", "weight", "correction")
 
 
 class UnknownName(InvalidProblem):
@@ -86,13 +86,14 @@ class Ready:
     fast, full : Prepared
         Solvers of the first phase, and of the method of the stream.
     count : int
-        Number of rows of the problem; rows without a value have no weight.
+        Number of rows m of the problem; rows without a value have the weight 0.
     row, first, second : int array (l,)
-        Rows that come from arrivals, and the two arrivals of each; `second` is -1 for a time of arrival.
+        Rows of the problem that come from arrivals, and the two arrivals of each, as columns of the arrivals of an
+        event. `second` is -1 for a time of arrival.
     stated : tuple of (int array, int array, Conversion, array)
         For each kind of rows with values: their columns, rows of the problem, unit, and the amount to add, SI.
     scale : float
-        Metres in a picosecond.
+        Metres that the signal travels in a picosecond.
     """
 
     fast: Prepared
@@ -105,10 +106,10 @@ class Ready:
     scale: float
 
     def si(self, arrivals: Array, values: Array) -> Array:
-        """Return the measurements (n, m) of the problem, SI.
+        """Return the measurements (n, m) of the problem for n events, SI.
 
-        `arrivals` (n, h) are in picoseconds since the first arrival of the event. `values` (n, v) are the other rows in
-        their units.
+        `arrivals` (n, h) are the times at h stations, picoseconds since the first arrival of each event. `values` (n,
+        v) are the other rows, in their units.
         """
         z = np.zeros((len(values), self.count))
         less = np.where(self.second >= 0, arrivals[:, self.second], 0.0) if len(self.row) else 0.0
@@ -219,23 +220,24 @@ class Site:
         """Return the name of a row for messages."""
         return self.row(key).name
 
-    def ready(self, heard: tuple[int, ...], rows: tuple[SiteRow, ...]) -> Ready | None:
+    def ready(self, receivers: tuple[int, ...], rows: tuple[SiteRow, ...]) -> Ready | None:
         """Return the prepared problem for arrivals and rows; None if they give no row.
 
-        `heard` are the stations with an arrival, ascending. `rows` are the rows with values. Raise InvalidProblem if
-        the file lacks data for a row, such as its noise.
+        `receivers` are the numbers of the stations with an arrival, ascending. `rows` are the rows with values. Raise
+        InvalidProblem if the file lacks data for a row, such as its noise.
         """
-        return _READY.find((self, heard, rows), lambda: self._prepare(heard, rows))
+        return _READY.find((self, receivers, rows), lambda: self._prepare(receivers, rows))
 
-    def between(self, heard: tuple[int, ...]) -> tuple[SiteRow, ...]:
-        """Return the rows that arrivals at the stations `heard` give.
+    def between(self, receivers: tuple[int, ...]) -> tuple[SiteRow, ...]:
+        """Return the rows of a problem that arrivals at the stations `receivers` (numbers, ascending) give.
 
         These are the rows of the template whose stations have arrivals. If they do not connect all stations, a
-        difference to the first station connects each further group.
+        difference to the first station connects each further group. Times of arrival need no connection: each station
+        without a row gets one.
         """
-        if not heard:
+        if not receivers:
             return ()
-        names = [self.stations[i] for i in heard]
+        names = [self.stations[i] for i in receivers]
         kept = [self.rows[i] for i in self.arriving if {self.rows[i].a, self.rows[i].b} - {""} <= set(names)]
         section, kind = self.rows[self.arriving[0]].section, self.rows[self.arriving[0]].kind
         if kind == "toa":
@@ -250,14 +252,15 @@ class Site:
                 group = {other: group[names[0]] if g == group[name] else g for other, g in group.items()}
         return tuple(kept)
 
-    def _prepare(self, heard: tuple[int, ...], rows: tuple[SiteRow, ...]) -> Ready | None:
-        timed = self.between(heard)
+    def _prepare(self, receivers: tuple[int, ...], rows: tuple[SiteRow, ...]) -> Ready | None:
+        """Return the prepared problem for arrivals and rows, as `ready`, but without the cache."""
+        timed = self.between(receivers)
         if not (timed or rows):
             return None
         draft, order = self._draft((*timed, *rows))
         problem = draft.loaded.problem
         bare = problem.with_rows(z=np.zeros(problem.count))
-        place, stated, links = {station: i for i, station in enumerate(heard)}, [], []
+        place, stated, links = {station: i for i, station in enumerate(receivers)}, [], []
         for chunk, number in zip(draft.chunks, draft.numbers, strict=True):
             section = next(i for i, table in enumerate(draft.tables) if table is chunk.table)
             column = np.array([order[section][row] for row in chunk.row.tolist()])
@@ -273,7 +276,10 @@ class Site:
         return Ready(fast, full, problem.count, row, first, second, tuple(stated), self.speed * 1e-12)
 
     def _draft(self, rows: tuple[SiteRow, ...]) -> tuple[Draft, list[list[int]]]:
-        """Return the problem of rows, and for each row of its tables the index in `rows`, -1 for none."""
+        """Return the problem of rows, and for each row of its tables the index in `rows`, -1 for a row without a value.
+
+        With a covariance matrix, all rows of the site are present, and rows without a value have the weight 0.
+        """
         sections, tables, order = [], [], []
         for i, (section, table) in enumerate(zip(self.file.measurements, self.tables, strict=True)):
             of_all = section.covariance is not None or self.file.covariance is not None
@@ -283,11 +289,11 @@ class Site:
                 what = f"the covariance of the site does not include {rows[others[0]].name}"
                 raise InvalidProblem(what, self.source, "send only rows of the site")
             # one matrix for all rows of an epoch: absent rows keep their place, with weight 0
-            own = [row for row in self.rows if row.section == i] if of_all else []
-            chosen = own or [*(rows[k] for k in sorted(listed.values())), *(rows[k] for k in others)]
+            all_rows = [row for row in self.rows if row.section == i] if of_all else []
+            chosen = all_rows or [*(rows[k] for k in sorted(listed.values())), *(rows[k] for k in others)]
             if not chosen:
                 continue
-            place = [listed.get(row.at, -1) for row in own] or [*sorted(listed.values()), *others]
+            place = [listed.get(row.at, -1) for row in all_rows] or [*sorted(listed.values()), *others]
             sections.append(section)
             tables.append(_table(table, section.kind is None, chosen, [k >= 0 for k in place]))
             order.append(place)
@@ -297,14 +303,18 @@ class Site:
 
 
 def _table(table: Table, kinds: bool, rows: Sequence[SiteRow], present: Sequence[bool]) -> Table:
-    """Return the rows of an event as a table with the form of a table of the site."""
+    """Return the rows of an event as a table with the columns of a table of the site.
+
+    `table` is that table. `kinds` is whether its rows state their kind. `present` (for each of `rows`) is whether the
+    event has a value; other rows get the weight 0.
+    """
     columns: dict[str, Array] = {}
     if kinds:
         columns["kind"] = np.array([row.kind for row in rows], dtype=object)
     for key in ("a", "b"):
         if any(getattr(row, key) for row in rows):
             columns[key] = np.array([getattr(row, key) or None for row in rows], dtype=object)
-    for key in _OWN:
+    for key in _ROW_SETTINGS:
         given = table.numbers(key) if table.has(key) else None
         stated = key == "sigma" and any(row.sigma is not None for row in rows)
         if given is None and not stated and (key != "weight" or all(present)):
@@ -316,7 +326,11 @@ def _table(table: Table, kinds: bool, rows: Sequence[SiteRow], present: Sequence
 
 
 def _row_setting(given: Array | None, key: str, row: SiteRow, source: str) -> float:
-    """Return the standard deviation, weight or correction of a row."""
+    """Return the standard deviation, weight or correction of a row, by `key`, in the unit of the file.
+
+    `given` has the values of the table of the site, if any. The standard deviation that an event states has priority.
+    Rows that the site does not list have the weight 1 and the correction 0.
+    """
     if key == "sigma" and row.sigma is not None:
         return row.sigma
     if given is not None and row.at >= 0:
@@ -386,7 +400,10 @@ def _check(draft: Draft, source: str) -> None:
 
 
 def _template(draft: Draft, source: str) -> tuple[SiteRow, ...]:
-    """Return the distinct rows, in the order of the file."""
+    """Return the distinct rows in the order of the file: each combination of kind and stations once.
+
+    A file with one epoch must not have two equal rows.
+    """
     found: dict[tuple[int, str, str, str], SiteRow] = {}
     for i, (section, table) in enumerate(zip(draft.file.measurements, draft.tables, strict=True)):
         kinds = [section.kind] * table.count if section.kind is not None else table.labels("kind").tolist()

@@ -36,16 +36,16 @@ class ChirpStack:
         self._foreign: set[str] = set()
 
     def __call__(self, line: bytes) -> bytes:
-        """Return an uplink as a whole event."""
+        """Return an uplink as a line with a whole event; lines of another form are returned unchanged."""
         found = _object(line)
         if found is None or not isinstance(found.get("rxInfo"), list):
             return line
         every = [each for each in found["rxInfo"] if isinstance(each, dict) and isinstance(each.get("gatewayId"), str)]
-        heard = [each for each in every if each["gatewayId"] in self._stations]
+        receptions = [each for each in every if each["gatewayId"] in self._stations]
         self._warn({each["gatewayId"] for each in every} - self._stations)
         arrivals = [
             {"station": each["gatewayId"], "time": str(each["fineTimeSinceGpsEpoch"]).removesuffix("s")}
-            for each in heard
+            for each in receptions
             if each.get("fineTimeSinceGpsEpoch") is not None
         ]
         device = found.get("deviceInfo")
@@ -82,23 +82,23 @@ class ModeS:
         self._seen: dict[str, tuple[int, int]] = {}
 
     def __call__(self, line: bytes) -> bytes:
-        """Return a message as one arrival."""
+        """Return a message as a line with one arrival; lines of another form are returned unchanged."""
         found = _object(line)
-        heard = None if found is None else found.get("mlat")
-        if found is None or not isinstance(heard, dict):
+        reception = None if found is None else found.get("mlat")
+        if found is None or not isinstance(reception, dict):
             return line
-        bits, time, station = heard.get("m"), heard.get("t"), found.get("receiver")
+        bits, time, station = reception.get("m"), reception.get("t"), found.get("receiver")
         if not isinstance(bits, str) or type(time) is not int:
             return line
         first, number = self._seen.pop(bits, (time, 0))
-        apart = (time - first + _DAY // 2) % _DAY - _DAY // 2
-        if abs(apart) > _TOGETHER:
-            first, number, apart = time, number + 1, 0
+        delay = (time - first + _DAY // 2) % _DAY - _DAY // 2
+        if abs(delay) > _TOGETHER:
+            first, number, delay = time, number + 1, 0
         self._seen[bits] = first, number
         if len(self._seen) > _MESSAGES:
             del self._seen[next(iter(self._seen))]
         # relative to the midnight of the first receiver, so that midnight does not split an event
-        event = {"event": f"{bits}-{number}", "station": station, "time_ns": first + apart}
+        event = {"event": f"{bits}-{number}", "station": station, "time_ns": first + delay}
         address = _address(bits)
         return json.dumps(event | ({"target": address} if address else {})).encode()
 
@@ -113,6 +113,7 @@ def _address(bits: str) -> str:
 
 
 def _object(line: bytes) -> dict[str, Any] | None:
+    """Return the JSON object of a line; None if it is too long or is not an object."""
     if len(line) > 4 * LINE:  # an uplink has many parts that are not used
         return None
     try:
@@ -162,16 +163,18 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callab
     number = 0
 
     def connected(client: Any, _: Any, __: Any, reason: Any, ___: Any) -> None:
+        """Subscribe to the topic after each connection, or log a warning if the broker refuses."""
         if reason.is_failure:
             LOG.warning("%s: the broker refuses (%s)", parts.hostname, reason)
         else:
             client.subscribe(topic, qos=1)  # again after each reconnection
 
-    def heard(_: Any, __: Any, message: Any) -> None:
+    def receive(_: Any, __: Any, message: Any) -> None:
+        """Pass the lines of a message to the stream."""
         nonlocal number
         number = _push(stream, message.payload, "mqtt", number, adapter)
 
-    client.on_connect, client.on_message = connected, heard
+    client.on_connect, client.on_message = connected, receive
     try:
         client.connect(parts.hostname, parts.port or (8883 if parts.scheme == "mqtts" else 1883))
     except (OSError, ValueError) as error:
@@ -179,6 +182,7 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callab
     client.loop_start()
 
     def stop() -> None:
+        """Disconnect from the broker, and end the thread of the client."""
         client.disconnect()
         client.loop_stop()
 
@@ -186,7 +190,10 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callab
 
 
 def _push(stream: Stream, payload: bytes, source: str, number: int, adapter: Adapter | None) -> int:
-    """Pass the lines of a message to a stream without waiting, and return the number of the last line."""
+    """Pass the lines of a message to a stream without waiting, and return the number of the last line.
+
+    `number` is the number of the last line of the messages before. Old lines that the full queue drops are counted.
+    """
     for data in payload.split(b"\n"):
         if not data.strip():
             continue
@@ -229,6 +236,7 @@ def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> Call
     ends = False
 
     def run() -> None:
+        """Receive messages until the source is stopped (a separate thread), and pass their lines to the stream."""
         number = 0
         while not ends:
             if not socket.poll(200):
@@ -247,6 +255,7 @@ def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> Call
     thread.start()
 
     def stop() -> None:
+        """Stop the source, and wait at most 5 s for its end."""
         nonlocal ends
         ends = True
         thread.join(5.0)

@@ -1,4 +1,8 @@
-"""A stream: lines from all sources go through one bounded queue; one thread answers, one thread writes."""
+"""A stream: lines from all sources go through one bounded queue; one thread answers, one thread writes.
+
+The thread that answers parses lines, collects events, closes them in time, and passes them to the engine. It also
+writes checkpoints, recordings and health.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +39,7 @@ _PAUSE = 1e-3
 # written together then stay together at any reading speed, and events with missing rows still close.
 _UNCOUNTED = 0.98
 # Bytes of a recording that are collected before writing.
-_GATHERED = 1 << 16
+_RECORD_BUFFER = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +154,7 @@ class Stream:
         Thread(target=self._run, name="optloc stream", daemon=True).start()
 
     def _new_engine(self, site: Site) -> Engine:
+        """Return the engine of a site with the settings of the stream."""
         s = self._settings
         return Engine(
             site,
@@ -190,6 +195,7 @@ class Stream:
         return self.tracks.why
 
     def _time(self) -> float:
+        """Return the time of the clock for which events wait, s: the clock without the seconds that do not count."""
         return self.clock() - self.held
 
     def close(self) -> None:
@@ -203,7 +209,7 @@ class Stream:
 
     @property
     def failed(self) -> bool:
-        """Whether the reader of the output has closed it."""
+        """Return whether the reader of the output has closed it."""
         return self._outbox.failed
 
     def health(self) -> Record:
@@ -214,6 +220,7 @@ class Stream:
     # The thread that answers.
 
     def _run(self) -> None:
+        """Answer lines until the end (the thread that answers); an error is stored for the thread that waits."""
         try:
             self._loop()
         except Exception as error:  # noqa: BLE001  # raised in the thread that waits for the stream
@@ -224,6 +231,7 @@ class Stream:
             self.ended.set()
 
     def _loop(self) -> None:
+        """Read lines and answer closed events until the queue of lines is closed or the output fails."""
         while not self._outbox.failed:
             due = min(self._engine.next_due, self._next_state, self._next_health) - self.clock()
             if not self._replayed:
@@ -246,7 +254,7 @@ class Stream:
             self._finish()
 
     def _do_timed_work(self) -> None:
-        """Do all timed work."""
+        """Answer closed events, then do the work that is due: deadlines, reload, health, recording and checkpoint."""
         now = self.clock()
         self._answer_closed()
         self._engine.expire()
@@ -271,6 +279,7 @@ class Stream:
         self._write_record(last=True)
 
     def _read(self, line: QueuedLine) -> None:
+        """Read one line: add its rows to an event, or run its command; report an invalid line."""
         counts, ticket = self.metrics.counts, line.ticket
         data = line.data.strip()
         refused = None
@@ -298,6 +307,7 @@ class Stream:
             ticket.handled(refused)
 
     def _run_command(self, command: str) -> Record:
+        """Run the command "flush" or "health", and return the record that answers it."""
         if command == "flush":
             self._events.flush(self.clock())
             return {"flushed": True}
@@ -306,6 +316,7 @@ class Stream:
         return record
 
     def _answer_closed(self) -> None:
+        """Pass the closed events to the engine, and keep them for checkpoints until their answers are written."""
         closed = list(self._events.closing())
         for event in closed:
             self._unwritten[event.name] = event
@@ -315,7 +326,8 @@ class Stream:
     # Answers, from all threads.
 
     def _answer(self, event: of_events.Event, record: Record, last: bool) -> None:
-        self._tell(record)
+        """Write an answer of an event, and pass it to all receivers; `last` marks the last answer of the event."""
+        self._publish(record)
         self._outbox.put(self._format(record, self.site.frame) or b"", event.name if last else None)
         if event.reply is not None:
             event.reply.answer(record, last)
@@ -324,13 +336,14 @@ class Stream:
 
     def _emit(self, record: Record) -> None:
         """Write a record that is not an answer: a note, an error, health."""
-        self._tell(record)
+        self._publish(record)
         if self._settings.format in OF_RECORDS:
             self._outbox.put(self._format(record, self.site.frame) or b"")
         else:
             self._say(json.dumps(record))
 
-    def _tell(self, record: Record) -> None:
+    def _publish(self, record: Record) -> None:
+        """Pass a record to the latest fixes and to the listeners."""
         self.latest(record)
         for listener in self.listeners:
             listener(record)
@@ -357,6 +370,7 @@ class Stream:
         self._say(f"The site is now {site.title!r}, with {len(site.rows)} rows of {len(site.stations)} stations.")
 
     def _checkpoint(self) -> None:
+        """Write a checkpoint, if set; events whose last answers are written count as closed."""
         for _ in range(len(self._outbox.written)):
             self._unwritten.pop(self._outbox.written.popleft(), None)
         if self._settings.state is not None:
@@ -366,13 +380,14 @@ class Stream:
                 self._say(f"No checkpoint is written: {error}")  # a full disk must not end the stream
 
     def _record_line(self, data: bytes, stamp: float) -> None:
-        """Record a line, which has one JSON object, with its time of reading."""
+        """Record a line with its time of reading, `stamp`, s, as the first key of its JSON object."""
         if self._record is not None:
             self._recorded += b'{"received":%.6f,' % stamp + data[1:] + b"\n"
-            if len(self._recorded) > _GATHERED:
+            if len(self._recorded) > _RECORD_BUFFER:
                 self._write_record()
 
     def _write_record(self, *, last: bool = False) -> None:
+        """Append the collected lines to the recording, if any; with `last`, finish the file."""
         if self._record is None:
             return
         if self._recorded:
@@ -383,7 +398,7 @@ class Stream:
 
 
 def warm_up(site: Site, phases: str) -> None:
-    """Solve a simulated event, so that machine code is loaded before the first real event.
+    """Solve simulated events, so that machine code is loaded before the first real event.
 
     `phases` are the phases of the answers: "two", "one" or "fix".
     """

@@ -62,7 +62,8 @@ class Scan(NamedTuple):
 class _StoredTrack:
     """A stored track.
 
-    origin: time of its first event, picoseconds. heard: time of its last event by the clock, s. last: last answer.
+    follower: tracker of the target. origin: time of its first event, picoseconds. heard: time of its last event by the
+    clock of the stream, s. last: last answer.
     """
 
     follower: Follower
@@ -111,7 +112,7 @@ class Tracks:
         return _reason_without_tracks(self._problem, self._how)
 
     def take(self, scans: Sequence[Scan]) -> None:
-        """Add events in the order in which they closed; the caller waits while the queue is full."""
+        """Queue events in the order in which they closed; the caller waits while the queue is full."""
         with self._changed:
             if self._thread is None:
                 self._thread = Thread(target=self._run, name="optloc tracks", daemon=True)
@@ -138,6 +139,7 @@ class Tracks:
         return [record | {"age": round(age, 3)} for record, age in reversed(kept)]
 
     def _run(self) -> None:
+        """Answer the waiting events until the tracks end (the thread of the tracks)."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._ends)
@@ -153,6 +155,10 @@ class Tracks:
             self._emit(scan.event, record)
 
     def _failed(self, event: Event, error: Exception) -> Record:
+        """Return the answer to an event whose track failed.
+
+        An unexpected error also removes the track.
+        """
         if isinstance(error, InvalidProblem):
             self._metrics.add("unsolvable")
             return unsolved(event, phase="track", error=str(error))
@@ -165,7 +171,11 @@ class Tracks:
         return unsolved(event, phase="track", error=f"{type(error).__name__}: {error}; a new track starts")
 
     def _track_event(self, event: Event, problem: Problem, z: Array) -> Record:
-        """Return the answer to an event from the track of its target."""
+        """Return the answer to an event from the track of its target.
+
+        `z` (m,) are the measurements of `problem`, SI. An event that is not later than the last event of its track is
+        refused. Raise InvalidProblem for an event without a time, or a site without tracks.
+        """
         if self.why:
             raise InvalidProblem(self.why, None, "request fixes instead of tracks")
         when = event.when if event.when is not None else min(event.times.values(), default=None)
@@ -185,7 +195,7 @@ class Tracks:
             return unsolved(event, phase="track", error=str(error))
         entries = track.follower.take(scan_of(problem, z, time))
         entry = entries[-1] if entries and entries[-1].time == time else None
-        record = _told(event, when, entry, track.follower, problem)
+        record = _answer_of(event, when, entry, track.follower, problem)
         with self._changed:
             now = self._clock()
             self._kept.pop(name, None)
@@ -207,20 +217,28 @@ class Tracks:
 
 
 def scan_of(problem: Problem, z: Array, time: float) -> Problem:
-    """Return measurements (m,) of a problem as one scan of a run with one target, at a time in seconds."""
+    """Return measurements (m,) of a problem, SI, as one scan of a run with one target; `time` is in seconds."""
     rows = np.ones(problem.count, dtype=bool)
     return alone(problem.with_rows(z=z), rows, np.array([time]))
 
 
-def _told(event: Event, when: int, entry: Entry | None, follower: Follower, problem: Problem) -> Record:
+def _answer_of(event: Event, when: int, entry: Entry | None, follower: Follower, problem: Problem) -> Record:
+    """Return the answer to an event: the state of its track, or "starting" or "lost" without a state.
+
+    `when` is the time of the event, picoseconds. `entry` is the result of the scan, or None.
+    """
     if entry is not None:
         return track_record(event, when * 1e-12, entry, problem)
-    said = {"status": "lost", "reason": follower.lost} if follower.lost else {"status": "starting"}
-    return unsolved(event, phase="track", target=event.target or UNNAMED, time=when * 1e-12, **said)
+    outcome = {"status": "lost", "reason": follower.lost} if follower.lost else {"status": "starting"}
+    return unsolved(event, phase="track", target=event.target or UNNAMED, time=when * 1e-12, **outcome)
 
 
 def _reason_without_tracks(problem: Problem, how: Following) -> str:
-    """Return the reason for which events of a site make no tracks; empty if they do."""
+    """Return the reason for which events of a site make no tracks; empty if they do.
+
+    `how` has the settings of the tracks. A track is started with measurements that are zero, to find errors of the
+    settings.
+    """
     if problem.priors:
         return f"the file has a prior of {problem.priors[0].name!r}; a track cannot use priors"
     if len(problem.motions) > 1 or problem.motions[0].known is not None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem, Status
-from optloc.cli.fix import _are_refuted, advice_json, grouping_of, tell_level
+from optloc.cli.fix import _needs_causes, advice_json, grouping_of, tell_level
 
 
 class Fixes(SimpleNamespace):
@@ -17,10 +17,10 @@ class Fixes(SimpleNamespace):
 
 
 @pytest.mark.parametrize(("refuted", "more"), [(0, False), (1, False), (100, True), (1000, True)])
-def test_fixes_are_refuted_where_chance_refutes_fewer(refuted, more):
+def test_fixes_needs_causes_where_chance_refutes_fewer(refuted, more):
     code = np.full(1000, Status.OK)
     code[:refuted] = Status.MISFIT
-    assert _are_refuted(Fixes(code=code, explanations=None)) is more
+    assert _needs_causes(Fixes(code=code, explanations=None)) is more
 
 
 def level(**given):

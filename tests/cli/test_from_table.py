@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from optloc import InvalidProblem
-from optloc.cli.from_table import columns_of, read_problem, table_told, takes_table
+from optloc.cli.from_table import columns_of, read_problem, table_hints, takes_table
 from optloc.cli.options import shipped_problems
 from optloc.files import read
 
@@ -20,14 +20,14 @@ def test_columns_are_named_by_role():
 
 @pytest.mark.parametrize("name", ["a.csv", "a.JSON", "a.parquet", "brdc.21o", "a.rnx"])
 def test_tables_are_known_by_their_ending(name):
-    assert table_told(Path(name), {"sigma": "3 m"}).sigma == "3 m"
+    assert table_hints(Path(name), {"sigma": "3 m"}).sigma == "3 m"
 
 
 def test_a_problem_file_takes_no_option_of_tables():
-    assert table_told(Path("a.toml"), {"sigma": None, "what": None}) is None
+    assert table_hints(Path("a.toml"), {"sigma": None, "what": None}) is None
     for given, flag in (({"what": "arrivals"}, "--as"), ({"time_unit": "s"}, "--time-unit")):
         with pytest.raises(InvalidProblem, match="is a problem file") as refused:
-            table_told(Path("a.toml"), given)
+            table_hints(Path("a.toml"), given)
         assert refused.value.where == flag
 
 

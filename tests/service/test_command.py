@@ -9,7 +9,17 @@ import pytest
 from service.lines import site_in
 
 from optloc import InvalidProblem
-from optloc.service.command import _settings, _threads, _tracking, one_of, part_of, run_check, seconds_of, told, wait
+from optloc.service.command import (
+    _settings,
+    _threads,
+    _tracking,
+    input_description,
+    one_of,
+    part_of,
+    run_check,
+    seconds_of,
+    wait,
+)
 from optloc.service.events import parse
 from optloc.service.site import FAST
 
@@ -43,7 +53,7 @@ def test_options_become_the_settings_of_a_stream():
 
 def test_each_line_that_check_shows_is_one_that_the_site_takes(tmp_path, capsys):
     site = site_in(tmp_path, method=FAST)
-    shown = [line.partition(": {")[2] for line in told(site) if ": {" in line]
+    shown = [line.partition(": {")[2] for line in input_description(site) if ": {" in line]
     assert len(shown) == 3
     for text in shown:
         assert parse(b"{" + text.encode(), site).event == "1"

@@ -217,9 +217,9 @@ def test_a_site_that_no_stream_can_have_is_refused(tmp_path, old, new, said):
 
 
 def test_what_is_told_of_a_site_is_what_it_takes(site):
-    from optloc.service.command import told
+    from optloc.service.command import input_description
 
-    lines = [text.partition(": ")[2] for text in told(replace(site))]
+    lines = [text.partition(": ")[2] for text in input_description(replace(site))]
     for text in lines[1:4]:
         assert parse(text.encode(), site).event == "1"
         assert json.loads(text)["event"] == "1"
