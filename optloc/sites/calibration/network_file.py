@@ -44,7 +44,7 @@ BETWEEN = "station_range"
 
 
 class _NetworkTable(BaseModel):
-    """A table of the file; unknown keys are an error."""
+    """A table of the network file; unknown keys are an error."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -151,7 +151,11 @@ def read_network(path: Path) -> Network:
 
 
 def _places(section: NetworkStations, table: Table, where: str) -> tuple[Array, Array]:
-    """Return prior station coordinates (M, d) and their standard deviations, metres; infinite if a cell is empty."""
+    """Return prior station coordinates (M, d) and their standard deviations, metres.
+
+    If a cell is empty, the coordinate is 0 and its standard deviation is infinite. `where` is the location of
+    the section for messages.
+    """
     unit = Units("length").conversion(section.unit, where)
     keys = ("x", "y", "z")[: section.dimension]
     if section.dimension == 2 and table.has("z"):
@@ -168,7 +172,7 @@ def _places(section: NetworkStations, table: Table, where: str) -> tuple[Array, 
 
 
 def _optional(table: Table, key: str) -> Array:
-    """Return a column as numbers, NaN where a cell or the column is missing."""
+    """Return a column as numbers (q,), NaN where a cell or the column is missing."""
     return table.numbers(key, optional=True) if table.has(key) else np.full(table.count, np.nan)
 
 
@@ -187,9 +191,11 @@ def _values(read: Context, name: str) -> tuple[Array, Array]:
 def _by_pulse(
     rows: list[tuple[str, Array, Array, Array, Array, Array]],
 ) -> tuple[tuple[str, ...], tuple[NetworkSlot, ...], Array, Array]:
-    """Return labels of pulses, slots, and tables (N, R) of values and standard deviations.
+    """Return labels (N) of pulses, slots (R), and tables (N, R) of values and standard deviations, metres.
 
-    If the same stations measure a pulse several times, each repetition has its own slot.
+    Each entry of `rows` is a section of the file: kind, pulses, stations a and b (-1 without), values and
+    standard deviations. If the same stations measure a pulse several times, each repetition has its own slot.
+    Cells without a measurement have an infinite standard deviation.
     """
     labels, _, pulse = distinct(np.concatenate([one[1] for one in rows]))
     slots: dict[tuple[str, int, int, int], int] = {}
@@ -219,6 +225,9 @@ def check_name(out: Path) -> None:
 
 def write_calibrated(found: Calibration, title: str, out: Path, source: Path) -> None:
     """Write a problem file with the estimated stations, their standard deviations, and the rows of the pulses.
+
+    The clocks are subtracted from the rows. `source` is the network file, which must not be overwritten by
+    `out`.
 
     Raises
     ------

@@ -74,7 +74,10 @@ def plot_network(
 
 
 def _histogram(axes: Axes, residuals: Array, dof: int) -> None:
-    """Draw the residuals (n,) and their expected normal distribution; its variance is dof / n, because of the fit."""
+    """Draw the whitened residuals (n,) and their expected normal distribution.
+
+    The variance of this distribution is dof / n, because the fit makes residuals smaller.
+    """
     edges = np.arange(-_FAR, _FAR + _BAR, _BAR)
     weights = np.full(residuals.size, 1.0 / (max(residuals.size, 1) * _BAR))
     axes.hist(np.clip(residuals, -_FAR, _FAR), bins=edges.tolist(), weights=weights, color=GREY)
@@ -100,7 +103,10 @@ def _view(
     known: Array,
     others: Sequence[Array],
 ) -> None:
-    """Draw the network in the plane of two coordinates."""
+    """Draw the network in the plane of two coordinates, `view` (for instance 0 and 1 for x and y).
+
+    The other arguments are those of `plot_network`.
+    """
     i, k = view
     d = stations.shape[1]
     axes.plot(pulses[:, i], pulses[:, k], ".", color=GREY, markersize=4, label="pulses")

@@ -59,7 +59,10 @@ def _run(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Calibrate, write the outputs and return the exit code: 0 for status ok, otherwise 1."""
+    """Calibrate, write the outputs and return the exit code: 0 for status ok, otherwise 1.
+
+    `gauge` are names of stations, separated by commas. `out` is a problem file, and `plot` is a picture.
+    """
     from optloc.cli import Screen, claim_outputs, dumps, line, say, write_picture, write_text
     from optloc.problem import Status
     from optloc.sites.calibration import calibrate as find

@@ -36,11 +36,11 @@ class PlaceOptions:
     choose, budget, criterion, worst, fail_one, gap, seconds
         See `SiteSelection`.
     at : str, optional
-        The only place of interest.
+        The only place of interest, for instance "1200,800,50".
     rows : bool
         Whether single rows are chosen instead of stations.
     draws : int
-        Simulated fixes at each place.
+        Simulated fixes at each place; 0: no check for ambiguity.
     """
 
     choose: int | None = None
@@ -114,7 +114,7 @@ def _of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
 
 
 def _with(selection: SiteSelection, wanted: PlaceOptions) -> SiteSelection:
-    """Return the selection with the options of the command line."""
+    """Return the selection with the options of the command line in place of the settings of the file."""
     given: dict[str, Any] = {
         key: value
         for key in ("choose", "budget", "worst", "fail_one", "gap", "seconds")

@@ -36,8 +36,9 @@ def check_groups(
 ) -> None:
     """Raise if no set of sites meets the groups, or if the wanted number of sites does not fit the groups.
 
-    `members` (G, n) marks the sites of each group. `state` (n,) is -1 for free, 0 for forbidden and 1 for kept
-    sites. `choose` is the wanted number of free sites; None leaves the number to the budget.
+    `members` (G, n) marks the n sites of each of the G groups. `names` are the names of the n sites. `state`
+    (n,) is -1 for free, 0 for forbidden and 1 for kept sites. `choose` is the wanted number of free sites;
+    None leaves the number to the budget.
 
     Raises
     ------
@@ -64,7 +65,11 @@ def check_groups(
 
 
 def _check_group(where: str, group: CountGroup, own: Array, names: Sequence[str], state: Array) -> None:
-    """Raise if no set of sites can meet this group, independent of the other groups."""
+    """Raise if no set of sites can meet this group, independent of the other groups.
+
+    `members` (n,) marks its sites, `names` are the names of all sites, and `state` (n,) is as in
+    `check_groups`. `where` is the place in the file for the message.
+    """
     kept, able, who = int((own & (state == 1)).sum()), int((own & (state != 0)).sum()), _list_names(own, names)
     if group.most is not None and kept > group.most:
         what = f"at most {group.most} of {who} may be taken, but {kept} of them are kept"
@@ -78,7 +83,11 @@ def _check_group(where: str, group: CountGroup, own: Array, names: Sequence[str]
 
 
 def _count(groups: Sequence[CountGroup], members: Array, state: Array, sign: float) -> int | None:
-    """Return the largest (sign -1) or smallest (sign 1) number of free sites that meets the groups, or None."""
+    """Return the largest (sign -1) or smallest (sign 1) number of free sites in a set that meets all groups.
+
+    The result is None if no set meets the groups. An integer programme finds it. `members` (G, n) marks the
+    sites of each group; `state` (n,) is as in `check_groups`.
+    """
     low = np.array([-np.inf if g.least is None else g.least for g in groups], dtype=float)
     high = np.array([np.inf if g.most is None else g.most for g in groups], dtype=float)
     rules = [LinearConstraint(members.astype(float), low, high)] if len(groups) else []
@@ -89,10 +98,10 @@ def _count(groups: Sequence[CountGroup], members: Array, state: Array, sign: flo
 
 
 def _limiting_groups(groups: Sequence[CountGroup], members: Array, state: Array, most: int) -> list[int]:
-    """Return the indices of the groups that limit the number of sites to `most`.
+    """Return the indices of the groups that limit the number of free sites to `most`, for an error message.
 
-    If the removal of one group allows more sites, the list has only this group. Otherwise it has all groups with
-    an upper limit.
+    If the removal of one group allows more sites, the list has only this group. Otherwise it has all groups
+    with an effective upper limit.
     """
     limiting = [i for i, group in enumerate(groups) if group.most is not None and group.most < members[i].sum()]
     for i in limiting:
@@ -103,7 +112,7 @@ def _limiting_groups(groups: Sequence[CountGroup], members: Array, state: Array,
 
 
 def _list_names(mask: Array, names: Sequence[str]) -> str:
-    """Return the names at the true entries of a mask (n,) as text; at most `_NAMED` names."""
+    """Return the names at the true entries of a mask (n,) as text: at most `_NAMED`, then the number of others."""
     members = [names[i] for i in np.flatnonzero(mask).tolist()]
     return ", ".join(members[:_NAMED]) + (f" and {len(members) - _NAMED} more" if len(members) > _NAMED else "")
 

@@ -77,7 +77,7 @@ _MANY = 10_000
 
 
 class _SelectionTable(BaseModel):
-    """A table of the file; unknown keys are an error."""
+    """A table of the selection file; unknown keys are an error."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -197,7 +197,7 @@ class LoadedSelection:
     source, title : str
         Name of the file, and its title.
     settings : dict
-        Tables of a problem file with all sites.
+        Tables of a problem file with all sites and their rows; `write_chosen` writes a part of them.
     regions : tuple of PlacementRegion
         Regions of the stations in the refinement; empty without a refinement.
     ground : PlacementGround, optional
@@ -277,7 +277,11 @@ def _data_only(section: StationsTable) -> DataTable:
 def _settings(
     file: SelectionFile, tables: Sequence[tuple[Table, StationsTable]], folder: Path, source: str
 ) -> dict[str, Any]:
-    """Return the tables of a problem file with all stations and the rows that each station would have."""
+    """Return the tables of a problem file with all stations and the rows that each station would have.
+
+    `tables` are the candidates and then, if the file has them, the existing stations; each with its section
+    of the file. `folder` is the folder of the file, and `source` is its name for messages.
+    """
     units = {(section.unit, section.speed_unit) for _, section in tables}
     if len(units) > 1:
         raise InvalidProblem("stations and candidates have different units", source, "use the same unit for both")
@@ -317,7 +321,7 @@ def _without_sigma(table: Table) -> Table:
 
 
 def _own_sigma(table: Table) -> tuple[Sequence[str], Sequence[float]]:
-    """Return names and sigmas of the candidates; empty without a column sigma."""
+    """Return names and sigmas of the candidates, in the unit of the measurements; empty without a column sigma."""
     if not table.has("sigma"):
         return (), ()
     return table.labels("name").tolist(), table.numbers("sigma").tolist()
@@ -326,7 +330,11 @@ def _own_sigma(table: Table) -> tuple[Sequence[str], Sequence[float]]:
 def _expected_rows(
     section: ExpectedTable, stations: Sequence[dict[str, Any]], own: dict[str, float], folder: Path, where: str
 ) -> list[dict[str, Any]]:
-    """Return the rows that a section lists; without a list, one row for each station except its second station."""
+    """Return the rows that a section lists; without a list, one row for each station except its second station.
+
+    Each row is a dict with the columns of a problem file. `stations` are the rows of the stations. `own` maps
+    a candidate to the sigma of its measurements, if the candidates have this column.
+    """
     if section.kind is None:
         raise InvalidProblem("the key 'kind' is missing", where, 'write kind = "toa"')
     kind_model(section.kind, join(where, "key 'kind'"))
@@ -351,13 +359,13 @@ def _expected_rows(
 
 
 def _column(candidates: Table, key: str, problem: Problem) -> Array:
-    """Return a candidate column (s,) for all stations of the problem, 0 for existing stations."""
+    """Return the candidate column `key` (s,) for all s stations of the problem, 0 for existing stations."""
     given = dict(zip(candidates.labels("name").tolist(), candidates.numbers(key).tolist(), strict=True))
     return np.array([given.get(name, 0.0) for name in problem.stations.names])
 
 
 def _group(table: GroupTable, candidates: Table, where: str) -> CountGroup:
-    """Return the rule of a group table, with the names of its members."""
+    """Return the rule of a group table, with the names of its members; `where` is its location for messages."""
     if (table.group is None) == (table.members is None):
         raise InvalidProblem("a group needs either the key group or the key members", where, "give one of the two")
     if table.most is None and table.least is None:
@@ -376,7 +384,11 @@ def _group(table: GroupTable, candidates: Table, where: str) -> CountGroup:
 def _places(
     section: TargetsTable, wanted: FrameTable, problem: Problem, folder: Path, source: str
 ) -> tuple[Array, tuple[str, ...], Array | None]:
-    """Return places (P, d), metres, their names, and their weights (P,); the weights are None if they are equal."""
+    """Return places (P, d), metres, their names, and their weights (P,); the weights are None if they are equal.
+
+    The places are the rows of the section, or a grid in its polygon. `wanted` is the frame of their
+    coordinates. The names default to P1, P2 and so on.
+    """
     where = join(source, "[targets]")
     if section.polygon is not None:
         if section.file is not None or section.rows is not None or section.spacing is None:
@@ -404,7 +416,7 @@ def _places(
 
 
 def _area(section: TargetsTable, frame: Frame, dimension: int, folder: Path, where: str) -> Array:
-    """Return places (P, d) on a square grid inside a polygon, metres."""
+    """Return places (P, d) on a square grid inside a polygon, metres; P is at most `_MANY`."""
     assert section.polygon is not None
     step = Units("length").plain(section.spacing or 0.0, section.unit, join(where, "key 'spacing'"))
     if not step > 0.0:
@@ -426,7 +438,10 @@ def _area(section: TargetsTable, frame: Frame, dimension: int, folder: Path, whe
 
 
 def _reach(file: SelectionFile, counts: Sequence[int], source: str) -> Array | None:
-    """Return the largest range (m,) of each row, metres; None if no section has a limit."""
+    """Return the largest range (m,) at which each row is measured, metres; None if no section has a limit.
+
+    `counts` are the numbers of rows of the sections. The order of the m rows is that of the assembled problem.
+    """
     if all(section.range_max is None for section in file.measurements):
         return None
     # `assemble` orders the blocks of rows by the first appearance of their kind and joins equal kinds
@@ -443,7 +458,10 @@ def _reach(file: SelectionFile, counts: Sequence[int], source: str) -> Array | N
 def _sight(
     section: SightTable | None, problem: Problem, places: Array, labels: Sequence[str], folder: Path, source: str
 ) -> Array | None:
-    """Return the sight factor (P, s) of each place and station, 0 if out of sight; None if all pairs are in sight."""
+    """Return the sight factor (P, s) of each place and station, 0 if out of sight; None if all pairs are in sight.
+
+    The factor multiplies sigma. `places` (P, d) are positions, metres, and `labels` are their names.
+    """
     if section is None:
         return None
     where, names = join(source, "[sight]"), problem.stations.names
@@ -476,7 +494,7 @@ def _sight(
 def _regions(
     section: RefineTable | None, frame: Frame, dimension: int, folder: Path, source: str
 ) -> tuple[tuple[PlacementRegion, ...], PlacementGround | None]:
-    """Return the convex regions of the refinement, and its terrain."""
+    """Return the convex regions of the refinement, and its terrain (None without); no region without a section."""
     if section is None:
         return (), None
     where = join(source, "[refine]")
@@ -494,7 +512,11 @@ def _regions(
 
 
 def write_chosen(loaded: LoadedSelection, taken: Sequence[str], out: Path, source: Path) -> None:
-    """Write a problem file with the taken stations and their rows, as input of `crlb --map` and studies."""
+    """Write a problem file with the taken stations and their rows, as input of `crlb --map` and studies.
+
+    `taken` are the names of the stations. Second stations of rows are written too. `source` is the selection
+    file, which must not be overwritten by `out`.
+    """
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("the output is a problem file, so its name must end in .toml", str(out), "change the name")
     claim(out, inputs=[source])

@@ -112,7 +112,7 @@ class SiteSelection:
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """The candidate sites of a selection as arrays: rows at each place, rules and states.
+    """The candidate sites of a selection as arrays: rows at each place, rules and states (P places, n sites, m rows).
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ class Candidates:
     design : Design
         Whitened rows and prior information at each place.
     rules, limits : array (R, n), (R,)
-        Linear rules rules @ w <= limits; the first rule is the count or the cost.
+        Linear rules rules @ w <= limits for a set w (n,) of 0 and 1; the first rule is the count or the cost.
     state : int array (n,)
         -1 for a free site, 0 for a forbidden site, 1 for a kept site.
     """
@@ -146,7 +146,10 @@ class Candidates:
     state: Array
 
     def assembled(self, chosen: Array) -> Problem:
-        """Return the batch of P problems with the rows of the taken sites (n,), as input of `optloc.crlb`."""
+        """Return the batch of P problems with the rows of the taken sites, as input of `optloc.crlb`.
+
+        `chosen` (n,) is 1 for each taken site; the rows of other sites get the weight 0.
+        """
         taken = np.asarray(chosen, dtype=float)[self.site]
         return self.problem.with_rows(weight=self.problem.weight * taken)
 
@@ -217,7 +220,7 @@ def _as_arrival_times(problem: Problem) -> Problem:
 
 
 def _sites(problem: Problem, selection: SiteSelection) -> tuple[Array, tuple[str, ...]]:
-    """Return the site (m,) of each row, and the names (n,) of the sites."""
+    """Return the site (m,) of each row, and the names (n,) of the sites: stations that measure, or single rows."""
     a, b = (np.concatenate([getattr(rows, end) for rows in problem.rows]) for end in ("a", "b"))
     stations = problem.stations.names
     if (a < 0).any():
@@ -242,7 +245,7 @@ def _sites(problem: Problem, selection: SiteSelection) -> tuple[Array, tuple[str
 
 
 def _check_apart(problem: Problem, site: Array, names: Sequence[str], places: Array) -> None:
-    """Raise if a place is at a station, or if two stations have the same position."""
+    """Raise if a place (P, d) is at a station, or if two stations have the same position."""
     stations = problem.stations.position.reshape(-1, problem.dimension)
     apart = np.linalg.norm(places[:, None] - stations[None], axis=-1)
     p, s = np.unravel_index(int(apart.argmin()), apart.shape)
@@ -259,7 +262,7 @@ def _check_apart(problem: Problem, site: Array, names: Sequence[str], places: Ar
 
 
 def _weight(selection: SiteSelection, count: int) -> Array:
-    """Return the weights (P,) of the places, sum 1."""
+    """Return the weights (P,) of the places, sum 1; `count` is the number P of places."""
     weight = np.ones(count) if selection.weights is None else np.asarray(selection.weights, dtype=float)
     if weight.shape != (count,) or not (weight > 0.0).all() or not np.isfinite(weight).all():
         what = f"the weights are not {count} positive numbers, one for each place"
@@ -268,7 +271,10 @@ def _weight(selection: SiteSelection, count: int) -> Array:
 
 
 def _weights(selection: SiteSelection, problem: Problem, places: Array) -> Array:
-    """Return the weights (P, m) of the rows: 0 out of sight or reach, and smaller where `sight` raises sigma."""
+    """Return the weights (P, m) of the rows: 0 out of sight or reach, and smaller where `sight` raises sigma.
+
+    `places` (P, d) are positions of the target, metres.
+    """
     count, stations = len(places), problem.stations.count
     weight = np.broadcast_to(problem.weight, (count, problem.count)).copy()
     end = np.concatenate([rows.a for rows in problem.rows])
@@ -292,8 +298,8 @@ def _weights(selection: SiteSelection, problem: Problem, places: Array) -> Array
 def _with_prior(problem: Problem, places: Array) -> Problem:
     """Return the problem with priors for position and emission time, so that the information is never singular.
 
-    The default prior of the position is half the extent of sites and places; for the emission time it is ten
-    times that length.
+    The default sigma of the position is half the extent of sites and places, metres. For the emission time it
+    is ten times that length. Unknowns with a given prior keep it. `places` is (P, d).
     """
     known = {prior.name for prior in problem.priors}
     points = np.concatenate([places, problem.stations.position.reshape(-1, problem.dimension)])
@@ -307,7 +313,12 @@ def _with_prior(problem: Problem, places: Array) -> Problem:
 
 
 def _rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
-    """Return the whitened rows (P, r, m, n) of each site; sites with fewer than r rows are padded with zeros."""
+    """Return the whitened rows (P, r, m, n) of each site; sites with fewer than r rows are padded with zeros.
+
+    r is the largest number of rows of a site, m the number of unknowns, and n = `count` the number of sites.
+    `vectors` (P, m) are the unknowns at each place, and `site` gives the site of each row. A row is the
+    derivative of a measurement by the unknowns, divided by its sigma.
+    """
     linear = linearise(problem, vectors)
     jacobian = np.concatenate([linear.shared, linear.local], axis=-1)
     found: list[list[Array]] = [[] for _ in range(count)]
@@ -328,7 +339,7 @@ def _rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
 
 
 def _prior(problem: Problem, vectors: Array) -> Array:
-    """Return the prior information (P, m, m) at each place."""
+    """Return the prior information (P, m, m) at each place: the inverse covariance of the priors of the m unknowns."""
     n, length, size = problem.layout.n_shared, problem.layout.n_local, len(vectors)
     none = Normal(
         np.zeros((size, n, n)),
@@ -349,9 +360,10 @@ def _prior(problem: Problem, vectors: Array) -> Array:
 
 
 def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tuple[Array, Array, Array]:
-    """Return rules (R, n), limits (R,) and states (n,) of the sites.
+    """Return rules (R, n), limits (R,) and states (n,) of the sites; a set w is allowed if rules @ w <= limits.
 
-    Only the group rules count the kept sites.
+    The rules are the number of sites, the budget and the groups. Only the group rules count the kept sites.
+    `names` are the n sites, and `site` gives the site of each row.
     """
     n, place = len(names), {name: i for i, name in enumerate(names)}
 
@@ -402,7 +414,7 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
 
 
 def _costs(selection: SiteSelection, n: int, site: Array) -> Array:
-    """Return the cost (n,) of each site."""
+    """Return the cost (n,) of each site; `site` gives the site of each row."""
     stations = np.concatenate([rows.a for rows in selection.problem.rows])
     cost = None if selection.cost is None else np.asarray(selection.cost, dtype=float)
     if cost is None or cost.shape != (selection.problem.stations.count,) or not (cost >= 0.0).all():
