@@ -1,4 +1,11 @@
-"""Data association: assignment of unlabelled rows to several predicted targets."""
+"""Data association: assignment of unlabelled rows to several predicted targets.
+
+A channel is a kind of measurement at its stations. In one scan, each channel has candidates: measured
+values that come from a target or are false.
+
+Letters: t targets, m channels, c candidates of a channel, n numbers of a state. S is the covariance of
+the innovations of a target. (...) are the axes of a batch of runs.
+"""
 
 from __future__ import annotations
 
@@ -108,13 +115,17 @@ def assigned(clutter: Clutter) -> Associate:
 
 
 def _compete(pick: Array) -> bool:
-    """Return whether any two targets take the same candidate, from picks (t, m)."""
+    """Return whether any two targets take the same candidate, from picks (t, m): a candidate number, or -1."""
     same = (pick[:, None] == pick[None]) & (pick[:, None] >= 0)
     return bool(same.any(-1).sum() > (pick >= 0).any(-1).sum())
 
 
 def _assign(sets: Sets) -> Array:
-    """Return the numbers (t,) of one set per target with the lowest sum of scores, without common candidates."""
+    """Return the numbers (t,) of one set per target with the lowest sum of scores, without common candidates.
+
+    An integer programme finds the sets. `sets` contains score (t, q) and picks (t, q, m) of q sets for each
+    target.
+    """
     from scipy.optimize import Bounds, LinearConstraint, milp
     from scipy.sparse import csr_array
 
@@ -177,7 +188,10 @@ class Clutter:
         check_width(self.width)
 
     def of(self, scan: Problem) -> Array:
-        """Return the density of false rows in each channel of a scan, (m,); raise InvalidProblem for unknown kinds."""
+        """Return the density of false rows in each channel of a scan, (m,), per metre or radian.
+
+        A kind without a density raises InvalidProblem.
+        """
         values = []
         for block in scan.rows:
             density = self.density.get(block.kind) if isinstance(self.density, Mapping) else self.density
@@ -208,9 +222,9 @@ class Sets:
 def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
     """Return the scores of all sets of candidates within their gates; see `optloc.tracking.associate.joint`.
 
-    `scan` has one row for each channel, `ahead` holds the predicted targets (..., t), and `z` (..., m, c) the
-    candidates. Sets grow channel by channel: the density of a set is the product of the densities of each row given the
-    rows before it. If there are too many sets, only the best partial sets are kept.
+    `scan` has one row for each channel. `ahead` contains the predicted targets (..., t), and `z` (..., m, c)
+    the candidates. Sets grow channel by channel: the density of a set is the product of the densities of each
+    row given the rows before it. If there are too many sets, only the best partial sets are kept.
     """
     apart, S = offsets(scan, ahead, z)
     distance = distances(apart, S, clutter.width)
@@ -248,7 +262,10 @@ def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
 
 
 def _keep_best(score: Array) -> Array:
-    """Return the numbers (..., p) of the sets (..., q) that are kept: the empty set first, at most `_SETS` sets."""
+    """Return the numbers (..., p) of the best p of q sets: the empty set first, at most `_SETS` sets.
+
+    `score` (..., q) is small for likely sets; sets that are impossible for all targets are omitted.
+    """
     possible = np.flatnonzero(np.isfinite(score).any(tuple(range(score.ndim - 1))))
     if len(possible) <= _SETS:
         return np.broadcast_to(possible, (*score.shape[:-1], len(possible)))
@@ -264,8 +281,8 @@ def _keep_best(score: Array) -> Array:
 def offsets(scan: Problem, ahead: State, z: Array) -> tuple[Array, Array]:
     """Return candidates minus predicted measurements of each target (..., t, m, c), and S (..., t, m, m).
 
-    `scan` has one row for each channel, `ahead` holds the predicted targets (..., t), and `z` (..., m, c) the
-    candidates.
+    `scan` has one row for each channel. `ahead` contains the predicted targets (..., t), and `z` (..., m, c)
+    the candidates. The units are metres, radians, m/s or ratios, as in `z`.
     """
     expected = predict(scan, ahead.mean)
     apart = misfits(scan, z, expected)
@@ -284,9 +301,9 @@ def misfits(scan: Problem, z: Array, expected: Array) -> Array:
 
 
 def distances(apart: Array, S: Array, width: float) -> Array:
-    """Return normalised distances (..., t, m, c) in sigmas; infinite outside the gate `width` and without a candidate.
+    """Return normalised distances (..., t, m, c) in sigmas; infinite outside the gate and without a candidate.
 
-    `apart` and `S` are the results of `offsets`.
+    `apart` and `S` are the results of `offsets`. `width` is the half width of the gate in sigmas.
     """
     distance = np.abs(apart) / np.sqrt(np.diagonal(S, axis1=-2, axis2=-1))[..., None]
     return np.where(distance <= width, distance, np.inf)

@@ -93,7 +93,7 @@ def _check(problem: Problem) -> None:
 
 
 def _with_constants(dynamics: Dynamics, constants: int) -> Dynamics:
-    """Return dynamics of a state with additional constants at its end."""
+    """Return dynamics of a state with additional constants at its end; `constants` is their number."""
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
         n = mean.shape[-1] - constants

@@ -17,7 +17,8 @@ from optloc.problem.problem import Problem
 def differences(run: Problem) -> Problem:
     """Return the run of one target with differences of arrivals in each epoch instead of the arrivals.
 
-    The differences and their covariance hold all information of the arrivals about positions.
+    The differences and their covariance contain all information of the arrivals about positions. So a tracker
+    needs no emission times.
     """
     scans = [reduce(cut(run, k, k + 1)) for k in range(run.epochs)]
     kinds = dict.fromkeys(rows.kind for scan in scans for rows in scan.rows)
@@ -41,7 +42,7 @@ def differences(run: Problem) -> Problem:
 
 
 def _one_after_another(parts: list[Rows]) -> Rows:
-    """Return several blocks of rows of one kind as one block."""
+    """Return several blocks of rows of one kind as one block, in the given order."""
 
     def of(name: str) -> Array:
         return np.concatenate([getattr(part, name) for part in parts])

@@ -158,9 +158,10 @@ class _TrackRun:
     - problem: the run.
     - scans: its scans as arrays.
     - bad: number of rows of each scan that are not finite.
-    - dynamics, rule, rules: as in `tracked`.
+    - dynamics, rule, rules: as in `tracked`; `rule` is the filter.
     - how: the filter with the gate for the compiled code; None for other filters.
-    - near: a prediction with a total variance below this limit (m^2) is followed. It is the squared half extent of the
+    - near: a prediction with a total variance below this limit (m^2) is followed. It is the squared half
+    extent of the
       stations.
     """
 
@@ -188,7 +189,10 @@ class _TrackRun:
         return cls(problem, Scans.of(problem, dynamics.order), bad, dynamics, rule, rules, how, near**2)
 
     def entries(self, condition: Condition, *, ends: bool = True) -> Iterator[Entry]:
-        """Yield one entry per scan, from the present condition of the track; `ends` as in `begin`."""
+        """Yield one entry per scan, from the present condition of the track, which is updated.
+
+        With `ends`, the problem has all scans of the run, as in `begin`.
+        """
         times, k = self.problem.times.tolist(), 0
         while k < len(times):
             if condition.state is None:
@@ -220,7 +224,7 @@ class _TrackRun:
             condition.judge(vague)
 
     def _starting(self, begun: Beginning, k: int, condition: Condition) -> Iterator[Entry]:
-        """Yield the scans of a start; only the last scan has a state."""
+        """Yield the scans of a start, from scan `k`; only the last scan has a state."""
         n = (self.dynamics.order + 1) * self.problem.dimension
         # Scans of a start have no separate states: their common fix is valid at the last scan.
         why = condition.why
@@ -238,7 +242,10 @@ class _TrackRun:
             yield Entry(time, done, begun.code, out, "restarted" if why else "started", reason)
 
     def _remaining(self, rivals: tuple[Rival, ...], k: int, entry: Entry, silence: float) -> tuple[Rival, ...]:
-        """Return the other states of a start that a scan does not refute."""
+        """Return the other states of a start that scan `k` does not refute.
+
+        `entry` is the result of the scan for the track. `silence` is the time since the last valid row, s.
+        """
         found = [self._update(k, rival.state, silence, None) for rival in rivals]
         others = [None if isinstance(one, str) else one[0] for one in found]
         return remaining(rivals, entry, others, self.rules.most)
@@ -251,9 +258,12 @@ class _TrackRun:
     def _update(
         self, k: int, state: State, silence: float, memory: Array | None
     ) -> tuple[Entry, Fit, Screen | None] | str:
-        """Return the entry of a scan, the fit of all rows to the prediction and the screen for lasting errors.
+        """Return the entry of scan `k`, the fit of all rows to the prediction and the screen for lasting errors.
 
-        If the state cannot be followed, return the reason instead.
+        The fit is the sum of squared innovations in sigmas and the number of rows. The screen is REPEATS, EXCESS
+        and SPREAD of `optloc.kernels.filter`; None for scans that the compiled filter does not support. `state`
+        is the state before the prediction. `silence` is the time since the last valid row, s. `memory` is the
+        memory of the screen. If the state cannot be followed, return the reason instead.
         """
         if self.rules.gap is not None and silence > self.rules.gap:
             return f"no valid row for {silence:.6g} s"
@@ -277,7 +287,10 @@ class _TrackRun:
         return ("" if self.rules.gap is not None else self._too_uncertain(ahead, silence)) or self._general(k, ahead)
 
     def _too_uncertain(self, ahead: State, silence: float) -> str:
-        """Return the reason why a prediction is too uncertain to follow; empty if it is not."""
+        """Return the reason why a prediction is too uncertain to follow; empty if it is not.
+
+        `silence` is the time since the last valid row, s.
+        """
         d = self.problem.dimension
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(ahead.cov[:d, :d])[-1], 0.0)))
         # If the prediction is uncertain by more than the spread of the stations, a new fix without a guess is better.
@@ -285,7 +298,10 @@ class _TrackRun:
         return f"the prediction was uncertain by {sigma:.3g} m after {silence:.6g} s" if sigma > limit else ""
 
     def _general(self, k: int, ahead: State) -> tuple[Entry, Fit, None]:
-        """Return the update of a prediction by any filter, with the rows of a scan that pass the gate."""
+        """Return the entry, fit and screen (None) of scan `k` for any filter, with the rows that pass the gate.
+
+        `ahead` is the predicted state. See `_update` for the fit.
+        """
         scan = scan_at(self.problem, k, self.dynamics.order)
         # Apply the gate before the update: a gross error would pull an iterated update.
         off = innovation(scan, ahead.mean, ahead.cov).normalised[scan.weight > 0.0] if scan.rows else np.zeros(0)
@@ -301,7 +317,10 @@ class _TrackRun:
         return self._entry(k, done, int(code), gated, causes), fit, None
 
     def _entry(self, k: int, done: Updated, code: int, gated: int, causes: list[str]) -> Entry:
-        """Return the entry of an update; `gated` is the number of rows that failed the gate."""
+        """Return the entry of an update `done` with a status `code`.
+
+        `gated` is the number of rows that failed the gate. `causes` are the causes of a numerical failure.
+        """
         rejected = gated + self.bad[k]
         found = objections(_FINDINGS, _Taken(Status(code), rejected, int(done.count), causes))
         status, reason = found[0] if found else (Status(code), "")

@@ -1,4 +1,10 @@
-"""Rows of the scans of a run as arrays, prepared once, so that each scan is one call of compiled code."""
+"""Rows of the scans of a run as arrays, prepared once, so that each scan is one call of compiled code.
+
+Scans have the same structure if their rows have the same kinds, stations and targets. Such scans share
+one `ScanRows`.
+
+Letters: m rows of a scan, n numbers of a state, G scans of one structure, N states of a batch (...).
+"""
 
 from __future__ import annotations
 
@@ -30,12 +36,15 @@ _KEPT = Cache["ScanRows | None"](256)
 class Scans:
     """The scans of a run of one target for the compiled update.
 
-    All shipped filters use these arrays. The general form of `optloc.tracking.updates` handles all other cases: kinds
-    without a tape, biases among the states, and station errors whose noise depends on the position. It also handles
-    noise that correlates epochs, batches with different stations or noise, and arrays of other libraries.
+    All shipped filters use these arrays. The general form of `optloc.tracking.updates` handles all other
+    cases: kinds
+    without a tape (compiled formula), biases among the states, and station errors whose noise depends on the
+    position. It
+    also handles noise that correlates epochs, batches with different stations or noise, and arrays of other
+    libraries.
 
     - problem: the run, see `optloc.tracking.track.scans`; its model of motion is ignored.
-    - order: order of the states.
+    - order: order of the states (0: position, 1: with velocity, 2: with acceleration).
     - rows: rows of each of k scans; None for a scan of the general form, or without rows.
     - item: number of each scan among the scans with the same structure.
     - memory: length of the memory array of a track, see `filter_scan`.
@@ -49,7 +58,7 @@ class Scans:
 
     @classmethod
     def of(cls, problem: Problem, order: int) -> Scans:
-        """Return the scans of a run."""
+        """Return the scans of a run for states of an order."""
         rows: list[ScanRows | None] = [None] * problem.epochs
         item = [0] * problem.epochs
         if problem.count and is_available(filter_scan):
@@ -109,7 +118,11 @@ class Scans:
     def _spread(
         self, rows: ScanRows, item: int, more: tuple[Array, Array] | None, shape: tuple[int, ...]
     ) -> tuple[ScanRows, tuple[int, ...]]:
-        """Return the rows with measurements and weights (1, N or 1, m) for states (...), and the common shape."""
+        """Return the rows of scan `item` with values for each state, and the common batch shape of rows and states.
+
+        The values are measurements and weights (1, N or 1, m). `more` replaces them, as in `filtered`. `shape` is
+        the batch shape of the states.
+        """
         batch, m = self.problem.batch_shape, rows.z.shape[2]
         if more is None:
             own = (part[item if len(part) > 1 else 0] for part in (rows.z, rows.weight))
@@ -126,7 +139,10 @@ def owned(values: Array) -> Array:
 
 
 def _each(values: Array, core: int, shape: tuple[int, ...]) -> Array:
-    """Return values (..., core axes) of states (...) as (N, core axes), or (1, core axes) if all states share them."""
+    """Return values (..., core axes) of states (...) as (N, core axes), or (1, core axes) if all states share them.
+
+    `core` is the number of core axes, and `shape` is the batch shape (...).
+    """
     if values.ndim == core:
         return owned(values)[None]
     inner = values.shape[values.ndim - core :]
@@ -154,7 +170,7 @@ def touched(problem: Problem) -> tuple[Array, Array]:
 
 @cache
 def _stay(n: int) -> Move:
-    """Return the prediction step for no elapsed time."""
+    """Return the prediction step for no elapsed time: a state of n numbers does not change."""
     return Move(np.eye(n), np.zeros((n, n)), np.zeros(n))
 
 
@@ -175,7 +191,10 @@ def _is_plain(problem: Problem) -> bool:
 
 
 def _structures(problem: Problem, order: int) -> Iterator[tuple[Array, Array, ScanRows | None]]:
-    """Yield, for each structure of scans, its epochs (G,), their rows (G, m), and the prepared rows."""
+    """Yield, for each structure of scans, its epochs (G,), their rows (G, m), and the prepared rows.
+
+    The prepared rows are None if the compiled filter does not support the scans.
+    """
     if problem.epochs == 1:
         one = np.zeros(1, dtype=np.int64), np.arange(problem.count)[None]
         made = _KEPT.find(_key(problem, order), lambda: _made(problem, order, *one) if _is_plain(problem) else None)
@@ -197,7 +216,7 @@ def _key(scan: Problem, order: int) -> Hashable:
 
 
 def _alike(problem: Problem) -> list[tuple[Array, Array]]:
-    """Return the epochs (G,) of each structure, and their rows (G, m)."""
+    """Return the epochs (G,) of each structure of scans, and the indices of their rows (G, m)."""
     epoch = problem.epoch
     order = np.argsort(epoch, kind="stable")
     start = np.searchsorted(epoch[order], np.arange(problem.epochs + 1))
@@ -217,7 +236,7 @@ def _alike(problem: Problem) -> list[tuple[Array, Array]]:
 
 
 def _by_scan(values: Array, index: Array) -> Array:
-    """Return values (..., m) at rows (G, r) as (G, N, r), with flattened leading axes."""
+    """Return values (..., m) at rows (G, r) as (G, N, r): N is the size of the flattened leading axes."""
     if index.shape[0] == 1 and values.ndim == 1:
         return values[index][None]
     picked = np.moveaxis(values[..., index], -2, 0)
@@ -225,7 +244,10 @@ def _by_scan(values: Array, index: Array) -> Array:
 
 
 def _made(problem: Problem, order: int, epochs: Array, index: Array) -> ScanRows | None:
-    """Return prepared scans without measurements and weights, or None if a kind has no tape."""
+    """Return prepared scans without measurements and weights, or None if a kind has no tape (compiled formula).
+
+    `epochs` (G,) are the scans, and `index` (G, m) are their rows.
+    """
     problem, m = with_station_noise(problem), index.shape[1]
     scan = _first_of(problem, order, epochs)
     found = tables(scan, (np.arange(m)[None],))
@@ -248,7 +270,7 @@ def _made(problem: Problem, order: int, epochs: Array, index: Array) -> ScanRows
 
 
 def _first_of(problem: Problem, order: int, epochs: Array) -> Problem:
-    """Return the first of some scans with the stations of all these scans, as a batch."""
+    """Return the first of some scans with the stations of all these scans, as a batch; `epochs` (G,) are the scans."""
     first, s = int(epochs[0]), problem.stations
     one = cut(replace(problem, motions=(Motion(order),), priors=(), constraints=()), first, first + 1)
     every = ((name, getattr(s, name)) for name in ("position", "velocity", "axes"))

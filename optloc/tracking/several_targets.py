@@ -62,8 +62,10 @@ def associated(
     update : callable or str
         A filter, or its name in `UPDATES`.
     missing : "drop" or "expect"
-        Treatment of a channel without a row. "drop" ignores it. "expect", as in one paper, uses the prediction as a
-        measurement, so that the covariance is too small; it is for comparison only.
+        Treatment of a channel without a row. "drop" ignores it. "expect" uses the prediction as a
+        measurement, so that
+        the covariance is too small. It is for comparison with a paper only
+        (doi:10.7654/j.issn.2097-1974.20240501).
 
     Raises
     ------
@@ -177,7 +179,10 @@ def _check(given: RowCandidates) -> RowCandidates:
 
 
 def channels_of(problem: Problem) -> tuple[Array, list[Array]]:
-    """Return the first row of each channel in ascending order, and all rows of each channel."""
+    """Return the first row of each channel, and all rows of each channel.
+
+    Rows are indices. Channels are in the order of their first rows.
+    """
     # A channel is a kind at its stations in one epoch; a row of b against a is a different channel from a against b.
     keys = [
         (kind, int(epoch), int(a), int(b))
@@ -192,14 +197,14 @@ def channels_of(problem: Problem) -> tuple[Array, list[Array]]:
 
 
 def _row(block: Rows, kept: Array) -> Rows:
-    """Return the kept rows of a block as channels, without measurements."""
+    """Return rows of a block, with the indices `kept` (k,), as channels without measurements."""
     nan, none = np.full(len(kept), np.nan), np.zeros(len(kept), dtype=np.int64)
     sure = np.ones(len(kept))
     return Rows(block.kind, nan, block.a[kept], block.b[kept], block.epoch[kept], none, sure, np.zeros(len(kept)))
 
 
 def _with_noise(problem: Problem, made: Problem, first: Array) -> Problem:
-    """Return the channels with the covariance of their first rows, epoch by epoch."""
+    """Return the channels `made` with the covariance of their first rows `first` (m,) in `problem`, epoch by epoch."""
     blocks = [
         noises.Block(members, noises.gathered(problem.noise, first[members]))
         for members in noises.group_members(made.epoch)
@@ -259,14 +264,17 @@ def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
 
 
 def _rows(block: Rows, own: Array, number: Array) -> Rows:
-    """Return the rows of one target from a block, with new epoch numbers."""
+    """Return the rows of one target from a block: the mask `own` selects them, and `number` maps old to new epochs."""
     picked = {name: getattr(block, name)[..., own] for name in ("z", "weight", "correction")}
     a, b = block.a[own], block.b[own]
     return replace(block, **picked, a=a, b=b, epoch=number[block.epoch[own]], target=np.zeros_like(a))
 
 
 def _blocks(noise: Noise, kept: Array) -> list[Block]:
-    """Return the noise of the kept rows; a group that loses rows keeps the covariance of its other rows."""
+    """Return the noise of the rows in the mask `kept` (m,), with new row numbers.
+
+    A group that loses rows keeps the covariance of its other rows.
+    """
     place, found = np.cumsum(kept) - 1, []
     for block in noise.blocks:
         inside = kept[block.row]

@@ -137,7 +137,10 @@ def two_point(first: Fix, second: Fix, times: tuple[float, float]) -> State:
 
 
 def counts(epochs: int, order: int, speed: float | None = None, rate: float | None = None) -> list[int]:
-    """Return the numbers of first epochs that a start tries, each half larger than the number before; see `begun`."""
+    """Return the numbers of first epochs that a start tries, each half larger than the number before; see `begun`.
+
+    `epochs` is the length of the run, the last number. `order`, `speed` and `rate` decide the first number.
+    """
     # With a prior of every rate, one epoch may be enough; otherwise a state of order q needs at least q + 1 scans.
     known = speed is not None and (order < 2 or rate is not None)
     count = 1 if order == 0 or known else order + 1
@@ -163,7 +166,11 @@ def first_fix(
 
 
 def _first(problem: Problem, count: int, order: int, speed: float | None, rate: float | None) -> Problem:
-    """Return the first epochs of a run as one problem, with priors of velocity and acceleration."""
+    """Return the first `count` epochs of a run as one problem, with priors of velocity and acceleration.
+
+    The unknown is a state of the given `order`. `speed` (m/s) and `rate` (m/s^2) are the sigmas of the
+    priors, or None.
+    """
     part = cut(problem, 0, count)
     d = problem.dimension
     priors = [
@@ -224,7 +231,9 @@ class Beginning:
 
     - last: last scan that was used or given up.
     - state: state at this scan, or None.
-    - code: ok; ambiguous if the state has alternatives; rejected if the rows contradict each other.
+    - code: ok; ambiguous if the state has alternatives; rejected if the rows contradict each other; curved if
+    the
+      covariance is not valid; without a state, the status of the last attempt.
     - waiting: status of the scans before; ok if a start follows.
     - reason: a sentence if the status is not ok.
     - fit: chi-square of the rows of the start, and its degrees of freedom.
@@ -254,7 +263,13 @@ class Undecided(Exception):  # noqa: N818  # no error: more scans follow
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """Scans that determine a state: fix, first and last scan, final state, excluded rows of all and of the last."""
+    """Successive scans that determine a state.
+
+    - fix: their common fix.
+    - first, last: numbers of the first and the last scan.
+    - state: state at the last scan.
+    - left_out, left_out_last: number of rows that a robust fix excludes, of all scans and of the last scan.
+    """
 
     fix: Fix
     first: int
@@ -281,13 +296,13 @@ class _Stretch:
 
     @property
     def clean(self) -> bool:
-        """Return whether a filter can start with this state."""
+        """Return whether a filter can start with this state: one Gaussian, from rows that fit together."""
         # With less redundancy, other rows might be the wrong rows, see `optloc.solvers.suspects`.
         sure = not self.left_out or int(self.fix.dof) > self.left_out
         return sure and self.p >= _PLAUSIBLE and is_one_gaussian(self.fix)
 
     def beginning(self, code: Status, reason: str = "") -> Beginning:
-        """Return the stretch as a start."""
+        """Return the stretch as a start with a status and its sentence."""
         return Beginning(self.last, self.state, code, Status.OK, reason, self.fit, self.left_out_last, self.first)
 
 
@@ -348,7 +363,7 @@ def _doubtful(best: _Stretch) -> Beginning:
 
 
 def _rivals(posed: Problem, best: _Stretch) -> Iterator[Rival]:
-    """Yield the other minima of a start as states, from its problem with the kept rows."""
+    """Yield the other minima of a start as states; `posed` is its problem, of which only the kept rows are used."""
     kept = posed.with_rows(weight=posed.weight * (best.fix.weights > 0.0))
     others = best.fix.alternatives
     for x, gap in zip(others.x, others.gap, strict=True):
@@ -376,7 +391,10 @@ _FINDINGS = (
 
 
 def _slides(count: float) -> Iterator[int]:
-    """Yield the numbers of the scans at which starts are tried: the next few scans, then at increasing distances."""
+    """Yield the numbers of the scans at which starts are tried: the next few scans, then at increasing distances.
+
+    There are at most `_TRIES` numbers, all below `count`.
+    """
     i = 0
     for _ in range(_TRIES):
         if i < count:
@@ -385,7 +403,11 @@ def _slides(count: float) -> Iterator[int]:
 
 
 def _stretch(run: Problem, k: int, tries: Sequence[int], fixed: Callable[[int], Fix]) -> tuple[_Stretch | None, Status]:
-    """Return the first unique start of a run from scan k, else the first start with an answer, and the last status."""
+    """Return the first unique start of a run from scan k, else the first start with an answer, and the last status.
+
+    `tries` are the numbers of scans to try. `fixed` returns the fix of a number of scans. The stretch is None
+    if no number of scans gives an answer. If the rows contradict each other, longer stretches are not tried.
+    """
     ambiguous, verdict = None, Status.TOO_FEW_ROWS
     for count in tries:
         if ambiguous is not None and count > _CLEAR:
@@ -414,14 +436,17 @@ def _stretch(run: Problem, k: int, tries: Sequence[int], fixed: Callable[[int], 
 
 
 def _is_vague(problem: Problem, state: State) -> bool:
-    """Return whether a state is more uncertain than the range of the target; NaN counts as uncertain."""
+    """Return whether the sigma of a position exceeds both the spread of the stations and the range of the target.
+
+    NaN counts as exceeding.
+    """
     d = problem.dimension
     sigma = float(np.sqrt(np.linalg.eigvalsh(state.cov[:d, :d])[-1]))
     return not sigma <= reach(problem, state.mean[:d])
 
 
 def _scans_with_rows(problem: Problem, first: int) -> Array:
-    """Return the scans from `first` on that have a valid row, in ascending order."""
+    """Return the numbers of the scans from `first` on that have a valid row, in ascending order."""
     scans = np.unique(problem.epoch[problem.weight > 0.0])
     return np.asarray(scans[scans >= first])
 

@@ -134,7 +134,10 @@ def followed(problem: Problem, start: State, dynamics: Dynamics, update: Update 
 
 
 def follow(problem: Problem, start: State, dynamics: Dynamics, rule: Update) -> Track:
-    """Return the track of a state through the scans of a run; scans at or before the start are ignored."""
+    """Return the track of a state through the scans of a run; scans at or before the start are ignored.
+
+    `rule` is the filter. The arguments are not checked, see `followed`.
+    """
     given, state, steps, times = Scans.of(problem, dynamics.order), start, [], []
     for k, time in enumerate(problem.times.tolist()):
         if time <= start.time:
@@ -174,7 +177,7 @@ def step(
 
 
 def move_of(state: State, dynamics: Dynamics, time: float, dimension: int) -> Move | None:
-    """Return the prediction step of a state (...) to a later time, or None for the same time."""
+    """Return the prediction step of a state (...) to a later `time`, s, or None for the same time."""
     dt = _elapsed(state, time)
     if dt == 0.0:
         return None
@@ -248,7 +251,10 @@ def take_scan(scan: Problem, ahead: State, rule: Update, causes: list[str] | Non
 
 
 def _contained(scan: Problem, ahead: State, rule: Update, causes: list[str]) -> Updated:
-    """Return the update of states; only a state of a batch whose update fails numerically is NaN."""
+    """Return the update of states (...); a state whose update fails numerically is NaN, and the others are valid.
+
+    If the update of a batch fails, each state is updated alone. The cause of a failure is appended to `causes`.
+    """
     try:
         return rule(scan, ahead.mean, ahead.cov)
     except NUMERICAL as error:
@@ -274,14 +280,14 @@ def _contained(scan: Problem, ahead: State, rule: Update, causes: list[str]) -> 
 
 
 def _keep(ahead: State) -> Updated:
-    """Return the prediction as an update without rows."""
+    """Return the prediction (...) as an update without rows: NIS is NaN, and count and log-likelihood are 0."""
     shape = ahead.mean.shape[:-1]
     none = np.zeros(shape)
     return Updated(ahead.mean, ahead.cov, np.full(shape, np.nan), none, none)
 
 
 def collect(times: Array, steps: list[tuple[Updated, Array]], dimension: int) -> Track:
-    """Return the updates and statuses of all scans as a track."""
+    """Return the updates and statuses of all scans, in the order of their `times` (k,), s, as a track."""
     if not steps:
         raise InvalidProblem("no scan is later than the start", "start", "give a start before the last scan")
 
@@ -345,7 +351,7 @@ def check_trackable(problem: Problem) -> None:
 
 
 def check_state(state: State, n: int) -> None:
-    """Raise InvalidProblem for a state of the wrong size, or with an invalid covariance."""
+    """Raise InvalidProblem for a state that does not have n numbers, or has an invalid covariance."""
     if state.mean.shape[-1:] != (n,) or state.cov.shape[-2:] != (n, n):
         raise InvalidProblem(
             f"{n} unknowns, but a state of {state.mean.shape[-1]} numbers and a covariance {state.cov.shape[-2:]}",

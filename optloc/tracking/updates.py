@@ -1,4 +1,9 @@
-"""Update of a predicted state by one scan: all filters use the same linearised rows."""
+"""Update of a predicted state by one scan: all filters use the same linearised rows.
+
+Letters: m rows of a scan, n numbers of a state, (...) a batch of states. H (m, n) is the derivative of
+the rows, P (n, n) the covariance of the predicted state, R (m, m) the covariance of the rows. K (n, m) is
+the gain, S = H P H' + R the covariance of the innovations. Whitened rows have R = I.
+"""
 
 from __future__ import annotations
 
@@ -115,7 +120,10 @@ class Filter:
         return self._general(scan, mean, cov)
 
     def _general(self, scan: Problem, mean: Array, cov: Array) -> Updated:
-        """Return the update in NumPy, for scans that `optloc.tracking.scan_rows.Scans` does not support."""
+        """Return the update in NumPy, for scans that `optloc.tracking.scan_rows.Scans` does not support.
+
+        `mean` (..., n) and `cov` (..., n, n) are the predicted states.
+        """
         form, gate = self.how.form, self.how.gate
         if np.isfinite(gate):
             scan = scan.with_rows(weight=weights_within(scan, mean, cov, gate))
@@ -279,7 +287,10 @@ def whitened(scan: Problem, x: Array, noise: tuple[Whitener, ...] | None = None)
 
 
 def _size_of(noise: tuple[Whitener, ...], shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """Return the number of present rows and the logarithm of the determinant of 2 pi R, each (...)."""
+    """Return the number of present rows and the logarithm of the determinant of 2 pi R, each (...).
+
+    `noise` are the whitening matrices of the rows, and `shape` is the batch shape (...).
+    """
     total = np.zeros((*shape, 2))
     for w in noise:
         # A block that many groups of rows share is stored once.
@@ -288,7 +299,10 @@ def _size_of(noise: tuple[Whitener, ...], shape: tuple[int, ...]) -> tuple[Array
 
 
 def joseph(H: Array, gain: Array, cov: Array) -> Array:
-    """Return (I - K H) P (I - K H)' + K K', (..., n, n), for whitened rows: symmetric and positive for any gain."""
+    """Return (I - K H) P (I - K H)' + K K', (..., n, n), for whitened rows: symmetric and positive for any gain.
+
+    This is the covariance after an update. `gain` is K (..., n, m), and `cov` is P (..., n, n).
+    """
     # The short form (I - K H) P is correct only for the optimal gain, and rounding makes it asymmetric.
     left = np.eye(cov.shape[-1]) - gain @ H
     out = left @ cov @ np.swapaxes(left, -1, -2) + gain @ np.swapaxes(gain, -1, -2)
@@ -296,7 +310,7 @@ def joseph(H: Array, gain: Array, cov: Array) -> Array:
 
 
 def _gain(H: Array, cov: Array) -> Array:
-    """Return the Kalman gain (..., n, m) for whitened rows."""
+    """Return the Kalman gain K (..., n, m) for whitened rows H (..., m, n) and predicted covariances (..., n, n)."""
     # With whitened rows, S is regular for any prior, even for an exactly known state.
     S = H @ cov @ np.swapaxes(H, -1, -2) + np.eye(H.shape[-2])
     solved, _ = linalg.solve(S, H @ cov)
@@ -304,7 +318,11 @@ def _gain(H: Array, cov: Array) -> Array:
 
 
 def _finish(white: White, cov: Array, mean: Array, after: Array) -> Updated:
-    """Return the updated state with its NIS and log-likelihood, from the rows at the prediction."""
+    """Return the updated state with its NIS and log-likelihood, from the rows at the prediction.
+
+    `white` are the whitened rows and `cov` (..., n, n) is the covariance, both at the prediction. `mean`
+    (..., n) and `after` (..., n, n) are the updated state.
+    """
     S = white.H @ cov @ np.swapaxes(white.H, -1, -2) + np.eye(white.H.shape[-2])
     # ln|2 pi S| of the rows as measured: the value of the whitened rows plus the logarithm of the whitening.
     lower, _ = linalg.factor(S)
@@ -315,7 +333,11 @@ def _finish(white: White, cov: Array, mean: Array, after: Array) -> Updated:
 
 
 def _converged(scan: Problem, mean: Array, cov: Array, white: White, how: Filtering) -> Array:
-    """Return the maximum a posteriori states by Gauss-Newton, starting from the predictions."""
+    """Return the maximum a posteriori states (..., n) by Gauss-Newton, starting from the predictions.
+
+    `mean` and `cov` are the predictions, and `white` are the rows linearised there. `how` contains the step
+    limits.
+    """
     # The prior is one more block of whitened rows: steps must not increase the cost of rows and prior together.
     prior = linalg.whitening(cov)
     x, cost, moving = mean, (white.residual**2).sum(-1), np.ones(mean.shape[:-1], dtype=bool)

@@ -1,7 +1,12 @@
 """Chains of detections of several scans that may come from one target, fitted in batches within a limit of work.
 
 The fix of one scan gives a position, and the fixes of two scans give a velocity. A chain with these start
-values needs one descent. A search without start values takes as long as hundreds of descents.
+values needs one descent, which is an iterative refinement. A search without start values takes as long as
+hundreds of descents.
+
+Letters: d coordinates, n numbers of a state (position, and velocity if it is known), B runs of
+detections, m rows, q states. The gate is the largest distance between a detection and a prediction at
+which both are compared.
 """
 
 from __future__ import annotations
@@ -48,12 +53,12 @@ LONG = 100.0
 
 @dataclass(slots=True)
 class ChainWork:
-    """The work that a call can still do, in units of about a millisecond."""
+    """The work that a call can still do (`left`), in units of about a millisecond."""
 
     left: float
 
     def take(self, cost: float) -> bool:
-        """Subtract a cost and return True if any work is left; otherwise return False."""
+        """Return whether work is left, and subtract the cost if so; the rest may become negative."""
         if self.left <= 0.0:
             return False
         self.left -= cost
@@ -69,7 +74,7 @@ class ChainTerms:
     order : int
         1 for targets with a velocity, 0 for targets at rest.
     speed : float, optional
-        Prior standard deviation of each velocity coordinate about zero, m/s.
+        Prior standard deviation of each velocity coordinate about zero, m/s; None without a prior.
     least_p : float
         Smallest p-value of a chain; a chain with a smaller p-value is not one target.
     """
@@ -88,10 +93,11 @@ class DetectionChain:
     detections : tuple of Detection
         Detections with models of this plug-in.
     x : array (q, n)
-        States at the last detection that fit, best first. A state is only a position if no row or prior
-        determines the velocity. q = 0 if no position is determined.
+        States at the last detection that fit, best first: metres, then m/s. A state is only a position if no
+        row or
+        prior determines the velocity. q = 0 if no position is determined.
     cov : array (n, n), optional
-        Covariance of the first state; None if it is too wide for a Gaussian.
+        Covariance of the first state; None if it is too wide for a Gaussian, or if there are several states.
     p : float
         p-value of the chi-square; 1 without redundancy.
     """
@@ -112,7 +118,10 @@ class DetectionChain:
 
 
 def is_flat(cov: Array, position: Array, detection: Any) -> bool:
-    """Return whether the largest sigma of a covariance (d, d), m^2, is below 5 % of the nearest range."""
+    """Return whether the largest sigma of a covariance (d, d), m^2, is below 5 % of the range of the nearest station.
+
+    Then a fix at `position` (d,) is nearly Gaussian. `detection` provides the stations.
+    """
     nearest = np.linalg.norm(detection.measurement_model.sites - position, axis=-1).min()
     return bool(np.isfinite(cov).all() and np.sqrt(np.linalg.eigvalsh(cov)[-1]) < _FLAT * nearest)
 
@@ -158,7 +167,7 @@ def _key(run: Sequence[Any]) -> Any:
 
 
 def _group_indices(keys: Sequence[Any]) -> list[list[int]]:
-    """Return lists of the indices of equal keys."""
+    """Return lists of the indices of equal keys, in the order of their first occurrence."""
     found: dict[Any, list[int]] = {}
     for i, key in enumerate(keys):
         found.setdefault(key, []).append(i)
@@ -166,7 +175,10 @@ def _group_indices(keys: Sequence[Any]) -> list[list[int]]:
 
 
 def alone(scan: Sequence[Any], terms: ChainTerms) -> list[DetectionChain]:
-    """Return a chain for each detection of a scan, with the fix of this detection alone."""
+    """Return a chain for each detection of a scan, with the fix of this detection alone.
+
+    Detections with the same rows are solved as one batch.
+    """
     out: list[Any] = [None] * len(scan)
     for members in _group_indices([_key([detection]) for detection in scan]):
         moving = scan[members[0]].measurement_model.rates is not None
@@ -179,7 +191,10 @@ def alone(scan: Sequence[Any], terms: ChainTerms) -> list[DetectionChain]:
 
 
 def _of_fix(detections: tuple[Any, ...], fix: Fix, terms: ChainTerms) -> DetectionChain:
-    """Return a chain with the states of its single fix; without a velocity in the fix, the velocity prior is added."""
+    """Return the chain of some detections with the states of their common fix.
+
+    If the fix has no velocity, the velocity prior of `terms` is added.
+    """
     p = float(fix.p_value)
     p = 1.0 if np.isnan(p) else p
     if not bool(fix.answered) or bool(fix.has(Status.UNBOUNDED)):
@@ -197,9 +212,9 @@ def _of_fix(detections: tuple[Any, ...], fix: Fix, terms: ChainTerms) -> Detecti
 def near(chains: Sequence[DetectionChain], single: DetectionChain, terms: ChainTerms) -> list[tuple[float, int]]:
     """Return the distance of a detection from each chain that it may continue, and the index of the chain.
 
-    The distance is the squared innovation in units of its covariance, divided by the gate: 1 at the edge of the
-    gate. Chains without a Gaussian state have no prediction and get the distance 1. Chains beyond the gate are
-    omitted.
+    The distance is the squared innovation in units of its covariance, divided by the gate: 1 at the edge of
+    the gate. Chains without a Gaussian state have no prediction and get the distance 1. Chains beyond the
+    gate are omitted. `single` is the chain of the detection alone.
     """
     detection = single.detections[-1]
     known = [
@@ -224,7 +239,11 @@ def near(chains: Sequence[DetectionChain], single: DetectionChain, terms: ChainT
 
 
 def _innovations(detection: Any, mean: Array, cov: Array) -> Array:
-    """Return the squared distances (C,) of a detection from the predictions of C states (C, n) with covariances."""
+    """Return the squared distances (C,) of a detection from the predictions of C states.
+
+    `mean` (C, n) and `cov` (C, n, n) are the predicted states. The distances are in units of the innovation
+    covariance.
+    """
     model = detection.measurement_model
     size, order = len(model.places), model.order
     # A rate model also needs the velocity. For a target at rest, the velocity is exactly zero.
@@ -243,7 +262,10 @@ def _same_stations(one: Any, two: Any) -> bool:
 
 
 def _predict(x: Array, chain: DetectionChain, detection: Any, d: int) -> Array:
-    """Return the states (q, n) of a chain at the time of a detection, for constant velocity."""
+    """Return the states x (q, n) of a chain at the time of a detection, for constant velocity.
+
+    States without a velocity do not change. `d` is the number of coordinates.
+    """
     if x.shape[1] == d:
         return x
     step = (detection.timestamp - chain.last).total_seconds()
@@ -251,7 +273,11 @@ def _predict(x: Array, chain: DetectionChain, detection: Any, d: int) -> Array:
 
 
 def _starts(chain: DetectionChain, single: DetectionChain, terms: ChainTerms) -> Array:
-    """Return start states (q, n) for the fit of a chain with one more detection."""
+    """Return start states (q, n) for the fit of a chain with one more detection.
+
+    They are predictions of the chain, and for a chain of one detection velocities from two positions.
+    `single` is the chain of the new detection.
+    """
     detection = single.detections[-1]
     d = len(detection.measurement_model.mapping)
     if not terms.order:
@@ -269,9 +295,10 @@ def _starts(chain: DetectionChain, single: DetectionChain, terms: ChainTerms) ->
 def grown(
     pairs: Sequence[tuple[DetectionChain, DetectionChain]], terms: ChainTerms, work: ChainWork
 ) -> list[tuple[DetectionChain, DetectionChain, DetectionChain]]:
-    """Return (longer chain, chain, chain of the detection) of the pairs that fit.
+    """Return (longer chain, chain, chain of the detection) of the pairs that fit together.
 
-    The first pairs come first, until no work is left. Pairs with the same rows and times are fitted as one batch.
+    `pairs` are chains with the chain of a later detection. They are fitted in their order, until no work is
+    left. Pairs with the same rows and times are fitted as one batch.
     """
     chosen: dict[Any, list[tuple[DetectionChain, DetectionChain, Array]]] = {}
     for chain, single in pairs:
@@ -291,7 +318,10 @@ def grown(
 def _fit(
     runs: Sequence[tuple[Any, ...]], starts: Sequence[Array], terms: ChainTerms, work: ChainWork
 ) -> list[DetectionChain | None]:
-    """Return the chains of runs with the same rows and times; None if a run needs a search and no work is left."""
+    """Return the chains of runs with the same rows and times; None if a run needs a search and no work is left.
+
+    `starts` are the start states (q, n) of each run; a run without starts needs a search.
+    """
     problem, z = posed(runs, terms)
     problem = problem.with_rows(z=z)
     dof = degrees_of_freedom(problem)
@@ -316,7 +346,11 @@ def _fit(
 
 
 def _best(run: tuple[Any, ...], done: Refined, p: Array, cov: Array, own: Array) -> DetectionChain:
-    """Return the chain of a run from its descents (indices `own`): their different minima, best first."""
+    """Return the chain of a run from its descents: their different minima, best first.
+
+    `done` are the descents of all runs, with p-values `p` (K,) and covariances `cov` (K, n, n). `own` are the
+    indices of the descents of this run.
+    """
     own = own[np.argsort(np.where(np.isfinite(done.cost[own]), done.cost[own], np.inf), kind="stable")]
     first, d = own[0], len(run[-1].measurement_model.mapping)
     kept: list[int] = []

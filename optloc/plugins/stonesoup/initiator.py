@@ -143,7 +143,10 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         return tracks
 
     def _extend_chains(self, scan: list[Any], work: ChainWork) -> list[DetectionChain]:
-        """Return new chains from a scan: extended chains (they replace the old chains), and single detections."""
+        """Return new chains from a scan: extended chains (they replace the old chains), and single detections.
+
+        Each chain and each detection is used at most once. The replaced chains are removed from the waiting chains.
+        """
         terms = ChainTerms(self.order, self.speed, self.least_p)
         # If the rows of one detection do not fit together, no chain with this detection fits.
         singles = [single for single in alone(scan, terms) if single.p >= self.least_p]
@@ -164,7 +167,10 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         return [*out, *(single for single in singles if id(single) not in taken)]
 
     def _confirmed_fix(self, chain: DetectionChain, work: ChainWork) -> Fix | None:
-        """Return the fix of a chain that is long enough, if the fix is unique and nearly Gaussian; otherwise None."""
+        """Return the fix of a chain that is long enough, if the fix is unique and nearly Gaussian; otherwise None.
+
+        Without work left, the result is None too.
+        """
         size = len(chain.detections[-1].measurement_model.mapping) * (self.order + 1)
         # Test the cheap conditions first: the search for other minima takes as long as hundreds of descents.
         if len(chain) < self.confirm or chain.cov is None or len(chain.cov) != size or not work.take(LONG):
