@@ -129,30 +129,30 @@ def _assign(sets: Sets) -> Array:
     from scipy.optimize import Bounds, LinearConstraint, milp
     from scipy.sparse import csr_array
 
-    owner, number, wanted = [], [], []
-    for target, own in enumerate(sets.score):
+    owners, number, wanted = [], [], []
+    for target, scores in enumerate(sets.score):
         # The empty set is the first set and conflicts with no set: sets with a higher score are not needed.
-        better = np.flatnonzero(own < own[0])
-        better = better[np.argsort(own[better], kind="stable")][:_RIVALS]
+        better = np.flatnonzero(scores < scores[0])
+        better = better[np.argsort(scores[better], kind="stable")][:_RIVALS]
         numbers = np.concatenate([[0], better])
-        owner.append(np.full(len(numbers), target))
+        owners.append(np.full(len(numbers), target))
         number.append(numbers)
         wanted.append(sets.picks[target, numbers])
-    who, which, pick = np.concatenate(owner), np.concatenate(number), np.concatenate(wanted)
+    owner_of_set, which, pick = np.concatenate(owners), np.concatenate(number), np.concatenate(wanted)
     column, channel = np.nonzero(pick >= 0)
     _, row = np.unique(np.stack([channel, pick[column, channel]]), axis=1, return_inverse=True)
     # Constraints: one set for every target, possibly the empty set; no row in two chosen sets.
-    everyone = csr_array((np.ones(len(who)), (who, np.arange(len(who)))))
-    once = csr_array((np.ones(len(row)), (row, column)), shape=(int(row.max()) + 1, len(who)))
+    everyone = csr_array((np.ones(len(owner_of_set)), (owner_of_set, np.arange(len(owner_of_set)))))
+    once = csr_array((np.ones(len(row)), (row, column)), shape=(int(row.max()) + 1, len(owner_of_set)))
     solved = milp(
-        sets.score[who, which],
-        integrality=np.ones(len(who), dtype=np.int64),
+        sets.score[owner_of_set, which],
+        integrality=np.ones(len(owner_of_set), dtype=np.int64),
         bounds=Bounds(0.0, 1.0),
         constraints=[LinearConstraint(everyone, 1.0, 1.0), LinearConstraint(once, -np.inf, 1.0)],
     )
     assert solved.x is not None  # the empty sets of all targets are always feasible
     taken = np.flatnonzero(solved.x > 0.5)
-    return np.asarray(which[taken[np.argsort(who[taken])]])
+    return np.asarray(which[taken[np.argsort(owner_of_set[taken])]])
 
 
 # Scores of sets of rows, at most one row of each channel, for predicted targets.

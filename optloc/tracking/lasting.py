@@ -222,7 +222,7 @@ class _Recursion:
         `rows` are the rows of the fix, and `cov` (n, n) is its covariance.
         """
         H, R, D = rows.H, rows.R, rows.D
-        gain = _solved(R, H @ cov).T
+        gain = _solve_regularised(R, H @ cov).T
         left = np.eye(len(R)) - H @ gain
         apart = np.abs(rows.scan[:, None] - rows.scan)
         ties = self.phi**apart * (D @ np.swapaxes(D, -1, -2))
@@ -234,7 +234,7 @@ class _Recursion:
             now = R if turn == 0 else R * (1.0 + max(self.excess, 0.0)) + self.size * ties[self.best]
             unit = _whitening(now)
             self.info, self.score = info.copy(), score.copy()
-            self._add(unit, unit @ rows.residual, noise, noise, errors)
+            self._add_size(unit, unit @ rows.residual, noise, noise, errors)
             self._estimate()
 
     def step(self, F: Array) -> None:
@@ -255,15 +255,15 @@ class _Recursion:
         S, noise = H @ cov @ H.T + R, H @ self.white @ H.T + R
         tied = H @ self.cross @ back
         errors = H @ self.lasting @ H.T + tied + np.swapaxes(tied, -1, -2) + D @ back
-        gain = _solved(S, H @ cov).T
+        gain = _solve_regularised(S, H @ cov).T
         unit = _whitening(S + max(self.excess, _LEAST - 1.0) * noise + self.size * errors[self.best], S)
         w = unit @ rows.residual
         self.info, self.score = _KEEP * self.info, _KEEP * self.score
-        self._add(unit, w, S, noise, errors)
+        self._add_size(unit, w, S, noise, errors)
         if self.before is not None:
             last, white, lasting, seen = self.before
             here = unit @ (H @ F @ lasting + D @ (self.phi * seen))
-            self._repeat(np.clip(w, -_WILD, _WILD), last, unit @ H @ F @ white, here)
+            self._add_correlation(np.clip(w, -_WILD, _WILD), last, unit @ H @ F @ white, here)
         seen = np.swapaxes(self.cross, -1, -2) @ H.T + back
         self.before = (
             np.clip(w, -_WILD, _WILD),
@@ -289,7 +289,7 @@ class _Recursion:
                 w, white, lasting, seen = self.before
                 self.before = w, white, lasting, np.pad(seen, [(0, 0), (0, more), (0, 0)])
 
-    def _add(self, unit: Array, w: Array, stated: Array, noise: Array, errors: Array) -> None:
+    def _add_size(self, unit: Array, w: Array, stated: Array, noise: Array, errors: Array) -> None:
         """Add the information from the size of a scan's innovations.
 
         `unit` (m, m) whitens them by the present estimate, and `w` (m,) are the whitened innovations. `stated`
@@ -298,17 +298,17 @@ class _Recursion:
         """
         w = np.clip(w, -_WILD, _WILD)
         stated, noise, errors = (unit @ each @ unit.T for each in (stated, noise, errors))
-        self._sum(0.5, np.outer(w, w) - stated, noise[None], errors)
+        self._accumulate(0.5, np.outer(w, w) - stated, noise[None], errors)
 
-    def _repeat(self, w: Array, last: Array, noise: Array, errors: Array) -> None:
+    def _add_correlation(self, w: Array, last: Array, noise: Array, errors: Array) -> None:
         """Add the information from the correlation between the innovations of this scan and of the scan before.
 
         `w` (m,) and `last` (r,) are the whitened innovations. `noise` (m, r) and `errors` (j, m, r) are the
         derivatives of their covariance by c^2 and s^2.
         """
-        self._sum(1.0, np.outer(w, last), noise[None], errors)
+        self._accumulate(1.0, np.outer(w, last), noise[None], errors)
 
-    def _sum(self, times: float, found: Array, noise: Array, errors: Array) -> None:
+    def _accumulate(self, times: float, found: Array, noise: Array, errors: Array) -> None:
         """Add an observed matrix to `info` and `score`.
 
         `times` is its weight. `found` (m, r) is the matrix. `noise` (1, m, r) and `errors` (j, m, r) are its
@@ -341,7 +341,7 @@ class _Recursion:
         self.excess = max(excess, _LEAST - 1.0) if large else 0.0
 
 
-def _solved(matrix: Array, right: Array) -> Array:
+def _solve_regularised(matrix: Array, right: Array) -> Array:
     """Return the inverse of a covariance (m, m), regularised by a small ridge, times the matrix `right`."""
     ridge = _RIDGE * float(np.trace(matrix)) / len(matrix)
     return np.asarray(np.linalg.solve(matrix + ridge * np.eye(len(matrix)), right))
@@ -434,11 +434,11 @@ class LastingErrors:
             found = self._found = self._restored(len(cov))
             self._on = True
             for each in self._recent:
-                _go_on(found, each, dynamics, None)
+                _process_scan(found, each, dynamics, None)
         else:
             assert self._found is not None
             found = self._found
-            _go_on(found, taken, dynamics, None if screen is None else self._memory)
+            _process_scan(found, taken, dynamics, None if screen is None else self._memory)
             self._on = screen is None or found.active or found.sure > _END or found.scans < _FEW
         return found.covariance(cov)
 
@@ -454,7 +454,7 @@ class LastingErrors:
         return found
 
 
-def _go_on(found: _Recursion, taken: Taken, dynamics: Dynamics, memory: Array | None) -> None:
+def _process_scan(found: _Recursion, taken: Taken, dynamics: Dynamics, memory: Array | None) -> None:
     """Process a scan in the recursion `found`.
 
     The rows of the scan are in `memory`, see `LastingErrors.memory`. Without `memory`, the rows are

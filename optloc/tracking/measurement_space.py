@@ -339,7 +339,7 @@ def _choose(mask: Array, one: _SpaceState, other: _SpaceState) -> _SpaceState:
     )
 
 
-def _rows(scan: Problem) -> list[int]:
+def _row_order(scan: Problem) -> list[int]:
     """Return the indices of range sum, azimuth and elevation, in this order, in a scan."""
     kinds = [block.kind for block in scan.rows]
     return [kinds.index(kind) for kind in _KINDS]
@@ -359,7 +359,7 @@ def _linearise_at(value: Array, scan: Problem, home: int) -> tuple[Array, Array,
     if scan.stations.axes is not None:
         u = (u[:, None] @ scan.stations.axes[..., 0, home, :, :])[:, 0]
     at = scan.stations.position[..., 0, home, :] + r[:, None] * u
-    linear, order = linearise(scan, at), _rows(scan)
+    linear, order = linearise(scan, at), _row_order(scan)
     H = linear.shared[:, order]
     # Range, azimuth and elevation increase along three orthogonal directions: the inverse needs no elimination.
     outward = np.concatenate([u[:, None], H[:, 1:]], axis=1)
@@ -388,7 +388,7 @@ def _advance(state: _SpaceState, scan: Problem, home: int, floor: float) -> _Spa
     A[:, 0, 0], B[:, 0, 0] = 1.0 - gain * x, gain
     A[:, 0, 1:] = -gain[:, None] * across * (1.0 - share)[:, None]
     B[:, 0, 1:] = -gain[:, None] * across * share[:, None]
-    R = noises.dense(scan.noise, np.array(_rows(scan)))
+    R = noises.dense(scan.noise, np.array(_row_order(scan)))
     cov = A @ state.cov @ np.swapaxes(A, -1, -2) + B @ R @ np.swapaxes(B, -1, -2)
     return _SpaceState(value, cov, state.P - optimal * x * state.P, state.count + 1.0)
 
@@ -406,7 +406,7 @@ def _restart(stretch: Problem, scan: Problem, home: int) -> _SpaceState:
     away = np.where(np.isfinite(start.mean), start.mean - at, 1.0)
     r = np.sqrt((away**2).sum(-1))
     linear = linearise(scan, at + away)
-    order = _rows(scan)[1:]
+    order = _row_order(scan)[1:]
     value = np.concatenate([r[:, None], (scan.observed - linear.residual)[:, order]], axis=-1)
     outward = np.concatenate([(away / r[:, None])[:, None], linear.shared[:, order]], axis=1)
     cov = outward @ start.cov @ np.swapaxes(outward, -1, -2)

@@ -198,7 +198,7 @@ class _TrackRun:
             if condition.state is None:
                 r = self.rules
                 start_here = begin(self.problem, k, self.dynamics, r.speed, r.rate, r.starts, ends=ends)
-                yield from self._starting(start_here, k, condition)
+                yield from self._start_entries(start_here, k, condition)
                 k, condition.state, condition.missed = start_here.last + 1, start_here.state, 0
                 condition.rivals = start_here.rivals
                 condition.recent.begin(start_here)
@@ -223,7 +223,7 @@ class _TrackRun:
             yield condition.judged(entry, cov, vague)
             condition.judge(vague)
 
-    def _starting(self, begun: Beginning, k: int, condition: Condition) -> Iterator[Entry]:
+    def _start_entries(self, begun: Beginning, k: int, condition: Condition) -> Iterator[Entry]:
         """Yield the scans of a start, from scan `k`; only the last scan has a state."""
         n = (self.dynamics.order + 1) * self.problem.dimension
         # Scans of a start have no separate states: their common fix is valid at the last scan.
@@ -284,7 +284,9 @@ class _TrackRun:
                     (values[REPEATS], values[EXCESS], values[SPREAD]),
                 )
         ahead = predicted(state, self.dynamics, time, self.problem.dimension)
-        return ("" if self.rules.gap is not None else self._too_uncertain(ahead, silence)) or self._general(k, ahead)
+        return ("" if self.rules.gap is not None else self._too_uncertain(ahead, silence)) or self._update_in_numpy(
+            k, ahead
+        )
 
     def _too_uncertain(self, ahead: State, silence: float) -> str:
         """Return the reason why a prediction is too uncertain to follow; empty if it is not.
@@ -297,7 +299,7 @@ class _TrackRun:
         limit = reach(self.problem, ahead.mean[:d])
         return f"the prediction was uncertain by {sigma:.3g} m after {silence:.6g} s" if sigma > limit else ""
 
-    def _general(self, k: int, ahead: State) -> tuple[Entry, Fit, None]:
+    def _update_in_numpy(self, k: int, ahead: State) -> tuple[Entry, Fit, None]:
         """Return the entry, fit and screen (None) of scan `k` for any filter, with the rows that pass the gate.
 
         `ahead` is the predicted state. See `_update` for the fit.
@@ -322,13 +324,13 @@ class _TrackRun:
         `gated` is the number of rows that failed the gate. `causes` are the causes of a numerical failure.
         """
         rejected = gated + self.bad[k]
-        found = objections(_FINDINGS, _Taken(Status(code), rejected, int(done.count), causes))
+        found = objections(_FINDINGS, _ScanOutcome(Status(code), rejected, int(done.count), causes))
         status, reason = found[0] if found else (Status(code), "")
         return Entry(float(self.problem.times[k]), done, status, rejected, "", reason)
 
 
 @dataclass(frozen=True, slots=True)
-class _Taken:
+class _ScanOutcome:
     """A scan after its update: status, numbers of rejected and used rows, and causes of a numerical failure."""
 
     status: Status

@@ -98,15 +98,15 @@ class Scans:
         if more is not None or shape or self.problem.batch_shape:
             rows, shape = self._spread(rows, item, more, shape)
             mean, cov = np.broadcast_to(mean, (*shape, n)), np.broadcast_to(cov, (*shape, n, n))
-        count, move = math.prod(shape), move or _stay(n)
-        ahead = Move(owned(move.F), _each(move.Q, 2, shape), _each(move.drive, 1, shape))
+        count, move = math.prod(shape), move or _no_move(n)
+        ahead = Move(owned(move.F), _per_state(move.Q, 2, shape), _per_state(move.drive, 1, shape))
         out = Filtered(np.empty((count, n)), np.empty((count, n, n)), np.empty((count, VALUES)))
         filter_scan(
             rows,
             item,
             ahead,
-            _each(mean, 1, shape),
-            _each(cov, 2, shape),
+            _per_state(mean, 1, shape),
+            _per_state(cov, 2, shape),
             how,
             _NONE if memory is None else memory,
             out,
@@ -129,7 +129,7 @@ class Scans:
             more = tuple(part[0] if len(part) == 1 else part.reshape(*batch, m) for part in own)
             shape = np.broadcast_shapes(shape, batch)
         shape = np.broadcast_shapes(shape, *(part.shape[:-1] for part in more))
-        z, weight = (_each(part, 1, shape)[None] for part in more)
+        z, weight = (_per_state(part, 1, shape)[None] for part in more)
         return rows._replace(z=z, weight=weight), shape
 
 
@@ -138,7 +138,7 @@ def owned(values: Array) -> Array:
     return values if values.flags.carray and values.dtype == float else np.array(values, dtype=float, order="C")
 
 
-def _each(values: Array, core: int, shape: tuple[int, ...]) -> Array:
+def _per_state(values: Array, core: int, shape: tuple[int, ...]) -> Array:
     """Return values (..., core axes) of states (...) as (N, core axes), or (1, core axes) if all states share them.
 
     `core` is the number of core axes, and `shape` is the batch shape (...).
@@ -169,7 +169,7 @@ def touched(problem: Problem) -> tuple[Array, Array]:
 
 
 @cache
-def _stay(n: int) -> Move:
+def _no_move(n: int) -> Move:
     """Return the prediction step for no elapsed time: a state of n numbers does not change."""
     return Move(np.eye(n), np.zeros((n, n)), np.zeros(n))
 
@@ -197,11 +197,11 @@ def _structures(problem: Problem, order: int) -> Iterator[tuple[Array, Array, Sc
     """
     if problem.epochs == 1:
         one = np.zeros(1, dtype=np.int64), np.arange(problem.count)[None]
-        made = _KEPT.find(_key(problem, order), lambda: _made(problem, order, *one) if _is_plain(problem) else None)
+        made = _KEPT.find(_key(problem, order), lambda: _prepared(problem, order, *one) if _is_plain(problem) else None)
         yield *one, made
     elif _is_plain(problem):
-        for epochs, index in _alike(problem):
-            yield epochs, index, _made(problem, order, epochs, index)
+        for epochs, index in _group_by_structure(problem):
+            yield epochs, index, _prepared(problem, order, epochs, index)
 
 
 def _key(scan: Problem, order: int) -> Hashable:
@@ -215,7 +215,7 @@ def _key(scan: Problem, order: int) -> Hashable:
     return (numbers, kinds, s.span, scan.frame, scan.medium, len(scan.motions), biases, order)
 
 
-def _alike(problem: Problem) -> list[tuple[Array, Array]]:
+def _group_by_structure(problem: Problem) -> list[tuple[Array, Array]]:
     """Return the epochs (G,) of each structure of scans, and the indices of their rows (G, m)."""
     epoch = problem.epoch
     order = np.argsort(epoch, kind="stable")
@@ -243,7 +243,7 @@ def _by_scan(values: Array, index: Array) -> Array:
     return np.ascontiguousarray(picked.reshape(len(index), -1, index.shape[1]))
 
 
-def _made(problem: Problem, order: int, epochs: Array, index: Array) -> ScanRows | None:
+def _prepared(problem: Problem, order: int, epochs: Array, index: Array) -> ScanRows | None:
     """Return prepared scans without measurements and weights, or None if a kind has no tape (compiled formula).
 
     `epochs` (G,) are the scans, and `index` (G, m) are their rows.

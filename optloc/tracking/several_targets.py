@@ -72,7 +72,7 @@ def associated(
     InvalidProblem
         If the filter is unknown, the state does not fit the dynamics, or the state has no axis of targets.
     """
-    given, filtering = _check(given), filter_of(update)
+    given, filtering = _checked(given), filter_of(update)
     d = given.channels.dimension
     check_state(start, (dynamics.order + 1) * d)
     if start.mean.ndim < 2:
@@ -157,13 +157,13 @@ def candidates(problem: Problem) -> RowCandidates:
     start = 0
     for block in problem.rows:
         kept = first[(first >= start) & (first < start + block.count)] - start
-        rows.append(_row(block, kept))
+        rows.append(_as_channels(block, kept))
         start += block.count
     made = replace(problem, rows=tuple(rows), motions=problem.motions[:1])
-    return _check(RowCandidates(_with_noise(problem, made, first), np.stack(values, axis=-2)))
+    return _checked(RowCandidates(_with_noise(problem, made, first), np.stack(values, axis=-2)))
 
 
-def _check(given: RowCandidates) -> RowCandidates:
+def _checked(given: RowCandidates) -> RowCandidates:
     """Return candidates minus known corrections; raise InvalidProblem if they do not fit their channels."""
     if given.channels.batch_shape != ():
         advice = "track runs with different stations or noise separately"
@@ -196,7 +196,7 @@ def channels_of(problem: Problem) -> tuple[Array, list[Array]]:
     return np.array([rows[0] for rows in members]), members
 
 
-def _row(block: Rows, kept: Array) -> Rows:
+def _as_channels(block: Rows, kept: Array) -> Rows:
     """Return rows of a block, with the indices `kept` (k,), as channels without measurements."""
     nan, none = np.full(len(kept), np.nan), np.zeros(len(kept), dtype=np.int64)
     sure = np.ones(len(kept))
@@ -243,7 +243,9 @@ def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
     number = np.full(problem.epochs, -1)
     number[epochs] = np.arange(len(epochs))
     parts = np.split(kept, np.cumsum([rows.count for rows in problem.rows])[:-1])
-    rows = tuple(_rows(block, own, number) for block, own in zip(problem.rows, parts, strict=True) if own.any())
+    rows = tuple(
+        _rows_of_target(block, own, number) for block, own in zip(problem.rows, parts, strict=True) if own.any()
+    )
     target = np.unique(np.concatenate([b.target[own] for b, own in zip(problem.rows, parts, strict=True)]))
     s = problem.stations
 
@@ -256,21 +258,21 @@ def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
         problem,
         stations=replace(s, position=position, velocity=at(s.velocity, 3), axes=at(s.axes, 4)),
         rows=rows,
-        noise=Noise(tuple(_blocks(problem.noise, kept))),
+        noise=Noise(tuple(_noise_of_rows(problem.noise, kept))),
         times=(problem.times if times is None else times)[epochs],
         motions=(Motion(span="epoch"),),
         constraints=tuple(replace(c, target=0) for c in problem.constraints if c.target in target),
     )
 
 
-def _rows(block: Rows, own: Array, number: Array) -> Rows:
+def _rows_of_target(block: Rows, own: Array, number: Array) -> Rows:
     """Return the rows of one target from a block: the mask `own` selects them, and `number` maps old to new epochs."""
     picked = {name: getattr(block, name)[..., own] for name in ("z", "weight", "correction")}
     a, b = block.a[own], block.b[own]
     return replace(block, **picked, a=a, b=b, epoch=number[block.epoch[own]], target=np.zeros_like(a))
 
 
-def _blocks(noise: Noise, kept: Array) -> list[Block]:
+def _noise_of_rows(noise: Noise, kept: Array) -> list[Block]:
     """Return the noise of the rows in the mask `kept` (m,), with new row numbers.
 
     A group that loses rows keeps the covariance of its other rows.

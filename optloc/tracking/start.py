@@ -162,10 +162,10 @@ def first_fix(
     method: str = "auto",
 ) -> Fix:
     """Return the fix of the first `count` epochs of a run, with a motion of the order of the dynamics; see `begun`."""
-    return solve(_first(problem, count, dynamics.order, speed, rate), method)
+    return solve(_start_problem(problem, count, dynamics.order, speed, rate), method)
 
 
-def _first(problem: Problem, count: int, order: int, speed: float | None, rate: float | None) -> Problem:
+def _start_problem(problem: Problem, count: int, order: int, speed: float | None, rate: float | None) -> Problem:
     """Return the first `count` epochs of a run as one problem, with priors of velocity and acceleration.
 
     The unknown is a state of the given `order`. `speed` (m/s) and `rate` (m/s^2) are the sigmas of the
@@ -326,7 +326,7 @@ def begin(
     doubtful: list[_Stretch] = []
     verdict, last = Status.TOO_FEW_ROWS, first
     observed = _scans_with_rows(problem, first)
-    for i in _slides(len(observed) if ends else np.inf):
+    for i in _trial_scans(len(observed) if ends else np.inf):
         if i >= len(observed):
             raise Undecided(problem.epochs + 1)
         last = int(observed[i])
@@ -334,7 +334,7 @@ def begin(
         # For a run that continues, add the next numbers of scans beyond the present length.
         tries = counts(run.epochs if ends else 2 * run.epochs + 2, dynamics.order, speed, rate)
         fixed = partial(first_fix, run, dynamics, speed=speed, rate=rate, method=method)
-        found, verdict = _stretch(run, last, tries, fixed)
+        found, verdict = _first_stretch(run, last, tries, fixed)
         if found is not None and found.clean:
             return found.beginning(Status.OK)
         if found is not None:
@@ -345,11 +345,11 @@ def begin(
             break
     if doubtful:
         best = min(doubtful, key=lambda each: each.fit[0] / max(each.fit[1], 1))
-        start = _doubtful(best)
+        start = _doubtful_start(best)
         if start.code != Status.AMBIGUOUS:
             return start
         run = cut(problem, best.first, problem.epochs)
-        posed = _first(run, best.last - best.first + 1, dynamics.order, speed, rate)
+        posed = _start_problem(run, best.last - best.first + 1, dynamics.order, speed, rate)
         return replace(start, rivals=tuple(_rivals(posed, best)))
     if verdict == Status.CONTRADICTORY:  # these scans contradict each other; later scans may agree
         return Beginning(last, None, Status.REJECTED, Status.REJECTED, "the rows of the scans contradict each other")
@@ -357,7 +357,7 @@ def begin(
     return Beginning(problem.epochs - 1, None, verdict, verdict, reason)
 
 
-def _doubtful(best: _Stretch) -> Beginning:
+def _doubtful_start(best: _Stretch) -> Beginning:
     """Return a start with a doubtful state, and the status that names the problem."""
     return best.beginning(*objections(_FINDINGS, best)[0])
 
@@ -390,7 +390,7 @@ _FINDINGS = (
 """Findings about a start with a doubtful state."""
 
 
-def _slides(count: float) -> Iterator[int]:
+def _trial_scans(count: float) -> Iterator[int]:
     """Yield the numbers of the scans at which starts are tried: the next few scans, then at increasing distances.
 
     There are at most `_TRIES` numbers, all below `count`.
@@ -402,7 +402,9 @@ def _slides(count: float) -> Iterator[int]:
         i = max(i + 1, i * 3 // 2)
 
 
-def _stretch(run: Problem, k: int, tries: Sequence[int], fixed: Callable[[int], Fix]) -> tuple[_Stretch | None, Status]:
+def _first_stretch(
+    run: Problem, k: int, tries: Sequence[int], fixed: Callable[[int], Fix]
+) -> tuple[_Stretch | None, Status]:
     """Return the first unique start of a run from scan k, else the first start with an answer, and the last status.
 
     `tries` are the numbers of scans to try. `fixed` returns the fix of a number of scans. The stretch is None

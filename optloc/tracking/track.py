@@ -224,7 +224,7 @@ def take_scan(scan: Problem, ahead: State, rule: Update, causes: list[str] | Non
     """
     shape = ahead.mean.shape[:-1]
     if not scan.rows or not scan.count:
-        return _keep(ahead), np.full(shape, int(Status.TOO_FEW_ROWS), dtype=np.int8)
+        return _prediction_only(ahead), np.full(shape, int(Status.TOO_FEW_ROWS), dtype=np.int8)
     usable, broken = scan, np.zeros((), dtype=bool)
     if not np.isfinite(scan.z).all():
         # One scan may serve many targets, and one target many runs, so the weights have the axes of both.
@@ -233,7 +233,7 @@ def take_scan(scan: Problem, ahead: State, rule: Update, causes: list[str] | Non
         usable, broken = scan.with_rows(z=np.where(bad, 0.0, scan.z), weight=weight * ~bad), np.asarray(bad.any(-1))
     # A lost state gets a status below, so it needs no warning.
     with np.errstate(all="ignore"):
-        done = _contained(usable, ahead, rule, [] if causes is None else causes)
+        done = _update_each(usable, ahead, rule, [] if causes is None else causes)
     if not broken.any() and np.isfinite(done.cov).all() and np.isfinite(done.mean).all() and np.all(done.count > 0):
         return done, np.zeros(done.mean.shape[:-1], dtype=np.int8)
     lost = ~(np.isfinite(done.mean).all(-1) & np.isfinite(done.cov).all((-1, -2)))
@@ -250,7 +250,7 @@ def take_scan(scan: Problem, ahead: State, rule: Update, causes: list[str] | Non
     ), code
 
 
-def _contained(scan: Problem, ahead: State, rule: Update, causes: list[str]) -> Updated:
+def _update_each(scan: Problem, ahead: State, rule: Update, causes: list[str]) -> Updated:
     """Return the update of states (...); a state whose update fails numerically is NaN, and the others are valid.
 
     If the update of a batch fails, each state is updated alone. The cause of a failure is appended to `causes`.
@@ -268,7 +268,7 @@ def _contained(scan: Problem, ahead: State, rule: Update, causes: list[str]) -> 
     size = math.prod(scan.batch_shape)
     which, flat = np.broadcast_to(np.arange(size).reshape(scan.batch_shape), shape).ravel(), scan.flat()
     each = [
-        _contained(flat.take(np.array([i])), State(ahead.time, *one), rule, causes)
+        _update_each(flat.take(np.array([i])), State(ahead.time, *one), rule, causes)
         for i, *one in zip(which, mean, cov, strict=True)
     ]
     return Updated(
@@ -279,7 +279,7 @@ def _contained(scan: Problem, ahead: State, rule: Update, causes: list[str]) -> 
     )
 
 
-def _keep(ahead: State) -> Updated:
+def _prediction_only(ahead: State) -> Updated:
     """Return the prediction (...) as an update without rows: NIS is NaN, and count and log-likelihood are 0."""
     shape = ahead.mean.shape[:-1]
     none = np.zeros(shape)

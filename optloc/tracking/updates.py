@@ -131,14 +131,14 @@ class Filter:
         slope, gain = white.H, _gain(white.H, cov)
         x = mean + (gain @ white.residual[..., None])[..., 0]
         if form == IEKF:
-            x = _converged(scan, mean, cov, white, self.how)
+            x = _map_states(scan, mean, cov, white, self.how)
         if form in (IEKF, MVEKF):
             slope = whitened(scan, x).H
             gain = _gain(slope, cov)
         if form == MGEKF:
             parts = [w * whitened(scan, mean + node * (x - mean)).H for node, w in zip(NODES, SHARES, strict=True)]
             slope = np.sum(parts, axis=0)
-        return _finish(white, cov, x, joseph(slope, gain, cov))
+        return _with_likelihood(white, cov, x, joseph(slope, gain, cov))
 
 
 ekf = Filter("the extended Kalman filter: one linearisation at the prediction", Filtering(EKF))
@@ -317,7 +317,7 @@ def _gain(H: Array, cov: Array) -> Array:
     return np.swapaxes(solved, -1, -2)
 
 
-def _finish(white: White, cov: Array, mean: Array, after: Array) -> Updated:
+def _with_likelihood(white: White, cov: Array, mean: Array, after: Array) -> Updated:
     """Return the updated state with its NIS and log-likelihood, from the rows at the prediction.
 
     `white` are the whitened rows and `cov` (..., n, n) is the covariance, both at the prediction. `mean`
@@ -332,7 +332,7 @@ def _finish(white: White, cov: Array, mean: Array, after: Array) -> Updated:
     return Updated(mean, after, nis, -0.5 * (nis + logdet), white.count)
 
 
-def _converged(scan: Problem, mean: Array, cov: Array, white: White, how: Filtering) -> Array:
+def _map_states(scan: Problem, mean: Array, cov: Array, white: White, how: Filtering) -> Array:
     """Return the maximum a posteriori states (..., n) by Gauss-Newton, starting from the predictions.
 
     `mean` and `cov` are the predictions, and `white` are the rows linearised there. `how` contains the step

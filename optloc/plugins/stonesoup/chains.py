@@ -137,12 +137,12 @@ def posed(runs: Sequence[Sequence[Any]], terms: ChainTerms) -> tuple[Problem, Ar
     times = np.array([(detection.timestamp - last).total_seconds() for detection in runs[0]])
     d = len(models[0][0].mapping)
     priors = [Prior("velocity", np.zeros(d), terms.speed**2 * np.eye(d))] if terms.order and terms.speed else []
-    rates = None if models[0][0].rates is None else _shared([[model.rates for model in run] for run in models])
+    rates = None if models[0][0].rates is None else _common_values([[model.rates for model in run] for run in models])
     rows = [model.rows for model in models[0]]
     problem = problem_of(
-        _shared([[model.sites for model in run] for run in models]),
+        _common_values([[model.sites for model in run] for run in models]),
         rows,
-        [_shared([run[k].covar() for run in models]) for k in range(len(rows))],
+        [_common_values([run[k].covar() for run in models]) for k in range(len(rows))],
         velocity=rates,
         times=times,
         motions=(Motion(terms.order, reference=0.0),),
@@ -152,13 +152,13 @@ def posed(runs: Sequence[Sequence[Any]], terms: ChainTerms) -> tuple[Problem, Ar
     return problem, z[:, rows_by_kind(rows)[1]]
 
 
-def _shared(values: Any) -> Array:
+def _common_values(values: Any) -> Array:
     """Return an array (B, ...), or only its first entry if all entries are equal."""
     array = np.asarray(values, dtype=float)
     return array[0] if (array == array[:1]).all() else array
 
 
-def _key(run: Sequence[Any]) -> Any:
+def _batch_key(run: Sequence[Any]) -> Any:
     """Return a key that is equal for runs that fit into one batch: same shapes, rows and time differences."""
     last = run[-1].timestamp
     shape = run[0].measurement_model.stations.shape, tuple(run[0].measurement_model.mapping)
@@ -180,17 +180,17 @@ def alone(scan: Sequence[Any], terms: ChainTerms) -> list[DetectionChain]:
     Detections with the same rows are solved as one batch.
     """
     out: list[Any] = [None] * len(scan)
-    for members in _group_indices([_key([detection]) for detection in scan]):
+    for members in _group_indices([_batch_key([detection]) for detection in scan]):
         moving = scan[members[0]].measurement_model.rates is not None
-        own = ChainTerms(terms.order if moving else 0, terms.speed, terms.least_p)
-        problem, z = posed([[scan[i]] for i in members], own)
+        terms_here = ChainTerms(terms.order if moving else 0, terms.speed, terms.least_p)
+        problem, z = posed([[scan[i]] for i in members], terms_here)
         fixes = prepare(problem, _QUICK)(z).flat()
         for place, i in enumerate(members):
-            out[i] = _of_fix((scan[i],), fixes[place], terms)
+            out[i] = _chain_of_fix((scan[i],), fixes[place], terms)
     return out
 
 
-def _of_fix(detections: tuple[Any, ...], fix: Fix, terms: ChainTerms) -> DetectionChain:
+def _chain_of_fix(detections: tuple[Any, ...], fix: Fix, terms: ChainTerms) -> DetectionChain:
     """Return the chain of some detections with the states of their common fix.
 
     If the fix has no velocity, the velocity prior of `terms` is added.
@@ -302,20 +302,20 @@ def grown(
     """
     chosen: dict[Any, list[tuple[DetectionChain, DetectionChain, Array]]] = {}
     for chain, single in pairs:
-        key, starts = _key((*chain.detections, *single.detections)), _starts(chain, single, terms)
+        key, starts = _batch_key((*chain.detections, *single.detections)), _starts(chain, single, terms)
         if not work.take((0.0 if key in chosen else _BATCH) + _DESCENT * len(starts)):
             break
         chosen.setdefault(key, []).append((chain, single, starts))
     out = []
     for members in chosen.values():
         runs = [(*chain.detections, *single.detections) for chain, single, _ in members]
-        longer = _fit(runs, [starts for _, _, starts in members], terms, work)
+        longer = _fit_runs(runs, [starts for _, _, starts in members], terms, work)
         found = zip(longer, members, strict=True)
         out += [(new, chain, single) for new, (chain, single, _) in found if new is not None and new.p >= terms.least_p]
     return out
 
 
-def _fit(
+def _fit_runs(
     runs: Sequence[tuple[Any, ...]], starts: Sequence[Array], terms: ChainTerms, work: ChainWork
 ) -> list[DetectionChain | None]:
     """Return the chains of runs with the same rows and times; None if a run needs a search and no work is left.
@@ -333,7 +333,7 @@ def _fit(
         p = tail_probability(done.cost, dof[item])
         cov, _ = covariance(done.equations)
         for i in begun:
-            out[i] = _best(runs[i], done, p, cov, np.flatnonzero(item == i))
+            out[i] = _chain_of_descents(runs[i], done, p, cov, np.flatnonzero(item == i))
     for i in range(len(runs)):
         if len(starts[i]):
             continue
@@ -341,20 +341,22 @@ def _fit(
             out[i] = DetectionChain(runs[i], np.zeros((0, problem.layout.size)), None, 1.0)
         elif work.take(LONG):
             fix = solve(problem.take(np.array([i])), "roots+lsr").flat()[0]
-            out[i] = _of_fix(runs[i], fix, terms)
+            out[i] = _chain_of_fix(runs[i], fix, terms)
     return out
 
 
-def _best(run: tuple[Any, ...], done: Refined, p: Array, cov: Array, own: Array) -> DetectionChain:
+def _chain_of_descents(run: tuple[Any, ...], done: Refined, p: Array, cov: Array, descents: Array) -> DetectionChain:
     """Return the chain of a run from its descents: their different minima, best first.
 
-    `done` are the descents of all runs, with p-values `p` (K,) and covariances `cov` (K, n, n). `own` are the
+    `done` are the descents of all runs, with p-values `p` (K,) and covariances `cov` (K, n, n). `descents` are the
     indices of the descents of this run.
     """
-    own = own[np.argsort(np.where(np.isfinite(done.cost[own]), done.cost[own], np.inf), kind="stable")]
-    first, d = own[0], len(run[-1].measurement_model.mapping)
+    descents = descents[
+        np.argsort(np.where(np.isfinite(done.cost[descents]), done.cost[descents], np.inf), kind="stable")
+    ]
+    first, d = descents[0], len(run[-1].measurement_model.mapping)
     kept: list[int] = []
-    for i in own:
+    for i in descents:
         if not done.cost[i] < done.cost[first] + GAP or len(kept) == _KEPT:
             break
         apart = [done.x[i] - done.x[j] for j in kept]

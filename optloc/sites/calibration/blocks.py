@@ -83,19 +83,19 @@ def blocks(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
     """
     net = lik.network
     d, cost, found = net.dimension, float(lik.cost(at)[0]), list[StationBlock]()
-    fixes = _stations(net, at, _inexact_stations(net))
+    fixes = _station_fixes(net, at, _inexact_stations(net))
     if fixes:
         costs = lik.cost(together(*(_moved_station(lik, at, i, fix.position[:d]) for i, fix in fixes)))
         for (i, fix), best in zip(fixes, costs, strict=True):
             name = f"station {net.names[i]}"
-            found.append(_block(fix, i, name, True, at.stations[0, i], cost - float(best)))
+            found.append(_block_of_fix(fix, i, name, True, at.stations[0, i], cost - float(best)))
     fix = place_pulses(net, at, np.arange(net.pulses))
     # pulses do not affect each other, so all of them move at once
     before = (lik.residual(at)[0] ** 2).sum(axis=1)
     after = (lik.residual(moved_pulses(lik, at, np.arange(net.pulses), fix.position))[0] ** 2).sum(axis=1)
     for j in range(net.pulses):
         above = float(before[j] - after[j])
-        found.append(_block(fix[j], j, f"pulse {net.labels[j]}", False, at.pulses[0, j], above))
+        found.append(_block_of_fix(fix[j], j, f"pulse {net.labels[j]}", False, at.pulses[0, j], above))
     return tuple(found)
 
 
@@ -196,7 +196,7 @@ def _masked_rows(kind: str, z: Array, sigma: Array, given: Array, **ends: Array)
     `z` and `sigma` (B, q) are values and standard deviations, metres. `given` (B, q) marks the measured
     entries. `ends` are the stations `a` and, if the kind needs them, `b` of each row (q,).
     """
-    deviation, weight = _shared(np.where(given, sigma, 1.0)), _shared(given.astype(float))
+    deviation, weight = _common_row(np.where(given, sigma, 1.0)), _common_row(given.astype(float))
     return measured(kind, np.where(given, z, 0.0), sigma=deviation, weight=weight, **ends)
 
 
@@ -220,15 +220,15 @@ def stations_alone(net: Network, at: NetworkEstimate, which: Array) -> Problem:
         given = np.isfinite(sigma[which])
         if given.any():
             rows.append(_masked_rows(kind, z[which], sigma[which], given, a=ends))
-    soft = np.isfinite(net.place_sigma[which])
+    has_prior = np.isfinite(net.place_sigma[which])
     # the prior covers all coordinates of a station, so unknown coordinates get a very wide one
     spread = float(np.ptp(places, axis=0).max()) or 1.0
     sigma = np.clip(net.place_sigma[which], _EXACT * spread, 1e6 * spread)
     prior = Prior("position", net.place[which], sigma[..., None] ** 2 * np.eye(net.dimension))
-    return assemble(places, *rows, priors=(prior,) if soft.any() else ()).flat()
+    return assemble(places, *rows, priors=(prior,) if has_prior.any() else ()).flat()
 
 
-def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: float) -> StationBlock:
+def _block_of_fix(fix: Fix, index: int, name: str, station: bool, here: Array, above: float) -> StationBlock:
     """Return the proof and the other positions of a block from its fix.
 
     `index`, `name` and `station` are as in `StationBlock`. `here` (d,) is the present position, metres.
@@ -258,7 +258,7 @@ def place_pulses(net: Network, at: NetworkEstimate, which: Array, method: str = 
     return solve(pulses_alone(net, at, which), method)
 
 
-def _shared(values: Array) -> Array:
+def _common_row(values: Array) -> Array:
     """Return values (n, q) as one row (q,) if all rows are equal; values that all problems share need less memory."""
     return np.asarray(values[0]) if (values == values[0]).all() else values
 
@@ -270,7 +270,7 @@ def _station_rows(net: Network, at: NetworkEstimate) -> tuple[Array, list[tuple[
     (M, q), metres. A partner is a pulse (0 to N - 1) or a station (N and above). The standard deviation is
     infinite without a measurement.
     """
-    timed, ranged = _ranges(net, at)
+    timed, ranged = _ranges_to_pulses(net, at)
     near = np.full((net.stations, net.stations), np.inf), np.zeros((net.stations, net.stations))
     for (i, k), distance, sigma in zip(net.between, net.distance, net.distance_sigma, strict=True):
         for one, other in ((i, k), (k, i)):
@@ -282,20 +282,20 @@ def _station_rows(net: Network, at: NetworkEstimate) -> tuple[Array, list[tuple[
     return np.concatenate([at.pulses[0], at.stations[0]]), kinds
 
 
-def _stations(net: Network, at: NetworkEstimate, which: list[int]) -> list[tuple[int, Fix]]:
+def _station_fixes(net: Network, at: NetworkEstimate, which: list[int]) -> list[tuple[int, Fix]]:
     """Return pairs of a station number and its fix from fixed pulses and stations; `which` are the station numbers.
 
     Stations without a prior are one batch. Each station with a prior is solved alone.
     """
-    soft = np.isfinite(net.place_sigma[which]).any(axis=1) if which else np.zeros(0, dtype=bool)
-    plain = np.array(which, dtype=int)[~soft]
-    free = _fixes(stations_alone(net, at, plain), at.stations[0, plain]) if plain.size else None
+    has_prior = np.isfinite(net.place_sigma[which]).any(axis=1) if which else np.zeros(0, dtype=bool)
+    plain = np.array(which, dtype=int)[~has_prior]
+    free = _fixes_with_proof(stations_alone(net, at, plain), at.stations[0, plain]) if plain.size else None
     out = [(int(i), free[n]) for n, i in enumerate(plain) if free is not None]
-    known = np.array(which, dtype=int)[soft]
+    known = np.array(which, dtype=int)[has_prior]
     return out + [(int(i), solve(stations_alone(net, at, np.array([i])))[0]) for i in known]
 
 
-def _fixes(problem: Problem, here: Array) -> Fix:
+def _fixes_with_proof(problem: Problem, here: Array) -> Fix:
     """Return fixes of a batch of blocks with their proof; with many rows, from the present positions `here` (n, d).
 
     Other starts need matrices of all rows.
@@ -307,7 +307,7 @@ def _fixes(problem: Problem, here: Array) -> Fix:
     return solve(problem, "lsr+certify", start=start)
 
 
-def _ranges(net: Network, at: NetworkEstimate) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+def _ranges_to_pulses(net: Network, at: NetworkEstimate) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Return sigmas and values (M, N) of the ranges from stations to pulses, in two pairs.
 
     The first pair contains the clock of the station (kinds toa and tdoa); the second pair does not (kind
@@ -354,7 +354,7 @@ def moved_pulses(lik: Likelihood, at: NetworkEstimate, which: Array, places: Arr
     pulses[0, which] = np.where(np.isfinite(places), places, pulses[0, which])
     there = replace(at, pulses=pulses)
     emits = np.array([MODELS[slot.kind].emission for slot in net.slots])
-    emission[0, which] += _mean(lik.residual(there)[0, which], (emits / net.sigma)[which])
+    emission[0, which] += _best_change(lik.residual(there)[0, which], (emits / net.sigma)[which])
     return replace(there, emission=np.where(net.emission, emission, at.emission))
 
 
@@ -369,12 +369,12 @@ def _moved_station(lik: Likelihood, at: NetworkEstimate, i: int, place: Array) -
     if net.synchronised:
         return there
     first, second, sign = clock_signs(net)
-    own = np.where(first == i, sign[0], 0.0) + np.where(second == i, sign[1], 0.0)
-    clocks[0, i] += _mean(lik.residual(there)[0].ravel(), (own / net.sigma).ravel())
+    sign_here = np.where(first == i, sign[0], 0.0) + np.where(second == i, sign[1], 0.0)
+    clocks[0, i] += _best_change(lik.residual(there)[0].ravel(), (sign_here / net.sigma).ravel())
     return replace(there, clocks=clocks)
 
 
-def _mean(residual: Array, slope: Array) -> Array:
+def _best_change(residual: Array, slope: Array) -> Array:
     """Return the change (...) of an unknown that best fits whitened residuals (..., q) with given slopes (..., q).
 
     A slope is the derivative of a whitened measurement by the unknown, 1 / m. Least squares gives the change,

@@ -274,9 +274,9 @@ def flat(lik: Likelihood, at: NetworkEstimate, covariance: Array) -> list[str]:
         )
     placed = np.flatnonzero(net.given.sum(axis=1) > d)
     pulses = at.pulses[0, placed]
-    if _in_one_plane(pulses, lambda normal: _of_pulses(lik, at, covariance, placed, normal)) and _may_be_mirrored(
-        net, at.stations[0], pulses
-    ):
+    if _in_one_plane(
+        pulses, lambda normal: _height_covariance(lik, at, covariance, placed, normal)
+    ) and _may_be_mirrored(net, at.stations[0], pulses):
         out.append(
             "The pulses are in one plane within their errors: the data do not show on which side the stations are."
         )
@@ -301,18 +301,18 @@ def _in_one_plane(points: Array, covariance: Callable[[Array], Array]) -> bool:
     return bool(height @ np.linalg.pinv(spread, hermitian=True) @ height < quantile(_LEVEL, len(left)))
 
 
-def _of_pulses(lik: Likelihood, at: NetworkEstimate, covariance: Array, which: Array, normal: Array) -> Array:
+def _height_covariance(lik: Likelihood, at: NetworkEstimate, covariance: Array, which: Array, normal: Array) -> Array:
     """Return the covariance (n, n) of the heights of pulses, m^2, from the noise of their rows and from the stations.
 
     The heights are coordinates along `normal` (d,). `which` (n,) are the numbers of the pulses, `at` is one
     estimate (S = 1), and `covariance` (P, P), m^2, is that of stations and clocks.
     """
     by_station, by_pulse = (one[which] for one in lik.jacobian(at)[:2])
-    own = np.einsum("c,jcr->jr", normal, np.linalg.pinv(by_pulse)[:, : len(normal)])
-    along = np.einsum("jr,jrp->jp", own, by_station)
+    height_slopes = np.einsum("c,jcr->jr", normal, np.linalg.pinv(by_pulse)[:, : len(normal)])
+    along = np.einsum("jr,jrp->jp", height_slopes, by_station)
     # The two parts are independent: the station covariance comes from the part of the rows that pulses do not
     # explain.
-    return np.asarray(np.diag((own**2).sum(axis=1)) + along @ covariance @ along.T)
+    return np.asarray(np.diag((height_slopes**2).sum(axis=1)) + along @ covariance @ along.T)
 
 
 def _may_be_mirrored(net: Network, stations: Array, pulses: Array) -> bool:
@@ -330,6 +330,6 @@ def _may_be_mirrored(net: Network, stations: Array, pulses: Array) -> bool:
     count, group = connected_components(linked, directed=False)
     known = np.isfinite(net.place_sigma)
     sigma = np.maximum(net.place_sigma, _ROUNDING * float(np.ptp(stations)))
-    off, now = ((np.where(known, x - net.place, 0.0) / sigma) ** 2 for x in (there, stations))
-    dearer = np.bincount(group, (off - now).sum(axis=1), count)
-    return count > 1 and bool((dearer < AMBIGUOUS_GAP).any())
+    cost_mirrored, cost_present = ((np.where(known, x - net.place, 0.0) / sigma) ** 2 for x in (there, stations))
+    extra_cost = np.bincount(group, (cost_mirrored - cost_present).sum(axis=1), count)
+    return count > 1 and bool((extra_cost < AMBIGUOUS_GAP).any())

@@ -115,7 +115,7 @@ class Likelihood:
         known = np.isfinite(net.place_sigma)
         place = np.where(known, net.place, at.stations)
         exact = _EXACT * (float(np.ptp(at.stations)) or 1.0)
-        far = np.array(_loose(net)) if self.tether is None else self.tether[:, None, None]
+        far = np.array(_wide_sigma(net)) if self.tether is None else self.tether[:, None, None]
         deviation = np.where(known, np.maximum(net.place_sigma, exact), far)
         covariance = deviation[..., None] ** 2 * np.eye(net.dimension)
         first, second, sign = clock_signs(net)
@@ -213,20 +213,20 @@ def likelihood(net: Network) -> Likelihood:
     m, d, (j, r) = net.stations, net.dimension, rows_of(net)
     first, second, _ = clock_signs(net)
     rows = list[Measured]()
-    for kind, part in _kinds(net, r):
+    for kind, part in _rows_by_kind(net, r):
         ends = {"a": first[r[part]], "b": second[r[part]]}
         rows.append(measured(kind, net.z[j, r][part], sigma=net.sigma[j, r][part], epoch=j[part], **ends))
     if len(net.between):
         a, b = net.between.T
         rows.append(measured(BETWEEN, net.distance, a=a, b=b, sigma=net.distance_sigma))
     stations = Stations(np.zeros((1, m, d)), net.names, covariance=np.tile(np.eye(d), (m, 1, 1)), span="run")
-    biases, motion = () if net.synchronised else (_clocks(net, r),), Motion(span="epoch")
+    biases, motion = () if net.synchronised else (_clock_bias(net, r),), Motion(span="epoch")
     return Likelihood(
         net, assemble(stations, *rows, times=np.arange(float(net.pulses)), motions=(motion,), biases=biases)
     )
 
 
-def _loose(net: Network) -> float:
+def _wide_sigma(net: Network) -> float:
     """Return the wide prior standard deviation of free coordinates and clocks, metres."""
     return _LOOSE * float(min(net.sigma.min(), *net.distance_sigma, np.inf))
 
@@ -242,7 +242,7 @@ def clock_signs(net: Network) -> tuple[Array, Array, Array]:
     return first, second, np.array(sign).T
 
 
-def _kinds(net: Network, r: Array) -> list[tuple[str, Array]]:
+def _rows_by_kind(net: Network, r: Array) -> list[tuple[str, Array]]:
     """Return each kind with the indices of its rows; `r` (m,) is the slot of each of the m rows."""
     kinds = np.array([slot.kind for slot in net.slots])[r]
     return [(kind, np.flatnonzero(kinds == kind)) for kind in dict.fromkeys(kinds.tolist())]
@@ -251,11 +251,11 @@ def _kinds(net: Network, r: Array) -> list[tuple[str, Array]]:
 def rows_of(net: Network) -> tuple[Array, Array]:
     """Return pulse (m,) and slot (m,) of each measurement, in the row order of the problem: kind by kind."""
     j, r = np.nonzero(net.given)
-    order = np.concatenate([part for _, part in _kinds(net, r)])
+    order = np.concatenate([part for _, part in _rows_by_kind(net, r)])
     return j[order], r[order]
 
 
-def _clocks(net: Network, r: Array) -> Bias:
+def _clock_bias(net: Network, r: Array) -> Bias:
     """Return the clock offsets of the stations as a bias, metres, relative to their start values.
 
     `r` (m,) is the slot of each row.
@@ -265,7 +265,7 @@ def _clocks(net: Network, r: Array) -> Bias:
     sign = np.concatenate([sign[0, r], sign[1, r]])
     used, m = sign != 0.0, net.stations
     return Bias(
-        "clock", net.names, row[used], member[used], sign[used], mean=np.zeros(m), sigma=np.full(m, _loose(net))
+        "clock", net.names, row[used], member[used], sign[used], mean=np.zeros(m), sigma=np.full(m, _wide_sigma(net))
     )
 
 

@@ -54,11 +54,11 @@ class NetworkSearchResult:
     @property
     def agreeing(self) -> int:
         """Return the number of starts that reach the best network, directly or by block moves."""
-        led = np.array([self.onward.get(_key(cost), cost) for cost in self.ends.cost])
-        return self.ends.counted(led <= self.cost + _SAME + equal_cost(self.cost))
+        reached = np.array([self.onward.get(_cost_key(cost), cost) for cost in self.ends.cost])
+        return self.ends.counted(reached <= self.cost + _SAME + equal_cost(self.cost))
 
 
-def _key(cost: float) -> float:
+def _cost_key(cost: float) -> float:
     """Return a rounded cost as key of `onward`: minima with equal keys are the same."""
     return round(float(cost), 4)
 
@@ -78,8 +78,8 @@ def search(
     for made, one in rounds(starts_of(lik, seed)):
         good = np.isfinite(one.cost)
         if good.any():
-            found = _merge(found, one.take(good), made)
-            _move_on(lik, found)
+            found = _add_round(found, one.take(good), made)
+            _improve_by_block_moves(lik, found)
             if tell is not None:
                 tell(f"{found.made} starts, {found.agreeing} at the least cost {found.cost:.5g}")
             agreed = found.agreeing >= AGREEING and _fits(net, found.cost)
@@ -90,7 +90,7 @@ def search(
     return found
 
 
-def _merge(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> NetworkSearchResult:
+def _add_round(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> NetworkSearchResult:
     """Add the minima of a round to the search result, and return the result; `made` is the number of starts."""
     if found is not None:
         ends = joined([found.ends, ends])
@@ -103,7 +103,7 @@ def _merge(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> Net
     return found
 
 
-def _move_on(lik: Likelihood, found: NetworkSearchResult) -> None:
+def _improve_by_block_moves(lik: Likelihood, found: NetworkSearchResult) -> None:
     """Move single blocks of the cheapest networks to other positions, as long as that lowers the cost.
 
     The results are written to `found`: `onward`, and `best` and `cost` if a network is cheaper.
@@ -113,11 +113,11 @@ def _move_on(lik: Likelihood, found: NetworkSearchResult) -> None:
     for i in np.argsort(ends.cost, kind="stable"):
         if found.agreeing >= AGREEING or tried == _TRIED:
             return
-        if _key(ends.cost[i]) in found.onward:
+        if _cost_key(ends.cost[i]) in found.onward:
             continue
         tried += 1
         at, cost = _sweep_block_moves(lik, ends.at.take(np.array([i])), float(ends.cost[i]))
-        found.onward[_key(ends.cost[i])] = cost
+        found.onward[_cost_key(ends.cost[i])] = cost
         if cost < found.cost - _SAME:
             found.best, found.cost = at, cost
 

@@ -66,7 +66,7 @@ def plot_network(
     views = [(0, 1)] if d == 2 else [(0, 1), (0, 2)]
     for row, view in enumerate(views):
         axes = figure.add_subplot(grid[row, 0])
-        _view(axes, view, names, stations, covariance, pulses, known, others)
+        _draw_plane(axes, view, names, stations, covariance, pulses, known, others)
         if row == 0:
             axes.legend(fontsize="small", loc="best")
     _histogram(figure.add_subplot(grid[:, 1]), residuals[np.isfinite(residuals)], dof)
@@ -93,7 +93,7 @@ def _histogram(axes: Axes, residuals: Array, dof: int) -> None:
     axes.set(xlabel="residual, standard deviations", ylabel="density", title=title)
 
 
-def _view(
+def _draw_plane(
     axes: Axes,
     view: tuple[int, int],
     names: Sequence[str],

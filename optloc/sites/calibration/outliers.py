@@ -75,8 +75,8 @@ def weights(residual: Array, given: Array) -> Array:
 def reweighted(lik: Likelihood, at: NetworkEstimate, rounds: int) -> NetworkEstimate:
     """Return S networks refined in `rounds` rounds of weights; without weights, gross rows dominate the steps."""
     for _ in range(rounds):
-        own = weights(lik.residual(at), lik.network.given)
-        at, _ = replace(lik, weight=own).refine(at, _STEPS)
+        row_weights = weights(lik.residual(at), lik.network.given)
+        at, _ = replace(lik, weight=row_weights).refine(at, _STEPS)
     return at
 
 
@@ -128,8 +128,8 @@ def _random_consensus(problem: Problem, here: Array, starts: Starts) -> Array:
     np.put_along_axis(few, order[:, : d + _SPARE], 1.0, axis=1)
     x = minima(many.with_rows(weight=few * given), x.reshape(-1, 1, d))[0][:, 0]
     for _ in range(_ALONE):
-        own = weights(whitened(many, x), given) * given
-        x = minima(many.with_rows(weight=own), x[:, None, :d])[0][:, 0]
+        row_weights = weights(whitened(many, x), given) * given
+        x = minima(many.with_rows(weight=row_weights), x[:, None, :d])[0][:, 0]
     now = vectors(problem, here[:, None])
     x = np.concatenate([now, x.reshape(size, _PLACES, -1)], axis=1)
     cost = np.stack([np.minimum(whitened(problem, x[:, k]) ** 2, PRICE).sum(axis=-1) for k in range(1 + _PLACES)])

@@ -97,14 +97,14 @@ def arrivals(network: Network) -> tuple[Array, Array, Array]:
             rows = np.flatnonzero(given & (kinds == kind))
             if rows.size:
                 values, deviation = network.z[j, rows], network.sigma[j, rows]
-                convert = _of_differences if kind == "tdoa" else _of_stations
+                convert = _arrivals_of_differences if kind == "tdoa" else _arrivals_of_stations
                 z[j], weight[j] = convert(ends[rows], values, 1.0 / deviation**2, m)
                 emission[j] = kind != "range"
                 break
     return z, weight, emission
 
 
-def _of_stations(ends: Array, values: Array, weight: Array, m: int) -> tuple[Array, Array]:
+def _arrivals_of_stations(ends: Array, values: Array, weight: Array, m: int) -> tuple[Array, Array]:
     """Return the mean value (M,) of each station's rows of one pulse, metres, and its inverse standard deviation (M,).
 
     `ends` (q, 2) are the stations of the q rows. `values` (q,) and `weight` (q,) are their values and inverse
@@ -116,11 +116,11 @@ def _of_stations(ends: Array, values: Array, weight: Array, m: int) -> tuple[Arr
     return np.divide(sums, total, out=np.zeros(m), where=total > 0.0), np.sqrt(total)
 
 
-def _of_differences(ends: Array, values: Array, weight: Array, m: int) -> tuple[Array, Array]:
+def _arrivals_of_differences(ends: Array, values: Array, weight: Array, m: int) -> tuple[Array, Array]:
     """Return the arrivals (M,), metres, and weights (M,) of the largest group of stations that differences link.
 
     The arrivals of one pulse have an unknown common constant; stations outside the group have weight 0.
-    `ends`, `values`, `weight` and `m` are as in `_of_stations`.
+    `ends`, `values`, `weight` and `m` are as in `_arrivals_of_stations`.
     """
     linked = np.zeros((m, m))
     np.add.at(linked, (ends[:, 0], ends[:, 1]), weight)

@@ -110,11 +110,11 @@ def _show(found: Calibration) -> None:
     with np.errstate(invalid="ignore"):
         sigma = found.sigma
     for i, name in enumerate(net.names[:_LINES]):
-        own = found.residuals[:, [i in (slot.a, slot.b) for slot in net.slots]]
-        own = own[np.isfinite(own)]
+        values = found.residuals[:, [i in (slot.a, slot.b) for slot in net.slots]]
+        values = values[np.isfinite(values)]
         cells = [f"{v:.3f} {s:.3f}" for v, s in zip(found.stations[i], sigma[i], strict=True)]
         clock = [] if net.synchronised else [f"{found.clocks[i]:.3f}"]
-        table.add_row(name, *cells, *clock, f"{np.sqrt(np.mean(own**2)):.2f}" if own.size else "-")
+        table.add_row(name, *cells, *clock, f"{np.sqrt(np.mean(values**2)):.2f}" if values.size else "-")
     console.print(table)
     for other in found.alternatives[:5]:
         say(console, f"{other.what}: cost + {other.gap:.3g}")

@@ -63,8 +63,8 @@ def run_place(
     The code is 1 if the gap did not close or too many simulated fixes are ambiguous, otherwise 0.
     """
     claim_outputs(out, picture=plot, inputs=[file])
-    loaded = read_selection(file) if is_selection(file) else _of_problem(file, wanted)
-    selection = _with(loaded.selection, wanted)
+    loaded = read_selection(file) if is_selection(file) else _selection_of_problem(file, wanted)
+    selection = _with_options(loaded.selection, wanted)
     with line(quiet or as_json) as tell:
 
         def report(bound: float, value: float, nodes: int) -> None:
@@ -92,7 +92,7 @@ def run_place(
     return 0 if found.closed and (found.draws is None or found.draws.clean) else 1
 
 
-def _of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
+def _selection_of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
     """Return the stations of a problem file as candidates, for a target at `--at` or at the fix of the file."""
     loaded = read(file, values=False)
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
@@ -113,7 +113,7 @@ def _of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
     return LoadedSelection(SiteSelection(problem, places, choose=wanted.choose), loaded.source, loaded.title, {})
 
 
-def _with(selection: SiteSelection, wanted: PlaceOptions) -> SiteSelection:
+def _with_options(selection: SiteSelection, wanted: PlaceOptions) -> SiteSelection:
     """Return the selection with the options of the command line in place of the settings of the file."""
     given: dict[str, Any] = {
         key: value

@@ -114,8 +114,8 @@ class SearchTask:
 
     def fits(self, sets: Array) -> Array:
         """Return a mask (B,) of the sets (B, n) that meet all rules, up to rounding."""
-        room = self.limits + _ROOM * np.maximum(1.0, np.abs(self.limits))
-        return np.asarray((sets @ self.rules.T <= room).all(-1))
+        upper = self.limits + _ROOM * np.maximum(1.0, np.abs(self.limits))
+        return np.asarray((sets @ self.rules.T <= upper).all(-1))
 
     def scale(self, value: float) -> float:
         """Return a value of the criterion as a variance, m^2.
@@ -243,33 +243,33 @@ def search(
     begun = monotonic()
     rows = np.ascontiguousarray(task.design.rows)  # each array layout would be compiled separately
     task = replace(task, design=replace(task.design, rows=rows))
-    made, state = _SearchState(task, task.asked(), gap, max(1, keep), {}, []), np.array(task.state, dtype=np.int64)
+    progress, state = _SearchState(task, task.asked(), gap, max(1, keep), {}, []), np.array(task.state, dtype=np.int64)
     if not propagate(task.rules, task.limits, state):
         return BestSetResult((), np.inf, True, np.inf, 0, np.zeros((0, 3)))
     root, w = -np.inf, np.where(state == IN, 1.0, 0.0)
     if (state == FREE).any():
         w[state == FREE] = 0.5
-        root, w, _ = _relax(made, state, w, np.nan, _ROOT_STEPS)
-        made.push(root, state, w)
+        root, w, _ = _relax(progress, state, w, np.nan, _ROOT_STEPS)
+        progress.push(root, state, w)
     for value, chosen in _start_sets(task, state, w, seed):
-        made.add(value, chosen)
-    if not made.seen:
-        return BestSetResult((), np.inf, True, np.inf, made.nodes, np.zeros((0, 3)))
-    course = [(monotonic() - begun, made.bound, made.value)]
-    while made.heap and made.heap[0][0] < made.enough and monotonic() - begun < seconds:
-        _branch(made, *made.heap[0][:1], *heappop(made.heap)[2:])
+        progress.add(value, chosen)
+    if not progress.seen:
+        return BestSetResult((), np.inf, True, np.inf, progress.nodes, np.zeros((0, 3)))
+    course = [(monotonic() - begun, progress.bound, progress.value)]
+    while progress.heap and progress.heap[0][0] < progress.enough and monotonic() - begun < seconds:
+        _branch(progress, *progress.heap[0][:1], *heappop(progress.heap)[2:])
         if monotonic() - begun > course[-1][0] + _EVERY:
-            course.append((monotonic() - begun, made.bound, made.value))
-            tell(made.bound, made.value, made.nodes)
-    closed = not made.heap or made.heap[0][0] >= made.enough
-    course.append((monotonic() - begun, made.bound, made.value))
-    first = min(made.seen.values(), key=itemgetter(0))[1]
+            course.append((monotonic() - begun, progress.bound, progress.value))
+            tell(progress.bound, progress.value, progress.nodes)
+    closed = not progress.heap or progress.heap[0][0] >= progress.enough
+    course.append((monotonic() - begun, progress.bound, progress.value))
+    first = min(progress.seen.values(), key=itemgetter(0))[1]
     for removed in np.flatnonzero((first == 1) & (task.state == FREE)).tolist():  # good alternatives
-        value, chosen = _exchange(task, made.asked, first, removed, np.inf)
+        value, chosen = _exchange(task, progress.asked, first, removed, np.inf)
         if chosen.any():
-            made.add(value, chosen)
-    best = sorted(made.seen.values(), key=itemgetter(0))[: made.keep]
-    return BestSetResult(tuple(best), made.bound, closed, root, made.nodes, np.array(course))
+            progress.add(value, chosen)
+    best = sorted(progress.seen.values(), key=itemgetter(0))[: progress.keep]
+    return BestSetResult(tuple(best), progress.bound, closed, root, progress.nodes, np.array(course))
 
 
 def _load() -> None:
@@ -286,14 +286,14 @@ def _load() -> None:
     _enumerate(one.asked(), state, np.zeros(2), 1.0)
 
 
-def _relax(made: _SearchState, state: Array, w: Array, enough: float, steps: int) -> tuple[float, Array, Array]:
+def _relax(progress: _SearchState, state: Array, w: Array, enough: float, steps: int) -> tuple[float, Array, Array]:
     """Return bound, weights (n,) and reduced costs (n,) of the relaxation of a node.
 
     `state` and `w` (n,) are the states and the first weights of all sites. The relaxation stops at the bound
     `enough` (NaN: no limit) or after `steps` steps. The reduced cost of a site is the rise of the bound if
     the site is taken (positive) or left out (negative).
     """
-    task, x, cost = made.task, w.copy(), np.empty(len(w))
+    task, x, cost = progress.task, w.copy(), np.empty(len(w))
     design = task.design
     bound, _, _ = expand(
         design.rows,
@@ -311,11 +311,11 @@ def _relax(made: _SearchState, state: Array, w: Array, enough: float, steps: int
         steps,
         cost,
     )
-    made.nodes += 1
+    progress.nodes += 1
     return float(bound), x, cost
 
 
-def _branch(made: _SearchState, bound: float, state: Array, w: Array) -> None:
+def _branch(progress: _SearchState, bound: float, state: Array, w: Array) -> None:
     """Open both children of a node: the site with the largest weight up to `_TAKEN` is taken, then left out.
 
     `bound` is the bound of the node, `state` (n,) and `w` (n,) are its states and weights.
@@ -325,36 +325,36 @@ def _branch(made: _SearchState, bound: float, state: Array, w: Array) -> None:
     for one in (1, 0):
         child, x = state.copy(), w.copy()
         child[j] = x[j] = one
-        _bound_node(made, bound, child, x)
+        _bound_node(progress, bound, child, x)
 
 
-def _bound_node(made: _SearchState, bound: float, state: Array, w: Array) -> None:
+def _bound_node(progress: _SearchState, bound: float, state: Array, w: Array) -> None:
     """Bound a node, and add it to the open nodes if it can contain a better set.
 
     A node without free sites is one set: its value is stored. A small node is enumerated. `bound` is the
     bound of the parent. `state` (n,) and `w` (n,) are states and first weights; `state` is changed.
     """
-    task = made.task
+    task = progress.task
     while propagate(task.rules, task.limits, state):
         if not (state == FREE).any():
             if task.fits(state[None])[0]:
-                made.add(float(task.score(state[None])[0]), state)
+                progress.add(float(task.score(state[None])[0]), state)
             return
         if _is_small(task, state):
-            value, best = _enumerate(made.asked, state, w, made.enough)
+            value, best = _enumerate(progress.asked, state, w, progress.enough)
             if best.any():
-                made.add(value, best)
+                progress.add(value, best)
             return
-        low, w, cost = _relax(made, state, w, made.enough, _STEPS)
+        low, w, cost = _relax(progress, state, w, progress.enough, _STEPS)
         bound = max(bound, low)
-        if bound >= made.enough:
+        if bound >= progress.enough:
             return
-        fixed = settle(low, cost, made.enough, state)
+        fixed = settle(low, cost, progress.enough, state)
         if not fixed or (state == FREE).sum() > 0.8 * ((state == FREE).sum() + fixed):
             if fixed and not propagate(task.rules, task.limits, state):
                 return
             if (state == FREE).any():
-                made.push(bound, state, w)
+                progress.push(bound, state, w)
                 return
 
 
@@ -373,12 +373,12 @@ def _enumerate(
 
 def _is_small(task: SearchTask, state: Array) -> bool:
     """Return whether a node has so few sets that enumeration is faster than a relaxation."""
-    free = task.rules[0][state == FREE]
+    sizes = task.rules[0][state == FREE]
     left = task.limits[0] - task.rules[0][state == IN].sum()
-    room = int((np.cumsum(np.sort(free)) <= left + _ROOM * max(1.0, abs(task.limits[0]))).sum())
-    last = max(1, room - int(task.fail))
-    counted = len(task.rules) == 1 and np.ptp(free) == 0.0
-    number = sum(comb(len(free), size) for size in range(last if counted else 1, last + 1))
+    addable = int((np.cumsum(np.sort(sizes)) <= left + _ROOM * max(1.0, abs(task.limits[0]))).sum())
+    largest = max(1, addable - int(task.fail))
+    counted = len(task.rules) == 1 and np.ptp(sizes) == 0.0
+    number = sum(comb(len(sizes), size) for size in range(largest if counted else 1, largest + 1))
     at_once = task.criterion == "A" and task.design.rows.shape[1] == 1
     return number <= (_FEW_FAIL if task.fail else _FEW) * (1.0 if at_once else _SLOW)
 

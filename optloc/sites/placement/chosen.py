@@ -270,8 +270,8 @@ def _placement(
     value, chosen = found.best[0]
     bound, reached = task.scale(found.bound), task.scale(value)
     gap = max(0.0, 1.0 - bound / reached)
-    before, sites = _before(candidates, task)
-    per_place, share = _per_place(candidates, chosen)
+    before, sites = _bounds_before(candidates, task)
+    per_place, share = _bound_and_prior_share(candidates, chosen)
     claim = f"no set of these candidates has a value more than {100 * gap:.2g} % lower"
     reason = claim if found.closed else f"the time limit ended the search: {claim}; raise the time limit or the gap"
     new = (chosen == 1) & (candidates.state != 1)
@@ -287,22 +287,22 @@ def _placement(
         found.closed,
         reason,
         per_place,
-        _failed(candidates, chosen),
+        _bounds_after_loss(candidates, chosen),
         before,
         sites,
         share,
         _redundancy(candidates, chosen),
         tuple(_swaps(task, names, chosen)),
         tuple((_select_names(names, (one == 1) & (candidates.state != 1)), task.scale(v)) for v, one in found.best),
-        tuple(_following(task, names, chosen)),
-        _course(task, found.course),
+        tuple(_next_sites(task, names, chosen)),
+        _course_in_m2(task, found.course),
         found.nodes,
         checked,
         tuple(_select_names(names, one == 1) for one in banned),
     )
 
 
-def _course(task: SearchTask, course: Array) -> Array:
+def _course_in_m2(task: SearchTask, course: Array) -> Array:
     """Return the recorded points (q, 3) of the search with bound and value as variances, m^2."""
     out = course.copy()
     out[:, 1:] = [[task.scale(v) for v in row] for row in course[:, 1:]]
@@ -314,7 +314,7 @@ def _select_names(names: Sequence[str], mask: Array) -> tuple[str, ...]:
     return tuple(names[i] for i in np.flatnonzero(mask).tolist())
 
 
-def _per_place(candidates: Candidates, chosen: Array) -> tuple[Array, Array]:
+def _bound_and_prior_share(candidates: Candidates, chosen: Array) -> tuple[Array, Array]:
     """Return the bound (P,) of the position error, metres, and the share (P,) of its variance from the prior.
 
     `chosen` (n,) is 1 for each taken site. If the share is large, the sites alone do not determine the
@@ -327,11 +327,11 @@ def _per_place(candidates: Candidates, chosen: Array) -> tuple[Array, Array]:
         "prmn,n,prkn->pmk", candidates.design.rows, chosen.astype(float), candidates.design.rows
     )
     inverse = np.linalg.inv(information)[:, :d]
-    owed = np.trace(inverse @ candidates.design.prior @ np.swapaxes(inverse, 1, 2), axis1=1, axis2=2)
-    return np.sqrt(variance), owed / variance
+    from_prior = np.trace(inverse @ candidates.design.prior @ np.swapaxes(inverse, 1, 2), axis1=1, axis2=2)
+    return np.sqrt(variance), from_prior / variance
 
 
-def _failed(candidates: Candidates, chosen: Array) -> Array:
+def _bounds_after_loss(candidates: Candidates, chosen: Array) -> Array:
     """Return the bound (P,) of the position error at each place after the worst loss of one site there, metres.
 
     `chosen` (n,) is 1 for each taken site.
@@ -342,7 +342,7 @@ def _failed(candidates: Candidates, chosen: Array) -> Array:
     return np.asarray(np.sqrt(variance.max(0)))
 
 
-def _before(candidates: Candidates, task: SearchTask) -> tuple[Array, tuple[str, ...]]:
+def _bounds_before(candidates: Candidates, task: SearchTask) -> tuple[Array, tuple[str, ...]]:
     """Return the bounds (P,) of the position error before the choice, metres, and the names of their sites.
 
     The sites are the kept sites, if they determine the position at each place. Otherwise they are the median
@@ -350,12 +350,12 @@ def _before(candidates: Candidates, task: SearchTask) -> tuple[Array, tuple[str,
     """
     kept = (candidates.state == 1).astype(np.int64)
     if kept.any():
-        per_place, share = _per_place(candidates, kept)
+        per_place, share = _bound_and_prior_share(candidates, kept)
         if (share <= PRIOR).all():
             return per_place, _select_names(candidates.names, kept)
     sets = np.array(list(random_sets(task, _RANDOM, candidates.selection.seed)))
     middle = sets[np.argsort(task.score(sets))[len(sets) // 2]]
-    return _per_place(candidates, middle)[0], _select_names(candidates.names, middle)
+    return _bound_and_prior_share(candidates, middle)[0], _select_names(candidates.names, middle)
 
 
 def _redundancy(candidates: Candidates, chosen: Array) -> Array:
@@ -389,7 +389,7 @@ def _swaps(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[Sw
     yield from sorted(found, key=lambda swap: -swap.value)
 
 
-def _following(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[tuple[str, float]]:
+def _next_sites(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[tuple[str, float]]:
     """Yield each site that is not taken or forbidden, with the criterion after its addition, m^2; best first.
 
     The rules are ignored: the list is for a user who can take more sites.
@@ -413,7 +413,7 @@ def drawn(candidates: Candidates, chosen: Array, count: int, seed: int = 0) -> D
 
     places, d = len(candidates.vectors), candidates.design.dimension
     flat = replace(candidates.assembled(chosen), priors=candidates.selection.problem.priors).flat()
-    bounds = _per_place(candidates, chosen)[0]
+    bounds = _bound_and_prior_share(candidates, chosen)[0]
     ambiguous, ratio, coverage = np.zeros(places), np.full(places, np.nan), np.full(places, np.nan)
     for p in range(places):
         one = flat.take(np.array([p]))
@@ -429,10 +429,10 @@ def drawn(candidates: Candidates, chosen: Array, count: int, seed: int = 0) -> D
             coverage[p] = np.mean(
                 np.einsum("qi,qij,qj->q", error[good], np.linalg.inv(cov), error[good]) <= _QUANTILE[d]
             )
-    return Draws(count, ambiguous, ratio, coverage, _flat(candidates, chosen, bounds))
+    return Draws(count, ambiguous, ratio, coverage, _thickness_over_bound(candidates, chosen, bounds))
 
 
-def _flat(candidates: Candidates, chosen: Array, bounds: Array) -> Array:
+def _thickness_over_bound(candidates: Candidates, chosen: Array, bounds: Array) -> Array:
     """Return the distance of the stations in sight from their best plane, divided by the bound at each place (P,).
 
     The distance is the smallest singular value of the centred positions, metres; in 2D, it is the distance
@@ -445,8 +445,8 @@ def _flat(candidates: Candidates, chosen: Array, bounds: Array) -> Array:
     owner = np.concatenate([rows.a for rows in candidates.problem.rows])
     for p in range(len(bounds)):
         in_sight = stations[np.unique(owner[weight[p] > 0.0])]
-        off = np.linalg.svd(in_sight - in_sight.mean(0), compute_uv=False)[-1] if len(in_sight) > 1 else 0.0
-        out[p] = off / bounds[p]
+        thickness = np.linalg.svd(in_sight - in_sight.mean(0), compute_uv=False)[-1] if len(in_sight) > 1 else 0.0
+        out[p] = thickness / bounds[p]
     return out
 
 

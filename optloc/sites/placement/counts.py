@@ -47,7 +47,7 @@ def check_groups(
     """
     for i, group in enumerate(groups):
         _check_group(f"groups, entry {i + 1}", group, members[i], names, state)
-    most, least = (_count(groups, members, state, sign) for sign in (-1.0, 1.0))
+    most, least = (_extreme_count(groups, members, state, sign) for sign in (-1.0, 1.0))
     if most is None or least is None:
         what = f"no set of sites meets the rules of groups {_group_numbers(groups)} together"
         raise InvalidProblem(what, "groups", "raise most or lower least of a group")
@@ -64,25 +64,26 @@ def check_groups(
         raise InvalidProblem(what, "choose", f"choose {least} or more, or lower least of a group")
 
 
-def _check_group(where: str, group: CountGroup, own: Array, names: Sequence[str], state: Array) -> None:
+def _check_group(where: str, group: CountGroup, members: Array, names: Sequence[str], state: Array) -> None:
     """Raise if no set of sites can meet this group, independent of the other groups.
 
     `members` (n,) marks its sites, `names` are the names of all sites, and `state` (n,) is as in
     `check_groups`. `where` is the place in the file for the message.
     """
-    kept, able, who = int((own & (state == 1)).sum()), int((own & (state != 0)).sum()), _list_names(own, names)
+    kept, available = int((members & (state == 1)).sum()), int((members & (state != 0)).sum())
+    listed = _list_names(members, names)
     if group.most is not None and kept > group.most:
-        what = f"at most {group.most} of {who} may be taken, but {kept} of them are kept"
+        what = f"at most {group.most} of {listed} may be taken, but {kept} of them are kept"
         raise InvalidProblem(what, where, "raise most, or keep fewer")
-    if group.least is not None and group.least > able:
-        what = f"at least {group.least} of {who} are wanted, but only {able} of them can be taken"
+    if group.least is not None and group.least > available:
+        what = f"at least {group.least} of {listed} are wanted, but only {available} of them can be taken"
         raise InvalidProblem(what, where, "lower least, or add candidates")
     if group.least is not None and group.most is not None and group.least > group.most:
-        what = f"at least {group.least} and at most {group.most} of {who} are wanted"
+        what = f"at least {group.least} and at most {group.most} of {listed} are wanted"
         raise InvalidProblem(what, where, "make least no larger than most")
 
 
-def _count(groups: Sequence[CountGroup], members: Array, state: Array, sign: float) -> int | None:
+def _extreme_count(groups: Sequence[CountGroup], members: Array, state: Array, sign: float) -> int | None:
     """Return the largest (sign -1) or smallest (sign 1) number of free sites in a set that meets all groups.
 
     The result is None if no set meets the groups. An integer programme finds it. `members` (G, n) marks the
@@ -106,7 +107,7 @@ def _limiting_groups(groups: Sequence[CountGroup], members: Array, state: Array,
     limiting = [i for i, group in enumerate(groups) if group.most is not None and group.most < members[i].sum()]
     for i in limiting:
         kept = [k for k in range(len(groups)) if k != i]
-        if (_count([groups[k] for k in kept], members[kept], state, -1.0) or 0) > most:
+        if (_extreme_count([groups[k] for k in kept], members[kept], state, -1.0) or 0) > most:
             return [i]
     return limiting
 

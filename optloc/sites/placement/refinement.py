@@ -58,13 +58,13 @@ def refined(
         regions.
     """
     candidates = candidates_of(selection)
-    _check(candidates)
+    _check_refinable(candidates)
     task, free = task_of(candidates), candidates.state != 1
     taken = np.isin(candidates.names, (*found.chosen, *found.kept)).astype(np.int64)
     sets = [taken, *(exchanged(task, one)[1] for one in random_sets(task, starts, selection.seed))]
     best: tuple[float, Array | None] = (np.inf, None)
     position = candidates.problem.stations.position.reshape(-1, candidates.design.dimension)
-    owner = _stations(candidates)
+    owner = _station_of_site(candidates)
     for chosen in sets:
         sites = np.flatnonzero((chosen == 1) & free)
         start = position[owner[sites]]
@@ -72,7 +72,7 @@ def refined(
         begin = np.array([home[1] for home in homes])
         parts = [home[0] for home in homes]
         for places in _local_optima(candidates, sites, begin, parts, ground):
-            reached = _value(candidates, sites, places)
+            reached = _criterion_at(candidates, sites, places)
             if reached < best[0]:
                 best = reached, places
     if best[1] is None:
@@ -110,7 +110,7 @@ def _local_optima(
     return out
 
 
-def _check(candidates: Candidates) -> None:
+def _check_refinable(candidates: Candidates) -> None:
     """Raise if the rows of the candidates do not allow a refinement.
 
     The refinement needs rows of stations that depend on positions only, with independent noise.
@@ -122,7 +122,7 @@ def _check(candidates: Candidates) -> None:
         raise InvalidProblem(f"{what} cannot be refined", "refine", "remove the refinement")
 
 
-def _stations(candidates: Candidates) -> Array:
+def _station_of_site(candidates: Candidates) -> Array:
     """Return the index (n,) of the station of each site."""
     return np.unique(np.concatenate([rows.a for rows in candidates.problem.rows]))
 
@@ -140,7 +140,7 @@ def _inside(place: Array, region: PlacementRegion, ground: PlacementGround | Non
     return bool((region.excess(place, ground) <= _EDGE).all())
 
 
-def _value(candidates: Candidates, sites: Array, places: Array) -> float:
+def _criterion_at(candidates: Candidates, sites: Array, places: Array) -> float:
     """Return the criterion with the new sites at positions (k, d), metres; the rows are linearised there.
 
     `sites` (k,) are the numbers of the new sites. The criterion is that of `formulations.placement`: m^2, or
@@ -148,15 +148,15 @@ def _value(candidates: Candidates, sites: Array, places: Array) -> float:
     """
     selection, stations = candidates.selection, candidates.selection.problem.stations
     position = np.array(stations.position)
-    position[..., _stations(candidates)[sites], :] = places
+    position[..., _station_of_site(candidates)[sites], :] = places
     moved = replace(selection, problem=replace(selection.problem, stations=replace(stations, position=position)))
     # Use the priors of the original candidates: default priors depend on the positions of the sites.
     moved = replace(moved, problem=replace(moved.problem, priors=candidates.problem.priors))
-    there = candidates_of(moved)
+    relinearised = candidates_of(moved)
     chosen = (candidates.state == 1).astype(float)
     chosen[sites] = 1.0
     return float(
-        value(there.design, chosen, LETTER[selection.criterion], worst=selection.worst, fail=selection.fail_one)
+        value(relinearised.design, chosen, LETTER[selection.criterion], worst=selection.worst, fail=selection.fail_one)
     )
 
 
@@ -208,9 +208,9 @@ class _Row:
     def h(self, ca: Any, t: Any, a: Any) -> Any:
         """Return the measurement of a target at t by a station at a, as an expression of the CasADi symbols t and a."""
         axes = tuple(tuple(float(v) for v in line) for line in np.atleast_2d(self.axes)) if self.axes.size else None
-        own = Point(tuple(ca.vertsplit(a)), axes=axes)
-        other = Point(tuple(map(float, self.other))) if self.other.size else own
-        return MODELS[self.kind].h(Point(tuple(ca.vertsplit(t))), own, other)
+        station = Point(tuple(ca.vertsplit(a)), axes=axes)
+        other = Point(tuple(map(float, self.other))) if self.other.size else station
+        return MODELS[self.kind].h(Point(tuple(ca.vertsplit(t))), station, other)
 
 
 def _site_rows(candidates: Candidates) -> list[_Row]:

@@ -173,10 +173,10 @@ def candidates_of(selection: SiteSelection) -> Candidates:
     vectors = np.zeros((len(places), size))
     vectors[:, : places.shape[1]] = places
     _check_apart(problem, site, names, places[:, :d])
-    batch = problem.with_rows(weight=_weights(selection, problem, places[:, :d]))
+    batch = problem.with_rows(weight=_row_weights(selection, problem, places[:, :d]))
     batch = _with_prior(batch, places[:, :d])
-    weight = _weight(selection, len(places))
-    design = Design(_rows(batch, vectors, site, len(names)), _prior(batch, vectors), weight, d)
+    weight = _place_weights(selection, len(places))
+    design = Design(_whitened_rows(batch, vectors, site, len(names)), _prior_information(batch, vectors), weight, d)
     rules, limits, state = _rules(selection, names, site)
     candidates = Candidates(selection, batch, vectors, site, names, design, rules, limits, state)
     _check_determined(candidates)
@@ -252,16 +252,16 @@ def _check_apart(problem: Problem, site: Array, names: Sequence[str], places: Ar
     if apart[p, s] < _SAME:
         what = f"place {p + 1} is at the position of station {problem.stations.names[s]!r}"
         raise InvalidProblem(what, "places", "move the place or the station by more than a millimetre")
-    own = np.unique(stations, axis=0, return_index=True)[1]
-    twice = np.setdiff1d(np.arange(len(stations)), own)
-    if len(twice):
-        name = problem.stations.names[int(twice[0])]
+    first = np.unique(stations, axis=0, return_index=True)[1]
+    repeated = np.setdiff1d(np.arange(len(stations)), first)
+    if len(repeated):
+        name = problem.stations.names[int(repeated[0])]
         raise InvalidProblem(
             f"station {name!r} has the position of another station", "candidates", "remove one of them"
         )
 
 
-def _weight(selection: SiteSelection, count: int) -> Array:
+def _place_weights(selection: SiteSelection, count: int) -> Array:
     """Return the weights (P,) of the places, sum 1; `count` is the number P of places."""
     weight = np.ones(count) if selection.weights is None else np.asarray(selection.weights, dtype=float)
     if weight.shape != (count,) or not (weight > 0.0).all() or not np.isfinite(weight).all():
@@ -270,7 +270,7 @@ def _weight(selection: SiteSelection, count: int) -> Array:
     return np.asarray(weight / weight.sum())
 
 
-def _weights(selection: SiteSelection, problem: Problem, places: Array) -> Array:
+def _row_weights(selection: SiteSelection, problem: Problem, places: Array) -> Array:
     """Return the weights (P, m) of the rows: 0 out of sight or reach, and smaller where `sight` raises sigma.
 
     `places` (P, d) are positions of the target, metres.
@@ -312,7 +312,7 @@ def _with_prior(problem: Problem, places: Array) -> Problem:
     return replace(problem, priors=tuple(priors))
 
 
-def _rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
+def _whitened_rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
     """Return the whitened rows (P, r, m, n) of each site; sites with fewer than r rows are padded with zeros.
 
     r is the largest number of rows of a site, m the number of unknowns, and n = `count` the number of sites.
@@ -338,10 +338,10 @@ def _rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
     return out
 
 
-def _prior(problem: Problem, vectors: Array) -> Array:
+def _prior_information(problem: Problem, vectors: Array) -> Array:
     """Return the prior information (P, m, m) at each place: the inverse covariance of the priors of the m unknowns."""
     n, length, size = problem.layout.n_shared, problem.layout.n_local, len(vectors)
-    none = Normal(
+    empty = Normal(
         np.zeros((size, n, n)),
         np.zeros((size, 1, length, length)),
         np.zeros((size, 1, n, length)),
@@ -349,7 +349,7 @@ def _prior(problem: Problem, vectors: Array) -> Array:
         np.zeros((size, 1, length)),
         np.zeros(size),
     )
-    known = with_priors(problem, vectors, none)
+    known = with_priors(problem, vectors, empty)
     out = np.zeros((size, n + length, n + length))
     out[:, :n, :n], out[:, n:, n:] = known.shared, known.local[:, 0]
     if (np.diagonal(out, axis1=1, axis2=2) <= 0.0).any():
@@ -365,18 +365,18 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
     The rules are the number of sites, the budget and the groups. Only the group rules count the kept sites.
     `names` are the n sites, and `site` gives the site of each row.
     """
-    n, place = len(names), {name: i for i, name in enumerate(names)}
+    n, index = len(names), {name: i for i, name in enumerate(names)}
 
-    def where(wanted: Sequence[str], argument: str) -> Array:
+    def indices_of(wanted: Sequence[str], argument: str) -> Array:
         """Return the indices of sites by name, or raise for an unknown name."""
         for name in wanted:
-            if name not in place:
+            if name not in index:
                 raise InvalidProblem(f"there is no site {name!r}", argument, nearest(name, list(names)))
-        return np.array([place[name] for name in wanted], dtype=int)
+        return np.array([index[name] for name in wanted], dtype=int)
 
     state = np.full(n, -1, dtype=np.int64)
-    kept = where(selection.kept, "kept")
-    state[where(selection.forbidden, "forbidden")] = 0
+    kept = indices_of(selection.kept, "kept")
+    state[indices_of(selection.forbidden, "forbidden")] = 0
     if (state[kept] == 0).any():
         raise InvalidProblem("a site is kept and forbidden", "forbidden", "remove it from one of the two lists")
     state[kept] = 1
@@ -391,8 +391,10 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
     if selection.budget is not None:
         rules.append(_costs(selection, n, site) * free)
         limits.append(float(selection.budget))
-    own = [np.isin(np.arange(n), where(g.members, f"groups, entry {i + 1}")) for i, g in enumerate(selection.groups)]
-    inside = np.array(own, dtype=bool).reshape(-1, n)
+    marks = [
+        np.isin(np.arange(n), indices_of(g.members, f"groups, entry {i + 1}")) for i, g in enumerate(selection.groups)
+    ]
+    inside = np.array(marks, dtype=bool).reshape(-1, n)
     check_groups(selection.groups, inside, names, state, selection.choose)
     if selection.choose is not None and selection.budget is None and selection.groups:
         # Without groups, a full set is always best, so the upper limit is enough. Groups need the exact number as a
