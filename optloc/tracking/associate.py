@@ -52,6 +52,7 @@ def nearest(width: float = 5.0) -> Associate:
     check_width(width)
 
     def rule(scan: Problem, ahead: State, z: Array) -> Array:
+        """Return the picks (..., t, m) of the nearest candidates in the gate."""
         apart, S = offsets(scan, ahead, z)
         # argmin is also 0 for a row without a candidate; the infinite distance distinguishes this case.
         distance = distances(apart, S, width)
@@ -78,6 +79,7 @@ def joint(clutter: Clutter) -> Associate:
     """
 
     def rule(scan: Problem, ahead: State, z: Array) -> Array:
+        """Return the picks (..., t, m) of the best set of each target."""
         sets = scored(scan, ahead, z, clutter)
         return sets.chosen(sets.score.argmin(-1))
 
@@ -102,6 +104,7 @@ def assigned(clutter: Clutter) -> Associate:
     """
 
     def rule(scan: Problem, ahead: State, z: Array) -> Array:
+        """Return the picks (..., t, m) of the best sets of all targets together."""
         # Most scans need no integer programme: if the best sets of all targets share no row, their sum is the minimum.
         sets = scored(scan, ahead, z, clutter)
         pick = sets.chosen(sets.score.argmin(-1))
@@ -178,6 +181,7 @@ class Clutter:
     width: float = 5.0
 
     def __post_init__(self) -> None:
+        """Raise InvalidProblem for a probability, density or width out of range."""
         if not 0.0 < self.detection < 1.0:
             what = f"the probability of detection is {self.detection}"
             raise InvalidProblem(what, "detection", "give a number between 0 and 1")
@@ -291,7 +295,10 @@ def offsets(scan: Problem, ahead: State, z: Array) -> tuple[Array, Array]:
 
 
 def misfits(scan: Problem, z: Array, expected: Array) -> Array:
-    """Return candidates (..., m, c) minus predicted values (..., t, m) as (..., t, m, c), with angles wrapped."""
+    """Return candidates (..., m, c) minus predicted values (..., t, m) as (..., t, m, c), with angles wrapped.
+
+    `z` are the candidates of a scan, and `expected` are the predicted values of each target.
+    """
     apart = z[..., None, :, :] - expected[..., None]
     for block, start in zip(scan.rows, scan.starts, strict=True):
         if MODELS[block.kind].period is not None:

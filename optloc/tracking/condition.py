@@ -34,9 +34,11 @@ class Recent:
     """
 
     def __init__(self, rules: Rules) -> None:
+        """Start with an empty window."""
         # The window must separate a lost track from a few gross errors in succession, even with one row per scan. If
         # one row in ten is a gross error, ten of twenty occur in one window of a million.
         self.scans: deque[Fit] = deque(maxlen=_WINDOW * rules.patience)
+        # Rules of the track; largest squared innovation of a row that counts; number of scans since the start.
         self.rules, self.most, self.since = rules, rules.most, 0
         # Mean squared innovation as a share of the squared gate; 0 with too few rows.
         self.share = 0.0
@@ -80,7 +82,10 @@ class Recent:
         )
 
     def judge(self, entry: Entry) -> Entry:
-        """Return the entry of a scan; if its status is ok, the status that follows from the last scans replaces it."""
+        """Return the entry of a scan with the status that follows from the last scans.
+
+        The status is replaced only if it is ok.
+        """
         found = objections(_FINDINGS, self) if entry.code == Status.OK else []
         return replace(entry, code=found[0][0], reason=found[0][1]) if found else entry
 

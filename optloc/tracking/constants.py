@@ -96,6 +96,7 @@ def _with_constants(dynamics: Dynamics, constants: int) -> Dynamics:
     """Return dynamics of a state with additional constants at its end; `constants` is their number."""
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        """Return F, Q and drive of the state with its constants; see `Step` of `optloc.tracking.dynamics`."""
         n = mean.shape[-1] - constants
         F, Q, drive = dynamics.step(dt, mean[..., :n], d)
         none = [(0, 0)] * (Q.ndim - 2)

@@ -47,6 +47,7 @@ def _one_after_another(parts: list[Rows]) -> Rows:
     """Return several blocks of rows of one kind as one block, in the given order."""
 
     def joined_column(name: str) -> Array:
+        """Return the values of all rows in the column `name`."""
         return np.concatenate([getattr(part, name) for part in parts])
 
     names = ("z", "a", "b", "epoch", "target", "weight", "correction")

@@ -73,6 +73,7 @@ def polynomial(order: int, noise: float = 0.0) -> Dynamics:
         raise InvalidProblem(f"the process noise is {noise}", "noise", "give a standard deviation of at least 0")
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        """Return F (n, n), Q and drive of one time step; see `Step`."""
         return *_polynomial(order, noise, dt, d), np.zeros(mean.shape)
 
     return Dynamics(("static", "constant velocity", "constant acceleration")[order], order, step)
@@ -97,6 +98,7 @@ def singer(time_constant: float, deviation: float) -> Dynamics:
     _positive(deviation, "deviation")
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        """Return F (n, n), Q and drive of one time step; see `Step`."""
         F, Q, _ = correlated(alpha, dt)
         return *_blocked(F, deviation**2 * Q, d), np.zeros(mean.shape)
 
@@ -129,6 +131,7 @@ def current_statistical(time_constant: float, limit: float, floor: float = 0.0) 
         raise InvalidProblem(f"the floor is {floor}", "floor", "give a standard deviation of at least 0")
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        """Return F (n, n), Q and drive of one time step; see `Step`."""
         F, Q, u = correlated(alpha, dt)
         present = mean[..., 2 * d :]
         gap = np.maximum(limit - np.abs(present), _CLAMP * limit)
@@ -212,7 +215,7 @@ def _blocked(F: Array, Q: Array, d: int) -> tuple[Array, Array]:
 
 
 def _positive(value: float, name: str) -> float:
-    """Return a finite positive number; raise InvalidProblem for other numbers."""
+    """Return a finite positive number; other numbers raise InvalidProblem with `name` as the argument."""
     if not (np.isfinite(value) and value > 0.0):
         raise InvalidProblem(f"{name} is {value}", name, "give a positive number")
     return float(value)

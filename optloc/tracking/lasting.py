@@ -177,13 +177,14 @@ class _Recursion:
     """
 
     def __init__(self, n: int) -> None:
+        """Start without information, for a state of n numbers."""
         J = 2 * len(_LASTS)
         self.phi = np.exp(-1.0 / np.tile(_LASTS, 2))[:, None, None]
         self.info, self.score = np.zeros((J, 2, 2)), np.zeros((J, 2))
         self.best, self.sure, self.scans = 0, 0.0, 0
         self.reset(np.zeros((n, n)))
         self.size, self.excess = 0.0, 0.0
-        """Squared lasting error, and excess of the white variance over the stated one, in stated variances."""
+        """Squared lasting error, and excess of the white variance over the stated variance, in stated variances."""
 
     @property
     def active(self) -> bool:
@@ -191,7 +192,10 @@ class _Recursion:
         return self.size > 0.0 or self.excess > 0.0
 
     def reset(self, white: Array) -> None:
-        """Start with a state without lasting errors; `white` (n, n) is the part of its covariance from white noise."""
+        """Start with a state without lasting errors; `info` and `score` do not change.
+
+        `white` (n, n) is the part of its covariance from white noise.
+        """
         J, n = len(self.phi), len(white)
         # Covariance from white noise, covariance from lasting errors, and covariance of the state with these errors.
         self.white, self.lasting, self.cross = white.copy(), np.zeros((J, n, n)), np.zeros((J, n, 0))
@@ -388,6 +392,7 @@ class LastingErrors:
     """
 
     def __init__(self, window: int) -> None:
+        """Start without errors; `window` is the number of scans that are processed again."""
         self._recent: deque[Taken] = deque(maxlen=window)
         self._start: _Start | None = None
         self._found: _Recursion | None = None
@@ -395,7 +400,7 @@ class LastingErrors:
         self._memory = np.zeros(COLUMNS)
 
     def memory(self, size: int) -> Array:
-        """Return the memory of the screen with at least this size, see `optloc.kernels.filter.filter_scan`."""
+        """Return the memory of the screen: an array of at least `size` numbers, see `filter_scan`."""
         if len(self._memory) < size:
             self._memory = np.zeros(size)
         return self._memory

@@ -202,7 +202,10 @@ def _line_track(problem: Problem, apart: Problem, fitted: Array, cov: Array, ok:
 
 
 def _solve_scans(scan: Problem) -> tuple[Array, Array]:
-    """Return positions (..., k, d) and statuses (..., k); the fix of the last epoch is the start of the others."""
+    """Return positions (..., k, d), metres, and statuses (..., k) of k scans.
+
+    The fix of the last epoch is the start of the other fixes. `scan` is a batch (..., k) of single scans.
+    """
     shape, flat = scan.batch_shape, scan.flat()
     size, count = int(np.prod(shape)), shape[-1]
     course, doubt = course_starts(flat), np.zeros(size, dtype=bool)

@@ -251,7 +251,7 @@ class _TrackRun:
         return remaining(rivals, entry, others, self.rules.most)
 
     def _stretch(self, begun: Beginning) -> Problem:
-        """Return the scans of a start as a problem."""
+        """Return the scans of a start as a problem, whose unknown is the state at the last of these scans."""
         motion = Motion(self.dynamics.order, reference=float(self.problem.times[begun.last]))
         return replace(cut(self.problem, begun.first, begun.last + 1), motions=(motion,))
 
@@ -431,7 +431,10 @@ class Follower:
 
 
 def _clean(problem: Problem) -> tuple[Problem, Array]:
-    """Return the run with weight zero for rows that are not finite, and a mask (m,) of these rows."""
+    """Return the run with weight zero for rows that are not finite, and a mask (m,) of these rows.
+
+    Their values are set to zero, so that no computation meets a NaN.
+    """
     broken = ~np.isfinite(problem.z) & (problem.weight > 0.0)
     if not broken.any():
         return problem, broken

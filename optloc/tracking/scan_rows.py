@@ -85,9 +85,10 @@ class Scans:
     ) -> Filtered | None:
         """Return states (..., n) after scan k, or None if the scan needs the general form.
 
-        `mean` (..., n) and `cov` (..., n, n) are the states before the prediction `move`; None for states at the time
-        of the scan. `how` is the filter. `more` replaces the measurements minus corrections (..., m) and the weights
-        (..., m). `memory` is the array of a track with a single state, see `filter_scan`.
+        `mean` (..., n) and `cov` (..., n, n) are the states before the prediction `move`. `move` is None for
+        states at the time of the scan. `how` is the filter. `more` replaces the measurements minus corrections
+        (..., m) and the weights (..., m). `memory` is the array of a track with a single state, see
+        `filter_scan`.
         """
         rows, n = self.rows[k], mean.shape[-1]
         if rows is None or type(mean) is not np.ndarray or rows.tables.shared != n:
@@ -175,7 +176,10 @@ def _no_move(n: int) -> Move:
 
 
 def _is_plain(problem: Problem) -> bool:
-    """Return whether the state is the only unknown, and a batch differs only in measurements and weights."""
+    """Return whether the compiled filter supports the run.
+
+    The state must be the only unknown, and a batch may differ only in measurements and weights.
+    """
     stations = problem.stations
     shared = [(stations.position, 3), (stations.velocity, 3), (stations.axes, 4)]
     shared += [(covariance, 3) for _, _, covariance in stations.errors]
@@ -205,7 +209,7 @@ def _structures(problem: Problem, order: int) -> Iterator[tuple[Array, Array, Sc
 
 
 def _key(scan: Problem, order: int) -> Hashable:
-    """Return a cache key of a scan without its time, measurements and weights."""
+    """Return a cache key of a scan without its time, measurements and weights; `order` is the order of the state."""
     s = scan.stations
     arrays = [s.position, s.velocity, s.axes, s.covariance, s.velocity_covariance]
     arrays += [array for block in scan.noise.blocks for array in (block.covariance, block.row)]

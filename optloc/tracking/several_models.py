@@ -20,7 +20,7 @@ from optloc.tracking.updates import Update, Updated, filter_of
 
 @dataclass(frozen=True, slots=True)
 class Parallel:
-    """Tracks of one target by several models.
+    """Tracks of one target by several models (k scans, q models).
 
     - models: q models of motion.
     - tracks: one track for each model; all have the same scans.
@@ -208,7 +208,10 @@ def mixed(states: Sequence[State], weight: Array, transition: Array) -> tuple[li
 
 
 def _transition(transition: Array, count: int) -> Array:
-    """Return the transition as an array (q, q); raise InvalidProblem if it is no table of probabilities."""
+    """Return the transition as an array (q, q) for q = `count` models.
+
+    A table that does not contain probabilities raises InvalidProblem.
+    """
     chain = np.asarray(transition, dtype=float)
     good = chain.shape == (count, count) and bool(np.all(chain >= 0.0))
     # Rows with three digits, such as 0.333, do not add up to one: they are refused, not scaled.
@@ -336,7 +339,10 @@ def spread(state: State, batch: tuple[int, ...]) -> State:
 
 
 def softmax(score: Array) -> Array:
-    """Return exp(score) divided by its sum along the last axis; equal shares if all scores are minus infinity."""
+    """Return exp(score) divided by its sum along the last axis; equal shares if all scores are minus infinity.
+
+    Log-likelihoods become probabilities.
+    """
     top = score.max(-1, keepdims=True)
     weight = np.where(np.isfinite(top), np.exp(score - np.where(np.isfinite(top), top, 0.0)), 1.0)
     return np.asarray(weight / weight.sum(-1, keepdims=True))

@@ -29,9 +29,9 @@ Missing = Literal["drop", "expect"]
 class Associated:
     """Tracks of several targets, and the rows of each target.
 
-    - track: a track with leading axes (..., t).
-    - picks: for each scan of the track, the candidate (..., t, m) of each target in each of its m channels; -1 for
-      none.
+    - track: a track of t targets, with leading axes (..., t).
+    - picks: for each scan of the track, the candidate (..., t, m) of each target in each of its m channels;
+    -1 for none.
     """
 
     track: Track
@@ -164,7 +164,10 @@ def candidates(problem: Problem) -> RowCandidates:
 
 
 def _checked(given: RowCandidates) -> RowCandidates:
-    """Return candidates minus known corrections; raise InvalidProblem if they do not fit their channels."""
+    """Return candidates without corrections: known corrections are subtracted from the values.
+
+    Candidates that do not fit their channels raise InvalidProblem.
+    """
     if given.channels.batch_shape != ():
         advice = "track runs with different stations or noise separately"
         raise InvalidProblem("the channels have batch axes", "candidates", advice)
@@ -250,6 +253,7 @@ def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
     s = problem.stations
 
     def at(values: Array | None, core: int) -> Array | None:
+        """Return station values at the epochs of the target; the axis of epochs is `core` axes from the end."""
         return values if values is None or values.shape[-core] == 1 else np.take(values, epochs, axis=-core)
 
     position = at(s.position, 3)

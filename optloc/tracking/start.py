@@ -257,6 +257,7 @@ class Undecided(Exception):  # noqa: N818  # no error: more scans follow
     """Raised if a start needs more scans than have arrived; `scans` is the necessary number of scans of the run."""
 
     def __init__(self, scans: int) -> None:
+        """Store the necessary number of scans."""
         super().__init__(scans)
         self.scans = scans
 
@@ -280,7 +281,10 @@ class _Stretch:
 
     @property
     def p(self) -> float:
-        """Return the p-value of the rows; 1 without redundancy, because no row contradicts the others then."""
+        """Return the p-value of the rows (chi-square).
+
+        Without redundancy it is 1, because then no row contradicts the others.
+        """
         p = float(self.fix.p_value)
         return 1.0 if np.isnan(p) else p
 
@@ -297,7 +301,7 @@ class _Stretch:
     @property
     def clean(self) -> bool:
         """Return whether a filter can start with this state: one Gaussian, from rows that fit together."""
-        # With less redundancy, other rows might be the wrong rows, see `optloc.solvers.suspects`.
+        # With less redundancy, other rows might be the wrong rows, see `optloc.solvers.suspect_rows`.
         sure = not self.left_out or int(self.fix.dof) > self.left_out
         return sure and self.p >= _PLAUSIBLE and is_one_gaussian(self.fix)
 
@@ -318,10 +322,10 @@ def begin(
 ) -> Beginning:
     """Return a start at scan `first` or later, without a guess.
 
-    The smallest number of scans that determines the state is solved as one problem. If their rows contradict each
-    other, the stretch of scans starts one scan later. If several states explain the rows, the stretch is extended.
-    `speed`, `rate` and `method` are as in `begun`. With `ends`, `problem` has all scans of the run; otherwise a start
-    that needs later scans raises `Undecided`.
+    The smallest number of scans that determines the state is solved as one problem. If their rows contradict
+    each other, a later scan is tried as the first one. If several states explain the rows, the stretch of
+    scans is extended. `speed`, `rate` and `method` are as in `begun`. With `ends`, `problem` has all scans of
+    the run; otherwise a start that needs later scans raises `Undecided`.
     """
     doubtful: list[_Stretch] = []
     verdict, last = Status.TOO_FEW_ROWS, first
@@ -454,7 +458,10 @@ def _scans_with_rows(problem: Problem, first: int) -> Array:
 
 
 def reach(problem: Problem, position: Array) -> float:
-    """Return the larger of the spread of the stations and the distance of a position (d,) from their centre, m."""
+    """Return the larger of the spread of the stations and the distance of a position (d,) from their centre, m.
+
+    A prediction that is more uncertain than this length is not followed.
+    """
     centre, spread = centre_and_spread(problem.stations.places.reshape(-1, problem.dimension))
     return max(float(spread), float(np.linalg.norm(position - centre)))
 

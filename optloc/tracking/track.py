@@ -32,7 +32,7 @@ class State:
     time : float
         Seconds.
     mean : array (..., n)
-        State [p, v, a].
+        State [p, v, a]: position (m), velocity (m/s) and acceleration (m/s^2), as far as the model has them.
     cov : array (..., n, n)
         Covariance of the state.
     """
@@ -44,14 +44,14 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """States of a target over time; a batch of targets has leading axes.
+    """States of a target over time (k scans); a batch of targets has leading axes (...).
 
     Parameters
     ----------
     times : array (k,)
         Times of the scans, seconds.
     mean : array (..., k, n)
-        State after each scan.
+        State [p, v, a] after each scan: m, m/s, m/s^2.
     cov : array (..., k, n, n)
         Covariance after each scan.
     nis : array (..., k)
@@ -61,7 +61,8 @@ class Track:
     loglikelihood : array (..., k)
         Log-likelihood of each scan given the prediction.
     code : int array (..., k)
-        `Status` of each scan. Ok. Too few rows: no valid row, the state is only predicted. Rejected: rows failed the
+        `Status` of each scan. Ok. Too few rows: no valid row, the state is only predicted. Rejected: rows
+        failed the
         gate or are not finite. Numerical: the state is lost.
     dimension : int
         2 or 3.
@@ -159,8 +160,9 @@ def step(
 ) -> tuple[Updated, Array]:
     """Return the state after prediction to scan k and update, and its status (...) as in `take_scan`.
 
-    The scan is not before the state. `more` replaces the measurements minus corrections (..., m) and the weights (...,
-    m) of the scan. One call of compiled code does the update if possible.
+    `given` are the scans, `state` is the state before the prediction, and `rule` is the filter. The scan is
+    not before the state. `more` replaces the measurements minus corrections (..., m) and the weights (..., m)
+    of the scan. One call of compiled code does the update if possible.
     """
     problem = given.problem
     time, d = float(problem.times[k]), problem.dimension
@@ -219,8 +221,8 @@ def predicted(state: State, dynamics: Dynamics, time: float, dimension: int) -> 
 def take_scan(scan: Problem, ahead: State, rule: Update, causes: list[str] | None = None) -> tuple[Updated, Array]:
     """Return the update of a predicted state (...) by a scan, and its status (...); a bad scan keeps the prediction.
 
-    `scan` is a problem of one epoch at the time of the state. If an update fails numerically, its cause is appended to
-    `causes`.
+    `scan` is a problem of one epoch at the time of the state `ahead`, and `rule` is the filter. If an update
+    fails numerically, its cause is appended to `causes`.
     """
     shape = ahead.mean.shape[:-1]
     if not scan.rows or not scan.count:
@@ -292,6 +294,7 @@ def collect(times: Array, steps: list[tuple[Updated, Array]], dimension: int) ->
         raise InvalidProblem("no scan is later than the start", "start", "give a start before the last scan")
 
     def stacked(name: str, core: int) -> Array:
+        """Return a field of all updates with an axis of scans before its `core` last axes."""
         return np.stack([getattr(done, name) for done, _ in steps], axis=-1 - core)
 
     return Track(
@@ -327,7 +330,10 @@ def scans(problem: Problem, order: int) -> Iterator[tuple[float, Problem]]:
 
 
 def scan_at(problem: Problem, k: int, order: int) -> Problem:
-    """Return one scan of a run, see `scans`; it has no rows if the epoch has no rows."""
+    """Return scan k of a run as a problem, see `scans`; it has no rows if the epoch has no rows.
+
+    `order` is the order of the state.
+    """
     if not (problem.epoch == k).any():
         return replace(problem, rows=())
     # The unknown of a scan is the state at the time of the scan, so this time is the reference of the motion.

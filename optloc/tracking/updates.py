@@ -55,9 +55,9 @@ class Updated:
     Parameters
     ----------
     mean : array (..., n)
-        State.
+        State [p, v, a]: m, m/s, m/s^2.
     cov : array (..., n, n)
-        Covariance.
+        Covariance of the state.
     nis : array (...)
         Normalised innovation squared at the prediction; chi-square distributed with `count` degrees of freedom.
     loglikelihood : array (...)
@@ -160,7 +160,7 @@ UPDATES: Registry[Update] = Registry(
 
 
 def filter_of(update: Update | str) -> Update:
-    """Return a filter by name; raise InvalidProblem for an unknown name."""
+    """Return the filter with a name in `UPDATES`, or the given filter; an unknown name raises InvalidProblem."""
     if not isinstance(update, str):
         return update
     if update not in UPDATES:
@@ -227,6 +227,7 @@ def reweighted(update: Update | str, loss: Loss | str) -> Update:
     chosen: Loss = loss
 
     def robust(scan: Problem, mean: Array, cov: Array) -> Updated:
+        """Return the update of predicted states (..., n) with weighted rows, until the weights are constant."""
         # Scan and state may have different leading axes; the loss works on a flat batch.
         many = np.broadcast_shapes(scan.batch_shape, mean.shape[:-1])
         x, flat = np.broadcast_to(mean, (*many, mean.shape[-1])).reshape(-1, mean.shape[-1]), scan.flat()
@@ -278,7 +279,10 @@ class White:
 
 
 def whitened(scan: Problem, x: Array, noise: tuple[Whitener, ...] | None = None) -> White:
-    """Return the rows of a scan linearised at states x (..., n) and whitened; absent rows are zero."""
+    """Return the rows of a scan linearised at states x (..., n) and whitened; absent rows are zero.
+
+    `noise` are whitening matrices from an earlier call; None: compute them.
+    """
     linear = linearise(scan, x, noise)
     both = np.concatenate([linear.shared, linear.residual[..., None]], axis=-1)
     white = np.concatenate([w.apply(both) for w in linear.noise], axis=-2)

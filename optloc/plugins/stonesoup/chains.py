@@ -129,8 +129,8 @@ def is_flat(cov: Array, position: Array, detection: Any) -> bool:
 def posed(runs: Sequence[Sequence[Any]], terms: ChainTerms) -> tuple[Problem, Array]:
     """Return the problem of B runs of detections, without values, and the values (B, m) of its rows.
 
-    The runs have the same rows in each scan, and the same time differences. The state is the state at the last
-    scan.
+    A run is a sequence of detections in the order of time. The runs have the same rows in each scan, and the
+    same time differences. The state is the state at the last scan.
     """
     models = [[detection.measurement_model for detection in run] for run in runs]
     last = runs[0][-1].timestamp

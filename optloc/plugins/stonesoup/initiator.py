@@ -111,6 +111,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
     )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Check the order, and start without chains."""
         super().__init__(*args, **kwargs)
         if self.order not in (0, 1):
             raise InvalidProblem(f"a motion of order {self.order} is not possible", "order", "use 0 or 1")

@@ -86,6 +86,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
     )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Check the shapes of stations, offset and covariance."""
         super().__init__(*args, **kwargs)
         self.stations = np.asarray(self.stations, dtype=float)
         if np.any(np.asarray(self.rotation_offset, dtype=float)):
@@ -179,7 +180,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         return self._with_angle_types(drawn.reshape(self.ndim_meas, num_samples))
 
     def logpdf(self, state1: Any, state2: Any, **kwargs: Any) -> Any:
-        """Return the logarithm of the density of a measurement given a state; angles are wrapped."""
+        """Return the logarithm of the density of a measurement `state1`, given a state `state2`; angles are wrapped."""
         from scipy.stats import multivariate_normal
 
         off = np.asarray(state1.state_vector - self.function(state2), dtype=float)
@@ -262,6 +263,7 @@ class RateMeasurement(StationMeasurement, ABC):
     )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Check the velocities of the stations and the state indices of the velocity."""
         super().__init__(*args, **kwargs)
         self.velocities = None if self.velocities is None else np.asarray(self.velocities, dtype=float)
         if self.velocities is not None and self.velocities.shape != self.stations.shape:

@@ -560,7 +560,7 @@ def _station_indices(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...
 
 
 def _placeable(network: Network) -> Array:
-    """Return a mask (N,) of the pulses whose number of rows is at least their number of unknowns."""
+    """Return a mask (N,) of the pulses that rows can place: at least one row for each of their unknowns."""
     needed = network.dimension + network.emission
     return np.asarray(network.given.sum(axis=1) >= needed)
 

@@ -65,7 +65,7 @@ class GaugeRank:
 
 
 def determined(lik: Likelihood, at: NetworkEstimate) -> GaugeRank:
-    """Return the determined, free and open motions at an estimate (S = 1)."""
+    """Return the determined, free and open motions at an estimate (S = 1): how far the rows fix stations and clocks."""
     p, jacobian = lik.free.size, without_pulses(lik, at)
     motions = frame_moves(lik.network, at)
     motions[~lik.free] = 0.0
@@ -104,10 +104,11 @@ _NONE = 1e-9
 def departure(lik: Likelihood, at: NetworkEstimate, rank: GaugeRank) -> float:
     """Return the largest deviation of the cost from the Gaussian cost, as the logarithm of their ratio.
 
-    The test points are three standard deviations away, on both sides of each principal axis of stations and
-    clocks. The pulses are refitted at each test point. The result is the largest ``|ln((f(x +- 3 t) - f(x)) /
-    9)|``, as for a fix (`optloc.model_checks.shape`). `at` (S = 1) is the estimate. `rank` contains its determined
-    motions; there must be no open motion.
+    A large number means that the covariance is not valid. The test points are three standard deviations away,
+    on both sides of each principal axis of stations and clocks. The pulses are refitted at each test point.
+    The result is the largest ``|ln((f(x +- 3 t) - f(x)) / 9)|``, as for a fix (`optloc.model_checks.shape`);
+    f is the cost and t is one standard deviation along the axis. `at` (S = 1) is the estimate. `rank`
+    contains its determined motions; there must be no open motion.
     """
     width, axes = np.linalg.eigh(rank.covariance(rank.free.T))
     far = (axes * (_FAR * np.sqrt(np.maximum(width, 0.0))))[:, width > _ZERO * width[-1]].T
@@ -302,10 +303,10 @@ def _in_one_plane(points: Array, covariance: Callable[[Array], Array]) -> bool:
 
 
 def _height_covariance(lik: Likelihood, at: NetworkEstimate, covariance: Array, which: Array, normal: Array) -> Array:
-    """Return the covariance (n, n) of the heights of pulses, m^2, from the noise of their rows and from the stations.
+    """Return the covariance (n, n) of the heights of pulses, m^2: from the noise of their rows, and from the stations.
 
-    The heights are coordinates along `normal` (d,). `which` (n,) are the numbers of the pulses, `at` is one
-    estimate (S = 1), and `covariance` (P, P), m^2, is that of stations and clocks.
+    The heights are coordinates along `normal` (d,). `which` (n,) are the numbers of the pulses, and `at` is
+    one estimate (S = 1). `covariance` (P, P), m^2, belongs to stations and clocks.
     """
     by_station, by_pulse = (one[which] for one in lik.jacobian(at)[:2])
     height_slopes = np.einsum("c,jcr->jr", normal, np.linalg.pinv(by_pulse)[:, : len(normal)])

@@ -59,7 +59,7 @@ class NetworkSearchResult:
 
 
 def _cost_key(cost: float) -> float:
-    """Return a rounded cost as key of `onward`: minima with equal keys are the same."""
+    """Return a rounded cost as key of `NetworkSearchResult.onward`: minima with equal keys are the same."""
     return round(float(cost), 4)
 
 

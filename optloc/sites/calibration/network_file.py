@@ -177,7 +177,10 @@ def _optional_column(table: Table, key: str) -> Array:
 
 
 def _values_and_sigmas(read: Context, name: str) -> tuple[Array, Array]:
-    """Return values (m,) and standard deviations (m,) of rows, metres; `name` is the unit in the file."""
+    """Return values (m,) and standard deviations (m,) of the rows of one section, metres.
+
+    `read` contains its table, and `name` is the unit in the file.
+    """
     units = Units("length", read.speed)
     unit = units.conversion(name, join(read.where, "key 'unit'"))
     z = values_of(read, unit, np.ones(read.table.count))

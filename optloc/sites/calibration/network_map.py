@@ -105,7 +105,7 @@ def _draw_plane(
 ) -> None:
     """Draw the network in the plane of two coordinates, `view` (for instance 0 and 1 for x and y).
 
-    The other arguments are those of `plot_network`.
+    `plot_network` explains the other arguments.
     """
     i, k = view
     d = stations.shape[1]

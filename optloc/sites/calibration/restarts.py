@@ -66,7 +66,7 @@ class RoundEnds:
 
 
 def joined(some: list[RoundEnds]) -> RoundEnds:
-    """Return the minima of several rounds as one object."""
+    """Return the minima of several rounds, `some`, as one object."""
     arrays = (np.concatenate([getattr(one, name) for one in some]) for name in ("cost", "start"))
     return RoundEnds(together(*(one.at for one in some)), *arrays)
 
@@ -242,7 +242,10 @@ def starts_of(lik: Likelihood, seed: int) -> Starts:
 
 
 def rounds(starts: Starts) -> Iterator[tuple[int, RoundEnds]]:
-    """Yield the number of starts so far and the minima of each round (low-rank fits and random positions)."""
+    """Yield, for each round, the number of starts so far and the minima that the starts of this round reach.
+
+    The starts are low-rank fits and random positions. The rounds never end; the caller stops the iteration.
+    """
     net, d = starts.lik.network, starts.dimension
     full = int(((starts.weight > 0.0).sum(axis=1) >= d + 3).sum())
     able = net.stations >= d + 3 and full > 0 and max(net.stations, full) >= unknowns(d)

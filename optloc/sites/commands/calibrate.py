@@ -149,7 +149,7 @@ def _record(found: Calibration, file: Path) -> dict[str, Any]:
 
 
 def _picture(found: Calibration, title: str) -> Any:
-    """Return the figure of the network."""
+    """Return the figure of the network; at most three alternatives are drawn."""
     from optloc.sites.calibration.network_map import plot_network
 
     net = found.network

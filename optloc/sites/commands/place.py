@@ -68,6 +68,7 @@ def run_place(
     with line(quiet or as_json) as tell:
 
         def report(bound: float, value: float, nodes: int) -> None:
+            """Show the progress of the search."""
             tell(f"best {value:.5g}, no set below {bound:.5g}, {nodes} nodes")
 
         tell("searching")
@@ -93,7 +94,10 @@ def run_place(
 
 
 def _selection_of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
-    """Return the stations of a problem file as candidates, for a target at `--at` or at the fix of the file."""
+    """Return the stations of a problem file as candidates, for a target at `--at` or at the fix of the file.
+
+    `wanted` are the options of the command line.
+    """
     loaded = read(file, values=False)
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
     problem = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
@@ -234,7 +238,7 @@ def _losses_table(found: Placement) -> Table:
 
 
 def _remarks(selection: SiteSelection, found: Placement) -> list[str]:
-    """Return sentences about weak places, the next station, simulated fixes and the refinement."""
+    """Return sentences about weak places, the next station, simulated fixes and the refinement, for the user."""
     names, out = _names_of(selection), []
     weak = [names[i] for i in np.flatnonzero(found.share_of_prior > PRIOR)]
     if weak:

@@ -19,10 +19,10 @@ _SAMPLES, _NODES = 200, 4
 
 
 def polygons_of(path: Path) -> list[Array]:
-    """Return the outer rings of all polygons of a GeoJSON file (RFC 7946), each (v, 2).
+    """Return the outer rings of all polygons of a GeoJSON file (RFC 7946), each (v, 2), as in the file.
 
-    The coordinates are those of the file, without a repeated last corner. Holes in the polygons are ignored.
-    A file without a polygon, or with a ring of fewer than four positions, is an error.
+    A repeated last corner is removed. Holes in the polygons are ignored. A file without a polygon, or with a
+    ring of fewer than four positions, is an error.
     """
     source = path.name
     data = json_of(read_text(path), source)

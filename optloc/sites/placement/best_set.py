@@ -188,14 +188,14 @@ class _SearchState:
         return min((value for value, _ in self.seen.values()), default=np.inf)
 
     def add(self, value: float, chosen: Array) -> None:
-        """Store a set (n,) and its value; if more than 4 `keep` sets are stored, drop all but the best."""
+        """Store a set (n,) and its value; if more than 4 `keep` sets are stored, keep only the best `keep` sets."""
         self.seen[chosen.astype(np.int8).tobytes()] = (value, chosen)
         if len(self.seen) > 4 * self.keep:  # limit the memory: keep the best sets
             best = sorted(self.seen.items(), key=lambda item: item[1][0])[: self.keep]
             self.seen = dict(best)
 
     def push(self, bound: float, state: Array, w: Array) -> None:
-        """Add an open node with its bound, states (n,) and weights (n,)."""
+        """Add an open node: its bound, the states (n,) of all sites and the weights (n,) of its relaxation."""
         self.count += 1  # equal bounds: arrays cannot be compared, counters can
         heappush(self.heap, (bound, self.count, state, w))
 
@@ -372,7 +372,7 @@ def _enumerate(
 
 
 def _is_small(task: SearchTask, state: Array) -> bool:
-    """Return whether a node has so few sets that enumeration is faster than a relaxation."""
+    """Return whether a node has so few sets that enumeration is faster than a relaxation; `state` (n,) is its state."""
     sizes = task.rules[0][state == FREE]
     left = task.limits[0] - task.rules[0][state == IN].sum()
     addable = int((np.cumsum(np.sort(sizes)) <= left + _ROOM * max(1.0, abs(task.limits[0]))).sum())
@@ -456,7 +456,7 @@ def _exchange(
 ) -> tuple[float, Array]:
     """Return value and set (n,) with the best new site, instead of site `removed` (None: in addition to all sites).
 
-    If no such set has a value below `enough`, the set is all zeros.
+    If no set of this kind has a value below `enough`, the set is all zeros.
     """
     state = np.where(chosen == 1, IN, np.where(task.state == FREE, FREE, OUT))
     if removed is not None:

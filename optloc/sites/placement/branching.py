@@ -1,8 +1,10 @@
 """Steps of the branch and bound in machine code: propagation of rules, score of whole sets, bound of a node.
 
+A node is a family of sets: its state (n,) marks each site as taken (IN), left out (OUT) or undecided
+(FREE). A set is 1 for each site that is taken, otherwise 0. Rules are linear: rules @ set <= limits.
+
 Letters: P places, n sites, m unknowns of the target, d of them coordinates of the position. A site has r
-rows (measurements) and there are R rules. A rule is whitened sums rules @ w <= limits over the sites that
-are taken (w = 1).
+rows (measurements), B is the number of sets, and R is the number of rules.
 """
 
 from __future__ import annotations
@@ -176,6 +178,7 @@ def expand(
     places, r, m, n = rows.shape
     free, taken = np.flatnonzero(state == FREE), np.flatnonzero(state == IN)
     count, sure = len(free), len(taken)
+    # `inner` are the rows of the free sites; `lines` and `left` are their rules and the limits that remain
     inner = np.empty((places, r, m, count))
     for p in range(places):
         for q in range(r):

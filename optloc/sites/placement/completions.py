@@ -375,7 +375,7 @@ def picked(asked: CompletionRequest, order: Array) -> OtherSites:
 
 @compiled
 def scratch(m: int, d: int) -> CompletionWorkspace:
-    """Return scratch arrays for `m` unknowns with `d` position coordinates."""
+    """Return the scratch arrays of the enumeration for `m` unknowns with `d` position coordinates."""
     square, small = np.empty((2, m, m)), np.empty((3, d, d))
     return CompletionWorkspace(
         square[0], square[1], small[0], small[1], small[2], np.empty(d), np.zeros(1, dtype=np.int64)
@@ -417,12 +417,15 @@ def exhaust(asked: CompletionRequest, state: Array, order: Array, most: int, eno
     room = min(most, number_left(asked.rules[0], asked.limits[0], state))
     if room < 1:
         return enough
+    # `room` is the number of sites that can be added, `sure` the number of taken sites, `deep` the largest depth. The
+    # last one or two sites are added by `finish`.
     members, sure, deep = np.empty(n + 2, dtype=np.int64), 0, max(0, room - (2 if asked.fail else 1))
     for j in range(n):
         if state[j] == IN:
             members[sure] = j
             sure += 1
     counted, others, work = is_counted(asked, order), picked(asked, order), scratch(m, asked.d)
+    # `at` is the next entry of `order` at each depth; `fresh` is True when a set is reached for the first time
     at, inverses = np.zeros(deep + 1, dtype=np.int64), np.empty((deep + 1, places, m, m))
     condition = np.empty(deep + 1)
     condition[0] = grow(asked, members, sure, inverses[0], np.inf, inverses[0], work)

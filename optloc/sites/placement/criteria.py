@@ -215,7 +215,7 @@ def bend(
     """Add the second derivatives of tr(W Cov) by the weights to the lower triangle of a Hessian (n, n).
 
     The entry is factor * (2 (g_i'M^-1 g_j)(c_i'W c_j) + extra (c_i'W c_j)^2); for log det Cov, `extra` is -1.
-    `rows`, `u` and `v` are those of `slope`. `near` and `along` (n,) are scratch.
+    `slope` explains `rows` and computes `u` and `v`. `near` and `along` (n,) are scratch.
     """
     r, m, n = rows.shape
     d = v.shape[1]
@@ -368,8 +368,8 @@ def turned(
     """Add the change of eigenvectors and eigenvalue shares with w to the Hessian (n, n); `bend` omits this change.
 
     `cov` (d, d) is the covariance, with the eigenvectors `basis` (d, d, columns) and their `shares` (d,); see
-    `measure`. `u` (r, m, n) is that of `slope`, and `gradient` (n,) is the gradient of tr(W Cov). `factor` is
-    the weight of the item. `along` (n,) is scratch.
+    `measure`. `u` (r, m, n) is an output of `slope`, and `gradient` (n,) is the gradient of tr(W Cov).
+    `factor` is the weight of the item. `along` (n,) is scratch.
     """
     d, n = shares.shape[0], hessian.shape[0]
     values = np.empty(d)

@@ -143,8 +143,8 @@ def _inside(place: Array, region: PlacementRegion, ground: PlacementGround | Non
 def _criterion_at(candidates: Candidates, sites: Array, places: Array) -> float:
     """Return the criterion with the new sites at positions (k, d), metres; the rows are linearised there.
 
-    `sites` (k,) are the numbers of the new sites. The criterion is that of `formulations.placement`: m^2, or
-    log det for "volume".
+    `sites` (k,) are the numbers of the new sites. The unit is m^2, except for "volume": log det of the
+    covariance.
     """
     selection, stations = candidates.selection, candidates.selection.problem.stations
     position = np.array(stations.position)
@@ -199,6 +199,7 @@ class _Row:
     """
 
     def __init__(self, candidates: Candidates, kind: str, site: int, a: int, b: int, scale: Array, rest: Array) -> None:
+        """Store the row of a site; `a` and `b` are the numbers of its stations (b < 0: no second station)."""
         stations, d = candidates.problem.stations, candidates.design.dimension
         self.kind, self.site, self.scale, self.rest = kind, site, scale, rest
         axes = stations.axes

@@ -79,6 +79,7 @@ def share_out(
     (Q,) 0 are omitted.
     """
     count, n = slopes.shape
+    # `pull` is sum a_q g_q, `push` is sum mu / s_q - 1, and `total` is sum a_q
     pull, push, total = np.zeros(n), -1.0, 0.0
     gradient[:] = 0.0
     for q in range(count):
@@ -219,6 +220,7 @@ def bound_at(
     `gradient` (n,) is its slope. `duals`, `rules` and `limits` are as in `step`. `at` (n,) is the minimiser
     of `cheapest`.
     """
+    # `held` is the part of the tangent that does not depend on the weights
     n, held = x.shape[0], low
     for j in range(n):
         reduced[j] = gradient[j]
@@ -284,6 +286,8 @@ def relax(
     values, share, slopes = np.empty((2, items)), np.ones(items), np.empty((items, n))
     gradient, hessian, reduced, at = np.empty(n), np.empty((n, n)), np.empty(n), np.empty(n)
     left, duals, x, turns = np.empty(count), np.empty(2 * n + count), w.copy(), np.zeros(items)
+    # `turns` are the weights of the items, `best` is the least criterion of weights that meet the rules, `late` counts
+    # the steps after `best` fell below `enough`, and `taken` counts all steps.
     bound, best, mu, level, late, taken = -np.inf, np.inf, -1.0, 0.0, 0, 0
     while taken < most:
         taken += 1
@@ -318,7 +322,7 @@ def relax(
 
 @compiled
 def mix(turns: Array, slopes: Array, gradient: Array) -> None:
-    """Write the gradient (n,): the sum of the item gradients (Q, n), weighted by `turns` (Q,)."""
+    """Write the gradient (n,) of the weighted sum of the items with gradients (Q, n) and weights `turns` (Q,)."""
     for j in range(gradient.shape[0]):
         gradient[j] = 0.0
         for q in range(turns.shape[0]):
@@ -329,7 +333,7 @@ def mix(turns: Array, slopes: Array, gradient: Array) -> None:
 def product(x: Array, left: Array, duals: Array, level: float, values: Array, share: Array) -> float:
     """Return the mean product of slacks and multipliers of sites, rules and (if there are several) items.
 
-    The next barrier parameter is a share of this mean. The arguments are those of `go`.
+    The next barrier parameter is a share of this mean. `go` explains the arguments.
     """
     n, count, items = x.shape[0], left.shape[0], share.shape[0]
     total, terms = 0.0, 2 * n + count
@@ -364,15 +368,18 @@ def go(
 
     Parameters
     ----------
-    x, left, duals, share : array (n,), (R,), (2 n + R,), (Q,)
-        Weights, slacks of the rules, multipliers of limits and rules, and multipliers of the items. All are
-        updated.
+    x, left, duals : array (n,), (R,), (2 n + R,)
+        Weights, slacks of the rules, and multipliers of 0 <= x <= 1 and of the rules. All are updated.
     rules, limits : array (R, n), (R,)
         rules @ x <= limits.
     mu, level : float
         Barrier parameter and level t of the items.
-    values, active : array (Q,)
-        Items at x; items with `active` 0 are omitted from the step.
+    values : array (Q,)
+        Items at x.
+    share : array (Q,)
+        Multipliers of the items; updated.
+    active : array (Q,)
+        Items with 0 are omitted from the elimination of the level.
     slopes : array (Q, n)
         Gradients of the items.
     gradient, hessian : array (n,), (n, n)

@@ -442,7 +442,7 @@ def _grid_in_polygon(section: TargetsTable, frame: Frame, dimension: int, folder
 def _range_limits(file: SelectionFile, counts: Sequence[int], source: str) -> Array | None:
     """Return the largest range (m,) at which each row is measured, metres; None if no section has a limit.
 
-    `counts` are the numbers of rows of the sections. The order of the m rows is that of the assembled problem.
+    `counts` are the numbers of rows of the sections. The m rows are in the order of the assembled problem.
     """
     if all(section.range_max is None for section in file.measurements):
         return None

@@ -368,7 +368,7 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
     n, index = len(names), {name: i for i, name in enumerate(names)}
 
     def indices_of(wanted: Sequence[str], argument: str) -> Array:
-        """Return the indices of sites by name, or raise for an unknown name."""
+        """Return the indices (k,) of sites by name; an unknown name is an error in `argument`."""
         for name in wanted:
             if name not in index:
                 raise InvalidProblem(f"there is no site {name!r}", argument, nearest(name, list(names)))
@@ -433,7 +433,10 @@ def _costs(selection: SiteSelection, n: int, site: Array) -> Array:
 
 
 def _check_determined(candidates: Candidates) -> None:
-    """Raise if all sites together do not determine the position at a place: then no set of sites has a fix there."""
+    """Raise if all sites together do not determine the position at a place: then no set of sites has a fix there.
+
+    The prior alone would then set the position, and the criterion would have no meaning.
+    """
     in_sight = (candidates.design.rows != 0.0).any(axis=(1, 2)) & (candidates.state != 0)
     rows = candidates.design.rows[..., candidates.state != 0]
     places, r, m, n = rows.shape
