@@ -69,7 +69,7 @@ class Recent:
     def lost(self) -> bool:
         """Return whether the track is lost: the window is full, and as bad as with half of its rows beyond the gate.
 
-        A start must have a full window of scans behind it.
+        Scans before the last start do not count: the window must be full since then.
         """
         return self.since >= len(self.scans) == self.scans.maxlen and self.share > _LOST
 

@@ -1,29 +1,20 @@
 """Errors that last from scan to scan: their detection in the innovations of a track, and their part of its covariance.
 
-A filter averages its rows as if their errors were independent. Delays of receivers, multipath and
-attitude last for
-many scans, so the average keeps them. The true covariance of a filter with lasting errors follows from
-its gain K, as
-in the consider analysis of Schmidt [1]_. Each station has an error b of s standard deviations of its
-rows, or all
-angles share one error. The error is a Gauss-Markov process that keeps the share phi from scan to scan.
-The rows measure
-h(x) + D b + v, with white noise v. The error e of the state has two steps:
+A filter averages its rows as if their errors were independent. Delays of receivers, multipath and attitude last for
+many scans, so the average keeps them. The true covariance of a filter with lasting errors follows from its gain K,
+as in the consider analysis of Schmidt [1]_. Each station has an error b of s standard deviations of its rows, or
+all angles share one error. The error is a Gauss-Markov process that keeps the share phi from scan to scan. The rows
+measure h(x) + D b + v, with white noise v. The error e of the state has two steps:
 
     e <- F e + w,   e <- (I - K H) e - K (D b + v).
 
-Its covariance is the covariance of the filter, plus (c^2 - 1) times the part from v, plus s^2 times the
-part from b.
-c is the true standard deviation of v divided by the stated one. The filter and its estimates do not
-change. The
-covariance of the innovations of a scan is linear in s^2 and c^2, and so is their covariance with the
-innovations before.
-Weighted least squares estimates both factors, and its score tests them [2]_.
+Its covariance is the covariance of the filter, plus (c^2 - 1) times the part from v, plus s^2 times the part from
+b. c is the true standard deviation of v divided by the stated one. The filter and its estimates do not change. The
+covariance of the innovations of a scan is linear in s^2 and c^2, and so is their covariance with the innovations
+before. Weighted least squares estimates both factors, and its score tests them [2]_.
 
-Letters: m rows of a scan, n numbers of a state, q lasting errors (stations times kinds), j hypotheses
-about the
-correlation time. F is the transition of the prediction, H (m, n) the derivative of the rows, R (m, m)
-their stated
+Letters: m rows of a scan, n numbers of a state, q lasting errors (stations times kinds), j hypotheses about the
+correlation time. F is the transition of the prediction, H (m, n) the derivative of the rows, R (m, m) their stated
 covariance. D (m, q) is the derivative of the rows by the errors.
 
 References

@@ -233,18 +233,16 @@ def _solve_scans(scan: Problem) -> tuple[Array, Array]:
 def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, floor: float = 0.0) -> Track:
     """Return the track of a target by the simplified recursion: running means of the angles and a scalar gain in range.
 
-    Angles are averaged. The range is updated with a scalar least-squares gain, by the part of the excess path
-    that the
-    step of the angles does not explain. For a static target, its variance in range approaches twice the
-    variance of the
-    maximum-likelihood fix. For a moving target, the track lags, and the covariance does not include this error.
+    Angles are averaged. The range is updated with a scalar least-squares gain, by the part of the excess path that
+    the step of the angles does not explain. For a static target, its variance in range approaches twice the
+    variance of the maximum-likelihood fix. For a moving target, the track lags, and the covariance does not include
+    this error.
 
     Parameters
     ----------
     problem : Problem
-        Batch (...) of runs: range sums of one pair of static stations, azimuth and elevation at one of them,
-        each once
-        per epoch. An epoch without all three does not change the state.
+        Batch (...) of runs: range sums of one pair of static stations, azimuth and elevation at one of them, each
+        once per epoch. An epoch without all three does not change the state.
     restart : int, optional
         Number of epochs after which the recursion starts again; None for never.
     mean : int
@@ -255,8 +253,7 @@ def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, f
     Returns
     -------
     Track
-        Positions, one for each epoch. The covariance is the first-order covariance of the recursion for a
-        static
+        Positions, one for each epoch. The covariance is the first-order covariance of the recursion for a static
         target.
 
     Raises
@@ -266,9 +263,8 @@ def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, f
 
     References
     ----------
-    M. I. Skolnik, "An analysis of bistatic radar", IRE Trans. Aerosp. Navig. Electron. ANE-8 (1961) (the
-    ellipse). The
-    recursion is taken from the paper of the page "One receiver and one illuminator", with corrected signs and
+    M. I. Skolnik, "An analysis of bistatic radar", IRE Trans. Aerosp. Navig. Electron. ANE-8 (1961) (the ellipse).
+    The recursion is taken from the paper of the page "One receiver and one illuminator", with corrected signs and
     indices.
     """
     check_trackable(problem)

@@ -36,12 +36,10 @@ _KEPT = Cache["ScanRows | None"](256)
 class Scans:
     """The scans of a run of one target for the compiled update.
 
-    All shipped filters use these arrays. The general form of `optloc.tracking.updates` handles all other
-    cases: kinds
-    without a tape (compiled formula), biases among the states, and station errors whose noise depends on the
-    position. It
-    also handles noise that correlates epochs, batches with different stations or noise, and arrays of other
-    libraries.
+    All shipped filters use these arrays. The general form of `optloc.tracking.updates` handles all other cases:
+    kinds without a tape (compiled formula), biases among the states, and station errors whose noise depends on the
+    position. It also handles noise that correlates epochs, batches with different stations or noise, and arrays of
+    other libraries.
 
     - problem: the run, see `optloc.tracking.track.scans`; its model of motion is ignored.
     - order: order of the states (0: position, 1: with velocity, 2: with acceleration).

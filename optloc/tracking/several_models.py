@@ -186,12 +186,10 @@ def imm(
 def mixed(states: Sequence[State], weight: Array, transition: Array) -> tuple[list[State], Array]:
     """Return the mixed state of each model before the next prediction, and the predicted probabilities (..., q).
 
-    The mixed state of a model is a mixture of the states of all models, weighted by the probability that each
-    was the last
-    model. `states` are the states of q models after the last scan, possibly of different orders. `weight`
-    (..., q) are the
-    probabilities after the last scan, and `transition` (q, q) is the table of `imm`. The mixed states keep
-    the orders.
+    The mixed state of a model is a mixture of the states of all models, weighted by the probability that each was
+    the last model. `states` are the states of q models after the last scan, possibly of different orders. `weight`
+    (..., q) are the probabilities after the last scan, and `transition` (q, q) is the table of `imm`. The mixed
+    states keep the orders.
     """
     coming = weight @ transition
     # Probability that the model was i, given that it is j now; for an unreachable model, avoid 0 / 0.

@@ -62,9 +62,8 @@ def associated(
     update : callable or str
         A filter, or its name in `UPDATES`.
     missing : "drop" or "expect"
-        Treatment of a channel without a row. "drop" ignores it. "expect" uses the prediction as a
-        measurement, so that
-        the covariance is too small. It is for comparison with a paper only
+        Treatment of a channel without a row. "drop" ignores it. "expect" uses the prediction as a measurement, so
+        that the covariance is too small. It is for comparison with a paper only
         (doi:10.7654/j.issn.2097-1974.20240501).
 
     Raises

@@ -61,9 +61,8 @@ class Track:
     loglikelihood : array (..., k)
         Log-likelihood of each scan given the prediction.
     code : int array (..., k)
-        `Status` of each scan. Ok. Too few rows: no valid row, the state is only predicted. Rejected: rows
-        failed the
-        gate or are not finite. Numerical: the state is lost.
+        `Status` of each scan. Ok. Too few rows: no valid row, the state is only predicted. Rejected: rows failed
+        the gate or are not finite. Numerical: the state is lost.
     dimension : int
         2 or 3.
     """

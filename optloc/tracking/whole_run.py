@@ -54,8 +54,7 @@ def along(state: State, times: Array, dimension: int) -> tuple[Array, Array]:
     """Return states (..., k, n) and covariances (..., k, n, n) along a polynomial course.
 
     The order of the course follows from the length n of the state: position, and velocity and acceleration if
-    present.
-    `times` (k,) are in seconds, before or after the state. `dimension` is 2 or 3.
+    present. `times` (k,) are in seconds, before or after the state. `dimension` is 2 or 3.
     """
     # Without process noise, the transition is exact forward and backward in time.
     model = polynomial(state.mean.shape[-1] // dimension - 1)

@@ -93,8 +93,7 @@ class DetectionChain:
     detections : tuple of Detection
         Detections with models of this plug-in.
     x : array (q, n)
-        States at the last detection that fit, best first: metres, then m/s. A state is only a position if no
-        row or
+        States at the last detection that fit, best first: metres, then m/s. A state is only a position if no row or
         prior determines the velocity. q = 0 if no position is determined.
     cov : array (n, n), optional
         Covariance of the first state; None if it is too wide for a Gaussian, or if there are several states.

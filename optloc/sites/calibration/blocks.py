@@ -52,8 +52,7 @@ class StationBlock:
     index : int
         Number of the station or pulse.
     proven : bool
-        Whether it is proven that no other position costs less, and that all positions within `AMBIGUOUS_GAP`
-        are
+        Whether it is proven that no other position costs less, and that all positions within `AMBIGUOUS_GAP` are
         listed.
     cheapest : bool
         Whether it is proven that no other position costs less.
@@ -146,9 +145,8 @@ def elsewhere(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
     Returns
     -------
     tuple of StationBlock
-        One block for each other position that costs at most `MOVED` more. The refinement starts from mirror
-        images in
-        the principal planes and in the centre of the block's partners.
+        One block for each other position that costs at most `MOVED` more. The refinement starts from mirror images
+        in the principal planes and in the centre of the block's partners.
     """
     net = lik.network
     stations, d = np.array(_inexact_stations(net), dtype=int), net.dimension

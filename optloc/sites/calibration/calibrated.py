@@ -94,8 +94,7 @@ class Calibration:
     emission : array (N,)
         Emission times multiplied by the propagation speed, metres.
     covariance : array (P, P)
-        Covariance of the M d station coordinates, then of unknown clocks, in that frame, square metres. NaN
-        if the
+        Covariance of the M d station coordinates, then of unknown clocks, in that frame, square metres. NaN if the
         measurements do not determine a motion.
     gauge : str
         Definition of the frame: "known places", "centre and main axes of the stations" or names of stations.
@@ -104,8 +103,7 @@ class Calibration:
     findings : tuple of str
         One sentence for each problem; empty for `ok`.
     proof : "blockwise" or "unknown"
-        "blockwise" is a proof for each single station or pulse while all others are fixed: no other position
-        has a
+        "blockwise" is a proof for each single station or pulse while all others are fixed: no other position has a
         lower cost. For a station, no other position costs up to 9 more. The proof does not cover joint moves of
         several stations or pulses.
     cost : float
@@ -513,8 +511,7 @@ def _alternatives(
 def _same_stations(at: NetworkEstimate, other: Alternative, covariance: Array) -> bool:
     """Return whether another network has the same stations as `at` (S = 1), within the covariance (P, P), m^2.
 
-    The stations are within the 95 % ellipsoid, and the covariance covers the squared error that the other
-    network
+    The stations are within the 95 % ellipsoid, and the covariance covers the squared error that the other network
     adds in proportion to its likelihood.
     """
     if not np.isfinite(covariance).all():

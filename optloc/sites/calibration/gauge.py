@@ -200,9 +200,8 @@ def in_frame(net: Network, at: NetworkEstimate, named: tuple[int, ...]) -> Netwo
     -------
     NetworkEstimate
         One of the two mirror images: the station that is farthest from the plane of the first two axes is above
-        this plane. In two dimensions, the same applies to the first axis. Without named stations, the station
-        with
-        the largest coordinate along each axis is on the positive side.
+        this plane. In two dimensions, the same applies to the first axis. Without named stations, the station that
+        is farthest from the origin along an axis has a positive coordinate there.
     """
     d = net.dimension
     stations = at.stations[0]

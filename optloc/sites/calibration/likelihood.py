@@ -3,7 +3,7 @@
 The network becomes a run of `optloc.problem`: each pulse is an epoch, and the station errors are constant
 over the run.
 
-Letters: S estimates, M stations, N pulses, R slots (columns of measurements), d coordinates. P is the
+Letters: S estimates, M stations, N pulses, R slots (columns of measurements), m rows of a run, d coordinates. P is the
 number of station unknowns: M d coordinates, then M clocks if the stations do not share a clock. A
 whitened number is divided by its standard deviation.
 """

@@ -27,7 +27,7 @@ _INSIDE = 0.02
 
 @compiled
 def propagate(rules: Array, limits: Array, state: Array) -> bool:
-    """Fix in `state` (n,) all sites that the rules decide; return False if the rules allow no set any more.
+    """Fix in `state` (n,) all sites that the rules decide; return False if the rules then allow no set.
 
     If all free sites fit together, the function takes them all: another site never makes a criterion worse.
     """

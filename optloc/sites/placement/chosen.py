@@ -103,13 +103,10 @@ class Placement:
     criterion : str
         "rms", "volume" or "axis".
     value, bound : float
-        The criterion of this set, and a lower bound for all sets that meet the rules, square metres. At each
-        place,
-        the criterion is the squared error ("rms"), the geometric mean of the variances along the axes
-        ("volume"), or
-        the largest variance ("axis"). The value is the mean over the places (geometric for "volume"), or
-        their maximum
-        if the selection has `worst`. With `fail_one`, it is the value after the worst loss of one site.
+        The criterion of this set, and a lower bound for all sets that meet the rules, square metres. At each place,
+        the criterion is the squared error ("rms"), the geometric mean of the variances along the axes ("volume"),
+        or the largest variance ("axis"). The value is the mean over the places (geometric for "volume"), or their
+        maximum if the selection has `worst`. With `fail_one`, it is the value after the worst loss of one site.
     gap : float
         Relative difference of value and bound: 1 - bound / value.
     closed : bool
@@ -117,12 +114,10 @@ class Placement:
     reason : str
         The meaning of gap and bound, as a sentence.
     per_place, failed : array (P,)
-        Bound of the position error at each place (root of the trace), metres: with this set, and after the
-        worst
+        Bound of the position error at each place (root of the trace), metres: with this set, and after the worst
         loss of one site at this place.
     before : array (P,)
-        The same bound for the kept sites. If the kept sites give no fix, it is the bound of the median of
-        random
+        The same bound for the kept sites. If the kept sites give no fix, it is the bound of the median of random
         sets.
     before_sites : tuple of str
         Sites of `before`.
