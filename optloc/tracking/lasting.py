@@ -132,9 +132,9 @@ def _errors(R: Array, columns: Array, sign: Array, stations: int) -> Array:
     `columns` (m, 2) are the error numbers of the two stations of each row (-1: none), and `sign` (m,) is the
     sign of the second station (0 for angles); see `touched`. `stations` is the number of stations.
 
-    `_Recursion` has the hypotheses j. Only angles share an error: an attitude. A common offset of ranges to
-    stations in one direction is the same as an error of the position. With this hypothesis, real tracks lost
-    a fifth of their `ok` scans.
+    `_Recursion` has the hypotheses j. Only angles share an error: an attitude. Ranges share none, because a common
+    offset of ranges to stations in one direction is the same as an error of the position. When ranges shared an
+    error, real tracks lost a fifth of their `ok` scans.
     """
     two = columns[:, 1] >= 0
     size = np.sqrt(np.diagonal(R) / np.where(two, 2.0, 1.0))

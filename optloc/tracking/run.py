@@ -184,7 +184,7 @@ class _TrackRun:
         if isinstance(rule, Filter):
             own = min(gate, rule.how.gate)
             how = rule.how._replace(gate=float(own), most=rules.most, d=problem.dimension)
-        # Whatever the position of the centre, one station is at least half of the largest extent away from it.
+        # For any position of the centre, one station is at least half of the largest extent away from it.
         near = 0.5 * float(np.ptp(problem.stations.places.reshape(-1, problem.dimension), axis=0).max())
         return cls(problem, Scans.of(problem, dynamics.order), bad, dynamics, rule, rules, how, near**2)
 

@@ -323,7 +323,7 @@ def begin(
     """Return a start at scan `first` or later, without a guess.
 
     The smallest number of scans that determines the state is solved as one problem. If their rows contradict
-    each other, a later scan is tried as the first one. If several states explain the rows, the stretch of
+    each other, the start begins at a later scan. If several states explain the rows, the stretch of
     scans is extended. `speed`, `rate` and `method` are as in `begun`. With `ends`, `problem` has all scans of
     the run; otherwise a start that needs later scans raises `Undecided`.
     """

@@ -1,8 +1,8 @@
 """Update of a predicted state by one scan: all filters use the same linearised rows.
 
 Letters: m rows of a scan, n numbers of a state, (...) a batch of states. H (m, n) is the derivative of
-the rows, P (n, n) the covariance of the predicted state, R (m, m) the covariance of the rows. K (n, m) is
-the gain, S = H P H' + R the covariance of the innovations. Whitened rows have R = I.
+the rows, and R (m, m) is their covariance. P (n, n) is the covariance of the predicted state, K (n, m) is the
+gain, and S = H P H' + R is the covariance of the innovations. Whitened rows have R = I.
 """
 
 from __future__ import annotations

@@ -286,8 +286,8 @@ def relax(
     values, share, slopes = np.empty((2, items)), np.ones(items), np.empty((items, n))
     gradient, hessian, reduced, at = np.empty(n), np.empty((n, n)), np.empty(n), np.empty(n)
     left, duals, x, turns = np.empty(count), np.empty(2 * n + count), w.copy(), np.zeros(items)
-    # `turns` are the weights of the items, `best` is the least criterion of weights that meet the rules, `late` counts
-    # the steps after `best` fell below `enough`, and `taken` counts all steps.
+    # `turns` are the weights of the items, and `best` is the least criterion of weights that meet the rules. `late`
+    # counts the steps after `best` fell below `enough`, and `taken` counts all steps.
     bound, best, mu, level, late, taken = -np.inf, np.inf, -1.0, 0.0, 0, 0
     while taken < most:
         taken += 1
