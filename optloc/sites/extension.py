@@ -75,7 +75,7 @@ def place(
 
 
 def _commands(app: typer.Typer) -> None:
-    """Add the commands of this package to the command line."""
+    """Add the commands `place` and `calibrate` to the command line."""
     app.command(rich_help_panel=ANSWERS, epilog=_PLACE)(place)
     app.command(rich_help_panel=ANSWERS, epilog=example(*NETWORKS))(calibrate)
 
@@ -90,7 +90,7 @@ def _kernels() -> Mapping[str, KernelPart]:
 
 
 def _place() -> None:
-    """Run a small placement, which calls all compiled functions."""
+    """Run a small placement that calls, and so compiles, all compiled functions of this package."""
     from optloc.cli import TARGET, problem_of
     from optloc.sites.placement import SiteSelection, place as chosen
 

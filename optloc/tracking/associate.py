@@ -1,4 +1,11 @@
-"""Data association: assignment of unlabelled rows to several predicted targets."""
+"""Data association: assignment of unlabelled rows to several predicted targets.
+
+A channel is a kind of measurement at its stations. In one scan, each channel has candidates: measured
+values that come from a target or are false.
+
+Letters: t targets, m channels, c candidates of a channel, n numbers of a state. S is the covariance of
+the innovations of a target. (...) are the axes of a batch of runs.
+"""
 
 from __future__ import annotations
 
@@ -45,6 +52,7 @@ def nearest(width: float = 5.0) -> Associate:
     check_width(width)
 
     def rule(scan: Problem, ahead: State, z: Array) -> Array:
+        """Return the picks (..., t, m) of the nearest candidates in the gate."""
         apart, S = offsets(scan, ahead, z)
         # argmin is also 0 for a row without a candidate; the infinite distance distinguishes this case.
         distance = distances(apart, S, width)
@@ -71,6 +79,7 @@ def joint(clutter: Clutter) -> Associate:
     """
 
     def rule(scan: Problem, ahead: State, z: Array) -> Array:
+        """Return the picks (..., t, m) of the best set of each target."""
         sets = scored(scan, ahead, z, clutter)
         return sets.chosen(sets.score.argmin(-1))
 
@@ -95,6 +104,7 @@ def assigned(clutter: Clutter) -> Associate:
     """
 
     def rule(scan: Problem, ahead: State, z: Array) -> Array:
+        """Return the picks (..., t, m) of the best sets of all targets together."""
         # Most scans need no integer programme: if the best sets of all targets share no row, their sum is the minimum.
         sets = scored(scan, ahead, z, clutter)
         pick = sets.chosen(sets.score.argmin(-1))
@@ -108,40 +118,44 @@ def assigned(clutter: Clutter) -> Associate:
 
 
 def _compete(pick: Array) -> bool:
-    """Return whether any two targets take the same candidate, from picks (t, m)."""
+    """Return whether any two targets take the same candidate, from picks (t, m): a candidate number, or -1."""
     same = (pick[:, None] == pick[None]) & (pick[:, None] >= 0)
     return bool(same.any(-1).sum() > (pick >= 0).any(-1).sum())
 
 
 def _assign(sets: Sets) -> Array:
-    """Return the numbers (t,) of one set per target with the lowest sum of scores, without common candidates."""
+    """Return the numbers (t,) of one set per target with the lowest sum of scores, without common candidates.
+
+    An integer programme finds the sets. `sets` contains score (t, q) and picks (t, q, m) of q sets for each
+    target.
+    """
     from scipy.optimize import Bounds, LinearConstraint, milp
     from scipy.sparse import csr_array
 
-    owner, number, wanted = [], [], []
-    for target, own in enumerate(sets.score):
+    owners, number, wanted = [], [], []
+    for target, scores in enumerate(sets.score):
         # The empty set is the first set and conflicts with no set: sets with a higher score are not needed.
-        better = np.flatnonzero(own < own[0])
-        better = better[np.argsort(own[better], kind="stable")][:_RIVALS]
+        better = np.flatnonzero(scores < scores[0])
+        better = better[np.argsort(scores[better], kind="stable")][:_RIVALS]
         numbers = np.concatenate([[0], better])
-        owner.append(np.full(len(numbers), target))
+        owners.append(np.full(len(numbers), target))
         number.append(numbers)
         wanted.append(sets.picks[target, numbers])
-    who, which, pick = np.concatenate(owner), np.concatenate(number), np.concatenate(wanted)
+    owner_of_set, which, pick = np.concatenate(owners), np.concatenate(number), np.concatenate(wanted)
     column, channel = np.nonzero(pick >= 0)
     _, row = np.unique(np.stack([channel, pick[column, channel]]), axis=1, return_inverse=True)
     # Constraints: one set for every target, possibly the empty set; no row in two chosen sets.
-    everyone = csr_array((np.ones(len(who)), (who, np.arange(len(who)))))
-    once = csr_array((np.ones(len(row)), (row, column)), shape=(int(row.max()) + 1, len(who)))
+    everyone = csr_array((np.ones(len(owner_of_set)), (owner_of_set, np.arange(len(owner_of_set)))))
+    once = csr_array((np.ones(len(row)), (row, column)), shape=(int(row.max()) + 1, len(owner_of_set)))
     solved = milp(
-        sets.score[who, which],
-        integrality=np.ones(len(who), dtype=np.int64),
+        sets.score[owner_of_set, which],
+        integrality=np.ones(len(owner_of_set), dtype=np.int64),
         bounds=Bounds(0.0, 1.0),
         constraints=[LinearConstraint(everyone, 1.0, 1.0), LinearConstraint(once, -np.inf, 1.0)],
     )
     assert solved.x is not None  # the empty sets of all targets are always feasible
     taken = np.flatnonzero(solved.x > 0.5)
-    return np.asarray(which[taken[np.argsort(who[taken])]])
+    return np.asarray(which[taken[np.argsort(owner_of_set[taken])]])
 
 
 # Scores of sets of rows, at most one row of each channel, for predicted targets.
@@ -167,6 +181,7 @@ class Clutter:
     width: float = 5.0
 
     def __post_init__(self) -> None:
+        """Raise InvalidProblem for a probability, density or width out of range."""
         if not 0.0 < self.detection < 1.0:
             what = f"the probability of detection is {self.detection}"
             raise InvalidProblem(what, "detection", "give a number between 0 and 1")
@@ -177,7 +192,10 @@ class Clutter:
         check_width(self.width)
 
     def of(self, scan: Problem) -> Array:
-        """Return the density of false rows in each channel of a scan, (m,); raise InvalidProblem for unknown kinds."""
+        """Return the density of false rows in each channel of a scan, (m,), per metre or radian.
+
+        A kind without a density raises InvalidProblem.
+        """
         values = []
         for block in scan.rows:
             density = self.density.get(block.kind) if isinstance(self.density, Mapping) else self.density
@@ -208,9 +226,9 @@ class Sets:
 def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
     """Return the scores of all sets of candidates within their gates; see `optloc.tracking.associate.joint`.
 
-    `scan` has one row for each channel, `ahead` holds the predicted targets (..., t), and `z` (..., m, c) the
-    candidates. Sets grow channel by channel: the density of a set is the product of the densities of each row given the
-    rows before it. If there are too many sets, only the best partial sets are kept.
+    `scan` has one row for each channel. `ahead` contains the predicted targets (..., t), and `z` (..., m, c)
+    the candidates. Sets grow channel by channel: the density of a set is the product of the densities of each
+    row given the rows before it. If there are too many sets, only the best partial sets are kept.
     """
     apart, S = offsets(scan, ahead, z)
     distance = distances(apart, S, clutter.width)
@@ -248,7 +266,10 @@ def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
 
 
 def _keep_best(score: Array) -> Array:
-    """Return the numbers (..., p) of the sets (..., q) that are kept: the empty set first, at most `_SETS` sets."""
+    """Return the numbers (..., p) of the best p of q sets: the empty set first, at most `_SETS` sets.
+
+    `score` (..., q) is small for likely sets; sets that are impossible for all targets are omitted.
+    """
     possible = np.flatnonzero(np.isfinite(score).any(tuple(range(score.ndim - 1))))
     if len(possible) <= _SETS:
         return np.broadcast_to(possible, (*score.shape[:-1], len(possible)))
@@ -264,8 +285,8 @@ def _keep_best(score: Array) -> Array:
 def offsets(scan: Problem, ahead: State, z: Array) -> tuple[Array, Array]:
     """Return candidates minus predicted measurements of each target (..., t, m, c), and S (..., t, m, m).
 
-    `scan` has one row for each channel, `ahead` holds the predicted targets (..., t), and `z` (..., m, c) the
-    candidates.
+    `scan` has one row for each channel. `ahead` contains the predicted targets (..., t), and `z` (..., m, c)
+    the candidates. The units are metres, radians, m/s or ratios, as in `z`.
     """
     expected = predict(scan, ahead.mean)
     apart = misfits(scan, z, expected)
@@ -274,7 +295,10 @@ def offsets(scan: Problem, ahead: State, z: Array) -> tuple[Array, Array]:
 
 
 def misfits(scan: Problem, z: Array, expected: Array) -> Array:
-    """Return candidates (..., m, c) minus predicted values (..., t, m) as (..., t, m, c), with angles wrapped."""
+    """Return candidates (..., m, c) minus predicted values (..., t, m) as (..., t, m, c), with angles wrapped.
+
+    `z` are the candidates of a scan, and `expected` are the predicted values of each target.
+    """
     apart = z[..., None, :, :] - expected[..., None]
     for block, start in zip(scan.rows, scan.starts, strict=True):
         if MODELS[block.kind].period is not None:
@@ -284,9 +308,9 @@ def misfits(scan: Problem, z: Array, expected: Array) -> Array:
 
 
 def distances(apart: Array, S: Array, width: float) -> Array:
-    """Return normalised distances (..., t, m, c) in sigmas; infinite outside the gate `width` and without a candidate.
+    """Return normalised distances (..., t, m, c) in sigmas; infinite outside the gate and without a candidate.
 
-    `apart` and `S` are the results of `offsets`.
+    `apart` and `S` are the results of `offsets`. `width` is the half width of the gate in sigmas.
     """
     distance = np.abs(apart) / np.sqrt(np.diagonal(S, axis1=-2, axis2=-1))[..., None]
     return np.where(distance <= width, distance, np.inf)

@@ -27,12 +27,18 @@ _LASTING = 5.0
 
 
 class Recent:
-    """Fit of the rows of the last scans to the prediction: their windowed NIS. Each row counts at most as the gate."""
+    """Fit of the rows of the last scans to the prediction: their windowed NIS.
+
+    NIS is the normalised innovation squared. The squared innovation of a row counts at most as the squared
+    gate.
+    """
 
     def __init__(self, rules: Rules) -> None:
+        """Start with an empty window."""
         # The window must separate a lost track from a few gross errors in succession, even with one row per scan. If
         # one row in ten is a gross error, ten of twenty occur in one window of a million.
         self.scans: deque[Fit] = deque(maxlen=_WINDOW * rules.patience)
+        # Rules of the track; largest squared innovation of a row that counts; number of scans since the start.
         self.rules, self.most, self.since = rules, rules.most, 0
         # Mean squared innovation as a share of the squared gate; 0 with too few rows.
         self.share = 0.0
@@ -41,14 +47,14 @@ class Recent:
         self.vague, self.lasting, self.rivals = "", 0.0, 0
 
     def begin(self, start: Beginning) -> None:
-        """Add the rows of a start. If they agree, the earlier scans are deleted; otherwise these still count."""
+        """Add the rows of a start. If they agree, the earlier scans are deleted; otherwise they still count."""
         if start.code == Status.OK:
             self.scans.clear()
         self.add(start.fit)
         self.since = 0
 
     def add(self, fit: Fit) -> None:
-        """Add the fit of the rows of one scan."""
+        """Add the fit of the rows of one scan: sum of their squared innovations in sigmas, and their number."""
         square, count = fit
         if count > 0:
             self.scans.append((min(square, self.most * count), count))
@@ -61,7 +67,10 @@ class Recent:
 
     @property
     def lost(self) -> bool:
-        """Return whether the window is full and as bad as with half of its rows beyond the gate."""
+        """Return whether the track is lost: the window is full, and as bad as with half of its rows beyond the gate.
+
+        Scans before the last start do not count: the window must be full since then.
+        """
         return self.since >= len(self.scans) == self.scans.maxlen and self.share > _LOST
 
     @property
@@ -73,7 +82,10 @@ class Recent:
         )
 
     def judge(self, entry: Entry) -> Entry:
-        """Return the entry of a scan; if its status is ok, the status that follows from the last scans replaces it."""
+        """Return the entry of a scan with the status that follows from the last scans.
+
+        The status is replaced only if it is ok.
+        """
         found = objections(_FINDINGS, self) if entry.code == Status.OK else []
         return replace(entry, code=found[0][0], reason=found[0][1]) if found else entry
 
@@ -99,12 +111,12 @@ _FINDINGS = (
 class Condition:
     """Condition of a track between two scans.
 
-    - state: None before a start.
+    - state: state after the last scan; None before a start.
     - last_row: time of the last valid row, s.
     - recent: fit of the last scans.
     - lasting: errors that last from scan to scan.
     - rivals: other states of the start that the scans do not refute.
-    - why: reason why the last state was given up.
+    - why: reason why the last state was given up; empty without a reason.
     - missed: number of successive scans in which the gate rejected most rows.
     - fresh: True until a given state has its first row.
     """
@@ -120,11 +132,15 @@ class Condition:
 
     @classmethod
     def of(cls, state: State | None, last_row: float, rules: Rules) -> Condition:
-        """Return the condition of a track before its first scan."""
+        """Return the condition of a track before its first scan; `state` is None if the track needs a start."""
         return cls(state, last_row, Recent(rules), LastingErrors(_WINDOW * rules.patience))
 
     def take(self, entry: Entry, fit: Fit, gated: int) -> None:
-        """Update the condition by a scan; `gated` is the number of rows that the gate rejected."""
+        """Update the condition by a scan.
+
+        `entry` is the result of the scan. `fit` is the sum of squared innovations (sigmas) and the number of its
+        rows. `gated` is the number of rows that the gate rejected.
+        """
         # Rows that are not finite have no information about the state: only rows that the gate rejected end a track. A
         # scan without rows does not change the count.
         used = int(entry.updated.count)
@@ -134,7 +150,10 @@ class Condition:
         self.state = State(entry.time, entry.updated.mean, entry.updated.cov)
 
     def judged(self, entry: Entry, cov: Array, vague: str) -> Entry:
-        """Return the entry with its covariance (n, n) and status; `vague` is the reason not to follow the position."""
+        """Return the entry with its covariance (n, n), lasting errors included, and its status.
+
+        `vague` is the reason why the position is too uncertain to follow; empty if it is not.
+        """
         self.recent.vague, self.recent.lasting, self.recent.rivals = vague, 0.0, len(self.rivals)
         if cov is not entry.updated.cov:
             self.recent.lasting = self.lasting.size
@@ -142,7 +161,10 @@ class Condition:
         return self.recent.judge(entry)
 
     def judge(self, vague: str) -> None:
-        """Give up the state if the track is lost, or if its position is too uncertain."""
+        """Give up the state if the track is lost, its position is too uncertain, or a rival is more likely.
+
+        `vague` is the reason why the position is too uncertain; empty if it is not. The reason is stored in `why`.
+        """
         if vague:
             self.state, self.why = None, vague
         elif self.missed >= self.recent.rules.patience:

@@ -35,7 +35,7 @@ def begun_with_constants(problem: Problem, dynamics: Dynamics, epochs: int) -> S
     State
         At the last used epoch: [p, v, a], then the biases in the order of the layout; NaN if there is no fix.
     """
-    _check(problem)
+    _check_constants(problem)
     time = float(problem.times[epochs - 1])
     # The state is estimated at the last used epoch, so that no scan is used twice.
     fix = solve(replace(cut(problem, 0, epochs), motions=(Motion(dynamics.order, reference=time),)))
@@ -74,7 +74,7 @@ def followed_with_constants(problem: Problem, start: State, dynamics: Dynamics, 
     ----------
     B. Friedland, "Treatment of bias in recursive filtering", IEEE Trans. Autom. Control 14 (1969): the augmented state.
     """
-    _check(problem)
+    _check_constants(problem)
     d = problem.dimension
     # All shared unknowns of the layout except the states of motion are constants of the run.
     constants = problem.layout.n_shared - sum((motion.order + 1) * d for motion in problem.motions)
@@ -82,7 +82,7 @@ def followed_with_constants(problem: Problem, start: State, dynamics: Dynamics, 
     return follow(problem, start, _with_constants(dynamics, constants), filter_of(update))
 
 
-def _check(problem: Problem) -> None:
+def _check_constants(problem: Problem) -> None:
     """Raise InvalidProblem if a tracker cannot use the run, or if a bias changes with time."""
     check_trackable(replace(problem, biases=()))
     # A bias that changes with time is not constant within a scan: its model would need the time.
@@ -93,9 +93,10 @@ def _check(problem: Problem) -> None:
 
 
 def _with_constants(dynamics: Dynamics, constants: int) -> Dynamics:
-    """Return dynamics of a state with additional constants at its end."""
+    """Return dynamics of a state with additional constants at its end; `constants` is their number."""
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        """Return F, Q and drive of the state with its constants; see `Step` of `optloc.tracking.dynamics`."""
         n = mean.shape[-1] - constants
         F, Q, drive = dynamics.step(dt, mean[..., :n], d)
         none = [(0, 0)] * (Q.ndim - 2)

@@ -17,14 +17,15 @@ from optloc.problem.problem import Problem
 def differences(run: Problem) -> Problem:
     """Return the run of one target with differences of arrivals in each epoch instead of the arrivals.
 
-    The differences and their covariance hold all information of the arrivals about positions.
+    The differences and their covariance contain all information of the arrivals about positions. So a tracker
+    needs no emission times.
     """
     scans = [reduce(cut(run, k, k + 1)) for k in range(run.epochs)]
     kinds = dict.fromkeys(rows.kind for scan in scans for rows in scan.rows)
-    own: dict[str, list[Rows]] = {kind: [] for kind in kinds}
+    blocks_of_kind: dict[str, list[Rows]] = {kind: [] for kind in kinds}
     numbers = [np.zeros(scan.count, dtype=np.int64) for scan in scans]
     count = 0
-    for kind, found in own.items():
+    for kind, found in blocks_of_kind.items():
         for k, scan in enumerate(scans):
             for rows, start in zip(scan.rows, scan.starts, strict=True):
                 if rows.kind == kind:
@@ -37,15 +38,18 @@ def differences(run: Problem) -> Problem:
         for block in scan.noise.blocks
         if block.row.size
     ]
-    return replace(run, rows=tuple(_one_after_another(found) for found in own.values()), noise=Noise(tuple(blocks)))
+    return replace(
+        run, rows=tuple(_one_after_another(found) for found in blocks_of_kind.values()), noise=Noise(tuple(blocks))
+    )
 
 
 def _one_after_another(parts: list[Rows]) -> Rows:
-    """Return several blocks of rows of one kind as one block."""
+    """Return several blocks of rows of one kind as one block, in the given order."""
 
-    def of(name: str) -> Array:
+    def joined_column(name: str) -> Array:
+        """Return the values of all rows in the column `name`."""
         return np.concatenate([getattr(part, name) for part in parts])
 
     names = ("z", "a", "b", "epoch", "target", "weight", "correction")
-    columns: dict[str, Any] = {name: of(name) for name in names}
+    columns: dict[str, Any] = {name: joined_column(name) for name in names}
     return replace(parts[0], **columns)

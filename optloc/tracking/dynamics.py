@@ -1,4 +1,10 @@
-"""Models of motion from one scan to the next: transition F, process noise Q and drive of a state [p, v, a]."""
+"""Models of motion from one scan to the next: transition F, process noise Q and drive of a state [p, v, a].
+
+The state is position, velocity and acceleration, as far as the order of the model has them, in m, m/s and
+m/s^2. Each part has d coordinates, and the whole state has n. A prediction is mean <- F mean + drive,
+covariance <- F covariance F' + Q. The drive is an input that the model computes from the mean; most
+models have none.
+"""
 
 from __future__ import annotations
 
@@ -67,6 +73,7 @@ def polynomial(order: int, noise: float = 0.0) -> Dynamics:
         raise InvalidProblem(f"the process noise is {noise}", "noise", "give a standard deviation of at least 0")
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        """Return F (n, n), Q and drive of one time step; see `Step`."""
         return *_polynomial(order, noise, dt, d), np.zeros(mean.shape)
 
     return Dynamics(("static", "constant velocity", "constant acceleration")[order], order, step)
@@ -91,6 +98,7 @@ def singer(time_constant: float, deviation: float) -> Dynamics:
     _positive(deviation, "deviation")
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        """Return F (n, n), Q and drive of one time step; see `Step`."""
         F, Q, _ = correlated(alpha, dt)
         return *_blocked(F, deviation**2 * Q, d), np.zeros(mean.shape)
 
@@ -123,6 +131,7 @@ def current_statistical(time_constant: float, limit: float, floor: float = 0.0) 
         raise InvalidProblem(f"the floor is {floor}", "floor", "give a standard deviation of at least 0")
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        """Return F (n, n), Q and drive of one time step; see `Step`."""
         F, Q, u = correlated(alpha, dt)
         present = mean[..., 2 * d :]
         gap = np.maximum(limit - np.abs(present), _CLAMP * limit)
@@ -139,7 +148,11 @@ def current_statistical(time_constant: float, limit: float, floor: float = 0.0) 
 # Scans at equal intervals have one time step; other runs have some dozens of recurring time steps.
 @lru_cache(maxsize=256)
 def _polynomial(order: int, noise: float, dt: float, d: int) -> tuple[Array, Array]:
-    """Return F and Q of a polynomial as read-only arrays, which the cache shares."""
+    """Return F (n, n) and Q (n, n) of a polynomial motion over `dt` seconds as read-only arrays.
+
+    The cache shares the arrays. `noise` is the standard deviation of the derivative of order `order` + 1, SI
+    units.
+    """
     powers = np.array([dt**j / factorial(j) for j in range(order + 2)])
     F = sum(powers[j] * np.eye(order + 1, k=j) for j in range(order + 1))
     # The next derivative is constant between scans: it enters position, velocity, ... with the factor dt^j / j!.
@@ -154,9 +167,10 @@ def _polynomial(order: int, noise: float, dt: float, d: int) -> tuple[Array, Arr
 def correlated(alpha: float, dt: float) -> tuple[Array, Array, Array]:
     """Return F (3, 3), Q (3, 3) for unit variance and U (3,) of an exponentially correlated acceleration of one axis.
 
-    With x = alpha dt, let f(s) be the response of [p, v, a] to an impulse of acceleration after the share s of the
-    step. Then Q = 2 x int_0^1 f f' ds in units of the step. For small x the closed form loses all digits, so f is
-    summed as a power series.
+    `alpha` is the inverse correlation time, 1/s, and `dt` is the time step, s. U is the effect of a constant
+    mean acceleration on [p, v, a], which F does not contain. With x = alpha dt, let f(s) be the response of
+    [p, v, a] to an impulse of acceleration after the share s of the step. Then Q = 2 x int_0^1 f f' ds in
+    units of the step. For small x the closed form loses all digits, so f is summed as a power series.
 
     References
     ----------
@@ -171,7 +185,10 @@ def correlated(alpha: float, dt: float) -> tuple[Array, Array, Array]:
 
 
 def _series(x: float) -> tuple[Array, Array, Array]:
-    """Return f at the end of the step, Q and U from power series in x."""
+    """Return f (3,) at the end of the step, Q (3, 3) and U (3,) in units of the step, from power series in x.
+
+    See `correlated` for f, Q, U and x.
+    """
     n = np.arange(_TERMS)
     terms = (-x) ** n / np.array([[float(factorial(k + p)) for k in range(_TERMS)] for p in (2, 1, 0)])
     # The integral of the product of the terms s^i and s^j of f over the step is 1 / (i + j + 1).
@@ -182,7 +199,7 @@ def _series(x: float) -> tuple[Array, Array, Array]:
 
 
 def _closed(x: float) -> tuple[Array, Array, Array]:
-    """Return f at the end of the step, Q and U in closed form."""
+    """Return f (3,) at the end of the step, Q (3, 3) and U (3,) in units of the step, in closed form; see `_series`."""
     e, e2 = np.exp(-x), np.exp(-2.0 * x)
     f = np.array([(x - 1.0 + e) / x**2, (1.0 - e) / x, e])
     q11 = (1.0 - e2 + 2.0 * x + 2.0 * x**3 / 3.0 - 2.0 * x**2 - 4.0 * x * e) / x**4
@@ -198,7 +215,7 @@ def _blocked(F: Array, Q: Array, d: int) -> tuple[Array, Array]:
 
 
 def _positive(value: float, name: str) -> float:
-    """Return a finite positive number; raise InvalidProblem for other numbers."""
+    """Return a finite positive number; other numbers raise InvalidProblem with `name` as the argument."""
     if not (np.isfinite(value) and value > 0.0):
         raise InvalidProblem(f"{name} is {value}", name, "give a positive number")
     return float(value)

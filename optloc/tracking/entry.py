@@ -43,7 +43,10 @@ class Rules:
 
     @property
     def most(self) -> float:
-        """Return the limit of the squared innovation of a row: the squared gate, at most the usual gate squared."""
+        """Return the largest squared innovation of a row that counts, in sigmas squared.
+
+        It is the squared gate, at most the square of the usual gate (25).
+        """
         return float(min(self.gate, _USUAL) ** 2)
 
 

@@ -1,22 +1,28 @@
 """Errors that last from scan to scan: their detection in the innovations of a track, and their part of its covariance.
 
 A filter averages its rows as if their errors were independent. Delays of receivers, multipath and attitude last for
-many scans, so the average keeps them. The true covariance of a filter with lasting errors follows from its gain K, as
-in the consider analysis of Schmidt [1]_. Each station has an error b of s standard deviations of its rows, or all
-angles share one error. The error is a Gauss-Markov process that keeps the share phi from scan to scan. The rows measure
-h(x) + D b + v, with white noise v. The error e of the state has two steps:
+many scans, so the average keeps them. The true covariance of a filter with lasting errors follows from its gain K,
+as in the consider analysis of Schmidt [1]_. Each station has an error b of s standard deviations of its rows, or
+all angles share one error. The error is a Gauss-Markov process that keeps the share phi from scan to scan. The rows
+measure h(x) + D b + v, with white noise v. The error e of the state has two steps:
 
     e <- F e + w,   e <- (I - K H) e - K (D b + v).
 
-Its covariance is the covariance of the filter, plus (c^2 - 1) times the part from v, plus s^2 times the part from b.
-The filter and its estimates do not change. The covariance of the innovations of a scan is linear in s^2 and c^2, and so
-is their covariance with the innovations before. Weighted least squares estimates both factors, and its score tests them
-[2]_.
+Its covariance is the covariance of the filter, plus (c^2 - 1) times the part from v, plus s^2 times the part from
+b. c is the true standard deviation of v divided by the stated one. The filter and its estimates do not change. The
+covariance of the innovations of a scan is linear in s^2 and c^2, and so is their covariance with the innovations
+before. Weighted least squares estimates both factors, and its score tests them [2]_.
+
+Letters: m rows of a scan, n numbers of a state, q lasting errors (stations times kinds), j hypotheses about the
+correlation time. F is the transition of the prediction, H (m, n) the derivative of the rows, R (m, m) their stated
+covariance. D (m, q) is the derivative of the rows by the errors.
 
 References
 ----------
-.. [1] S. F. Schmidt, "Application of state-space methods to navigation problems", Advances in Control Systems 3 (1966).
-.. [2] R. K. Mehra, "On the identification of variances and adaptive Kalman filtering", IEEE Trans. Autom. Control 15
+.. [1] S. F. Schmidt, "Application of state-space methods to navigation problems", Advances in Control
+Systems 3 (1966).
+.. [2] R. K. Mehra, "On the identification of variances and adaptive Kalman filtering", IEEE Trans. Autom.
+Control 15
    (1970): the autocovariances of innovations.
 """
 
@@ -72,7 +78,15 @@ _RIDGE = 1e-10
 
 @dataclass(frozen=True, slots=True)
 class _LastingRows:
-    """Used rows, linearised: H (m, n), residuals and scan numbers (m,), R (m, m), lasting errors D (j, m, q)."""
+    """Rows of one or several scans that pass the gate, linearised.
+
+    - H (m, n): derivatives by the state.
+    - residual (m,): measurements minus predictions, SI units.
+    - scan (m,): numbers of the scans.
+    - R (m, m): stated covariance.
+    - D (j, m, q): derivatives by the lasting errors for each hypothesis; the unit of an error is one stated
+    sigma.
+    """
 
     H: Array
     residual: Array
@@ -82,7 +96,11 @@ class _LastingRows:
 
     @classmethod
     def of(cls, part: Problem, at: Array, cov: Array | None) -> _LastingRows:
-        """Return the rows of scans at a state that pass the gate; without a covariance, the residuals of a fit."""
+        """Return the rows of the scans `part` at a state `at` (n,) that pass the gate.
+
+        `cov` (n, n) is the covariance of the predicted state, which widens the gate. It is None for the residuals
+        of a fit.
+        """
         linear = linearise(part, at, ())
         R = noises.dense(with_station_noise(part, at).noise, np.arange(part.count))
         spread = np.diagonal(R) + (0.0 if cov is None else ((linear.shared @ cov) * linear.shared).sum(-1))
@@ -92,7 +110,11 @@ class _LastingRows:
 
     @classmethod
     def written(cls, rows: ScanRows, item: int, memory: Array, n: int, stations: int) -> _LastingRows:
-        """Return the rows of a scan from the memory of the compiled filter, see `optloc.kernels.filter`."""
+        """Return the rows of a scan that the compiled filter wrote to `memory`, see `optloc.kernels.filter`.
+
+        `item` is the number of the scan among the scans with these `rows`. `n` is the size of the state, and
+        `stations` is the number of stations.
+        """
         m = rows.z.shape[2]
         line = memory[len(memory) - m * (n + 2) :].reshape(m, n + 2)
         R = rows.covariance[item if len(rows.covariance) > 1 else 0]
@@ -107,9 +129,12 @@ class _LastingRows:
 def _errors(R: Array, columns: Array, sign: Array, stations: int) -> Array:
     """Return the derivatives D (j, m, q) of rows by lasting errors, scaled to the stated variance of each row.
 
-    `_Recursion` has the hypotheses j. Only angles share an error: an attitude. A common offset of ranges to stations in
-    one direction is the same as an error of the position. With this hypothesis, real tracks lost a fifth of their `ok`
-    scans.
+    `columns` (m, 2) are the error numbers of the two stations of each row (-1: none), and `sign` (m,) is the
+    sign of the second station (0 for angles); see `touched`. `stations` is the number of stations.
+
+    `_Recursion` has the hypotheses j. Only angles share an error: an attitude. Ranges share none, because a common
+    offset of ranges to stations in one direction is the same as an error of the position. When ranges shared an
+    error, real tracks lost a fifth of their `ok` scans.
     """
     two = columns[:, 1] >= 0
     size = np.sqrt(np.diagonal(R) / np.where(two, 2.0, 1.0))
@@ -126,26 +151,42 @@ def _errors(R: Array, columns: Array, sign: Array, stations: int) -> Array:
 class _Recursion:
     """The parts of a filter's covariance, and the accumulated score of lasting errors.
 
-    The hypotheses j are the correlation times of `_LASTS`. The first half of the hypotheses has an error for each
-    station, the other half one error for all angles of a kind.
+    The hypotheses j are the correlation times of `_LASTS`. The first half of the hypotheses has an error for
+    each station, the other half one error for all angles of a kind.
+
+    - phi (j, 1, 1): share of the error that stays from one scan to the next.
+    - info (j, 2, 2), score (j, 2): normal equations for the excess of the white variance and for the lasting
+    variance.
+    - best: number of the best hypothesis; sure: its score in standard deviations.
+    - scans: number of scans since the start.
+    - white (n, n), lasting (j, n, n): parts of the covariance from white noise and from lasting errors of
+    unit size.
+    - cross (j, n, q): covariance of the state with the lasting errors.
+    - before: whitened innovations of the last scan, and their covariances with the next scan; None without a
+    last scan.
+    - size, excess: estimates of s^2 and of c^2 - 1 of the module; 0 if they are not significant.
     """
 
     def __init__(self, n: int) -> None:
+        """Start without information, for a state of n numbers."""
         J = 2 * len(_LASTS)
         self.phi = np.exp(-1.0 / np.tile(_LASTS, 2))[:, None, None]
         self.info, self.score = np.zeros((J, 2, 2)), np.zeros((J, 2))
         self.best, self.sure, self.scans = 0, 0.0, 0
         self.reset(np.zeros((n, n)))
         self.size, self.excess = 0.0, 0.0
-        """Squared lasting error, and excess of the white variance over the stated one, in stated variances."""
+        """Squared lasting error, and excess of the white variance over the stated variance, in stated variances."""
 
     @property
     def active(self) -> bool:
-        """Return whether an error was found."""
+        """Return whether a lasting error, or an excess of white noise, is significant."""
         return self.size > 0.0 or self.excess > 0.0
 
     def reset(self, white: Array) -> None:
-        """Start with a state without lasting errors; `white` (n, n) is the part of its covariance from white noise."""
+        """Start with a state without lasting errors; `info` and `score` do not change.
+
+        `white` (n, n) is the part of its covariance from white noise.
+        """
         J, n = len(self.phi), len(white)
         # Covariance from white noise, covariance from lasting errors, and covariance of the state with these errors.
         self.white, self.lasting, self.cross = white.copy(), np.zeros((J, n, n)), np.zeros((J, n, 0))
@@ -153,12 +194,15 @@ class _Recursion:
         self.before: tuple[Array, Array, Array, Array] | None = None
 
     def covariance(self, cov: Array) -> Array:
-        """Return the covariance (n, n) of a filter including the errors, at least the covariance without them."""
+        """Return the covariance (n, n) of a filter with the errors; `cov` (n, n) is the covariance without them.
+
+        A negative excess does not reduce it.
+        """
         wide = cov + max(self.excess, 0.0) * self.white + self.size * self.lasting[self.best]
         return np.asarray(0.5 * (wide + wide.T))
 
     def begin(self, rows: _LastingRows, cov: Array) -> None:
-        """Add the fix of a stretch of scans, with the covariance (n, n) of its state."""
+        """Add the fix of a stretch of scans, with the covariance (n, n) of its state, and start the parts from it."""
         self.reset(cov)
         self.scans = 0
         if 0 < len(rows.residual) <= _MOST:
@@ -168,9 +212,12 @@ class _Recursion:
                 self.reset(cov)
 
     def _test_start(self, rows: _LastingRows, cov: Array) -> None:
-        """Estimate lasting errors from the residuals of a start; later iterations weight by the estimate."""
+        """Estimate lasting errors from the residuals of a start; later iterations weight by the estimate.
+
+        `rows` are the rows of the fix, and `cov` (n, n) is its covariance.
+        """
         H, R, D = rows.H, rows.R, rows.D
-        gain = _solved(R, H @ cov).T
+        gain = _solve_regularised(R, H @ cov).T
         left = np.eye(len(R)) - H @ gain
         apart = np.abs(rows.scan[:, None] - rows.scan)
         ties = self.phi**apart * (D @ np.swapaxes(D, -1, -2))
@@ -182,17 +229,20 @@ class _Recursion:
             now = R if turn == 0 else R * (1.0 + max(self.excess, 0.0)) + self.size * ties[self.best]
             unit = _whitening(now)
             self.info, self.score = info.copy(), score.copy()
-            self._add(unit, unit @ rows.residual, noise, noise, errors)
+            self._add_size(unit, unit @ rows.residual, noise, noise, errors)
             self._estimate()
 
     def step(self, F: Array) -> None:
-        """Propagate the parts of the covariance by a prediction with the transition F."""
+        """Propagate the parts of the covariance by a prediction with the transition F (n, n)."""
         self.white = F @ self.white @ F.T
         self.lasting = F @ self.lasting @ F.T
         self.cross = self.phi * (F @ self.cross)
 
     def take(self, rows: _LastingRows, F: Array, cov: Array) -> None:
-        """Add a scan after its prediction; `cov` is the predicted covariance (n, n)."""
+        """Add a scan after its prediction, and update the parts of the covariance and the estimates.
+
+        `F` (n, n) is the transition of the prediction, and `cov` (n, n) is the predicted covariance.
+        """
         self.scans += 1
         self._widen(rows.D.shape[-1])
         H, R, D = rows.H, rows.R, np.pad(rows.D, [(0, 0), (0, 0), (0, self.cross.shape[-1] - rows.D.shape[-1])])
@@ -200,15 +250,15 @@ class _Recursion:
         S, noise = H @ cov @ H.T + R, H @ self.white @ H.T + R
         tied = H @ self.cross @ back
         errors = H @ self.lasting @ H.T + tied + np.swapaxes(tied, -1, -2) + D @ back
-        gain = _solved(S, H @ cov).T
+        gain = _solve_regularised(S, H @ cov).T
         unit = _whitening(S + max(self.excess, _LEAST - 1.0) * noise + self.size * errors[self.best], S)
         w = unit @ rows.residual
         self.info, self.score = _KEEP * self.info, _KEEP * self.score
-        self._add(unit, w, S, noise, errors)
+        self._add_size(unit, w, S, noise, errors)
         if self.before is not None:
             last, white, lasting, seen = self.before
             here = unit @ (H @ F @ lasting + D @ (self.phi * seen))
-            self._repeat(np.clip(w, -_WILD, _WILD), last, unit @ H @ F @ white, here)
+            self._add_correlation(np.clip(w, -_WILD, _WILD), last, unit @ H @ F @ white, here)
         seen = np.swapaxes(self.cross, -1, -2) @ H.T + back
         self.before = (
             np.clip(w, -_WILD, _WILD),
@@ -226,7 +276,7 @@ class _Recursion:
         self._estimate()
 
     def _widen(self, columns: int) -> None:
-        """Add columns for stations that were in no earlier scan; nothing is lost."""
+        """Add columns for stations that were in no earlier scan; `columns` is the new number q of errors."""
         more = columns - self.cross.shape[-1]
         if more > 0:
             self.cross = np.pad(self.cross, [(0, 0), (0, 0), (0, more)])
@@ -234,18 +284,31 @@ class _Recursion:
                 w, white, lasting, seen = self.before
                 self.before = w, white, lasting, np.pad(seen, [(0, 0), (0, more), (0, 0)])
 
-    def _add(self, unit: Array, w: Array, stated: Array, noise: Array, errors: Array) -> None:
-        """Add the information from the size of a scan's innovations; `unit` whitens them by the present estimate."""
+    def _add_size(self, unit: Array, w: Array, stated: Array, noise: Array, errors: Array) -> None:
+        """Add the information from the size of a scan's innovations.
+
+        `unit` (m, m) whitens them by the present estimate, and `w` (m,) are the whitened innovations. `stated`
+        (m, m) is their stated covariance. `noise` (m, m) and `errors` (j, m, m) are its derivatives by c^2 and
+        s^2.
+        """
         w = np.clip(w, -_WILD, _WILD)
         stated, noise, errors = (unit @ each @ unit.T for each in (stated, noise, errors))
-        self._sum(0.5, np.outer(w, w) - stated, noise[None], errors)
+        self._accumulate(0.5, np.outer(w, w) - stated, noise[None], errors)
 
-    def _repeat(self, w: Array, last: Array, noise: Array, errors: Array) -> None:
-        """Add the information of the correlation between the innovations of this scan and of the scan before."""
-        self._sum(1.0, np.outer(w, last), noise[None], errors)
+    def _add_correlation(self, w: Array, last: Array, noise: Array, errors: Array) -> None:
+        """Add the information from the correlation between the innovations of this scan and of the scan before.
 
-    def _sum(self, times: float, found: Array, noise: Array, errors: Array) -> None:
-        """Add an observed matrix, with its derivatives (j or 1, ...) by the white and by the lasting variance."""
+        `w` (m,) and `last` (r,) are the whitened innovations. `noise` (m, r) and `errors` (j, m, r) are the
+        derivatives of their covariance by c^2 and s^2.
+        """
+        self._accumulate(1.0, np.outer(w, last), noise[None], errors)
+
+    def _accumulate(self, times: float, found: Array, noise: Array, errors: Array) -> None:
+        """Add an observed matrix to `info` and `score`.
+
+        `times` is its weight. `found` (m, r) is the matrix. `noise` (1, m, r) and `errors` (j, m, r) are its
+        derivatives by the white and by the lasting variance.
+        """
         one, mixed, two = ((a * b).sum((-1, -2)) for a, b in ((noise, noise), (noise, errors), (errors, errors)))
         self.info[:, 0, 0] += times * one
         self.info[:, 0, 1] += times * mixed
@@ -255,7 +318,10 @@ class _Recursion:
         self.score[:, 1] += times * (found * errors).sum((-1, -2))
 
     def _estimate(self) -> None:
-        """Choose the correlation time with the highest score; errors count only if the score is significant."""
+        """Choose the correlation time with the highest score, and set `best`, `sure`, `size` and `excess`.
+
+        Errors count only if the score is significant; otherwise `size` and `excess` are 0.
+        """
         info = self.info
         alone = np.maximum(info[:, 1, 1] - info[:, 0, 1] ** 2 / np.maximum(info[:, 0, 0], 1e-12), 1e-12)
         value = (self.score[:, 1] - info[:, 0, 1] * self.score[:, 0] / np.maximum(info[:, 0, 0], 1e-12)) / alone
@@ -270,14 +336,18 @@ class _Recursion:
         self.excess = max(excess, _LEAST - 1.0) if large else 0.0
 
 
-def _solved(matrix: Array, right: Array) -> Array:
-    """Return the inverse of a covariance (m, m), regularised by a small ridge, times a matrix."""
+def _solve_regularised(matrix: Array, right: Array) -> Array:
+    """Return the inverse of a covariance (m, m), regularised by a small ridge, times the matrix `right`."""
     ridge = _RIDGE * float(np.trace(matrix)) / len(matrix)
     return np.asarray(np.linalg.solve(matrix + ridge * np.eye(len(matrix)), right))
 
 
 def _whitening(cov: Array, other: Array | None = None) -> Array:
-    """Return the inverse root of a covariance (m, m), or of `other` if rounding makes the covariance indefinite."""
+    """Return the inverse root (m, m) of a covariance; it whitens vectors with this covariance.
+
+    If rounding makes the covariance indefinite, `other` replaces it (if given), and small eigenvalues are
+    raised.
+    """
     scale = _RIDGE * float(np.trace(cov)) / len(cov) * np.eye(len(cov))
     try:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(cov + scale)))
@@ -288,7 +358,11 @@ def _whitening(cov: Array, other: Array | None = None) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """A start: its rows, its covariance, and the sums of scores before it."""
+    """A start of a track.
+
+    - rows, cov (n, n): its rows and the covariance of its state.
+    - info, score: the sums of `_Recursion` before the start.
+    """
 
     rows: _LastingRows
     cov: Array
@@ -303,12 +377,13 @@ Taken = tuple[Scans, int, State]
 class LastingErrors:
     """The lasting errors of a track, and its covariance with them.
 
-    The compiled filter screens each scan, see `REPEATS` and `EXCESS` of `optloc.kernels.filter`. If the screen finds an
-    error, `_Recursion` processes the last `window` scans again. From then on it processes each scan, until no error is
-    left. It always processes scans that the compiled filter does not support.
+    The compiled filter screens each scan, see `REPEATS` and `EXCESS` of `optloc.kernels.filter`. If the
+    screen finds an error, `_Recursion` processes the last `window` scans again. From then on it processes
+    each scan, until no error is left. It always processes scans that the compiled filter does not support.
     """
 
     def __init__(self, window: int) -> None:
+        """Start without errors; `window` is the number of scans that are processed again."""
         self._recent: deque[Taken] = deque(maxlen=window)
         self._start: _Start | None = None
         self._found: _Recursion | None = None
@@ -316,7 +391,7 @@ class LastingErrors:
         self._memory = np.zeros(COLUMNS)
 
     def memory(self, size: int) -> Array:
-        """Return the memory of the screen with at least this size, see `optloc.kernels.filter.filter_scan`."""
+        """Return the memory of the screen: an array of at least `size` numbers, see `filter_scan`."""
         if len(self._memory) < size:
             self._memory = np.zeros(size)
         return self._memory
@@ -329,9 +404,9 @@ class LastingErrors:
         return float(np.sqrt(found.size)) if alone and found is not None else 0.0
 
     def begin(self, stretch: Problem, state: State) -> Array:
-        """Return the covariance (n, n) of a new state, the fix of a stretch of scans.
+        """Return the covariance (n, n) of a new state, the fix of a stretch of scans, lasting errors included.
 
-        `stretch` holds the scans with a motion of the order of the state; `state` belongs to the last scan.
+        `stretch` contains the scans, with a motion of the order of the state. `state` belongs to the last scan.
         """
         found = self._found or _Recursion(len(state.mean))
         rows = _LastingRows.of(stretch, state.mean, None)
@@ -345,8 +420,8 @@ class LastingErrors:
     def take(self, taken: Taken, dynamics: Dynamics, cov: Array, screen: tuple[float, float, float] | None) -> Array:
         """Return the covariance (n, n) of the state after a scan, lasting errors included.
 
-        `cov` (n, n) is the covariance of the filter after the scan. `screen` holds REPEATS, EXCESS and SPREAD of the
-        scan; None for a scan that the compiled filter does not support.
+        `cov` (n, n) is the covariance of the filter after the scan. `screen` contains REPEATS, EXCESS and SPREAD
+        of the scan; it is None for a scan that the compiled filter does not support.
         """
         self._recent.append(taken)
         if not self._on:
@@ -355,16 +430,16 @@ class LastingErrors:
             found = self._found = self._restored(len(cov))
             self._on = True
             for each in self._recent:
-                _go_on(found, each, dynamics, None)
+                _process_scan(found, each, dynamics, None)
         else:
             assert self._found is not None
             found = self._found
-            _go_on(found, taken, dynamics, None if screen is None else self._memory)
+            _process_scan(found, taken, dynamics, None if screen is None else self._memory)
             self._on = screen is None or found.active or found.sure > _END or found.scans < _FEW
         return found.covariance(cov)
 
     def _restored(self, n: int) -> _Recursion:
-        """Return the recursion before the scans that are processed again."""
+        """Return the recursion before the recent scans, which are processed again; `n` is the size of the state."""
         found, start = _Recursion(n), self._start
         if start is not None and len(self._recent) < (self._recent.maxlen or 0):
             found.info, found.score = start.info, start.score
@@ -375,8 +450,12 @@ class LastingErrors:
         return found
 
 
-def _go_on(found: _Recursion, taken: Taken, dynamics: Dynamics, memory: Array | None) -> None:
-    """Process a scan with the rows in `memory`; without `memory`, the rows are linearised again."""
+def _process_scan(found: _Recursion, taken: Taken, dynamics: Dynamics, memory: Array | None) -> None:
+    """Process a scan in the recursion `found`.
+
+    The rows of the scan are in `memory`, see `LastingErrors.memory`. Without `memory`, the rows are
+    linearised again.
+    """
     scans, k, before = taken
     problem, written = scans.problem, scans.rows[k]
     dt = float(problem.times[k]) - before.time

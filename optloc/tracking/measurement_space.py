@@ -1,4 +1,8 @@
-"""Smoothing in measurement space: polynomials through the rows of a run, and a fix of their values."""
+"""Smoothing in measurement space: polynomials through the rows of a run, and a fix of their values.
+
+Letters: k epochs, m rows of an epoch, d coordinates, N runs of a batch (...). A fitted polynomial has q =
+1 or 2 numbers for each row: its present value and, for an order above 0, its rate per second.
+"""
 
 from __future__ import annotations
 
@@ -97,7 +101,10 @@ def _check_lines(problem: Problem, order: int, window: int | None) -> None:
 
 
 def _unwrap(apart: Problem) -> Array:
-    """Return the measurements (..., k, m) minus corrections, with unwrapped angles; absent values are filled in."""
+    """Return the measurements (..., k, m) minus corrections, with unwrapped angles; absent values are filled in.
+
+    `apart` is the run with a separate problem for each epoch.
+    """
     weight = _weights(apart)
     columns = []
     period = [MODELS[rows.kind].period for rows in apart.rows for _ in range(rows.count)]
@@ -112,7 +119,10 @@ def _unwrap(apart: Problem) -> Array:
 
 
 def _weights(apart: Problem) -> Array:
-    """Return weights divided by variances (..., k, m); zero for rows that are absent or not finite."""
+    """Return weights divided by variances (..., k, m); zero for rows that are absent or not finite.
+
+    If all runs of a batch have the same weights, the result has no batch axes.
+    """
     variance = noises.variances(apart.noise, apart.count)
     weight = np.asarray(np.where(np.isfinite(apart.z), apart.weight, 0.0) / variance)
     # Store weights that all runs of a batch share once, so that the estimator is computed once.
@@ -121,7 +131,12 @@ def _weights(apart: Problem) -> Array:
 
 
 def _estimator(since: Array, weight: Array, order: int) -> tuple[Array, Array]:
-    """Return the linear estimator (..., 1 or 2, k, m) of present value and rate, and a mask (...) of its existence."""
+    """Return the linear estimator (..., q, k, m) of present value and rate, and a mask (...) of its existence.
+
+    `since` (k,) are times before the present, s (at most 0), and `weight` (..., k, m) are inverse variances.
+    The estimator times the measurements (..., k, m), summed over k, gives the values (..., q, m). It is 0 if
+    a polynomial is not determined.
+    """
     # Times as shares of the window: powers of seconds would make the normal matrix ill-conditioned.
     span = float(np.abs(since).max(initial=0.0)) or 1.0
     powers = (since / span)[:, None] ** np.arange(order + 1)
@@ -137,7 +152,11 @@ def _estimator(since: Array, weight: Array, order: int) -> tuple[Array, Array]:
 
 
 def _propagate(estimator: Array, apart: Problem, past: slice) -> Array:
-    """Return the covariance (..., q, m, q, m) of values and rates."""
+    """Return the covariance (..., q, m, q, m) of the fitted values and rates.
+
+    `estimator` (..., q, k, m) is the result of `_estimator` for the epochs `past`, whose noise comes from
+    `apart`.
+    """
     R = noises.dense(apart.noise, np.arange(apart.count))
     k = estimator.shape[-2]
     R = R[..., past, :, :] if R.ndim > 2 and R.shape[-3] > 1 else np.broadcast_to(R, (k, *R.shape[-2:]))
@@ -146,7 +165,10 @@ def _propagate(estimator: Array, apart: Problem, past: slice) -> Array:
 
 
 def _line_track(problem: Problem, apart: Problem, fitted: Array, cov: Array, ok: Array) -> Track:
-    """Return the track of fitted values (..., k, q, m) with covariance (..., k, q, m, q, m)."""
+    """Return the track of fitted values (..., k, q, m) with covariance (..., k, q, m, q, m).
+
+    `apart` is the run with a separate problem for each epoch. `ok` (..., k) marks epochs with a polynomial.
+    """
     d, m, batch = problem.dimension, apart.count, fitted.shape[:-2]
     n = fitted.shape[-2] * d
     # The fitted values form a scan, and their covariance is its noise; the unit matrix if there is no fit.
@@ -180,7 +202,10 @@ def _line_track(problem: Problem, apart: Problem, fitted: Array, cov: Array, ok:
 
 
 def _solve_scans(scan: Problem) -> tuple[Array, Array]:
-    """Return positions (..., k, d) and statuses (..., k); the fix of the last epoch is the start of the others."""
+    """Return positions (..., k, d), metres, and statuses (..., k) of k scans.
+
+    The fix of the last epoch is the start of the other fixes. `scan` is a batch (..., k) of single scans.
+    """
     shape, flat = scan.batch_shape, scan.flat()
     size, count = int(np.prod(shape)), shape[-1]
     course, doubt = course_starts(flat), np.zeros(size, dtype=bool)
@@ -208,15 +233,16 @@ def _solve_scans(scan: Problem) -> tuple[Array, Array]:
 def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, floor: float = 0.0) -> Track:
     """Return the track of a target by the simplified recursion: running means of the angles and a scalar gain in range.
 
-    Angles are averaged. The range is updated with a scalar least-squares gain, by the part of the excess path that the
-    step of the angles does not explain. For a static target, its variance in range approaches twice the variance of the
-    maximum-likelihood fix. For a moving target, the track lags, and the covariance does not include this error.
+    Angles are averaged. The range is updated with a scalar least-squares gain, by the part of the excess path that
+    the step of the angles does not explain. For a static target, its variance in range approaches twice the
+    variance of the maximum-likelihood fix. For a moving target, the track lags, and the covariance does not include
+    this error.
 
     Parameters
     ----------
     problem : Problem
-        Batch (...) of runs: range sums of one pair of static stations, azimuth and elevation at one of them, each once
-        per epoch. An epoch without all three does not change the state.
+        Batch (...) of runs: range sums of one pair of static stations, azimuth and elevation at one of them, each
+        once per epoch. An epoch without all three does not change the state.
     restart : int, optional
         Number of epochs after which the recursion starts again; None for never.
     mean : int
@@ -237,8 +263,9 @@ def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, f
 
     References
     ----------
-    M. I. Skolnik, "An analysis of bistatic radar", IRE Trans. Aerosp. Navig. Electron. ANE-8 (1961) (the ellipse). The
-    recursion is taken from the paper `bistatic`, with corrected signs and indices.
+    M. I. Skolnik, "An analysis of bistatic radar", IRE Trans. Aerosp. Navig. Electron. ANE-8 (1961) (the ellipse).
+    The recursion is taken from the paper of the page "One receiver and one illuminator", with corrected signs and
+    indices.
     """
     check_trackable(problem)
     _check_smoothing(restart, mean, floor)
@@ -269,7 +296,12 @@ def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, f
 
 @dataclass(frozen=True, slots=True)
 class _SpaceState:
-    """Range, azimuth and elevation (N, 3), their covariance, the recursion's weight P (N,), and used epochs (N,)."""
+    """State of the simplified recursion for N runs.
+
+    - value (N, 3), cov (N, 3, 3): range (m), azimuth and elevation (rad), and their covariance.
+    - P (N,): weight of the recursion for the range; its gain is P x / (1 + x P x), with the path slope x.
+    - count (N,): number of used epochs.
+    """
 
     value: Array
     cov: Array
@@ -288,7 +320,7 @@ def _check_smoothing(restart: int | None, mean: int, floor: float) -> None:
 
 
 def _receiver(problem: Problem) -> int:
-    """Return the number of the receiver of a bistatic pair; raise InvalidProblem for other rows."""
+    """Return the station number of the receiver of a bistatic pair; raise InvalidProblem for other rows."""
     found = pair(problem)
     if found is None:
         advice = "give range_sum of one pair of static stations, azimuth and elevation at one of them, once per epoch"
@@ -306,21 +338,27 @@ def _choose(mask: Array, one: _SpaceState, other: _SpaceState) -> _SpaceState:
     )
 
 
-def _rows(scan: Problem) -> list[int]:
-    """Return the indices of range sum, azimuth and elevation in a scan."""
+def _row_order(scan: Problem) -> list[int]:
+    """Return the indices of range sum, azimuth and elevation, in this order, in a scan."""
     kinds = [block.kind for block in scan.rows]
     return [kinds.index(kind) for kind in _KINDS]
 
 
 def _linearise_at(value: Array, scan: Problem, home: int) -> tuple[Array, Array, Array, Array]:
-    """Return position (N, 3) and its derivatives (N, 3, 3) at (range, azimuth, elevation), residuals, path slopes."""
+    """Return position, axes, residuals and path slopes of states in range, azimuth and elevation.
+
+    - Position (N, 3), metres, at `value` (N, 3): range (m), azimuth and elevation (rad) from station `home`.
+    - Axes (N, 3, 3): derivatives of the position by range, azimuth and elevation (columns).
+    - Residuals (N, 3) of range sum, azimuth and elevation.
+    - Path slopes (N, 3): derivatives of the range sum by range, azimuth and elevation.
+    """
     r, azimuth, elevation = value.T
     ahead = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     u = np.stack(ahead, axis=-1)
     if scan.stations.axes is not None:
         u = (u[:, None] @ scan.stations.axes[..., 0, home, :, :])[:, 0]
     at = scan.stations.position[..., 0, home, :] + r[:, None] * u
-    linear, order = linearise(scan, at), _rows(scan)
+    linear, order = linearise(scan, at), _row_order(scan)
     H = linear.shared[:, order]
     # Range, azimuth and elevation increase along three orthogonal directions: the inverse needs no elimination.
     outward = np.concatenate([u[:, None], H[:, 1:]], axis=1)
@@ -329,7 +367,10 @@ def _linearise_at(value: Array, scan: Problem, home: int) -> tuple[Array, Array,
 
 
 def _advance(state: _SpaceState, scan: Problem, home: int, floor: float) -> _SpaceState:
-    """Return the state after one more scan: a step of the angles, then a step of the range by the rest of the path."""
+    """Return the state after one more scan: a step of the angles, then a step of the range by the rest of the path.
+
+    `home` is the number of the receiver, and `floor` is the smallest gain.
+    """
     _, _, residual, slopes = _linearise_at(state.value, scan, home)
     x, across = slopes[:, 0], slopes[:, 1:]
     # Running means of the angles: the n-th value has a share of 1/n, but at least the floor.
@@ -346,13 +387,17 @@ def _advance(state: _SpaceState, scan: Problem, home: int, floor: float) -> _Spa
     A[:, 0, 0], B[:, 0, 0] = 1.0 - gain * x, gain
     A[:, 0, 1:] = -gain[:, None] * across * (1.0 - share)[:, None]
     B[:, 0, 1:] = -gain[:, None] * across * share[:, None]
-    R = noises.dense(scan.noise, np.array(_rows(scan)))
+    R = noises.dense(scan.noise, np.array(_row_order(scan)))
     cov = A @ state.cov @ np.swapaxes(A, -1, -2) + B @ R @ np.swapaxes(B, -1, -2)
     return _SpaceState(value, cov, state.P - optimal * x * state.P, state.count + 1.0)
 
 
 def _restart(stretch: Problem, scan: Problem, home: int) -> _SpaceState:
-    """Return the state of the mean measurement of a stretch of scans, solved in closed form and refined."""
+    """Return the state of the mean measurement of a stretch of scans, solved in closed form and refined.
+
+    `scan` is the last scan of the stretch, and `home` is the number of the receiver. A run without a fix gets
+    NaN.
+    """
     track = lines(stretch, 0)
     start, used = track.last, (track.count > 0).sum(-1)
     at = scan.stations.position[..., 0, home, :]
@@ -360,7 +405,7 @@ def _restart(stretch: Problem, scan: Problem, home: int) -> _SpaceState:
     away = np.where(np.isfinite(start.mean), start.mean - at, 1.0)
     r = np.sqrt((away**2).sum(-1))
     linear = linearise(scan, at + away)
-    order = _rows(scan)[1:]
+    order = _row_order(scan)[1:]
     value = np.concatenate([r[:, None], (scan.observed - linear.residual)[:, order]], axis=-1)
     outward = np.concatenate([(away / r[:, None])[:, None], linear.shared[:, order]], axis=1)
     cov = outward @ start.cov @ np.swapaxes(outward, -1, -2)
@@ -369,7 +414,7 @@ def _restart(stretch: Problem, scan: Problem, home: int) -> _SpaceState:
 
 
 def _bistatic_track(problem: Problem, steps: list[tuple[Array, Array, Array, Array]]) -> Track:
-    """Return position, covariance, count and status of all scans as a track."""
+    """Return position, covariance, count and status of all scans (`steps`, for N runs each) as a track."""
     batch, k = problem.batch_shape, len(steps)
     mean, cov, count, code = (np.stack([step[i] for step in steps], axis=1) for i in range(4))
     none = np.zeros((*batch, k))

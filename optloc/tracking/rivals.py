@@ -54,7 +54,7 @@ def remaining(rivals: Sequence[Rival], entry: Entry, others: Sequence[Entry | No
 
 
 def _cost(entry: Entry, most: float) -> float:
-    """Return twice the negative log-likelihood of a scan; each rejected row counts as `most`."""
+    """Return twice the negative log-likelihood of a scan; each rejected row counts as `most`, a squared innovation."""
     return -2.0 * float(entry.updated.loglikelihood) + most * entry.rejected
 
 

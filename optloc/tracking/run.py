@@ -158,9 +158,10 @@ class _TrackRun:
     - problem: the run.
     - scans: its scans as arrays.
     - bad: number of rows of each scan that are not finite.
-    - dynamics, rule, rules: as in `tracked`.
+    - dynamics, rule, rules: as in `tracked`; `rule` is the filter.
     - how: the filter with the gate for the compiled code; None for other filters.
-    - near: a prediction with a total variance below this limit (m^2) is followed. It is the squared half extent of the
+    - near: a prediction with a total variance below this limit (m^2) is followed. It is the squared half
+    extent of the
       stations.
     """
 
@@ -183,18 +184,21 @@ class _TrackRun:
         if isinstance(rule, Filter):
             own = min(gate, rule.how.gate)
             how = rule.how._replace(gate=float(own), most=rules.most, d=problem.dimension)
-        # Whatever the position of the centre, one station is at least half of the largest extent away from it.
+        # For any position of the centre, one station is at least half of the largest extent away from it.
         near = 0.5 * float(np.ptp(problem.stations.places.reshape(-1, problem.dimension), axis=0).max())
         return cls(problem, Scans.of(problem, dynamics.order), bad, dynamics, rule, rules, how, near**2)
 
     def entries(self, condition: Condition, *, ends: bool = True) -> Iterator[Entry]:
-        """Yield one entry per scan, from the present condition of the track; `ends` as in `begin`."""
+        """Yield one entry per scan, from the present condition of the track, which is updated.
+
+        With `ends`, the problem has all scans of the run, as in `begin`.
+        """
         times, k = self.problem.times.tolist(), 0
         while k < len(times):
             if condition.state is None:
                 r = self.rules
                 start_here = begin(self.problem, k, self.dynamics, r.speed, r.rate, r.starts, ends=ends)
-                yield from self._starting(start_here, k, condition)
+                yield from self._start_entries(start_here, k, condition)
                 k, condition.state, condition.missed = start_here.last + 1, start_here.state, 0
                 condition.rivals = start_here.rivals
                 condition.recent.begin(start_here)
@@ -219,8 +223,8 @@ class _TrackRun:
             yield condition.judged(entry, cov, vague)
             condition.judge(vague)
 
-    def _starting(self, begun: Beginning, k: int, condition: Condition) -> Iterator[Entry]:
-        """Yield the scans of a start; only the last scan has a state."""
+    def _start_entries(self, begun: Beginning, k: int, condition: Condition) -> Iterator[Entry]:
+        """Yield the scans of a start, from scan `k`; only the last scan has a state."""
         n = (self.dynamics.order + 1) * self.problem.dimension
         # Scans of a start have no separate states: their common fix is valid at the last scan.
         why = condition.why
@@ -238,22 +242,28 @@ class _TrackRun:
             yield Entry(time, done, begun.code, out, "restarted" if why else "started", reason)
 
     def _remaining(self, rivals: tuple[Rival, ...], k: int, entry: Entry, silence: float) -> tuple[Rival, ...]:
-        """Return the other states of a start that a scan does not refute."""
+        """Return the other states of a start that scan `k` does not refute.
+
+        `entry` is the result of the scan for the track. `silence` is the time since the last valid row, s.
+        """
         found = [self._update(k, rival.state, silence, None) for rival in rivals]
         others = [None if isinstance(one, str) else one[0] for one in found]
         return remaining(rivals, entry, others, self.rules.most)
 
     def _stretch(self, begun: Beginning) -> Problem:
-        """Return the scans of a start as a problem."""
+        """Return the scans of a start as a problem, whose unknown is the state at the last of these scans."""
         motion = Motion(self.dynamics.order, reference=float(self.problem.times[begun.last]))
         return replace(cut(self.problem, begun.first, begun.last + 1), motions=(motion,))
 
     def _update(
         self, k: int, state: State, silence: float, memory: Array | None
     ) -> tuple[Entry, Fit, Screen | None] | str:
-        """Return the entry of a scan, the fit of all rows to the prediction and the screen for lasting errors.
+        """Return the entry of scan `k`, the fit of all rows to the prediction and the screen for lasting errors.
 
-        If the state cannot be followed, return the reason instead.
+        The fit is the sum of squared innovations in sigmas and the number of rows. The screen is REPEATS, EXCESS
+        and SPREAD of `optloc.kernels.filter`; None for scans that the compiled filter does not support. `state`
+        is the state before the prediction. `silence` is the time since the last valid row, s. `memory` is the
+        memory of the screen. If the state cannot be followed, return the reason instead.
         """
         if self.rules.gap is not None and silence > self.rules.gap:
             return f"no valid row for {silence:.6g} s"
@@ -274,18 +284,26 @@ class _TrackRun:
                     (values[REPEATS], values[EXCESS], values[SPREAD]),
                 )
         ahead = predicted(state, self.dynamics, time, self.problem.dimension)
-        return ("" if self.rules.gap is not None else self._too_uncertain(ahead, silence)) or self._general(k, ahead)
+        return ("" if self.rules.gap is not None else self._too_uncertain(ahead, silence)) or self._update_in_numpy(
+            k, ahead
+        )
 
     def _too_uncertain(self, ahead: State, silence: float) -> str:
-        """Return the reason why a prediction is too uncertain to follow; empty if it is not."""
+        """Return the reason why a prediction is too uncertain to follow; empty if it is not.
+
+        `silence` is the time since the last valid row, s.
+        """
         d = self.problem.dimension
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(ahead.cov[:d, :d])[-1], 0.0)))
         # If the prediction is uncertain by more than the spread of the stations, a new fix without a guess is better.
         limit = reach(self.problem, ahead.mean[:d])
         return f"the prediction was uncertain by {sigma:.3g} m after {silence:.6g} s" if sigma > limit else ""
 
-    def _general(self, k: int, ahead: State) -> tuple[Entry, Fit, None]:
-        """Return the update of a prediction by any filter, with the rows of a scan that pass the gate."""
+    def _update_in_numpy(self, k: int, ahead: State) -> tuple[Entry, Fit, None]:
+        """Return the entry, fit and screen (None) of scan `k` for any filter, with the rows that pass the gate.
+
+        `ahead` is the predicted state. See `_update` for the fit.
+        """
         scan = scan_at(self.problem, k, self.dynamics.order)
         # Apply the gate before the update: a gross error would pull an iterated update.
         off = innovation(scan, ahead.mean, ahead.cov).normalised[scan.weight > 0.0] if scan.rows else np.zeros(0)
@@ -301,15 +319,18 @@ class _TrackRun:
         return self._entry(k, done, int(code), gated, causes), fit, None
 
     def _entry(self, k: int, done: Updated, code: int, gated: int, causes: list[str]) -> Entry:
-        """Return the entry of an update; `gated` is the number of rows that failed the gate."""
+        """Return the entry of an update `done` with a status `code`.
+
+        `gated` is the number of rows that failed the gate. `causes` are the causes of a numerical failure.
+        """
         rejected = gated + self.bad[k]
-        found = objections(_FINDINGS, _Taken(Status(code), rejected, int(done.count), causes))
+        found = objections(_FINDINGS, _ScanOutcome(Status(code), rejected, int(done.count), causes))
         status, reason = found[0] if found else (Status(code), "")
         return Entry(float(self.problem.times[k]), done, status, rejected, "", reason)
 
 
 @dataclass(frozen=True, slots=True)
-class _Taken:
+class _ScanOutcome:
     """A scan after its update: status, numbers of rejected and used rows, and causes of a numerical failure."""
 
     status: Status
@@ -410,7 +431,10 @@ class Follower:
 
 
 def _clean(problem: Problem) -> tuple[Problem, Array]:
-    """Return the run with weight zero for rows that are not finite, and a mask (m,) of these rows."""
+    """Return the run with weight zero for rows that are not finite, and a mask (m,) of these rows.
+
+    Their values are set to zero, so that no computation meets a NaN.
+    """
     broken = ~np.isfinite(problem.z) & (problem.weight > 0.0)
     if not broken.any():
         return problem, broken

@@ -1,4 +1,10 @@
-"""Rows of the scans of a run as arrays, prepared once, so that each scan is one call of compiled code."""
+"""Rows of the scans of a run as arrays, prepared once, so that each scan is one call of compiled code.
+
+Scans have the same structure if their rows have the same kinds, stations and targets. Such scans share
+one `ScanRows`.
+
+Letters: m rows of a scan, n numbers of a state, G scans of one structure, N states of a batch (...).
+"""
 
 from __future__ import annotations
 
@@ -30,12 +36,13 @@ _KEPT = Cache["ScanRows | None"](256)
 class Scans:
     """The scans of a run of one target for the compiled update.
 
-    All shipped filters use these arrays. The general form of `optloc.tracking.updates` handles all other cases: kinds
-    without a tape, biases among the states, and station errors whose noise depends on the position. It also handles
-    noise that correlates epochs, batches with different stations or noise, and arrays of other libraries.
+    All shipped filters use these arrays. The general form of `optloc.tracking.updates` handles all other cases:
+    kinds without a tape (compiled formula), biases among the states, and station errors whose noise depends on the
+    position. It also handles noise that correlates epochs, batches with different stations or noise, and arrays of
+    other libraries.
 
     - problem: the run, see `optloc.tracking.track.scans`; its model of motion is ignored.
-    - order: order of the states.
+    - order: order of the states (0: position, 1: with velocity, 2: with acceleration).
     - rows: rows of each of k scans; None for a scan of the general form, or without rows.
     - item: number of each scan among the scans with the same structure.
     - memory: length of the memory array of a track, see `filter_scan`.
@@ -49,7 +56,7 @@ class Scans:
 
     @classmethod
     def of(cls, problem: Problem, order: int) -> Scans:
-        """Return the scans of a run."""
+        """Return the scans of a run for states of an order."""
         rows: list[ScanRows | None] = [None] * problem.epochs
         item = [0] * problem.epochs
         if problem.count and is_available(filter_scan):
@@ -76,9 +83,10 @@ class Scans:
     ) -> Filtered | None:
         """Return states (..., n) after scan k, or None if the scan needs the general form.
 
-        `mean` (..., n) and `cov` (..., n, n) are the states before the prediction `move`; None for states at the time
-        of the scan. `how` is the filter. `more` replaces the measurements minus corrections (..., m) and the weights
-        (..., m). `memory` is the array of a track with a single state, see `filter_scan`.
+        `mean` (..., n) and `cov` (..., n, n) are the states before the prediction `move`. `move` is None for
+        states at the time of the scan. `how` is the filter. `more` replaces the measurements minus corrections
+        (..., m) and the weights (..., m). `memory` is the array of a track with a single state, see
+        `filter_scan`.
         """
         rows, n = self.rows[k], mean.shape[-1]
         if rows is None or type(mean) is not np.ndarray or rows.tables.shared != n:
@@ -89,15 +97,15 @@ class Scans:
         if more is not None or shape or self.problem.batch_shape:
             rows, shape = self._spread(rows, item, more, shape)
             mean, cov = np.broadcast_to(mean, (*shape, n)), np.broadcast_to(cov, (*shape, n, n))
-        count, move = math.prod(shape), move or _stay(n)
-        ahead = Move(owned(move.F), _each(move.Q, 2, shape), _each(move.drive, 1, shape))
+        count, move = math.prod(shape), move or _no_move(n)
+        ahead = Move(owned(move.F), _per_state(move.Q, 2, shape), _per_state(move.drive, 1, shape))
         out = Filtered(np.empty((count, n)), np.empty((count, n, n)), np.empty((count, VALUES)))
         filter_scan(
             rows,
             item,
             ahead,
-            _each(mean, 1, shape),
-            _each(cov, 2, shape),
+            _per_state(mean, 1, shape),
+            _per_state(cov, 2, shape),
             how,
             _NONE if memory is None else memory,
             out,
@@ -109,14 +117,18 @@ class Scans:
     def _spread(
         self, rows: ScanRows, item: int, more: tuple[Array, Array] | None, shape: tuple[int, ...]
     ) -> tuple[ScanRows, tuple[int, ...]]:
-        """Return the rows with measurements and weights (1, N or 1, m) for states (...), and the common shape."""
+        """Return the rows of scan `item` with values for each state, and the common batch shape of rows and states.
+
+        The values are measurements and weights (1, N or 1, m). `more` replaces them, as in `filtered`. `shape` is
+        the batch shape of the states.
+        """
         batch, m = self.problem.batch_shape, rows.z.shape[2]
         if more is None:
             own = (part[item if len(part) > 1 else 0] for part in (rows.z, rows.weight))
             more = tuple(part[0] if len(part) == 1 else part.reshape(*batch, m) for part in own)
             shape = np.broadcast_shapes(shape, batch)
         shape = np.broadcast_shapes(shape, *(part.shape[:-1] for part in more))
-        z, weight = (_each(part, 1, shape)[None] for part in more)
+        z, weight = (_per_state(part, 1, shape)[None] for part in more)
         return rows._replace(z=z, weight=weight), shape
 
 
@@ -125,8 +137,11 @@ def owned(values: Array) -> Array:
     return values if values.flags.carray and values.dtype == float else np.array(values, dtype=float, order="C")
 
 
-def _each(values: Array, core: int, shape: tuple[int, ...]) -> Array:
-    """Return values (..., core axes) of states (...) as (N, core axes), or (1, core axes) if all states share them."""
+def _per_state(values: Array, core: int, shape: tuple[int, ...]) -> Array:
+    """Return values (..., core axes) of states (...) as (N, core axes), or (1, core axes) if all states share them.
+
+    `core` is the number of core axes, and `shape` is the batch shape (...).
+    """
     if values.ndim == core:
         return owned(values)[None]
     inner = values.shape[values.ndim - core :]
@@ -153,13 +168,16 @@ def touched(problem: Problem) -> tuple[Array, Array]:
 
 
 @cache
-def _stay(n: int) -> Move:
-    """Return the prediction step for no elapsed time."""
+def _no_move(n: int) -> Move:
+    """Return the prediction step for no elapsed time: a state of n numbers does not change."""
     return Move(np.eye(n), np.zeros((n, n)), np.zeros(n))
 
 
 def _is_plain(problem: Problem) -> bool:
-    """Return whether the state is the only unknown, and a batch differs only in measurements and weights."""
+    """Return whether the compiled filter supports the run.
+
+    The state must be the only unknown, and a batch may differ only in measurements and weights.
+    """
     stations = problem.stations
     shared = [(stations.position, 3), (stations.velocity, 3), (stations.axes, 4)]
     shared += [(covariance, 3) for _, _, covariance in stations.errors]
@@ -175,18 +193,21 @@ def _is_plain(problem: Problem) -> bool:
 
 
 def _structures(problem: Problem, order: int) -> Iterator[tuple[Array, Array, ScanRows | None]]:
-    """Yield, for each structure of scans, its epochs (G,), their rows (G, m), and the prepared rows."""
+    """Yield, for each structure of scans, its epochs (G,), their rows (G, m), and the prepared rows.
+
+    The prepared rows are None if the compiled filter does not support the scans.
+    """
     if problem.epochs == 1:
         one = np.zeros(1, dtype=np.int64), np.arange(problem.count)[None]
-        made = _KEPT.find(_key(problem, order), lambda: _made(problem, order, *one) if _is_plain(problem) else None)
+        made = _KEPT.find(_key(problem, order), lambda: _prepared(problem, order, *one) if _is_plain(problem) else None)
         yield *one, made
     elif _is_plain(problem):
-        for epochs, index in _alike(problem):
-            yield epochs, index, _made(problem, order, epochs, index)
+        for epochs, index in _group_by_structure(problem):
+            yield epochs, index, _prepared(problem, order, epochs, index)
 
 
 def _key(scan: Problem, order: int) -> Hashable:
-    """Return a cache key of a scan without its time, measurements and weights."""
+    """Return a cache key of a scan without its time, measurements and weights; `order` is the order of the state."""
     s = scan.stations
     arrays = [s.position, s.velocity, s.axes, s.covariance, s.velocity_covariance]
     arrays += [array for block in scan.noise.blocks for array in (block.covariance, block.row)]
@@ -196,8 +217,8 @@ def _key(scan: Problem, order: int) -> Hashable:
     return (numbers, kinds, s.span, scan.frame, scan.medium, len(scan.motions), biases, order)
 
 
-def _alike(problem: Problem) -> list[tuple[Array, Array]]:
-    """Return the epochs (G,) of each structure, and their rows (G, m)."""
+def _group_by_structure(problem: Problem) -> list[tuple[Array, Array]]:
+    """Return the epochs (G,) of each structure of scans, and the indices of their rows (G, m)."""
     epoch = problem.epoch
     order = np.argsort(epoch, kind="stable")
     start = np.searchsorted(epoch[order], np.arange(problem.epochs + 1))
@@ -217,15 +238,18 @@ def _alike(problem: Problem) -> list[tuple[Array, Array]]:
 
 
 def _by_scan(values: Array, index: Array) -> Array:
-    """Return values (..., m) at rows (G, r) as (G, N, r), with flattened leading axes."""
+    """Return values (..., m) at rows (G, r) as (G, N, r): N is the size of the flattened leading axes."""
     if index.shape[0] == 1 and values.ndim == 1:
         return values[index][None]
     picked = np.moveaxis(values[..., index], -2, 0)
     return np.ascontiguousarray(picked.reshape(len(index), -1, index.shape[1]))
 
 
-def _made(problem: Problem, order: int, epochs: Array, index: Array) -> ScanRows | None:
-    """Return prepared scans without measurements and weights, or None if a kind has no tape."""
+def _prepared(problem: Problem, order: int, epochs: Array, index: Array) -> ScanRows | None:
+    """Return prepared scans without measurements and weights, or None if a kind has no tape (compiled formula).
+
+    `epochs` (G,) are the scans, and `index` (G, m) are their rows.
+    """
     problem, m = with_station_noise(problem), index.shape[1]
     scan = _first_of(problem, order, epochs)
     found = tables(scan, (np.arange(m)[None],))
@@ -248,7 +272,7 @@ def _made(problem: Problem, order: int, epochs: Array, index: Array) -> ScanRows
 
 
 def _first_of(problem: Problem, order: int, epochs: Array) -> Problem:
-    """Return the first of some scans with the stations of all these scans, as a batch."""
+    """Return the first of some scans with the stations of all these scans, as a batch; `epochs` (G,) are the scans."""
     first, s = int(epochs[0]), problem.stations
     one = cut(replace(problem, motions=(Motion(order),), priors=(), constraints=()), first, first + 1)
     every = ((name, getattr(s, name)) for name in ("position", "velocity", "axes"))

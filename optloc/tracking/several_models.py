@@ -20,7 +20,7 @@ from optloc.tracking.updates import Update, Updated, filter_of
 
 @dataclass(frozen=True, slots=True)
 class Parallel:
-    """Tracks of one target by several models.
+    """Tracks of one target by several models (k scans, q models).
 
     - models: q models of motion.
     - tracks: one track for each model; all have the same scans.
@@ -186,8 +186,10 @@ def imm(
 def mixed(states: Sequence[State], weight: Array, transition: Array) -> tuple[list[State], Array]:
     """Return the mixed state of each model before the next prediction, and the predicted probabilities (..., q).
 
-    `states` are the states of q models after the last scan, possibly of different orders. `weight` (..., q) are the
-    probabilities after the last scan, and `transition` (q, q) is the table of `imm`. The mixed states keep the orders.
+    The mixed state of a model is a mixture of the states of all models, weighted by the probability that each was
+    the last model. `states` are the states of q models after the last scan, possibly of different orders. `weight`
+    (..., q) are the probabilities after the last scan, and `transition` (q, q) is the table of `imm`. The mixed
+    states keep the orders.
     """
     coming = weight @ transition
     # Probability that the model was i, given that it is j now; for an unreachable model, avoid 0 / 0.
@@ -204,7 +206,10 @@ def mixed(states: Sequence[State], weight: Array, transition: Array) -> tuple[li
 
 
 def _transition(transition: Array, count: int) -> Array:
-    """Return the transition as an array (q, q); raise InvalidProblem if it is no table of probabilities."""
+    """Return the transition as an array (q, q) for q = `count` models.
+
+    A table that does not contain probabilities raises InvalidProblem.
+    """
     chain = np.asarray(transition, dtype=float)
     good = chain.shape == (count, count) and bool(np.all(chain >= 0.0))
     # Rows with three digits, such as 0.333, do not add up to one: they are refused, not scaled.
@@ -218,7 +223,7 @@ def _transition(transition: Array, count: int) -> Array:
 
 
 def _in_order_of(state: State, own: State) -> State:
-    """Return a state in the order of another state, which also provides missing components."""
+    """Return a state in the order of the state `own`, which also provides missing components and their covariance."""
     n, present = own.mean.shape[-1], state.mean.shape[-1]
     if present >= n:
         return State(state.time, state.mean[..., :n], state.cov[..., :n, :n])
@@ -230,7 +235,10 @@ def _in_order_of(state: State, own: State) -> State:
 
 
 def _weigh(done: Sequence[tuple[Updated, Array]], coming: Array) -> tuple[Array, Array]:
-    """Return the probabilities (..., q) after a scan, and the log-likelihood (...) of the scan."""
+    """Return the probabilities (..., q) of the models after a scan, and the log-likelihood (...) of the scan.
+
+    `done` are the update and status of each model. `coming` (..., q) are the probabilities before the scan.
+    """
     fit = [np.where(code == Status.NUMERICAL, -np.inf, each.loglikelihood) for each, code in done]
     with np.errstate(divide="ignore"):
         score = np.log(coming) + np.stack(fit, axis=-1)
@@ -245,7 +253,10 @@ def _weigh(done: Sequence[tuple[Updated, Array]], coming: Array) -> tuple[Array,
 
 
 def _combine(done: Sequence[tuple[Updated, Array]], weight: Array, total: Array) -> tuple[Updated, Array]:
-    """Return the update over all models, and its status: the best status of the models."""
+    """Return the update over all models, and its status (...): the best status of the models.
+
+    `weight` (..., q) are the probabilities of the models, and `total` (...) is the log-likelihood of the scan.
+    """
     n = max(each.mean.shape[-1] for each, _ in done)
     both = [_padded(each, n) for each, _ in done]
     mean, cov = moments([one for one, _ in both], [around for _, around in both], weight)
@@ -258,7 +269,10 @@ def _combine(done: Sequence[tuple[Updated, Array]], weight: Array, total: Array)
 
 
 def _padded(done: Updated, n: int) -> tuple[Array, Array]:
-    """Return mean (..., n) and covariance (..., n, n); missing velocity or acceleration is zero without variance."""
+    """Return mean (..., n) and covariance (..., n, n); missing velocity or acceleration is zero without variance.
+
+    `n` is the size of the largest model.
+    """
     present = done.mean.shape[-1]
     if present == n:
         return done.mean, done.cov
@@ -323,7 +337,10 @@ def spread(state: State, batch: tuple[int, ...]) -> State:
 
 
 def softmax(score: Array) -> Array:
-    """Return exp(score) divided by its sum along the last axis; equal shares if all scores are minus infinity."""
+    """Return exp(score) divided by its sum along the last axis; equal shares if all scores are minus infinity.
+
+    Log-likelihoods become probabilities.
+    """
     top = score.max(-1, keepdims=True)
     weight = np.where(np.isfinite(top), np.exp(score - np.where(np.isfinite(top), top, 0.0)), 1.0)
     return np.asarray(weight / weight.sum(-1, keepdims=True))

@@ -29,9 +29,9 @@ Missing = Literal["drop", "expect"]
 class Associated:
     """Tracks of several targets, and the rows of each target.
 
-    - track: a track with leading axes (..., t).
-    - picks: for each scan of the track, the candidate (..., t, m) of each target in each of its m channels; -1 for
-      none.
+    - track: a track of t targets, with leading axes (..., t).
+    - picks: for each scan of the track, the candidate (..., t, m) of each target in each of its m channels;
+    -1 for none.
     """
 
     track: Track
@@ -62,15 +62,16 @@ def associated(
     update : callable or str
         A filter, or its name in `UPDATES`.
     missing : "drop" or "expect"
-        Treatment of a channel without a row. "drop" ignores it. "expect", as in one paper, uses the prediction as a
-        measurement, so that the covariance is too small; it is for comparison only.
+        Treatment of a channel without a row. "drop" ignores it. "expect" uses the prediction as a measurement, so
+        that the covariance is too small. It is for comparison with a paper only
+        (doi:10.7654/j.issn.2097-1974.20240501).
 
     Raises
     ------
     InvalidProblem
         If the filter is unknown, the state does not fit the dynamics, or the state has no axis of targets.
     """
-    given, filtering = _check(given), filter_of(update)
+    given, filtering = _checked(given), filter_of(update)
     d = given.channels.dimension
     check_state(start, (dynamics.order + 1) * d)
     if start.mean.ndim < 2:
@@ -155,14 +156,17 @@ def candidates(problem: Problem) -> RowCandidates:
     start = 0
     for block in problem.rows:
         kept = first[(first >= start) & (first < start + block.count)] - start
-        rows.append(_row(block, kept))
+        rows.append(_as_channels(block, kept))
         start += block.count
     made = replace(problem, rows=tuple(rows), motions=problem.motions[:1])
-    return _check(RowCandidates(_with_noise(problem, made, first), np.stack(values, axis=-2)))
+    return _checked(RowCandidates(_with_noise(problem, made, first), np.stack(values, axis=-2)))
 
 
-def _check(given: RowCandidates) -> RowCandidates:
-    """Return candidates minus known corrections; raise InvalidProblem if they do not fit their channels."""
+def _checked(given: RowCandidates) -> RowCandidates:
+    """Return candidates without corrections: known corrections are subtracted from the values.
+
+    Candidates that do not fit their channels raise InvalidProblem.
+    """
     if given.channels.batch_shape != ():
         advice = "track runs with different stations or noise separately"
         raise InvalidProblem("the channels have batch axes", "candidates", advice)
@@ -177,7 +181,10 @@ def _check(given: RowCandidates) -> RowCandidates:
 
 
 def channels_of(problem: Problem) -> tuple[Array, list[Array]]:
-    """Return the first row of each channel in ascending order, and all rows of each channel."""
+    """Return the first row of each channel, and all rows of each channel.
+
+    Rows are indices. Channels are in the order of their first rows.
+    """
     # A channel is a kind at its stations in one epoch; a row of b against a is a different channel from a against b.
     keys = [
         (kind, int(epoch), int(a), int(b))
@@ -191,15 +198,15 @@ def channels_of(problem: Problem) -> tuple[Array, list[Array]]:
     return np.array([rows[0] for rows in members]), members
 
 
-def _row(block: Rows, kept: Array) -> Rows:
-    """Return the kept rows of a block as channels, without measurements."""
+def _as_channels(block: Rows, kept: Array) -> Rows:
+    """Return rows of a block, with the indices `kept` (k,), as channels without measurements."""
     nan, none = np.full(len(kept), np.nan), np.zeros(len(kept), dtype=np.int64)
     sure = np.ones(len(kept))
     return Rows(block.kind, nan, block.a[kept], block.b[kept], block.epoch[kept], none, sure, np.zeros(len(kept)))
 
 
 def _with_noise(problem: Problem, made: Problem, first: Array) -> Problem:
-    """Return the channels with the covariance of their first rows, epoch by epoch."""
+    """Return the channels `made` with the covariance of their first rows `first` (m,) in `problem`, epoch by epoch."""
     blocks = [
         noises.Block(members, noises.gathered(problem.noise, first[members]))
         for members in noises.group_members(made.epoch)
@@ -238,11 +245,14 @@ def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
     number = np.full(problem.epochs, -1)
     number[epochs] = np.arange(len(epochs))
     parts = np.split(kept, np.cumsum([rows.count for rows in problem.rows])[:-1])
-    rows = tuple(_rows(block, own, number) for block, own in zip(problem.rows, parts, strict=True) if own.any())
+    rows = tuple(
+        _rows_of_target(block, own, number) for block, own in zip(problem.rows, parts, strict=True) if own.any()
+    )
     target = np.unique(np.concatenate([b.target[own] for b, own in zip(problem.rows, parts, strict=True)]))
     s = problem.stations
 
     def at(values: Array | None, core: int) -> Array | None:
+        """Return station values at the epochs of the target; the axis of epochs is `core` axes from the end."""
         return values if values is None or values.shape[-core] == 1 else np.take(values, epochs, axis=-core)
 
     position = at(s.position, 3)
@@ -251,22 +261,25 @@ def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
         problem,
         stations=replace(s, position=position, velocity=at(s.velocity, 3), axes=at(s.axes, 4)),
         rows=rows,
-        noise=Noise(tuple(_blocks(problem.noise, kept))),
+        noise=Noise(tuple(_noise_of_rows(problem.noise, kept))),
         times=(problem.times if times is None else times)[epochs],
         motions=(Motion(span="epoch"),),
         constraints=tuple(replace(c, target=0) for c in problem.constraints if c.target in target),
     )
 
 
-def _rows(block: Rows, own: Array, number: Array) -> Rows:
-    """Return the rows of one target from a block, with new epoch numbers."""
+def _rows_of_target(block: Rows, own: Array, number: Array) -> Rows:
+    """Return the rows of one target from a block: the mask `own` selects them, and `number` maps old to new epochs."""
     picked = {name: getattr(block, name)[..., own] for name in ("z", "weight", "correction")}
     a, b = block.a[own], block.b[own]
     return replace(block, **picked, a=a, b=b, epoch=number[block.epoch[own]], target=np.zeros_like(a))
 
 
-def _blocks(noise: Noise, kept: Array) -> list[Block]:
-    """Return the noise of the kept rows; a group that loses rows keeps the covariance of its other rows."""
+def _noise_of_rows(noise: Noise, kept: Array) -> list[Block]:
+    """Return the noise of the rows in the mask `kept` (m,), with new row numbers.
+
+    A group that loses rows keeps the covariance of its other rows.
+    """
     place, found = np.cumsum(kept) - 1, []
     for block in noise.blocks:
         inside = kept[block.row]

@@ -137,7 +137,10 @@ def two_point(first: Fix, second: Fix, times: tuple[float, float]) -> State:
 
 
 def counts(epochs: int, order: int, speed: float | None = None, rate: float | None = None) -> list[int]:
-    """Return the numbers of first epochs that a start tries, each half larger than the number before; see `begun`."""
+    """Return the numbers of first epochs that a start tries, each half larger than the number before; see `begun`.
+
+    `epochs` is the length of the run, the last number. `order`, `speed` and `rate` decide the first number.
+    """
     # With a prior of every rate, one epoch may be enough; otherwise a state of order q needs at least q + 1 scans.
     known = speed is not None and (order < 2 or rate is not None)
     count = 1 if order == 0 or known else order + 1
@@ -159,11 +162,15 @@ def first_fix(
     method: str = "auto",
 ) -> Fix:
     """Return the fix of the first `count` epochs of a run, with a motion of the order of the dynamics; see `begun`."""
-    return solve(_first(problem, count, dynamics.order, speed, rate), method)
+    return solve(_start_problem(problem, count, dynamics.order, speed, rate), method)
 
 
-def _first(problem: Problem, count: int, order: int, speed: float | None, rate: float | None) -> Problem:
-    """Return the first epochs of a run as one problem, with priors of velocity and acceleration."""
+def _start_problem(problem: Problem, count: int, order: int, speed: float | None, rate: float | None) -> Problem:
+    """Return the first `count` epochs of a run as one problem, with priors of velocity and acceleration.
+
+    The unknown is a state of the given `order`. `speed` (m/s) and `rate` (m/s^2) are the sigmas of the
+    priors, or None.
+    """
     part = cut(problem, 0, count)
     d = problem.dimension
     priors = [
@@ -224,7 +231,9 @@ class Beginning:
 
     - last: last scan that was used or given up.
     - state: state at this scan, or None.
-    - code: ok; ambiguous if the state has alternatives; rejected if the rows contradict each other.
+    - code: ok; ambiguous if the state has alternatives; rejected if the rows contradict each other; curved if
+    the
+      covariance is not valid; without a state, the status of the last attempt.
     - waiting: status of the scans before; ok if a start follows.
     - reason: a sentence if the status is not ok.
     - fit: chi-square of the rows of the start, and its degrees of freedom.
@@ -248,13 +257,20 @@ class Undecided(Exception):  # noqa: N818  # no error: more scans follow
     """Raised if a start needs more scans than have arrived; `scans` is the necessary number of scans of the run."""
 
     def __init__(self, scans: int) -> None:
+        """Store the necessary number of scans."""
         super().__init__(scans)
         self.scans = scans
 
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """Scans that determine a state: fix, first and last scan, final state, excluded rows of all and of the last."""
+    """Successive scans that determine a state.
+
+    - fix: their common fix.
+    - first, last: numbers of the first and the last scan.
+    - state: state at the last scan.
+    - left_out, left_out_last: number of rows that a robust fix excludes, of all scans and of the last scan.
+    """
 
     fix: Fix
     first: int
@@ -265,7 +281,10 @@ class _Stretch:
 
     @property
     def p(self) -> float:
-        """Return the p-value of the rows; 1 without redundancy, because no row contradicts the others then."""
+        """Return the p-value of the rows (chi-square).
+
+        Without redundancy it is 1, because then no row contradicts the others.
+        """
         p = float(self.fix.p_value)
         return 1.0 if np.isnan(p) else p
 
@@ -281,13 +300,13 @@ class _Stretch:
 
     @property
     def clean(self) -> bool:
-        """Return whether a filter can start with this state."""
-        # With less redundancy, other rows might be the wrong rows, see `optloc.solvers.suspects`.
+        """Return whether a filter can start with this state: one Gaussian, from rows that fit together."""
+        # With less redundancy, other rows might be the wrong rows, see `optloc.solvers.suspect_rows`.
         sure = not self.left_out or int(self.fix.dof) > self.left_out
         return sure and self.p >= _PLAUSIBLE and is_one_gaussian(self.fix)
 
     def beginning(self, code: Status, reason: str = "") -> Beginning:
-        """Return the stretch as a start."""
+        """Return the stretch as a start with a status and its sentence."""
         return Beginning(self.last, self.state, code, Status.OK, reason, self.fit, self.left_out_last, self.first)
 
 
@@ -303,15 +322,15 @@ def begin(
 ) -> Beginning:
     """Return a start at scan `first` or later, without a guess.
 
-    The smallest number of scans that determines the state is solved as one problem. If their rows contradict each
-    other, the stretch of scans starts one scan later. If several states explain the rows, the stretch is extended.
-    `speed`, `rate` and `method` are as in `begun`. With `ends`, `problem` has all scans of the run; otherwise a start
-    that needs later scans raises `Undecided`.
+    The smallest number of scans that determines the state is solved as one problem. If their rows contradict
+    each other, the start begins at a later scan. If several states explain the rows, the stretch of
+    scans is extended. `speed`, `rate` and `method` are as in `begun`. With `ends`, `problem` has all scans of
+    the run; otherwise a start that needs later scans raises `Undecided`.
     """
     doubtful: list[_Stretch] = []
     verdict, last = Status.TOO_FEW_ROWS, first
     observed = _scans_with_rows(problem, first)
-    for i in _slides(len(observed) if ends else np.inf):
+    for i in _trial_scans(len(observed) if ends else np.inf):
         if i >= len(observed):
             raise Undecided(problem.epochs + 1)
         last = int(observed[i])
@@ -319,7 +338,7 @@ def begin(
         # For a run that continues, add the next numbers of scans beyond the present length.
         tries = counts(run.epochs if ends else 2 * run.epochs + 2, dynamics.order, speed, rate)
         fixed = partial(first_fix, run, dynamics, speed=speed, rate=rate, method=method)
-        found, verdict = _stretch(run, last, tries, fixed)
+        found, verdict = _first_stretch(run, last, tries, fixed)
         if found is not None and found.clean:
             return found.beginning(Status.OK)
         if found is not None:
@@ -330,11 +349,11 @@ def begin(
             break
     if doubtful:
         best = min(doubtful, key=lambda each: each.fit[0] / max(each.fit[1], 1))
-        start = _doubtful(best)
+        start = _doubtful_start(best)
         if start.code != Status.AMBIGUOUS:
             return start
         run = cut(problem, best.first, problem.epochs)
-        posed = _first(run, best.last - best.first + 1, dynamics.order, speed, rate)
+        posed = _start_problem(run, best.last - best.first + 1, dynamics.order, speed, rate)
         return replace(start, rivals=tuple(_rivals(posed, best)))
     if verdict == Status.CONTRADICTORY:  # these scans contradict each other; later scans may agree
         return Beginning(last, None, Status.REJECTED, Status.REJECTED, "the rows of the scans contradict each other")
@@ -342,13 +361,13 @@ def begin(
     return Beginning(problem.epochs - 1, None, verdict, verdict, reason)
 
 
-def _doubtful(best: _Stretch) -> Beginning:
+def _doubtful_start(best: _Stretch) -> Beginning:
     """Return a start with a doubtful state, and the status that names the problem."""
     return best.beginning(*objections(_FINDINGS, best)[0])
 
 
 def _rivals(posed: Problem, best: _Stretch) -> Iterator[Rival]:
-    """Yield the other minima of a start as states, from its problem with the kept rows."""
+    """Yield the other minima of a start as states; `posed` is its problem, of which only the kept rows are used."""
     kept = posed.with_rows(weight=posed.weight * (best.fix.weights > 0.0))
     others = best.fix.alternatives
     for x, gap in zip(others.x, others.gap, strict=True):
@@ -375,8 +394,11 @@ _FINDINGS = (
 """Findings about a start with a doubtful state."""
 
 
-def _slides(count: float) -> Iterator[int]:
-    """Yield the numbers of the scans at which starts are tried: the next few scans, then at increasing distances."""
+def _trial_scans(count: float) -> Iterator[int]:
+    """Yield the numbers of the scans at which starts are tried: the next few scans, then at increasing distances.
+
+    There are at most `_TRIES` numbers, all below `count`.
+    """
     i = 0
     for _ in range(_TRIES):
         if i < count:
@@ -384,8 +406,14 @@ def _slides(count: float) -> Iterator[int]:
         i = max(i + 1, i * 3 // 2)
 
 
-def _stretch(run: Problem, k: int, tries: Sequence[int], fixed: Callable[[int], Fix]) -> tuple[_Stretch | None, Status]:
-    """Return the first unique start of a run from scan k, else the first start with an answer, and the last status."""
+def _first_stretch(
+    run: Problem, k: int, tries: Sequence[int], fixed: Callable[[int], Fix]
+) -> tuple[_Stretch | None, Status]:
+    """Return the first unique start of a run from scan k, else the first start with an answer, and the last status.
+
+    `tries` are the numbers of scans to try. `fixed` returns the fix of a number of scans. The stretch is None
+    if no number of scans gives an answer. If the rows contradict each other, longer stretches are not tried.
+    """
     ambiguous, verdict = None, Status.TOO_FEW_ROWS
     for count in tries:
         if ambiguous is not None and count > _CLEAR:
@@ -414,20 +442,26 @@ def _stretch(run: Problem, k: int, tries: Sequence[int], fixed: Callable[[int], 
 
 
 def _is_vague(problem: Problem, state: State) -> bool:
-    """Return whether a state is more uncertain than the range of the target; NaN counts as uncertain."""
+    """Return whether the sigma of a position exceeds both the spread of the stations and the range of the target.
+
+    NaN counts as exceeding.
+    """
     d = problem.dimension
     sigma = float(np.sqrt(np.linalg.eigvalsh(state.cov[:d, :d])[-1]))
     return not sigma <= reach(problem, state.mean[:d])
 
 
 def _scans_with_rows(problem: Problem, first: int) -> Array:
-    """Return the scans from `first` on that have a valid row, in ascending order."""
+    """Return the numbers of the scans from `first` on that have a valid row, in ascending order."""
     scans = np.unique(problem.epoch[problem.weight > 0.0])
     return np.asarray(scans[scans >= first])
 
 
 def reach(problem: Problem, position: Array) -> float:
-    """Return the larger of the spread of the stations and the distance of a position (d,) from their centre, m."""
+    """Return the larger of the spread of the stations and the distance of a position (d,) from their centre, m.
+
+    A prediction that is more uncertain than this length is not followed.
+    """
     centre, spread = centre_and_spread(problem.stations.places.reshape(-1, problem.dimension))
     return max(float(spread), float(np.linalg.norm(position - centre)))
 

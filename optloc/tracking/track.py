@@ -32,7 +32,7 @@ class State:
     time : float
         Seconds.
     mean : array (..., n)
-        State [p, v, a].
+        State [p, v, a]: position (m), velocity (m/s) and acceleration (m/s^2), as far as the model has them.
     cov : array (..., n, n)
         Covariance of the state.
     """
@@ -44,14 +44,14 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """States of a target over time; a batch of targets has leading axes.
+    """States of a target over time (k scans); a batch of targets has leading axes (...).
 
     Parameters
     ----------
     times : array (k,)
         Times of the scans, seconds.
     mean : array (..., k, n)
-        State after each scan.
+        State [p, v, a] after each scan: m, m/s, m/s^2.
     cov : array (..., k, n, n)
         Covariance after each scan.
     nis : array (..., k)
@@ -61,8 +61,8 @@ class Track:
     loglikelihood : array (..., k)
         Log-likelihood of each scan given the prediction.
     code : int array (..., k)
-        `Status` of each scan. Ok. Too few rows: no valid row, the state is only predicted. Rejected: rows failed the
-        gate or are not finite. Numerical: the state is lost.
+        `Status` of each scan. Ok. Too few rows: no valid row, the state is only predicted. Rejected: rows failed
+        the gate or are not finite. Numerical: the state is lost.
     dimension : int
         2 or 3.
     """
@@ -134,7 +134,10 @@ def followed(problem: Problem, start: State, dynamics: Dynamics, update: Update 
 
 
 def follow(problem: Problem, start: State, dynamics: Dynamics, rule: Update) -> Track:
-    """Return the track of a state through the scans of a run; scans at or before the start are ignored."""
+    """Return the track of a state through the scans of a run; scans at or before the start are ignored.
+
+    `rule` is the filter. The arguments are not checked, see `followed`.
+    """
     given, state, steps, times = Scans.of(problem, dynamics.order), start, [], []
     for k, time in enumerate(problem.times.tolist()):
         if time <= start.time:
@@ -156,8 +159,9 @@ def step(
 ) -> tuple[Updated, Array]:
     """Return the state after prediction to scan k and update, and its status (...) as in `take_scan`.
 
-    The scan is not before the state. `more` replaces the measurements minus corrections (..., m) and the weights (...,
-    m) of the scan. One call of compiled code does the update if possible.
+    `given` are the scans, `state` is the state before the prediction, and `rule` is the filter. The scan is
+    not before the state. `more` replaces the measurements minus corrections (..., m) and the weights (..., m)
+    of the scan. One call of compiled code does the update if possible.
     """
     problem = given.problem
     time, d = float(problem.times[k]), problem.dimension
@@ -174,7 +178,7 @@ def step(
 
 
 def move_of(state: State, dynamics: Dynamics, time: float, dimension: int) -> Move | None:
-    """Return the prediction step of a state (...) to a later time, or None for the same time."""
+    """Return the prediction step of a state (...) to a later `time`, s, or None for the same time."""
     dt = _elapsed(state, time)
     if dt == 0.0:
         return None
@@ -216,12 +220,12 @@ def predicted(state: State, dynamics: Dynamics, time: float, dimension: int) -> 
 def take_scan(scan: Problem, ahead: State, rule: Update, causes: list[str] | None = None) -> tuple[Updated, Array]:
     """Return the update of a predicted state (...) by a scan, and its status (...); a bad scan keeps the prediction.
 
-    `scan` is a problem of one epoch at the time of the state. If an update fails numerically, its cause is appended to
-    `causes`.
+    `scan` is a problem of one epoch at the time of the state `ahead`, and `rule` is the filter. If an update
+    fails numerically, its cause is appended to `causes`.
     """
     shape = ahead.mean.shape[:-1]
     if not scan.rows or not scan.count:
-        return _keep(ahead), np.full(shape, int(Status.TOO_FEW_ROWS), dtype=np.int8)
+        return _prediction_only(ahead), np.full(shape, int(Status.TOO_FEW_ROWS), dtype=np.int8)
     usable, broken = scan, np.zeros((), dtype=bool)
     if not np.isfinite(scan.z).all():
         # One scan may serve many targets, and one target many runs, so the weights have the axes of both.
@@ -230,7 +234,7 @@ def take_scan(scan: Problem, ahead: State, rule: Update, causes: list[str] | Non
         usable, broken = scan.with_rows(z=np.where(bad, 0.0, scan.z), weight=weight * ~bad), np.asarray(bad.any(-1))
     # A lost state gets a status below, so it needs no warning.
     with np.errstate(all="ignore"):
-        done = _contained(usable, ahead, rule, [] if causes is None else causes)
+        done = _update_each(usable, ahead, rule, [] if causes is None else causes)
     if not broken.any() and np.isfinite(done.cov).all() and np.isfinite(done.mean).all() and np.all(done.count > 0):
         return done, np.zeros(done.mean.shape[:-1], dtype=np.int8)
     lost = ~(np.isfinite(done.mean).all(-1) & np.isfinite(done.cov).all((-1, -2)))
@@ -247,8 +251,11 @@ def take_scan(scan: Problem, ahead: State, rule: Update, causes: list[str] | Non
     ), code
 
 
-def _contained(scan: Problem, ahead: State, rule: Update, causes: list[str]) -> Updated:
-    """Return the update of states; only a state of a batch whose update fails numerically is NaN."""
+def _update_each(scan: Problem, ahead: State, rule: Update, causes: list[str]) -> Updated:
+    """Return the update of states (...); a state whose update fails numerically is NaN, and the others are valid.
+
+    If the update of a batch fails, each state is updated alone. The cause of a failure is appended to `causes`.
+    """
     try:
         return rule(scan, ahead.mean, ahead.cov)
     except NUMERICAL as error:
@@ -262,7 +269,7 @@ def _contained(scan: Problem, ahead: State, rule: Update, causes: list[str]) -> 
     size = math.prod(scan.batch_shape)
     which, flat = np.broadcast_to(np.arange(size).reshape(scan.batch_shape), shape).ravel(), scan.flat()
     each = [
-        _contained(flat.take(np.array([i])), State(ahead.time, *one), rule, causes)
+        _update_each(flat.take(np.array([i])), State(ahead.time, *one), rule, causes)
         for i, *one in zip(which, mean, cov, strict=True)
     ]
     return Updated(
@@ -273,19 +280,20 @@ def _contained(scan: Problem, ahead: State, rule: Update, causes: list[str]) -> 
     )
 
 
-def _keep(ahead: State) -> Updated:
-    """Return the prediction as an update without rows."""
+def _prediction_only(ahead: State) -> Updated:
+    """Return the prediction (...) as an update without rows: NIS is NaN, and count and log-likelihood are 0."""
     shape = ahead.mean.shape[:-1]
     none = np.zeros(shape)
     return Updated(ahead.mean, ahead.cov, np.full(shape, np.nan), none, none)
 
 
 def collect(times: Array, steps: list[tuple[Updated, Array]], dimension: int) -> Track:
-    """Return the updates and statuses of all scans as a track."""
+    """Return the updates and statuses of all scans, in the order of their `times` (k,), s, as a track."""
     if not steps:
         raise InvalidProblem("no scan is later than the start", "start", "give a start before the last scan")
 
     def stacked(name: str, core: int) -> Array:
+        """Return a field of all updates with an axis of scans before its `core` last axes."""
         return np.stack([getattr(done, name) for done, _ in steps], axis=-1 - core)
 
     return Track(
@@ -321,7 +329,10 @@ def scans(problem: Problem, order: int) -> Iterator[tuple[float, Problem]]:
 
 
 def scan_at(problem: Problem, k: int, order: int) -> Problem:
-    """Return one scan of a run, see `scans`; it has no rows if the epoch has no rows."""
+    """Return scan k of a run as a problem, see `scans`; it has no rows if the epoch has no rows.
+
+    `order` is the order of the state.
+    """
     if not (problem.epoch == k).any():
         return replace(problem, rows=())
     # The unknown of a scan is the state at the time of the scan, so this time is the reference of the motion.
@@ -345,7 +356,7 @@ def check_trackable(problem: Problem) -> None:
 
 
 def check_state(state: State, n: int) -> None:
-    """Raise InvalidProblem for a state of the wrong size, or with an invalid covariance."""
+    """Raise InvalidProblem for a state that does not have n numbers, or has an invalid covariance."""
     if state.mean.shape[-1:] != (n,) or state.cov.shape[-2:] != (n, n):
         raise InvalidProblem(
             f"{n} unknowns, but a state of {state.mean.shape[-1]} numbers and a covariance {state.cov.shape[-2:]}",

@@ -1,4 +1,9 @@
-"""Update of a predicted state by one scan: all filters use the same linearised rows."""
+"""Update of a predicted state by one scan: all filters use the same linearised rows.
+
+Letters: m rows of a scan, n numbers of a state, (...) a batch of states. H (m, n) is the derivative of
+the rows, and R (m, m) is their covariance. P (n, n) is the covariance of the predicted state, K (n, m) is the
+gain, and S = H P H' + R is the covariance of the innovations. Whitened rows have R = I.
+"""
 
 from __future__ import annotations
 
@@ -50,9 +55,9 @@ class Updated:
     Parameters
     ----------
     mean : array (..., n)
-        State.
+        State [p, v, a]: m, m/s, m/s^2.
     cov : array (..., n, n)
-        Covariance.
+        Covariance of the state.
     nis : array (...)
         Normalised innovation squared at the prediction; chi-square distributed with `count` degrees of freedom.
     loglikelihood : array (...)
@@ -115,7 +120,10 @@ class Filter:
         return self._general(scan, mean, cov)
 
     def _general(self, scan: Problem, mean: Array, cov: Array) -> Updated:
-        """Return the update in NumPy, for scans that `optloc.tracking.scan_rows.Scans` does not support."""
+        """Return the update in NumPy, for scans that `optloc.tracking.scan_rows.Scans` does not support.
+
+        `mean` (..., n) and `cov` (..., n, n) are the predicted states.
+        """
         form, gate = self.how.form, self.how.gate
         if np.isfinite(gate):
             scan = scan.with_rows(weight=weights_within(scan, mean, cov, gate))
@@ -123,14 +131,14 @@ class Filter:
         slope, gain = white.H, _gain(white.H, cov)
         x = mean + (gain @ white.residual[..., None])[..., 0]
         if form == IEKF:
-            x = _converged(scan, mean, cov, white, self.how)
+            x = _map_states(scan, mean, cov, white, self.how)
         if form in (IEKF, MVEKF):
             slope = whitened(scan, x).H
             gain = _gain(slope, cov)
         if form == MGEKF:
             parts = [w * whitened(scan, mean + node * (x - mean)).H for node, w in zip(NODES, SHARES, strict=True)]
             slope = np.sum(parts, axis=0)
-        return _finish(white, cov, x, joseph(slope, gain, cov))
+        return _with_likelihood(white, cov, x, joseph(slope, gain, cov))
 
 
 ekf = Filter("the extended Kalman filter: one linearisation at the prediction", Filtering(EKF))
@@ -152,7 +160,7 @@ UPDATES: Registry[Update] = Registry(
 
 
 def filter_of(update: Update | str) -> Update:
-    """Return a filter by name; raise InvalidProblem for an unknown name."""
+    """Return the filter with a name in `UPDATES`, or the given filter; an unknown name raises InvalidProblem."""
     if not isinstance(update, str):
         return update
     if update not in UPDATES:
@@ -219,6 +227,7 @@ def reweighted(update: Update | str, loss: Loss | str) -> Update:
     chosen: Loss = loss
 
     def robust(scan: Problem, mean: Array, cov: Array) -> Updated:
+        """Return the update of predicted states (..., n) with weighted rows, until the weights are constant."""
         # Scan and state may have different leading axes; the loss works on a flat batch.
         many = np.broadcast_shapes(scan.batch_shape, mean.shape[:-1])
         x, flat = np.broadcast_to(mean, (*many, mean.shape[-1])).reshape(-1, mean.shape[-1]), scan.flat()
@@ -270,7 +279,10 @@ class White:
 
 
 def whitened(scan: Problem, x: Array, noise: tuple[Whitener, ...] | None = None) -> White:
-    """Return the rows of a scan linearised at states x (..., n) and whitened; absent rows are zero."""
+    """Return the rows of a scan linearised at states x (..., n) and whitened; absent rows are zero.
+
+    `noise` are whitening matrices from an earlier call; None: compute them.
+    """
     linear = linearise(scan, x, noise)
     both = np.concatenate([linear.shared, linear.residual[..., None]], axis=-1)
     white = np.concatenate([w.apply(both) for w in linear.noise], axis=-2)
@@ -279,7 +291,10 @@ def whitened(scan: Problem, x: Array, noise: tuple[Whitener, ...] | None = None)
 
 
 def _size_of(noise: tuple[Whitener, ...], shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """Return the number of present rows and the logarithm of the determinant of 2 pi R, each (...)."""
+    """Return the number of present rows and the logarithm of the determinant of 2 pi R, each (...).
+
+    `noise` are the whitening matrices of the rows, and `shape` is the batch shape (...).
+    """
     total = np.zeros((*shape, 2))
     for w in noise:
         # A block that many groups of rows share is stored once.
@@ -288,7 +303,10 @@ def _size_of(noise: tuple[Whitener, ...], shape: tuple[int, ...]) -> tuple[Array
 
 
 def joseph(H: Array, gain: Array, cov: Array) -> Array:
-    """Return (I - K H) P (I - K H)' + K K', (..., n, n), for whitened rows: symmetric and positive for any gain."""
+    """Return (I - K H) P (I - K H)' + K K', (..., n, n), for whitened rows: symmetric and positive for any gain.
+
+    This is the covariance after an update. `gain` is K (..., n, m), and `cov` is P (..., n, n).
+    """
     # The short form (I - K H) P is correct only for the optimal gain, and rounding makes it asymmetric.
     left = np.eye(cov.shape[-1]) - gain @ H
     out = left @ cov @ np.swapaxes(left, -1, -2) + gain @ np.swapaxes(gain, -1, -2)
@@ -296,15 +314,19 @@ def joseph(H: Array, gain: Array, cov: Array) -> Array:
 
 
 def _gain(H: Array, cov: Array) -> Array:
-    """Return the Kalman gain (..., n, m) for whitened rows."""
+    """Return the Kalman gain K (..., n, m) for whitened rows H (..., m, n) and predicted covariances (..., n, n)."""
     # With whitened rows, S is regular for any prior, even for an exactly known state.
     S = H @ cov @ np.swapaxes(H, -1, -2) + np.eye(H.shape[-2])
     solved, _ = linalg.solve(S, H @ cov)
     return np.swapaxes(solved, -1, -2)
 
 
-def _finish(white: White, cov: Array, mean: Array, after: Array) -> Updated:
-    """Return the updated state with its NIS and log-likelihood, from the rows at the prediction."""
+def _with_likelihood(white: White, cov: Array, mean: Array, after: Array) -> Updated:
+    """Return the updated state with its NIS and log-likelihood, from the rows at the prediction.
+
+    `white` are the whitened rows and `cov` (..., n, n) is the covariance, both at the prediction. `mean`
+    (..., n) and `after` (..., n, n) are the updated state.
+    """
     S = white.H @ cov @ np.swapaxes(white.H, -1, -2) + np.eye(white.H.shape[-2])
     # ln|2 pi S| of the rows as measured: the value of the whitened rows plus the logarithm of the whitening.
     lower, _ = linalg.factor(S)
@@ -314,8 +336,12 @@ def _finish(white: White, cov: Array, mean: Array, after: Array) -> Updated:
     return Updated(mean, after, nis, -0.5 * (nis + logdet), white.count)
 
 
-def _converged(scan: Problem, mean: Array, cov: Array, white: White, how: Filtering) -> Array:
-    """Return the maximum a posteriori states by Gauss-Newton, starting from the predictions."""
+def _map_states(scan: Problem, mean: Array, cov: Array, white: White, how: Filtering) -> Array:
+    """Return the maximum a posteriori states (..., n) by Gauss-Newton, starting from the predictions.
+
+    `mean` and `cov` are the predictions, and `white` are the rows linearised there. `how` contains the step
+    limits.
+    """
     # The prior is one more block of whitened rows: steps must not increase the cost of rows and prior together.
     prior = linalg.whitening(cov)
     x, cost, moving = mean, (white.residual**2).sum(-1), np.ones(mean.shape[:-1], dtype=bool)

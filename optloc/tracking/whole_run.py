@@ -53,8 +53,8 @@ def fitted(problem: Problem, order: int, *, reference: float | None = None, meth
 def along(state: State, times: Array, dimension: int) -> tuple[Array, Array]:
     """Return states (..., k, n) and covariances (..., k, n, n) along a polynomial course.
 
-    The order of the course follows from the length n of the state: position, and velocity and acceleration if present.
-    `times` (k,) are in seconds, before or after the state.
+    The order of the course follows from the length n of the state: position, and velocity and acceleration if
+    present. `times` (k,) are in seconds, before or after the state. `dimension` is 2 or 3.
     """
     # Without process noise, the transition is exact forward and backward in time.
     model = polynomial(state.mean.shape[-1] // dimension - 1)

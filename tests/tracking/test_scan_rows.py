@@ -5,7 +5,7 @@ import pytest
 
 from optloc import Motion, assemble, measured
 from optloc.base import linalg
-from optloc.tracking.scan_rows import _alike, _is_plain, owned, size_of, touched
+from optloc.tracking.scan_rows import _group_by_structure, _is_plain, owned, size_of, touched
 
 PLACES = np.array([[0.0, 0.0], [900.0, 0.0], [0.0, 900.0]])
 
@@ -35,7 +35,7 @@ def test_the_size_of_a_covariance_is_its_rank_and_determinant(rank):
 
 def test_epochs_with_the_same_rows_are_alike():
     rows = measured("range", a=[0, 1, 0, 2, 0, 1], epoch=[0, 0, 1, 1, 2, 2], sigma=1.0)
-    found = {tuple(epochs.tolist()): index.tolist() for epochs, index in _alike(run(rows))}
+    found = {tuple(epochs.tolist()): index.tolist() for epochs, index in _group_by_structure(run(rows))}
     assert found == {(0, 2): [[0, 1], [4, 5]], (1,): [[2, 3]]}
 
 

@@ -8,7 +8,7 @@ import pytest
 from optloc import Frame, InvalidProblem, Motion, NoSolution, assemble, measured
 from optloc.linear.constraints import height
 from optloc.tracking import polynomial
-from optloc.tracking.start import _slides, begun, counts, out_of_sight, reach, two_point, with_height_rows
+from optloc.tracking.start import _trial_scans, begun, counts, out_of_sight, reach, two_point, with_height_rows
 
 PLACES = np.array([[0.0, 0.0], [900.0, 0.0], [0.0, 900.0], [900.0, 1000.0]])
 START, RATE = np.array([300.0, 400.0]), np.array([5.0, -3.0])
@@ -35,8 +35,8 @@ def test_each_try_takes_half_more_scans_than_the_last():
     assert counts(3, 0) == [1, 2, 3]
     assert counts(4, 1, speed=10.0) == [1, 2, 3, 4]
     assert counts(4, 2, speed=10.0) == [3, 4]
-    assert list(_slides(5.0)) == [0, 1, 2, 3, 4]
-    assert list(_slides(np.inf))[-3:] == [19, 28, 42]
+    assert list(_trial_scans(5.0)) == [0, 1, 2, 3, 4]
+    assert list(_trial_scans(np.inf))[-3:] == [19, 28, 42]
 
 
 def test_two_fixes_are_a_state_whose_velocity_has_the_errors_of_both():

@@ -57,6 +57,7 @@ def register_yaml(yaml: Any) -> None:
     # The tag of a class in a file contains its module. Read only the class name, so that old files work after a
     # class moves to another module.
     def construct(constructor: Any, suffix: str, node: Any) -> Any:
+        """Return the object of a YAML node; `suffix` is its tag after the package name."""
         constructor.deep_construct = True
         (properties,) = constructor.construct_yaml_omap(node)  # the generator must run to its end
         return classes[suffix.rpartition(".")[2]](**properties)

@@ -1,7 +1,12 @@
 """Chains of detections of several scans that may come from one target, fitted in batches within a limit of work.
 
 The fix of one scan gives a position, and the fixes of two scans give a velocity. A chain with these start
-values needs one descent. A search without start values takes as long as hundreds of descents.
+values needs one descent, which is an iterative refinement. A search without start values takes as long as
+hundreds of descents.
+
+Letters: d coordinates, n numbers of a state (position, and velocity if it is known), B runs of
+detections, m rows, q states. The gate is the largest distance between a detection and a prediction at
+which both are compared.
 """
 
 from __future__ import annotations
@@ -48,12 +53,12 @@ LONG = 100.0
 
 @dataclass(slots=True)
 class ChainWork:
-    """The work that a call can still do, in units of about a millisecond."""
+    """The work that a call can still do (`left`), in units of about a millisecond."""
 
     left: float
 
     def take(self, cost: float) -> bool:
-        """Subtract a cost and return True if any work is left; otherwise return False."""
+        """Return whether work is left, and subtract the cost if so; the rest may become negative."""
         if self.left <= 0.0:
             return False
         self.left -= cost
@@ -69,7 +74,7 @@ class ChainTerms:
     order : int
         1 for targets with a velocity, 0 for targets at rest.
     speed : float, optional
-        Prior standard deviation of each velocity coordinate about zero, m/s.
+        Prior standard deviation of each velocity coordinate about zero, m/s; None without a prior.
     least_p : float
         Smallest p-value of a chain; a chain with a smaller p-value is not one target.
     """
@@ -88,10 +93,10 @@ class DetectionChain:
     detections : tuple of Detection
         Detections with models of this plug-in.
     x : array (q, n)
-        States at the last detection that fit, best first. A state is only a position if no row or prior
-        determines the velocity. q = 0 if no position is determined.
+        States at the last detection that fit, best first: metres, then m/s. A state is only a position if no row or
+        prior determines the velocity. q = 0 if no position is determined.
     cov : array (n, n), optional
-        Covariance of the first state; None if it is too wide for a Gaussian.
+        Covariance of the first state; None if it is too wide for a Gaussian, or if there are several states.
     p : float
         p-value of the chi-square; 1 without redundancy.
     """
@@ -112,7 +117,10 @@ class DetectionChain:
 
 
 def is_flat(cov: Array, position: Array, detection: Any) -> bool:
-    """Return whether the largest sigma of a covariance (d, d), m^2, is below 5 % of the nearest range."""
+    """Return whether the largest sigma of a covariance (d, d), m^2, is below 5 % of the range of the nearest station.
+
+    Then a fix at `position` (d,) is nearly Gaussian. `detection` provides the stations.
+    """
     nearest = np.linalg.norm(detection.measurement_model.sites - position, axis=-1).min()
     return bool(np.isfinite(cov).all() and np.sqrt(np.linalg.eigvalsh(cov)[-1]) < _FLAT * nearest)
 
@@ -120,20 +128,20 @@ def is_flat(cov: Array, position: Array, detection: Any) -> bool:
 def posed(runs: Sequence[Sequence[Any]], terms: ChainTerms) -> tuple[Problem, Array]:
     """Return the problem of B runs of detections, without values, and the values (B, m) of its rows.
 
-    The runs have the same rows in each scan, and the same time differences. The state is the state at the last
-    scan.
+    A run is a sequence of detections in the order of time. The runs have the same rows in each scan, and the
+    same time differences. The state is the state at the last scan.
     """
     models = [[detection.measurement_model for detection in run] for run in runs]
     last = runs[0][-1].timestamp
     times = np.array([(detection.timestamp - last).total_seconds() for detection in runs[0]])
     d = len(models[0][0].mapping)
     priors = [Prior("velocity", np.zeros(d), terms.speed**2 * np.eye(d))] if terms.order and terms.speed else []
-    rates = None if models[0][0].rates is None else _shared([[model.rates for model in run] for run in models])
+    rates = None if models[0][0].rates is None else _common_values([[model.rates for model in run] for run in models])
     rows = [model.rows for model in models[0]]
     problem = problem_of(
-        _shared([[model.sites for model in run] for run in models]),
+        _common_values([[model.sites for model in run] for run in models]),
         rows,
-        [_shared([run[k].covar() for run in models]) for k in range(len(rows))],
+        [_common_values([run[k].covar() for run in models]) for k in range(len(rows))],
         velocity=rates,
         times=times,
         motions=(Motion(terms.order, reference=0.0),),
@@ -143,13 +151,13 @@ def posed(runs: Sequence[Sequence[Any]], terms: ChainTerms) -> tuple[Problem, Ar
     return problem, z[:, rows_by_kind(rows)[1]]
 
 
-def _shared(values: Any) -> Array:
+def _common_values(values: Any) -> Array:
     """Return an array (B, ...), or only its first entry if all entries are equal."""
     array = np.asarray(values, dtype=float)
     return array[0] if (array == array[:1]).all() else array
 
 
-def _key(run: Sequence[Any]) -> Any:
+def _batch_key(run: Sequence[Any]) -> Any:
     """Return a key that is equal for runs that fit into one batch: same shapes, rows and time differences."""
     last = run[-1].timestamp
     shape = run[0].measurement_model.stations.shape, tuple(run[0].measurement_model.mapping)
@@ -158,7 +166,7 @@ def _key(run: Sequence[Any]) -> Any:
 
 
 def _group_indices(keys: Sequence[Any]) -> list[list[int]]:
-    """Return lists of the indices of equal keys."""
+    """Return lists of the indices of equal keys, in the order of their first occurrence."""
     found: dict[Any, list[int]] = {}
     for i, key in enumerate(keys):
         found.setdefault(key, []).append(i)
@@ -166,20 +174,26 @@ def _group_indices(keys: Sequence[Any]) -> list[list[int]]:
 
 
 def alone(scan: Sequence[Any], terms: ChainTerms) -> list[DetectionChain]:
-    """Return a chain for each detection of a scan, with the fix of this detection alone."""
+    """Return a chain for each detection of a scan, with the fix of this detection alone.
+
+    Detections with the same rows are solved as one batch.
+    """
     out: list[Any] = [None] * len(scan)
-    for members in _group_indices([_key([detection]) for detection in scan]):
+    for members in _group_indices([_batch_key([detection]) for detection in scan]):
         moving = scan[members[0]].measurement_model.rates is not None
-        own = ChainTerms(terms.order if moving else 0, terms.speed, terms.least_p)
-        problem, z = posed([[scan[i]] for i in members], own)
+        terms_here = ChainTerms(terms.order if moving else 0, terms.speed, terms.least_p)
+        problem, z = posed([[scan[i]] for i in members], terms_here)
         fixes = prepare(problem, _QUICK)(z).flat()
         for place, i in enumerate(members):
-            out[i] = _of_fix((scan[i],), fixes[place], terms)
+            out[i] = _chain_of_fix((scan[i],), fixes[place], terms)
     return out
 
 
-def _of_fix(detections: tuple[Any, ...], fix: Fix, terms: ChainTerms) -> DetectionChain:
-    """Return a chain with the states of its single fix; without a velocity in the fix, the velocity prior is added."""
+def _chain_of_fix(detections: tuple[Any, ...], fix: Fix, terms: ChainTerms) -> DetectionChain:
+    """Return the chain of some detections with the states of their common fix.
+
+    If the fix has no velocity, the velocity prior of `terms` is added.
+    """
     p = float(fix.p_value)
     p = 1.0 if np.isnan(p) else p
     if not bool(fix.answered) or bool(fix.has(Status.UNBOUNDED)):
@@ -197,9 +211,9 @@ def _of_fix(detections: tuple[Any, ...], fix: Fix, terms: ChainTerms) -> Detecti
 def near(chains: Sequence[DetectionChain], single: DetectionChain, terms: ChainTerms) -> list[tuple[float, int]]:
     """Return the distance of a detection from each chain that it may continue, and the index of the chain.
 
-    The distance is the squared innovation in units of its covariance, divided by the gate: 1 at the edge of the
-    gate. Chains without a Gaussian state have no prediction and get the distance 1. Chains beyond the gate are
-    omitted.
+    The distance is the squared innovation in units of its covariance, divided by the gate: 1 at the edge of
+    the gate. Chains without a Gaussian state have no prediction and get the distance 1. Chains beyond the
+    gate are omitted. `single` is the chain of the detection alone.
     """
     detection = single.detections[-1]
     known = [
@@ -224,7 +238,11 @@ def near(chains: Sequence[DetectionChain], single: DetectionChain, terms: ChainT
 
 
 def _innovations(detection: Any, mean: Array, cov: Array) -> Array:
-    """Return the squared distances (C,) of a detection from the predictions of C states (C, n) with covariances."""
+    """Return the squared distances (C,) of a detection from the predictions of C states.
+
+    `mean` (C, n) and `cov` (C, n, n) are the predicted states. The distances are in units of the innovation
+    covariance.
+    """
     model = detection.measurement_model
     size, order = len(model.places), model.order
     # A rate model also needs the velocity. For a target at rest, the velocity is exactly zero.
@@ -243,7 +261,10 @@ def _same_stations(one: Any, two: Any) -> bool:
 
 
 def _predict(x: Array, chain: DetectionChain, detection: Any, d: int) -> Array:
-    """Return the states (q, n) of a chain at the time of a detection, for constant velocity."""
+    """Return the states x (q, n) of a chain at the time of a detection, for constant velocity.
+
+    States without a velocity do not change. `d` is the number of coordinates.
+    """
     if x.shape[1] == d:
         return x
     step = (detection.timestamp - chain.last).total_seconds()
@@ -251,7 +272,11 @@ def _predict(x: Array, chain: DetectionChain, detection: Any, d: int) -> Array:
 
 
 def _starts(chain: DetectionChain, single: DetectionChain, terms: ChainTerms) -> Array:
-    """Return start states (q, n) for the fit of a chain with one more detection."""
+    """Return start states (q, n) for the fit of a chain with one more detection.
+
+    They are predictions of the chain, and for a chain of one detection velocities from two positions.
+    `single` is the chain of the new detection.
+    """
     detection = single.detections[-1]
     d = len(detection.measurement_model.mapping)
     if not terms.order:
@@ -269,29 +294,33 @@ def _starts(chain: DetectionChain, single: DetectionChain, terms: ChainTerms) ->
 def grown(
     pairs: Sequence[tuple[DetectionChain, DetectionChain]], terms: ChainTerms, work: ChainWork
 ) -> list[tuple[DetectionChain, DetectionChain, DetectionChain]]:
-    """Return (longer chain, chain, chain of the detection) of the pairs that fit.
+    """Return (longer chain, chain, chain of the detection) of the pairs that fit together.
 
-    The first pairs come first, until no work is left. Pairs with the same rows and times are fitted as one batch.
+    `pairs` are chains with the chain of a later detection. They are fitted in their order, until no work is
+    left. Pairs with the same rows and times are fitted as one batch.
     """
     chosen: dict[Any, list[tuple[DetectionChain, DetectionChain, Array]]] = {}
     for chain, single in pairs:
-        key, starts = _key((*chain.detections, *single.detections)), _starts(chain, single, terms)
+        key, starts = _batch_key((*chain.detections, *single.detections)), _starts(chain, single, terms)
         if not work.take((0.0 if key in chosen else _BATCH) + _DESCENT * len(starts)):
             break
         chosen.setdefault(key, []).append((chain, single, starts))
     out = []
     for members in chosen.values():
         runs = [(*chain.detections, *single.detections) for chain, single, _ in members]
-        longer = _fit(runs, [starts for _, _, starts in members], terms, work)
+        longer = _fit_runs(runs, [starts for _, _, starts in members], terms, work)
         found = zip(longer, members, strict=True)
         out += [(new, chain, single) for new, (chain, single, _) in found if new is not None and new.p >= terms.least_p]
     return out
 
 
-def _fit(
+def _fit_runs(
     runs: Sequence[tuple[Any, ...]], starts: Sequence[Array], terms: ChainTerms, work: ChainWork
 ) -> list[DetectionChain | None]:
-    """Return the chains of runs with the same rows and times; None if a run needs a search and no work is left."""
+    """Return the chains of runs with the same rows and times; None if a run needs a search and no work is left.
+
+    `starts` are the start states (q, n) of each run; a run without starts needs a search.
+    """
     problem, z = posed(runs, terms)
     problem = problem.with_rows(z=z)
     dof = degrees_of_freedom(problem)
@@ -303,7 +332,7 @@ def _fit(
         p = tail_probability(done.cost, dof[item])
         cov, _ = covariance(done.equations)
         for i in begun:
-            out[i] = _best(runs[i], done, p, cov, np.flatnonzero(item == i))
+            out[i] = _chain_of_descents(runs[i], done, p, cov, np.flatnonzero(item == i))
     for i in range(len(runs)):
         if len(starts[i]):
             continue
@@ -311,16 +340,22 @@ def _fit(
             out[i] = DetectionChain(runs[i], np.zeros((0, problem.layout.size)), None, 1.0)
         elif work.take(LONG):
             fix = solve(problem.take(np.array([i])), "roots+lsr").flat()[0]
-            out[i] = _of_fix(runs[i], fix, terms)
+            out[i] = _chain_of_fix(runs[i], fix, terms)
     return out
 
 
-def _best(run: tuple[Any, ...], done: Refined, p: Array, cov: Array, own: Array) -> DetectionChain:
-    """Return the chain of a run from its descents (indices `own`): their different minima, best first."""
-    own = own[np.argsort(np.where(np.isfinite(done.cost[own]), done.cost[own], np.inf), kind="stable")]
-    first, d = own[0], len(run[-1].measurement_model.mapping)
+def _chain_of_descents(run: tuple[Any, ...], done: Refined, p: Array, cov: Array, descents: Array) -> DetectionChain:
+    """Return the chain of a run from its descents: their different minima, best first.
+
+    `done` are the descents of all runs, with p-values `p` (K,) and covariances `cov` (K, n, n). `descents` are the
+    indices of the descents of this run.
+    """
+    descents = descents[
+        np.argsort(np.where(np.isfinite(done.cost[descents]), done.cost[descents], np.inf), kind="stable")
+    ]
+    first, d = descents[0], len(run[-1].measurement_model.mapping)
     kept: list[int] = []
-    for i in own:
+    for i in descents:
         if not done.cost[i] < done.cost[first] + GAP or len(kept) == _KEPT:
             break
         apart = [done.x[i] - done.x[j] for j in kept]

@@ -111,6 +111,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
     )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Check the order, and start without chains."""
         super().__init__(*args, **kwargs)
         if self.order not in (0, 1):
             raise InvalidProblem(f"a motion of order {self.order} is not possible", "order", "use 0 or 1")
@@ -143,7 +144,10 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         return tracks
 
     def _extend_chains(self, scan: list[Any], work: ChainWork) -> list[DetectionChain]:
-        """Return new chains from a scan: extended chains (they replace the old chains), and single detections."""
+        """Return new chains from a scan: extended chains (they replace the old chains), and single detections.
+
+        Each chain and each detection is used at most once. The replaced chains are removed from the waiting chains.
+        """
         terms = ChainTerms(self.order, self.speed, self.least_p)
         # If the rows of one detection do not fit together, no chain with this detection fits.
         singles = [single for single in alone(scan, terms) if single.p >= self.least_p]
@@ -164,7 +168,10 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         return [*out, *(single for single in singles if id(single) not in taken)]
 
     def _confirmed_fix(self, chain: DetectionChain, work: ChainWork) -> Fix | None:
-        """Return the fix of a chain that is long enough, if the fix is unique and nearly Gaussian; otherwise None."""
+        """Return the fix of a chain that is long enough, if the fix is unique and nearly Gaussian; otherwise None.
+
+        Without work left, the result is None too.
+        """
         size = len(chain.detections[-1].measurement_model.mapping) * (self.order + 1)
         # Test the cheap conditions first: the search for other minima takes as long as hundreds of descents.
         if len(chain) < self.confirm or chain.cov is None or len(chain.cov) != size or not work.take(LONG):

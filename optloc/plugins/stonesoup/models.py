@@ -1,7 +1,9 @@
 """Measurement models of Stone Soup with functions, derivatives and inverses of optloc, and a feeder for pairs.
 
-One measurement of a model is one scan with several rows. The feeder joins detections of single pairs to such
-scans. Rows that share a station have correlated errors; the feeder computes their covariance.
+One measurement of a model is one scan with several rows. The feeder joins detections of single pairs to
+such scans. Rows that share a station have correlated errors; the feeder computes their covariance.
+
+Letters: s stations, d coordinates, m rows of a measurement, n numbers of a state, N states.
 """
 
 from __future__ import annotations
@@ -84,6 +86,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
     )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Check the shapes of stations, offset and covariance."""
         super().__init__(*args, **kwargs)
         self.stations = np.asarray(self.stations, dtype=float)
         if np.any(np.asarray(self.rotation_offset, dtype=float)):
@@ -103,7 +106,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
     @property
     @abstractmethod
     def rows(self) -> Sequence[Row]:
-        """Return kind and stations of each row of the measurement."""
+        """Return kind and stations of each of the m rows of the measurement."""
 
     @property
     def ndim_meas(self) -> int:
@@ -132,7 +135,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         return self._build_problem(Motion())
 
     def _build_problem(self, motion: Motion) -> Problem:
-        """Return the optloc problem of one measurement for a motion, with all values zero."""
+        """Return the optloc problem of one measurement, with all values zero; `motion` is its unknown."""
         rates = None if self.rates is None else self.rates[None]
         covariance = np.asarray(self.noise_covar, dtype=float)
         return problem_of(self.sites[None], [self.rows], [covariance], velocity=rates, motions=(motion,))
@@ -177,7 +180,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         return self._with_angle_types(drawn.reshape(self.ndim_meas, num_samples))
 
     def logpdf(self, state1: Any, state2: Any, **kwargs: Any) -> Any:
-        """Return the logarithm of the density of a measurement given a state; angles are wrapped."""
+        """Return the logarithm of the density of a measurement `state1`, given a state `state2`; angles are wrapped."""
         from scipy.stats import multivariate_normal
 
         off = np.asarray(state1.state_vector - self.function(state2), dtype=float)
@@ -185,7 +188,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
 
     @property
     def order(self) -> Array:
-        """Return the index in the measurement of each row of `problem`, which sorts the rows by kind."""
+        """Return the index (m,) in the measurement of each row of `problem`, which sorts the rows by kind."""
         return rows_by_kind([self.rows])[1]
 
     def _in_scan_order(self, values: Array) -> Array:
@@ -260,6 +263,7 @@ class RateMeasurement(StationMeasurement, ABC):
     )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Check the velocities of the stations and the state indices of the velocity."""
         super().__init__(*args, **kwargs)
         self.velocities = None if self.velocities is None else np.asarray(self.velocities, dtype=float)
         if self.velocities is not None and self.velocities.shape != self.stations.shape:
@@ -361,12 +365,15 @@ class AnyRows(RateMeasurement):
 
 
 def values_of(detection: Any) -> Array:
-    """Return the values (m,) of a detection."""
+    """Return the values (m,) of a detection: metres, radians, ratios or m/s."""
     return np.asarray(detection.state_vector, dtype=float)[:, 0]
 
 
 def rows_by_kind(scans: Sequence[Sequence[Row]]) -> tuple[dict[str, list[tuple[int, int, int]]], Array]:
-    """Return (a, b, scan) of the rows of each kind, and the index of each row in the concatenated scans."""
+    """Return (a, b, scan) of the rows of each kind, and the index (m,) of each row in the concatenated scans.
+
+    The kinds are in the order of their first row. An optloc problem needs its rows in this order.
+    """
     found: dict[str, list[tuple[int, int, int]]] = {}
     places: dict[str, list[int]] = {}
     every = [(k, row) for k, rows in enumerate(scans) for row in rows]
@@ -449,7 +456,7 @@ class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
             yield time, {self._join(group) for group in groups.values()}
 
     def _join(self, group: list[Detection]) -> Detection:
-        """Return one vector detection from the pair detections of one target."""
+        """Return one vector detection from the pair detections of one target at one time."""
         group = sorted(group, key=lambda detection: np.atleast_2d(detection.measurement_model.pairs).tolist())
         models = [detection.measurement_model for detection in group]
         first = models[0]
@@ -474,7 +481,11 @@ class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
 
 
 def _forest(pairs: Array, stations: int) -> Array:
-    """Return a mask (m,) of the pairs that connect two groups of stations which earlier pairs do not connect."""
+    """Return a mask (m,) of the pairs (m, 2) that form no closed loop with earlier pairs.
+
+    Each kept pair connects two groups of stations that earlier pairs do not connect. `stations` is the number
+    of stations.
+    """
     # Label of the connected group of each station.
     group, kept = np.arange(stations), np.zeros(len(pairs), dtype=bool)
     for i, (a, b) in enumerate(pairs):

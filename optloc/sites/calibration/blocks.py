@@ -1,6 +1,10 @@
 """Fixes of a single station or pulse of a network while all others are fixed, with the proof of an ordinary fix.
 
-A block is one station or one pulse. Its partners are the stations and pulses that share rows with it.
+A block is one station or one pulse. Its partners are the stations and pulses that share rows with it. So
+a block is a fix from its partners, which are the stations of this fix.
+
+Letters: M stations, N pulses, R slots (columns of measurements), S estimates, B blocks with K start
+positions each, d coordinates. A clock is an offset times the propagation speed, metres.
 """
 
 from __future__ import annotations
@@ -55,9 +59,9 @@ class StationBlock:
     refuted : bool
         Whether another position costs less.
     gaps : tuple of float
-        Costs of the other positions minus the cost of the present position.
+        Costs (chi-square) of the other positions minus the cost of the present position.
     places : array (q, d)
-        The other positions, metres.
+        The other positions, metres, in the order of `gaps`.
     """
 
     name: str
@@ -73,34 +77,38 @@ class StationBlock:
 def blocks(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
     """Return the proof of each pulse and of each station that is not exact, while all others are fixed.
 
-    Stations come first. `at` is one estimate, S = 1. Each proof is the proof of a fix from known stations; it
-    does not exclude that several blocks move together.
+    Stations come first. `lik` is the likelihood of the network and `at` is one estimate, S = 1. Each proof is
+    the proof of a fix from known stations; it does not exclude that several blocks move together.
     """
     net = lik.network
     d, cost, found = net.dimension, float(lik.cost(at)[0]), list[StationBlock]()
-    fixes = _stations(net, at, _inexact_stations(net))
+    fixes = _station_fixes(net, at, _inexact_stations(net))
     if fixes:
         costs = lik.cost(together(*(_moved_station(lik, at, i, fix.position[:d]) for i, fix in fixes)))
         for (i, fix), best in zip(fixes, costs, strict=True):
             name = f"station {net.names[i]}"
-            found.append(_block(fix, i, name, True, at.stations[0, i], cost - float(best)))
+            found.append(_block_of_fix(fix, i, name, True, at.stations[0, i], cost - float(best)))
     fix = place_pulses(net, at, np.arange(net.pulses))
     # pulses do not affect each other, so all of them move at once
     before = (lik.residual(at)[0] ** 2).sum(axis=1)
     after = (lik.residual(moved_pulses(lik, at, np.arange(net.pulses), fix.position))[0] ** 2).sum(axis=1)
     for j in range(net.pulses):
         above = float(before[j] - after[j])
-        found.append(_block(fix[j], j, f"pulse {net.labels[j]}", False, at.pulses[0, j], above))
+        found.append(_block_of_fix(fix[j], j, f"pulse {net.labels[j]}", False, at.pulses[0, j], above))
     return tuple(found)
 
 
 def _inexact_stations(net: Network) -> list[int]:
-    """Return the numbers of the stations that are not known exactly."""
+    """Return the numbers of the stations with a coordinate that is not known exactly."""
     return [i for i in range(net.stations) if (net.place_sigma[i] > 0.0).any()]
 
 
 def mirrored(problem: Problem, here: Array) -> Array:
-    """Return mirror positions (B, K, d) of blocks: in the principal planes of their partners, and in their centre."""
+    """Return mirror positions (B, d + 1, d) of blocks: in the principal planes of their partners, and in their centre.
+
+    `problem` is a batch of B blocks, and `here` (B, d) are their positions, metres. Flat partners make a
+    block ambiguous, so its other minimum is often close to a mirror position.
+    """
     partners = problem.stations.position[..., 0, np.concatenate([rows.a for rows in problem.rows]), :]
     weight = np.broadcast_to(problem.weight > 0.0, (len(here), problem.count))
     weight = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1)
@@ -113,7 +121,11 @@ def mirrored(problem: Problem, here: Array) -> Array:
 
 
 def minima(problem: Problem, places: Array) -> tuple[Array, Array]:
-    """Return the minima (B, K, size) of blocks from start positions (B, K, d), and their costs (B, K)."""
+    """Return the minima (B, K, size) that refinements of blocks reach from start positions, and their costs (B, K).
+
+    `problem` is a batch of B blocks, and `places` (B, K, d) are the start positions, metres. `size` is the
+    number of unknowns of a block: d, plus one for an emission time or a clock.
+    """
     count, each = places.shape[:2]
     start = vectors(problem, places).reshape(count * each, -1)
     done = refine(problem, start, item=np.repeat(np.arange(count), each), tolerance=_LAST, limit=_ALONE)
@@ -133,8 +145,8 @@ def elsewhere(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
     Returns
     -------
     tuple of StationBlock
-        One block for each other position. The refinement starts from mirror images in the principal planes of the
-        block's partners.
+        One block for each other position that costs at most `MOVED` more. The refinement starts from mirror images
+        in the principal planes and in the centre of the block's partners.
     """
     net = lik.network
     stations, d = np.array(_inexact_stations(net), dtype=int), net.dimension
@@ -158,7 +170,10 @@ def elsewhere(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
 
 
 def pulses_alone(net: Network, at: NetworkEstimate, which: Array | None = None) -> Problem:
-    """Return n pulses of S estimates (all pulses by default) as a batch of S n fixes from fixed stations."""
+    """Return n pulses of S estimates (all pulses by default) as a batch of S n fixes from fixed stations.
+
+    `which` (n,) are the numbers of the pulses. The clocks of the stations are subtracted from the measurements.
+    """
     which = np.arange(net.pulses) if which is None else which
     first, second, sign = clock_signs(net)
     tick = (sign[0] * at.clocks[:, first] + sign[1] * at.clocks[:, second])[:, None]
@@ -174,13 +189,17 @@ def pulses_alone(net: Network, at: NetworkEstimate, which: Array | None = None) 
 
 
 def _masked_rows(kind: str, z: Array, sigma: Array, given: Array, **ends: Array) -> Measured:
-    """Return rows (B, q) of one kind; rows that are not given have weight 0."""
-    deviation, weight = _shared(np.where(given, sigma, 1.0)), _shared(given.astype(float))
+    """Return rows (B, q) of one kind for B blocks; rows that are not given have weight 0.
+
+    `z` and `sigma` (B, q) are values and standard deviations, metres. `given` (B, q) marks the measured
+    entries. `ends` are the stations `a` and, if the kind needs them, `b` of each row (q,).
+    """
+    deviation, weight = _common_row(np.where(given, sigma, 1.0)), _common_row(given.astype(float))
     return measured(kind, np.where(given, z, 0.0), sigma=deviation, weight=weight, **ends)
 
 
 def settled(net: Network, at: NetworkEstimate) -> NetworkEstimate:
-    """Return the estimates with their pulses at the best fit to the fixed stations."""
+    """Return the estimates with their pulses, and emission times, at the best fit to the fixed stations."""
     problem = pulses_alone(net, at)
     done = minima(problem, at.pulses.reshape(-1, 1, net.dimension))[0].reshape(at.count, net.pulses, -1)
     d = net.dimension
@@ -188,23 +207,31 @@ def settled(net: Network, at: NetworkEstimate) -> NetworkEstimate:
 
 
 def stations_alone(net: Network, at: NetworkEstimate, which: Array) -> Problem:
-    """Return some stations as a batch of fixes from the pulses and the other stations, which are fixed."""
+    """Return stations as a batch of fixes from the pulses and the other stations, which are fixed.
+
+    `at` is one estimate, S = 1. `which` (n,) are the numbers of the stations. Their prior positions become
+    priors of the fixes.
+    """
     places, kinds = _station_rows(net, at)
     rows = []
     for kind, ends, sigma, z in kinds:
         given = np.isfinite(sigma[which])
         if given.any():
             rows.append(_masked_rows(kind, z[which], sigma[which], given, a=ends))
-    soft = np.isfinite(net.place_sigma[which])
+    has_prior = np.isfinite(net.place_sigma[which])
     # the prior covers all coordinates of a station, so unknown coordinates get a very wide one
     spread = float(np.ptp(places, axis=0).max()) or 1.0
     sigma = np.clip(net.place_sigma[which], _EXACT * spread, 1e6 * spread)
     prior = Prior("position", net.place[which], sigma[..., None] ** 2 * np.eye(net.dimension))
-    return assemble(places, *rows, priors=(prior,) if soft.any() else ()).flat()
+    return assemble(places, *rows, priors=(prior,) if has_prior.any() else ()).flat()
 
 
-def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: float) -> StationBlock:
-    """Return a block from a fix; `above` is the cost of the present position minus the cost of the fix."""
+def _block_of_fix(fix: Fix, index: int, name: str, station: bool, here: Array, above: float) -> StationBlock:
+    """Return the proof and the other positions of a block from its fix.
+
+    `index`, `name` and `station` are as in `StationBlock`. `here` (d,) is the present position, metres.
+    `above` is the cost of the present position minus the cost of the fix.
+    """
     claims, d = fix.claims, len(here)
     x = np.concatenate([fix.position[None, :d], fix.alternatives.x.reshape(-1, fix.x.shape[-1])[:, :d]])
     gaps = np.concatenate([[0.0], fix.alternatives.gap.ravel()])
@@ -229,14 +256,19 @@ def place_pulses(net: Network, at: NetworkEstimate, which: Array, method: str = 
     return solve(pulses_alone(net, at, which), method)
 
 
-def _shared(values: Array) -> Array:
-    """Return values (n, q) as one row (q,) if all rows are equal; shared values allow one batch."""
+def _common_row(values: Array) -> Array:
+    """Return values (n, q) as one row (q,) if all rows are equal; values that all problems share need less memory."""
     return np.asarray(values[0]) if (values == values[0]).all() else values
 
 
 def _station_rows(net: Network, at: NetworkEstimate) -> tuple[Array, list[tuple[str, Array, Array, Array]]]:
-    """Return positions of pulses and stations, and the stations' rows: kind, partners, sigmas, values (M, q)."""
-    timed, ranged = _ranges(net, at)
+    """Return the positions (N + M, d) of pulses and stations, and the rows of all stations for each kind.
+
+    The rows of a kind are a tuple: kind, numbers (q,) of the partners, standard deviations (M, q) and values
+    (M, q), metres. A partner is a pulse (0 to N - 1) or a station (N and above). The standard deviation is
+    infinite without a measurement.
+    """
+    timed, ranged = _ranges_to_pulses(net, at)
     near = np.full((net.stations, net.stations), np.inf), np.zeros((net.stations, net.stations))
     for (i, k), distance, sigma in zip(net.between, net.distance, net.distance_sigma, strict=True):
         for one, other in ((i, k), (k, i)):
@@ -248,18 +280,21 @@ def _station_rows(net: Network, at: NetworkEstimate) -> tuple[Array, list[tuple[
     return np.concatenate([at.pulses[0], at.stations[0]]), kinds
 
 
-def _stations(net: Network, at: NetworkEstimate, which: list[int]) -> list[tuple[int, Fix]]:
-    """Return fixes of stations from fixed pulses and stations."""
-    soft = np.isfinite(net.place_sigma[which]).any(axis=1) if which else np.zeros(0, dtype=bool)
-    plain = np.array(which, dtype=int)[~soft]
-    free = _fixes(stations_alone(net, at, plain), at.stations[0, plain]) if plain.size else None
+def _station_fixes(net: Network, at: NetworkEstimate, which: list[int]) -> list[tuple[int, Fix]]:
+    """Return pairs of a station number and its fix from fixed pulses and stations; `which` are the station numbers.
+
+    Stations without a prior are one batch. Each station with a prior is solved alone.
+    """
+    has_prior = np.isfinite(net.place_sigma[which]).any(axis=1) if which else np.zeros(0, dtype=bool)
+    plain = np.array(which, dtype=int)[~has_prior]
+    free = _fixes_with_proof(stations_alone(net, at, plain), at.stations[0, plain]) if plain.size else None
     out = [(int(i), free[n]) for n, i in enumerate(plain) if free is not None]
-    known = np.array(which, dtype=int)[soft]
+    known = np.array(which, dtype=int)[has_prior]
     return out + [(int(i), solve(stations_alone(net, at, np.array([i])))[0]) for i in known]
 
 
-def _fixes(problem: Problem, here: Array) -> Fix:
-    """Return fixes with their proof; with many rows, from the present position.
+def _fixes_with_proof(problem: Problem, here: Array) -> Fix:
+    """Return fixes of a batch of blocks with their proof; with many rows, from the present positions `here` (n, d).
 
     Other starts need matrices of all rows.
     """
@@ -270,10 +305,12 @@ def _fixes(problem: Problem, here: Array) -> Fix:
     return solve(problem, "lsr+certify", start=start)
 
 
-def _ranges(net: Network, at: NetworkEstimate) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return sigmas and values (M, N) of the ranges to pulses: with the station's clock, then without.
+def _ranges_to_pulses(net: Network, at: NetworkEstimate) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Return sigmas and values (M, N) of the ranges from stations to pulses, in two pairs.
 
-    Several rows of one pulse are combined to their mean, weighted by inverse variance.
+    The first pair contains the clock of the station (kinds toa and tdoa); the second pair does not (kind
+    range). Several rows of one pulse are combined to their mean, weighted by inverse variance. Sigma is
+    infinite without a row.
     """
     m, n = net.stations, net.pulses
     information, sums = np.zeros((2, m, n)), np.zeros((2, m, n))
@@ -296,35 +333,49 @@ def _ranges(net: Network, at: NetworkEstimate) -> tuple[tuple[Array, Array], tup
 
 
 def moved(lik: Likelihood, at: NetworkEstimate, block: StationBlock, place: Array) -> NetworkEstimate:
-    """Return an estimate with one block at another position, and with the clock or emission time that fits there."""
+    """Return an estimate with one block at another position, and with the clock or emission time that fits there.
+
+    `at` is one estimate (S = 1), and `place` (d,) is the position, metres.
+    """
     if block.station:
         return _moved_station(lik, at, block.index, place)
     return moved_pulses(lik, at, np.array([block.index]), place[None])
 
 
 def moved_pulses(lik: Likelihood, at: NetworkEstimate, which: Array, places: Array) -> NetworkEstimate:
-    """Return an estimate with some pulses (n,) at other positions (n, d), with the emission times that fit there."""
+    """Return an estimate (S = 1) with some pulses at other positions, with the emission times that fit there.
+
+    `which` (n,) are the numbers of the pulses, and `places` (n, d) are the positions, metres. A pulse whose
+    new position is NaN does not move.
+    """
     net, pulses, emission = lik.network, at.pulses.copy(), at.emission.copy()
     pulses[0, which] = np.where(np.isfinite(places), places, pulses[0, which])
     there = replace(at, pulses=pulses)
     emits = np.array([MODELS[slot.kind].emission for slot in net.slots])
-    emission[0, which] += _mean(lik.residual(there)[0, which], (emits / net.sigma)[which])
+    emission[0, which] += _best_change(lik.residual(there)[0, which], (emits / net.sigma)[which])
     return replace(there, emission=np.where(net.emission, emission, at.emission))
 
 
 def _moved_station(lik: Likelihood, at: NetworkEstimate, i: int, place: Array) -> NetworkEstimate:
-    """Return an estimate with station i at another position (d,), and with the clock that fits there."""
+    """Return an estimate (S = 1) with station `i` at another position (d,), metres.
+
+    Its clock is changed to the value that fits there best.
+    """
     stations, clocks, net = at.stations.copy(), at.clocks.copy(), lik.network
     stations[0, i] = np.where(np.isfinite(place), place, stations[0, i])
     there = replace(at, stations=stations)
     if net.synchronised:
         return there
     first, second, sign = clock_signs(net)
-    own = np.where(first == i, sign[0], 0.0) + np.where(second == i, sign[1], 0.0)
-    clocks[0, i] += _mean(lik.residual(there)[0].ravel(), (own / net.sigma).ravel())
+    sign_here = np.where(first == i, sign[0], 0.0) + np.where(second == i, sign[1], 0.0)
+    clocks[0, i] += _best_change(lik.residual(there)[0].ravel(), (sign_here / net.sigma).ravel())
     return replace(there, clocks=clocks)
 
 
-def _mean(residual: Array, slope: Array) -> Array:
-    """Return the change (...) of an unknown that best fits whitened residuals (..., q) with given slopes (..., q)."""
+def _best_change(residual: Array, slope: Array) -> Array:
+    """Return the change (...) of an unknown that best fits whitened residuals (..., q) with given slopes (..., q).
+
+    A slope is the derivative of a whitened measurement by the unknown, 1 / m. Least squares gives the change,
+    metres.
+    """
     return np.asarray((residual * slope).sum(axis=-1) / np.maximum((slope**2).sum(axis=-1), 1e-300))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -93,7 +94,8 @@ class Calibration:
     emission : array (N,)
         Emission times multiplied by the propagation speed, metres.
     covariance : array (P, P)
-        Covariance of the M d station coordinates, then of unknown clocks, in that frame, square metres.
+        Covariance of the M d station coordinates, then of unknown clocks, in that frame, square metres. NaN if the
+        measurements do not determine a motion.
     gauge : str
         Definition of the frame: "known places", "centre and main axes of the stations" or names of stations.
     status : Status
@@ -175,7 +177,7 @@ class Calibration:
 
 
 def spans(stations: Array) -> tuple[Array, Array, Array]:
-    """Return all pairs of stations (q, 2), their distances (q,), metres, and the derivatives (q, M d)."""
+    """Return all pairs of stations (q, 2), their distances (q,), metres, and the derivatives of these (q, M d)."""
     m, d = stations.shape
     pairs = np.array([(i, k) for i in range(m) for k in range(i)], dtype=int).reshape(-1, 2)
     line = stations[pairs[:, 0]] - stations[pairs[:, 1]]
@@ -248,25 +250,18 @@ def calibrate(
 def _calibrate_robust(
     network: Network, gauge: tuple[str, ...], seed: int, starts: int | None, tell: Callable[[str], None] | None
 ) -> Calibration:
-    """Return the network of the rows that agree, with a list of the rows that were left out."""
+    """Return the network of the rows that agree, with a list of the rows that were left out; see `calibrate`."""
     core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])
     gross = np.zeros(network.z.shape, dtype=bool)
     gross[core] = outliers(network.take(core), seed)
-    found = calibrate(
-        replace(network, sigma=np.where(gross, np.inf, network.sigma)), gauge=gauge, seed=seed, starts=starts, tell=tell
-    )
+    run = partial(calibrate, gauge=gauge, seed=seed, starts=starts, tell=tell)
+    found = run(replace(network, sigma=np.where(gross, np.inf, network.sigma)))
     # test all rows again, also of pulses that were not in the search
     residual = _all_residuals(network, found)
     again = network.given & (residual**2 > PRICE)
     if (again != gross).any() and np.isfinite(found.stations).all():
         gross = again
-        found = calibrate(
-            replace(network, sigma=np.where(gross, np.inf, network.sigma)),
-            gauge=gauge,
-            seed=seed,
-            starts=starts,
-            tell=tell,
-        )
+        found = run(replace(network, sigma=np.where(gross, np.inf, network.sigma)))
     left = np.argwhere(gross)
     if not len(left):
         return found
@@ -277,13 +272,13 @@ def _calibrate_robust(
 
 
 def _all_residuals(network: Network, found: Calibration) -> Array:
-    """Return whitened residuals (N, R) of all rows; zeros for pulses without a position."""
+    """Return whitened residuals (N, R) of all rows of a calibration; zeros for pulses without a position."""
     at = NetworkEstimate(found.stations[None], found.clocks[None], found.pulses[None], found.emission[None])
     return np.asarray(np.nan_to_num(likelihood(network).residual(at)[0]))
 
 
 def _add_other_pulses(network: Network, at: NetworkEstimate, core: Array, rest: Array) -> NetworkEstimate:
-    """Return an estimate of all pulses with enough rows: the pulses of the search, and fixes of the others."""
+    """Return an estimate of the pulses `core` of the search (`at`, S = 1), and of `rest`, the others, from fixes."""
     n, d = network.pulses, network.dimension
     pulses, emission = np.zeros((1, n, d)), np.zeros((1, n))
     pulses[0, core], emission[0, core] = at.pulses[0], at.emission[0]
@@ -294,11 +289,11 @@ def _add_other_pulses(network: Network, at: NetworkEstimate, core: Array, rest: 
     return NetworkEstimate(at.stations, at.clocks, whole.pulses[:, every], whole.emission[:, every])
 
 
-# Status and findings.
-
-
 def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, named: tuple[int, ...]) -> Calibration:
-    """Return the calibration: block proofs, frame, covariance, alternatives, findings and status."""
+    """Return the calibration of the refined estimate `at` (S = 1): proofs, frame, covariance, findings and status.
+
+    `found` is the search, and `named` are the stations of the frame.
+    """
     net = lik.network
     soft = bool(np.isfinite(net.place_sigma).any())
     at, checked, others = proven(lik, at)
@@ -344,7 +339,7 @@ def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, nam
 
 
 def _open_words(net: Network, rank: GaugeRank) -> str:
-    """Return a sentence about open motions, with the stations that move most."""
+    """Return a sentence about motions that the measurements do not determine, with the stations that move most."""
     m, d = net.stations, net.dimension
     share = np.sqrt((rank.open[: m * d] ** 2).sum(axis=1).reshape(m, d).sum(axis=1))
     if not net.synchronised:
@@ -358,6 +353,7 @@ def _open_words(net: Network, rank: GaugeRank) -> str:
 
 
 def _curved_words(far: float) -> str:
+    """Return a sentence about a covariance that is not valid; `far` is the result of `departure`."""
     words = f"three standard deviations away, the rise of the cost differs by a factor of up to {np.exp(far):.2g}"
     return f"The covariance does not cover the error: {words}."
 
@@ -371,7 +367,7 @@ class _Facts:
     net, found, motions : Network, NetworkSearchResult, GaugeRank
         The network, its search, and its determined and open motions.
     p : float
-        Probability of residuals at least as large.
+        Probability of residuals at least as large (chi-square).
     sides : tuple of str
         Sentences about stations, or pulses, in one plane.
     departure : float
@@ -449,6 +445,7 @@ _FINDINGS = (
 
 
 def _shorten(names: list[str]) -> str:
+    """Return at most three names as text, then the number of others."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
@@ -477,7 +474,10 @@ def _alternatives(
     found: NetworkSearchResult,
     others: list[tuple[str, NetworkEstimate]],
 ) -> tuple[Alternative, ...]:
-    """Return other minima within `LISTED_GAP`: moved blocks, minima of other starts, and the mirror image."""
+    """Return other minima than `at` (S = 1): moved blocks, minima of other starts, and the mirror image.
+
+    Their cost is within `LISTED_GAP`. `others` are estimates (S = 1) with a description; they are refined.
+    """
     net = lik.network
     soft = bool(np.isfinite(net.place_sigma).any())
     if at.pulses.shape[1] == found.best.pulses.shape[1]:  # otherwise the starts contain only a part of the pulses
@@ -509,7 +509,7 @@ def _alternatives(
 
 
 def _same_stations(at: NetworkEstimate, other: Alternative, covariance: Array) -> bool:
-    """Return whether another network has the same stations, within the covariance.
+    """Return whether another network has the same stations as `at` (S = 1), within the covariance (P, P), m^2.
 
     The stations are within the 95 % ellipsoid, and the covariance covers the squared error that the other network
     adds in proportion to its likelihood.
@@ -534,13 +534,10 @@ def _moved_pulses(at: NetworkEstimate, other: Alternative) -> Array:
 
 
 def _shape(at: NetworkEstimate, soft: bool) -> Array:
-    """Return distances of stations to stations and pulses, which need no frame; with priors, also positions."""
+    """Return distances of stations to stations and pulses, metres, to compare networks; if `soft`, also positions."""
     points = np.concatenate([at.stations[0], at.pulses[0]])
     apart = np.linalg.norm(points[:, None] - at.stations[0][None], axis=-1).ravel()
     return np.concatenate([apart, at.stations.ravel()]) if soft else apart
-
-
-# Preparation and completion of a search.
 
 
 def _station_indices(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
@@ -560,13 +557,13 @@ def _station_indices(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...
 
 
 def _placeable(network: Network) -> Array:
-    """Return a mask (N,) of the pulses whose number of rows is at least their number of unknowns."""
+    """Return a mask (N,) of the pulses that rows can place: at least one row for each of their unknowns."""
     needed = network.dimension + network.emission
     return np.asarray(network.given.sum(axis=1) >= needed)
 
 
 def _failure(network: Network, status: Status, words: str) -> Calibration:
-    """Return a calibration without estimates, with a status and its sentence."""
+    """Return a calibration without estimates (all NaN), with a status and its sentence `words`."""
     m, n, d = network.stations, network.pulses, network.dimension
     p = m * d + (0 if network.synchronised else m)
     nan = np.full
@@ -592,7 +589,7 @@ def _failure(network: Network, status: Status, words: str) -> Calibration:
 
 
 def _with_all_pulses(made: Calibration, network: Network, enough: Array) -> Calibration:
-    """Return a calibration of all pulses, with NaN for pulses that have too few rows."""
+    """Return a calibration of all pulses, with NaN for pulses that have too few rows (outside `enough` (N,))."""
     pulses = np.full((network.pulses, network.dimension), np.nan)
     emission, residuals = np.full(network.pulses, np.nan), np.full(network.z.shape, np.nan)
     pulses[enough], emission[enough], residuals[enough] = made.pulses, made.emission, made.residuals

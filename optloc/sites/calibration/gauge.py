@@ -1,7 +1,11 @@
 """The gauge freedom of a network: its frame, and mirror images if stations or pulses are in one plane.
 
-Rows between stations and pulses do not change if the whole network moves, turns or is mirrored. This module
-finds these motions, and other open motions, at an estimate. It also sets the frame of the result.
+Rows between stations and pulses do not change if the whole network moves, turns or is mirrored. This
+module finds these motions, and other open motions, at an estimate. It also sets the frame of the result.
+
+Letters: M stations, N pulses, d coordinates, S estimates. P is the number of station unknowns: M d
+coordinates, then M clocks if the stations do not share a clock. All of them are in metres. A motion is a
+direction (P,) of change.
 """
 
 from __future__ import annotations
@@ -33,11 +37,11 @@ class GaugeRank:
     Parameters
     ----------
     jacobian : array (q, P)
-        Whitened derivatives by station coordinates and clocks, without the part that pulses explain.
+        Whitened derivatives by station coordinates and clocks, without the part that pulses explain, 1 / m.
     free : array (P, g)
         Orthonormal basis of the frame: motions of the whole network and of all clocks that change no row.
     open : array (P, f)
-        Orthonormal basis of the other motions that change no row.
+        Orthonormal basis of the other motions that change no row; f > 0 means that the geometry is singular.
     """
 
     jacobian: Array
@@ -45,7 +49,10 @@ class GaugeRank:
     open: Array
 
     def covariance(self, fixed: Array) -> Array:
-        """Return the covariance (P, P), m^2, in the frame in which `fixed` (g, P) times each change is zero."""
+        """Return the covariance (P, P), m^2, of stations and clocks in a frame.
+
+        The frame is defined by `fixed` (g, P): `fixed` times each change of the unknowns is zero.
+        """
         p = self.jacobian.shape[1]
         moving = np.flatnonzero(np.abs(self.jacobian).max(axis=0) > 0.0)
         basis = np.eye(p)[:, moving]
@@ -58,7 +65,7 @@ class GaugeRank:
 
 
 def determined(lik: Likelihood, at: NetworkEstimate) -> GaugeRank:
-    """Return the determined, free and open motions at an estimate (S = 1)."""
+    """Return the determined, free and open motions at an estimate (S = 1): how far the rows fix stations and clocks."""
     p, jacobian = lik.free.size, without_pulses(lik, at)
     motions = frame_moves(lik.network, at)
     motions[~lik.free] = 0.0
@@ -72,7 +79,10 @@ def determined(lik: Likelihood, at: NetworkEstimate) -> GaugeRank:
 
 
 def without_pulses(lik: Likelihood, at: NetworkEstimate) -> Array:
-    """Return a triangle (q, P): the derivatives at an estimate (S = 1) after elimination of the pulses."""
+    """Return a triangle (q, P): the whitened derivatives at an estimate (S = 1) after elimination of the pulses.
+
+    Its normal matrix is the information about stations and clocks if the pulses are unknown.
+    """
     by_station, by_pulse, known = lik.jacobian(at)
     n, r, p = by_station.shape
     # the columns of a distant pulse have very different lengths, so scale them first
@@ -94,10 +104,11 @@ _NONE = 1e-9
 def departure(lik: Likelihood, at: NetworkEstimate, rank: GaugeRank) -> float:
     """Return the largest deviation of the cost from the Gaussian cost, as the logarithm of their ratio.
 
-    The test points are three standard deviations away, on both sides of each principal axis of stations and
-    clocks. The pulses are refitted at each test point. The result is the largest ``|ln((f(x +- 3 t) - f(x)) /
-    9)|``, as for a fix (`optloc.model_checks.shape`). `at` (S = 1) is the estimate. `rank` contains its determined
-    motions; there must be no open motion.
+    A large number means that the covariance is not valid. The test points are three standard deviations away,
+    on both sides of each principal axis of stations and clocks. The pulses are refitted at each test point.
+    The result is the largest ``|ln((f(x +- 3 t) - f(x)) / 9)|``, as for a fix (`optloc.model_checks.shape`);
+    f is the cost and t is one standard deviation along the axis. `at` (S = 1) is the estimate. `rank`
+    contains its determined motions; there must be no open motion.
     """
     width, axes = np.linalg.eigh(rank.covariance(rank.free.T))
     far = (axes * (_FAR * np.sqrt(np.maximum(width, 0.0))))[:, width > _ZERO * width[-1]].T
@@ -115,7 +126,10 @@ def shifted(at: NetworkEstimate, moves: Array) -> NetworkEstimate:
 
 
 def over(one: NetworkEstimate, at: NetworkEstimate) -> NetworkEstimate:
-    """Return a network rotated, and mirrored if needed, onto the stations of another network (Procrustes)."""
+    """Return network `one` (S = 1) rotated, and mirrored if needed, onto the stations of network `at` (Procrustes).
+
+    Then the positions of two free networks can be compared.
+    """
     a, b = one.stations[0], at.stations[0]
     u, _, v = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
     turn = u @ v
@@ -127,13 +141,17 @@ def over(one: NetworkEstimate, at: NetworkEstimate) -> NetworkEstimate:
 
 
 def _span(columns: Array) -> Array:
-    """Return an orthonormal basis of the space of the columns."""
+    """Return an orthonormal basis (P, g) of the space of the columns (P, k)."""
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(u[:, s > _ZERO * max(float(np.max(s, initial=0.0)), 1e-300)])
 
 
 def _null_space(jacobian: Array, basis: Array, size: float) -> Array:
-    """Return a basis of the directions in a subspace that a matrix maps to zero."""
+    """Return a basis (P, f) of the directions in a subspace that a matrix maps to zero.
+
+    `basis` (P, k) spans the subspace. A singular value of at most `_ZERO` times `size`, the norm of the
+    matrix, is zero.
+    """
     if not basis.shape[1]:
         return basis
     _, s, turn = np.linalg.svd(jacobian @ basis, full_matrices=True)
@@ -143,7 +161,10 @@ def _null_space(jacobian: Array, basis: Array, size: float) -> Array:
 
 
 def frame_moves(net: Network, at: NetworkEstimate) -> Array:
-    """Return the motions of the frame as columns (P, g): translations, rotations and a common clock offset."""
+    """Return the motions of the frame as columns (P, g): translations, rotations and a common clock offset.
+
+    Each column has length 1. `at` is one estimate, S = 1.
+    """
     m, d = net.stations, net.dimension
     p = m * d + (0 if net.synchronised else m)
     columns = []
@@ -179,7 +200,8 @@ def in_frame(net: Network, at: NetworkEstimate, named: tuple[int, ...]) -> Netwo
     -------
     NetworkEstimate
         One of the two mirror images: the station that is farthest from the plane of the first two axes is above
-        this plane. In two dimensions, the same holds for the first axis.
+        this plane. In two dimensions, the same applies to the first axis. Without named stations, the station that
+        is farthest from the origin along an axis has a positive coordinate there.
     """
     d = net.dimension
     stations = at.stations[0]
@@ -212,7 +234,10 @@ def with_mean_clock(net: Network, at: NetworkEstimate, named: tuple[int, ...] = 
 
 
 def fixed_by(net: Network, named: tuple[int, ...]) -> Array:
-    """Return a selection matrix (g, P) of the coordinates and the clock that the named stations fix at zero."""
+    """Return a selection matrix (g, P) of the coordinates and the clock that the named stations fix at zero.
+
+    It is the argument of `GaugeRank.covariance`. `named` are the numbers of d stations.
+    """
     m, d = net.stations, net.dimension
     p = m * d + (0 if net.synchronised else m)
     indices = [named[c] * d + k for c in range(d) for k in range(d) if k >= c]
@@ -249,9 +274,9 @@ def flat(lik: Likelihood, at: NetworkEstimate, covariance: Array) -> list[str]:
         )
     placed = np.flatnonzero(net.given.sum(axis=1) > d)
     pulses = at.pulses[0, placed]
-    if _in_one_plane(pulses, lambda normal: _of_pulses(lik, at, covariance, placed, normal)) and _may_be_mirrored(
-        net, at.stations[0], pulses
-    ):
+    if _in_one_plane(
+        pulses, lambda normal: _height_covariance(lik, at, covariance, placed, normal)
+    ) and _may_be_mirrored(net, at.stations[0], pulses):
         out.append(
             "The pulses are in one plane within their errors: the data do not show on which side the stations are."
         )
@@ -259,7 +284,10 @@ def flat(lik: Likelihood, at: NetworkEstimate, covariance: Array) -> list[str]:
 
 
 def _in_one_plane(points: Array, covariance: Callable[[Array], Array]) -> bool:
-    """Return whether points (m, d) are in one plane; `covariance` gives the (m, m) of their heights along a normal."""
+    """Return whether points (m, d) are in one plane within their errors, at the probability level `_LEVEL`.
+
+    `covariance` returns the covariance (m, m), m^2, of the heights of the points along a normal (d,).
+    """
     m, d = points.shape
     if m <= d:
         return True
@@ -273,21 +301,26 @@ def _in_one_plane(points: Array, covariance: Callable[[Array], Array]) -> bool:
     return bool(height @ np.linalg.pinv(spread, hermitian=True) @ height < quantile(_LEVEL, len(left)))
 
 
-def _of_pulses(lik: Likelihood, at: NetworkEstimate, covariance: Array, which: Array, normal: Array) -> Array:
-    """Return the covariance (n, n) of the heights of pulses, from the noise of their rows and from the stations."""
+def _height_covariance(lik: Likelihood, at: NetworkEstimate, covariance: Array, which: Array, normal: Array) -> Array:
+    """Return the covariance (n, n) of the heights of pulses, m^2: from the noise of their rows, and from the stations.
+
+    The heights are coordinates along `normal` (d,). `which` (n,) are the numbers of the pulses, and `at` is
+    one estimate (S = 1). `covariance` (P, P), m^2, belongs to stations and clocks.
+    """
     by_station, by_pulse = (one[which] for one in lik.jacobian(at)[:2])
-    own = np.einsum("c,jcr->jr", normal, np.linalg.pinv(by_pulse)[:, : len(normal)])
-    along = np.einsum("jr,jrp->jp", own, by_station)
+    height_slopes = np.einsum("c,jcr->jr", normal, np.linalg.pinv(by_pulse)[:, : len(normal)])
+    along = np.einsum("jr,jrp->jp", height_slopes, by_station)
     # The two parts are independent: the station covariance comes from the part of the rows that pulses do not
     # explain.
-    return np.asarray(np.diag((own**2).sum(axis=1)) + along @ covariance @ along.T)
+    return np.asarray(np.diag((height_slopes**2).sum(axis=1)) + along @ covariance @ along.T)
 
 
 def _may_be_mirrored(net: Network, stations: Array, pulses: Array) -> bool:
     """Return whether prior places and distances allow stations (m, d) to be mirrored in the plane of the pulses.
 
-    Stations with measured distances between them are mirrored together. If all stations are mirrored, the result
-    is the mirror image of the whole network, which is the same network.
+    `pulses` (n, d) are positions in one plane. Stations with measured distances between them are mirrored
+    together. If all stations are mirrored, the result is the mirror image of the whole network, which is the
+    same network.
     """
     middle = pulses.mean(axis=0)
     normal = np.linalg.svd(pulses - middle)[2][-1]
@@ -297,6 +330,6 @@ def _may_be_mirrored(net: Network, stations: Array, pulses: Array) -> bool:
     count, group = connected_components(linked, directed=False)
     known = np.isfinite(net.place_sigma)
     sigma = np.maximum(net.place_sigma, _ROUNDING * float(np.ptp(stations)))
-    off, now = ((np.where(known, x - net.place, 0.0) / sigma) ** 2 for x in (there, stations))
-    dearer = np.bincount(group, (off - now).sum(axis=1), count)
-    return count > 1 and bool((dearer < AMBIGUOUS_GAP).any())
+    cost_mirrored, cost_present = ((np.where(known, x - net.place, 0.0) / sigma) ** 2 for x in (there, stations))
+    extra_cost = np.bincount(group, (cost_mirrored - cost_present).sum(axis=1), count)
+    return count > 1 and bool((extra_cost < AMBIGUOUS_GAP).any())

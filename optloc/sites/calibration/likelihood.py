@@ -2,6 +2,10 @@
 
 The network becomes a run of `optloc.problem`: each pulse is an epoch, and the station errors are constant
 over the run.
+
+Letters: S estimates, M stations, N pulses, R slots (columns of measurements), m rows of a run, d coordinates. P is the
+number of station unknowns: M d coordinates, then M clocks if the stations do not share a clock. A
+whitened number is divided by its standard deviation.
 """
 
 from __future__ import annotations
@@ -56,7 +60,7 @@ class NetworkEstimate:
         return NetworkEstimate(self.stations[which], self.clocks[which], self.pulses[which], self.emission[which])
 
     def where(self, mask: Array, other: NetworkEstimate) -> NetworkEstimate:
-        """Return the estimates with values of `other` where the mask (S,) is false."""
+        """Return the estimates, with values of `other` where the mask (S,) is false."""
         two, three = mask[:, None], mask[:, None, None]
         return NetworkEstimate(
             np.where(three, self.stations, other.stations),
@@ -67,7 +71,7 @@ class NetworkEstimate:
 
 
 def together(*estimates: NetworkEstimate) -> NetworkEstimate:
-    """Return several sets of estimates as one."""
+    """Return several sets of estimates as one; S is the sum of their numbers."""
     names = NetworkEstimate.__dataclass_fields__
     return NetworkEstimate(*(np.concatenate([getattr(one, name) for one in estimates]) for name in names))
 
@@ -101,12 +105,17 @@ class Likelihood:
         return np.concatenate([(self.network.place_sigma > 0.0).ravel(), clocks])
 
     def posed(self, at: NetworkEstimate) -> tuple[Problem, Array]:
-        """Return S estimates as a batch of problems, about their stations and clocks, and as vectors (S, size)."""
+        """Return S estimates as a batch of problems, and as parameter vectors (S, size) of these problems.
+
+        Each problem is linearised about the stations and clocks of its estimate: the stations have the estimated
+        positions, and the clocks are corrections of the rows. So the vectors contain only deviations of known
+        coordinates, and the pulses.
+        """
         net, problem, (j, r) = self.network, self.problem, rows_of(self.network)
         known = np.isfinite(net.place_sigma)
         place = np.where(known, net.place, at.stations)
         exact = _EXACT * (float(np.ptp(at.stations)) or 1.0)
-        far = np.array(_loose(net)) if self.tether is None else self.tether[:, None, None]
+        far = np.array(_wide_sigma(net)) if self.tether is None else self.tether[:, None, None]
         deviation = np.where(known, np.maximum(net.place_sigma, exact), far)
         covariance = deviation[..., None] ** 2 * np.eye(net.dimension)
         first, second, sign = clock_signs(net)
@@ -130,7 +139,7 @@ class Likelihood:
         return made, x
 
     def _estimate(self, problem: Problem, x: Array, at: NetworkEstimate) -> NetworkEstimate:
-        """Return the estimates at parameter vectors x (S, size), linearised about `at`."""
+        """Return the estimates at parameter vectors x (S, size) of `problem`, the result of `posed(at)`."""
         net, local = self.network, problem.layout.split(x)[1]
         moved = problem.stations.position[:, 0] + x[:, _columns(problem, "stations")].reshape(at.stations.shape)
         stations = np.where(net.place_sigma > 0.0, moved, net.place)
@@ -139,7 +148,10 @@ class Likelihood:
         return NetworkEstimate(stations, clocks, local[..., :d], local[..., d] if local.shape[-1] > d else at.emission)
 
     def refine(self, at: NetworkEstimate, steps: int = _STEPS) -> tuple[NetworkEstimate, Array]:
-        """Return the minima that the refinement of the estimates reaches, and their costs (S,)."""
+        """Return the minima that the refinement of the estimates reaches, and their costs (S,).
+
+        `steps` is the largest number of steps.
+        """
         if not at.count:
             return at, np.zeros(0)
         problem, x = self.posed(at)
@@ -147,12 +159,12 @@ class Likelihood:
         return self._estimate(problem, done.x, at), done.cost
 
     def _whitened(self, at: NetworkEstimate) -> Array:
-        """Return whitened residuals (S, m) of all rows, without weights."""
+        """Return whitened residuals (S, m) of all m rows, without weights."""
         problem, x = self.posed(at)
         return np.asarray((problem.observed - predict(problem, x)) / np.sqrt(variances(problem.noise, problem.count)))
 
     def cost(self, at: NetworkEstimate) -> Array:
-        """Return the weighted sum of squared residuals (S,), priors included; `weight` does not affect it."""
+        """Return the sum of squared whitened residuals (S,), priors included; `weight` does not affect it."""
         place = np.where(self.network.place_sigma > 0.0, self.network.place_sigma, np.inf)
         known = (at.stations - self.network.place) / place
         return np.asarray((self._whitened(at) ** 2).sum(axis=1) + (known**2).sum(axis=(1, 2)))
@@ -197,61 +209,67 @@ class Likelihood:
 
 
 def likelihood(net: Network) -> Likelihood:
-    """Return the likelihood of a network."""
+    """Return the likelihood of a network, with weight 1 for all rows."""
     m, d, (j, r) = net.stations, net.dimension, rows_of(net)
     first, second, _ = clock_signs(net)
     rows = list[Measured]()
-    for kind, part in _kinds(net, r):
+    for kind, part in _rows_by_kind(net, r):
         ends = {"a": first[r[part]], "b": second[r[part]]}
         rows.append(measured(kind, net.z[j, r][part], sigma=net.sigma[j, r][part], epoch=j[part], **ends))
     if len(net.between):
         a, b = net.between.T
         rows.append(measured(BETWEEN, net.distance, a=a, b=b, sigma=net.distance_sigma))
     stations = Stations(np.zeros((1, m, d)), net.names, covariance=np.tile(np.eye(d), (m, 1, 1)), span="run")
-    biases, motion = () if net.synchronised else (_clocks(net, r),), Motion(span="epoch")
+    biases, motion = () if net.synchronised else (_clock_bias(net, r),), Motion(span="epoch")
     return Likelihood(
         net, assemble(stations, *rows, times=np.arange(float(net.pulses)), motions=(motion,), biases=biases)
     )
 
 
-def _loose(net: Network) -> float:
+def _wide_sigma(net: Network) -> float:
     """Return the wide prior standard deviation of free coordinates and clocks, metres."""
     return _LOOSE * float(min(net.sigma.min(), *net.distance_sigma, np.inf))
 
 
 def clock_signs(net: Network) -> tuple[Array, Array, Array]:
-    """Return the stations a (R,) and b (R,) of each slot, and the signs (2, R) of their clocks in the measurement."""
+    """Return the stations a (R,) and b (R,) of each slot, and the signs (2, R) of their clocks in the measurement.
+
+    A sign is 1, -1 or 0 (no effect). For slots without a second station, b is 0 and its sign is 0.
+    """
     first = np.array([slot.a for slot in net.slots])
     second = np.array([max(slot.b, 0) for slot in net.slots])
     sign = [[float(slot.kind in CLOCKED), -1.0 * (slot.kind == "tdoa")] for slot in net.slots]
     return first, second, np.array(sign).T
 
 
-def _kinds(net: Network, r: Array) -> list[tuple[str, Array]]:
-    """Return each kind with the indices of its rows; `r` (m,) is the slot of each row."""
+def _rows_by_kind(net: Network, r: Array) -> list[tuple[str, Array]]:
+    """Return each kind with the indices of its rows; `r` (m,) is the slot of each of the m rows."""
     kinds = np.array([slot.kind for slot in net.slots])[r]
     return [(kind, np.flatnonzero(kinds == kind)) for kind in dict.fromkeys(kinds.tolist())]
 
 
 def rows_of(net: Network) -> tuple[Array, Array]:
-    """Return pulse and slot of each row, in the row order of the problem: kind by kind."""
+    """Return pulse (m,) and slot (m,) of each measurement, in the row order of the problem: kind by kind."""
     j, r = np.nonzero(net.given)
-    order = np.concatenate([part for _, part in _kinds(net, r)])
+    order = np.concatenate([part for _, part in _rows_by_kind(net, r)])
     return j[order], r[order]
 
 
-def _clocks(net: Network, r: Array) -> Bias:
-    """Return the clock offsets of the stations as a bias, relative to their start values."""
+def _clock_bias(net: Network, r: Array) -> Bias:
+    """Return the clock offsets of the stations as a bias, metres, relative to their start values.
+
+    `r` (m,) is the slot of each row.
+    """
     first, second, sign = clock_signs(net)
     row, member = np.tile(np.arange(len(r)), 2), np.concatenate([first[r], second[r]])
     sign = np.concatenate([sign[0, r], sign[1, r]])
     used, m = sign != 0.0, net.stations
     return Bias(
-        "clock", net.names, row[used], member[used], sign[used], mean=np.zeros(m), sigma=np.full(m, _loose(net))
+        "clock", net.names, row[used], member[used], sign[used], mean=np.zeros(m), sigma=np.full(m, _wide_sigma(net))
     )
 
 
 def _columns(problem: Problem, name: str) -> Array:
-    """Return the indices of an unknown in the shared parameter vector."""
+    """Return the indices of the unknown `name` in the shared parameter vector."""
     slot, _ = problem.layout.find(name)
     return np.arange(slot.start, slot.start + slot.size)

@@ -25,8 +25,9 @@ _EXACT = 1e-9
 def bent(lik: Likelihood, at: NetworkEstimate) -> tuple[NetworkEstimate, Array] | None:
     """Return the minima that moved networks reach, and their costs (S,); None if an open motion changes no row.
 
-    Each copy of the network (`at`, S = 1) is moved along one direction. A first refinement holds its stations
-    there with a tether, so that better determined directions adapt. A second refinement has no tether.
+    Each copy of the network (`at`, S = 1) is moved along one direction of large variance. A tether is a prior
+    with a small standard deviation. In a first refinement, it keeps the stations at their new positions, so
+    that better determined directions adapt. A second refinement has no tether.
     """
     rank = determined(lik, at)
     if rank.open.shape[1]:

@@ -1,7 +1,8 @@
 """Multi-start search for a network, until three starts agree on the least cost.
 
-Each round makes starts (`rounds`) and then moves single stations or pulses (`blocks`) of the cheapest
-networks.
+Each round makes starts (`restarts.rounds`) and then moves single stations or pulses (`blocks`) of the
+cheapest networks. A block is one station or pulse. The cost is chi-square: the sum of squared whitened
+residuals.
 """
 
 from __future__ import annotations
@@ -37,10 +38,11 @@ _SAME = 0.01
 
 @dataclass(slots=True)
 class NetworkSearchResult:
-    """State of a search.
+    """State and result of a search.
 
-    `ends` holds the minima of all starts and `best`, `cost` the best network. `made` is the number of starts.
-    `onward` maps the cost of a minimum to the lower cost that block moves reach from it.
+    `ends` contains the minima of all starts. `best` (S = 1) is the best network, and `cost` is its cost.
+    `made` is the number of starts. `onward` maps the rounded cost of a minimum to the lower cost that block
+    moves reach from it.
     """
 
     ends: RoundEnds
@@ -52,12 +54,12 @@ class NetworkSearchResult:
     @property
     def agreeing(self) -> int:
         """Return the number of starts that reach the best network, directly or by block moves."""
-        led = np.array([self.onward.get(_key(cost), cost) for cost in self.ends.cost])
-        return self.ends.counted(led <= self.cost + _SAME + equal_cost(self.cost))
+        reached = np.array([self.onward.get(_cost_key(cost), cost) for cost in self.ends.cost])
+        return self.ends.counted(reached <= self.cost + _SAME + equal_cost(self.cost))
 
 
-def _key(cost: float) -> float:
-    """Return a rounded cost as key of `onward`: minima with equal keys are the same."""
+def _cost_key(cost: float) -> float:
+    """Return a rounded cost as key of `NetworkSearchResult.onward`: minima with equal keys are the same."""
     return round(float(cost), 4)
 
 
@@ -66,8 +68,9 @@ def search(
 ) -> NetworkSearchResult | None:
     """Return the cheapest network of the search, or None if no start converges.
 
-    `seed` sets the random starts. The search ends after `limit` starts even if no three of them agree. The
-    function calls `tell` with a progress message after each round.
+    `seed` sets the random starts. The search ends if `AGREEING` starts reach the least cost and this cost
+    fits the noise. It ends after `limit` starts (None: `_STARTS`) even if they do not agree. The function
+    calls `tell` with a progress message after each round.
     """
     limit = limit or _STARTS
     lik = likelihood(net)
@@ -75,8 +78,8 @@ def search(
     for made, one in rounds(starts_of(lik, seed)):
         good = np.isfinite(one.cost)
         if good.any():
-            found = _merge(found, one.take(good), made)
-            _move_on(lik, found)
+            found = _add_round(found, one.take(good), made)
+            _improve_by_block_moves(lik, found)
             if tell is not None:
                 tell(f"{found.made} starts, {found.agreeing} at the least cost {found.cost:.5g}")
             agreed = found.agreeing >= AGREEING and _fits(net, found.cost)
@@ -87,7 +90,7 @@ def search(
     return found
 
 
-def _merge(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> NetworkSearchResult:
+def _add_round(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> NetworkSearchResult:
     """Add the minima of a round to the search result, and return the result; `made` is the number of starts."""
     if found is not None:
         ends = joined([found.ends, ends])
@@ -100,24 +103,27 @@ def _merge(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> Net
     return found
 
 
-def _move_on(lik: Likelihood, found: NetworkSearchResult) -> None:
-    """Move single blocks of the cheapest networks to other positions, as long as that lowers the cost."""
+def _improve_by_block_moves(lik: Likelihood, found: NetworkSearchResult) -> None:
+    """Move single blocks of the cheapest networks to other positions, as long as that lowers the cost.
+
+    The results are written to `found`: `onward`, and `best` and `cost` if a network is cheaper.
+    """
     ends = found.ends
     tried = 0
     for i in np.argsort(ends.cost, kind="stable"):
         if found.agreeing >= AGREEING or tried == _TRIED:
             return
-        if _key(ends.cost[i]) in found.onward:
+        if _cost_key(ends.cost[i]) in found.onward:
             continue
         tried += 1
         at, cost = _sweep_block_moves(lik, ends.at.take(np.array([i])), float(ends.cost[i]))
-        found.onward[_key(ends.cost[i])] = cost
+        found.onward[_cost_key(ends.cost[i])] = cost
         if cost < found.cost - _SAME:
             found.best, found.cost = at, cost
 
 
 def _sweep_block_moves(lik: Likelihood, at: NetworkEstimate, cost: float) -> tuple[NetworkEstimate, float]:
-    """Return the network and the cost that repeated block moves reach from a minimum."""
+    """Return the network (S = 1) and the cost that repeated block moves reach from the minimum `at` with this cost."""
     for _ in range(_SWEEPS):
         found = sorted(elsewhere(lik, at), key=lambda block: block.gaps[0])[:_MOVES]
         if not found:
@@ -133,7 +139,7 @@ def _sweep_block_moves(lik: Likelihood, at: NetworkEstimate, cost: float) -> tup
 def proven(
     lik: Likelihood, at: NetworkEstimate
 ) -> tuple[NetworkEstimate, tuple[StationBlock, ...], list[tuple[str, NetworkEstimate]]]:
-    """Move blocks to all other positions that their proofs did not exclude, until no move lowers the cost.
+    """Return the network after moves to all positions that block proofs did not exclude, until no move lowers the cost.
 
     Parameters
     ----------
@@ -149,7 +155,7 @@ def proven(
     blocks : tuple of StationBlock
         Stations and pulses with their proofs.
     others : list of (str, NetworkEstimate)
-        Refined networks with one block at another position, and a description of each.
+        Refined networks after a move of one block or of all stations, and a description of each.
     """
     cost, others = float(lik.cost(at)[0]), list[tuple[str, NetworkEstimate]]()
     for _ in range(_SWEEPS):
@@ -175,7 +181,11 @@ def proven(
 def _apply_joint_moves(
     lik: Likelihood, at: NetworkEstimate, cost: float
 ) -> tuple[NetworkEstimate, float, list[tuple[str, NetworkEstimate]]]:
-    """Return the cheapest network that joint moves reach, its cost, and the other minima of these moves."""
+    """Return the cheapest network that joint moves of all stations reach, its cost, and their other minima.
+
+    `at` (S = 1) is a minimum with this `cost`. Each other minimum has a description. If an open motion
+    changes no row, no move is made.
+    """
     for _ in range(_SWEEPS):
         made = bent(lik, at)
         if made is None:
@@ -190,13 +200,16 @@ def _apply_joint_moves(
 
 
 def _fits(net: Network, cost: float) -> bool:
-    """Return whether the cost of a network passes the chi-square test."""
+    """Return whether the cost of a network passes the chi-square test: its p-value is at least `P_MISFIT`."""
     dof = np.array(net.rows - net.unknowns + frame_size(net))
     return not float(tail_probability(np.array(cost), dof)) < P_MISFIT
 
 
 def frame_size(network: Network) -> int:
-    """Return the number of unknowns that the frame adds; known coordinates reduce it."""
+    """Return the number of unknowns that only the frame fixes: motions and a common clock offset that change no row.
+
+    They do not count in the degrees of freedom. Each known coordinate reduces the number by one.
+    """
     d = network.dimension
     known = int(np.isfinite(network.place_sigma).sum())
     clocks = int(not network.synchronised and any(slot.kind in CLOCKED for slot in network.slots))

@@ -109,7 +109,7 @@ class Network:
 
     @property
     def rows(self) -> int:
-        """Return the number of measurements and of prior coordinates that are not exact."""
+        """Return the number of measurements, distances between stations, and prior coordinates that are not exact."""
         soft = np.isfinite(self.place_sigma) & (self.place_sigma > 0.0)
         return int(self.given.sum() + len(self.distance) + soft.sum())
 

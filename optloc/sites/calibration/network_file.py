@@ -44,7 +44,7 @@ BETWEEN = "station_range"
 
 
 class _NetworkTable(BaseModel):
-    """A table of the file; unknown keys are an error."""
+    """A table of the network file; unknown keys are an error."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -109,29 +109,29 @@ def read_network(path: Path) -> Network:
         table_of(file.stations, folder, where := join(source, "[stations]")), file.stations.unit
     )
     names = tuple(str(name) for name in table.labels("name"))
-    place, place_sigma = _places(file.stations, table, where)
+    place, place_sigma = _prior_places(file.stations, table, where)
     rows: list[tuple[str, Array, Array, Array, Array, Array]] = []
     apart: list[tuple[Array, Array, Array, Array]] = []
     for i, section in enumerate(file.measurements):
         place_of = join(source, f"[[measurements]] {i + 1}")
-        own = table_of(section, folder, place_of)
-        if section.kind != BETWEEN and not own.has("epoch"):
+        rows_table = table_of(section, folder, place_of)
+        if section.kind != BETWEEN and not rows_table.has("epoch"):
             advice = "add a column epoch; for known stations, use optloc fix"
-            raise InvalidProblem("the rows have no column epoch for the pulse", own.source, advice)
+            raise InvalidProblem("the rows have no column epoch for the pulse", rows_table.source, advice)
         between = section.kind == BETWEEN
         kind = BETWEEN if between else kind_named(section.kind, place_of)
         if not between and kind not in KINDS:
             raise InvalidProblem(f"networks have no rows of kind {kind!r}", place_of, nearest(kind, [*KINDS, BETWEEN]))
-        read = Context(MeasurementsTable(sigma=section.sigma), own, names, place_of, speed, values=True)
-        z, sigma = _values(read, section.unit)
+        read = Context(MeasurementsTable(sigma=section.sigma), rows_table, names, place_of, speed, values=True)
+        z, sigma = _values_and_sigmas(read, section.unit)
         a, b = ends_of(read, kind, 2 if between else MODELS[kind].stations)
         if between:
             apart.append((a, b, z, sigma))
         else:
-            rows.append((kind, own.labels("epoch"), a, b, z, sigma))
+            rows.append((kind, rows_table.labels("epoch"), a, b, z, sigma))
     if not rows:
         raise InvalidProblem("the file has no pulses", source, 'add [[measurements]] of kind "toa", "tdoa" or "range"')
-    labels, slots, table_z, table_sigma = _by_pulse(rows)
+    labels, slots, table_z, table_sigma = _tables_by_pulse(rows)
     ends = np.array([[a, b] for one in apart for a, b in zip(one[0], one[1], strict=True)], dtype=np.int64)
     return checked(
         Network(
@@ -150,30 +150,37 @@ def read_network(path: Path) -> Network:
     )
 
 
-def _places(section: NetworkStations, table: Table, where: str) -> tuple[Array, Array]:
-    """Return prior station coordinates (M, d) and their standard deviations, metres; infinite if a cell is empty."""
+def _prior_places(section: NetworkStations, table: Table, where: str) -> tuple[Array, Array]:
+    """Return prior station coordinates (M, d) and their standard deviations, metres.
+
+    If a cell is empty, the coordinate is 0 and its standard deviation is infinite. `where` is the location of
+    the section for messages.
+    """
     unit = Units("length").conversion(section.unit, where)
     keys = ("x", "y", "z")[: section.dimension]
     if section.dimension == 2 and table.has("z"):
         raise InvalidProblem(
             "a network of dimension 2 has no column z", where, "remove the column, or write dimension = 3"
         )
-    place = np.array([_optional(table, key) for key in keys]).T * unit.factor
-    own = _optional(table, "sigma") * unit.factor
+    place = np.array([_optional_column(table, key) for key in keys]).T * unit.factor
+    column = _optional_column(table, "sigma") * unit.factor
     common = 0.0 if section.sigma is None else Units("length").plain(section.sigma, section.unit, where)
-    sigma = np.where(np.isnan(own), common, own)[:, None]
+    sigma = np.where(np.isnan(column), common, column)[:, None]
     if (sigma < 0.0).any():
         raise InvalidProblem("a standard deviation is negative", where, "give zero for an exact position")
     return np.where(np.isnan(place), 0.0, place), np.where(np.isnan(place), np.inf, sigma)
 
 
-def _optional(table: Table, key: str) -> Array:
-    """Return a column as numbers, NaN where a cell or the column is missing."""
+def _optional_column(table: Table, key: str) -> Array:
+    """Return a column as numbers (q,), NaN where a cell or the column is missing."""
     return table.numbers(key, optional=True) if table.has(key) else np.full(table.count, np.nan)
 
 
-def _values(read: Context, name: str) -> tuple[Array, Array]:
-    """Return values (m,) and standard deviations (m,) of rows, metres; `name` is the unit in the file."""
+def _values_and_sigmas(read: Context, name: str) -> tuple[Array, Array]:
+    """Return values (m,) and standard deviations (m,) of the rows of one section, metres.
+
+    `read` contains its table, and `name` is the unit in the file.
+    """
     units = Units("length", read.speed)
     unit = units.conversion(name, join(read.where, "key 'unit'"))
     z = values_of(read, unit, np.ones(read.table.count))
@@ -184,12 +191,14 @@ def _values(read: Context, name: str) -> tuple[Array, Array]:
     return z, sigma
 
 
-def _by_pulse(
+def _tables_by_pulse(
     rows: list[tuple[str, Array, Array, Array, Array, Array]],
 ) -> tuple[tuple[str, ...], tuple[NetworkSlot, ...], Array, Array]:
-    """Return labels of pulses, slots, and tables (N, R) of values and standard deviations.
+    """Return labels (N) of pulses, slots (R), and tables (N, R) of values and standard deviations, metres.
 
-    If the same stations measure a pulse several times, each repetition has its own slot.
+    Each entry of `rows` is a section of the file: kind, pulses, stations a and b (-1 without), values and
+    standard deviations. If the same stations measure a pulse several times, each repetition has its own slot.
+    Cells without a measurement have an infinite standard deviation.
     """
     labels, _, pulse = distinct(np.concatenate([one[1] for one in rows]))
     slots: dict[tuple[str, int, int, int], int] = {}
@@ -220,6 +229,9 @@ def check_name(out: Path) -> None:
 def write_calibrated(found: Calibration, title: str, out: Path, source: Path) -> None:
     """Write a problem file with the estimated stations, their standard deviations, and the rows of the pulses.
 
+    The clocks are subtracted from the rows. `source` is the network file, which must not be overwritten by
+    `out`.
+
     Raises
     ------
     InvalidProblem
@@ -233,9 +245,9 @@ def write_calibrated(found: Calibration, title: str, out: Path, source: Path) ->
     claim(out, inputs=[source])
     net, sigma = found.network, np.sqrt(np.mean(found.sigma**2, axis=1))
     stations = []
-    for name, place, own in zip(net.names, found.stations, sigma, strict=True):
+    for name, place, deviation in zip(net.names, found.stations, sigma, strict=True):
         at = {key: float(v) for key, v in zip("xyz", place, strict=False)}
-        stations.append({"name": name} | at | {"sigma": max(float(own), _EXACT)})
+        stations.append({"name": name} | at | {"sigma": max(float(deviation), _EXACT)})
     measurements = []
     for kind in dict.fromkeys(slot.kind for slot in net.slots):
         rows = []

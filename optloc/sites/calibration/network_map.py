@@ -66,7 +66,7 @@ def plot_network(
     views = [(0, 1)] if d == 2 else [(0, 1), (0, 2)]
     for row, view in enumerate(views):
         axes = figure.add_subplot(grid[row, 0])
-        _view(axes, view, names, stations, covariance, pulses, known, others)
+        _draw_plane(axes, view, names, stations, covariance, pulses, known, others)
         if row == 0:
             axes.legend(fontsize="small", loc="best")
     _histogram(figure.add_subplot(grid[:, 1]), residuals[np.isfinite(residuals)], dof)
@@ -74,7 +74,10 @@ def plot_network(
 
 
 def _histogram(axes: Axes, residuals: Array, dof: int) -> None:
-    """Draw the residuals (n,) and their expected normal distribution; its variance is dof / n, because of the fit."""
+    """Draw the whitened residuals (n,) and their expected normal distribution.
+
+    The variance of this distribution is dof / n, because the fit makes residuals smaller.
+    """
     edges = np.arange(-_FAR, _FAR + _BAR, _BAR)
     weights = np.full(residuals.size, 1.0 / (max(residuals.size, 1) * _BAR))
     axes.hist(np.clip(residuals, -_FAR, _FAR), bins=edges.tolist(), weights=weights, color=GREY)
@@ -90,7 +93,7 @@ def _histogram(axes: Axes, residuals: Array, dof: int) -> None:
     axes.set(xlabel="residual, standard deviations", ylabel="density", title=title)
 
 
-def _view(
+def _draw_plane(
     axes: Axes,
     view: tuple[int, int],
     names: Sequence[str],
@@ -100,7 +103,10 @@ def _view(
     known: Array,
     others: Sequence[Array],
 ) -> None:
-    """Draw the network in the plane of two coordinates."""
+    """Draw the network in the plane of two coordinates, `view` (for instance 0 and 1 for x and y).
+
+    `plot_network` explains the other arguments.
+    """
     i, k = view
     d = stations.shape[1]
     axes.plot(pulses[:, i], pulses[:, k], ".", color=GREY, markersize=4, label="pulses")

@@ -1,11 +1,14 @@
 """Gross errors in the rows of a network, found without a first guess.
 
-Refinements with the weights of the Geman-McClure loss lead from random positions to networks that agree with
-most rows. Stations and pulses with many contradicting rows are then placed again from random subsets of their
-rows. The network with the least truncated cost wins.
+Refinements with the weights of the Geman-McClure loss lead from random positions to networks that agree
+with most rows. Stations and pulses with many contradicting rows are then placed again from random subsets
+of their rows. The network with the least truncated cost wins. The truncated cost counts each squared
+residual up to `PRICE`.
 
-Source: S. Geman and D. McClure, "Statistical methods for tomographic image reconstruction", Bull. Int. Stat.
-Inst. 52 (1987).
+Letters: S networks, N pulses, R slots, B blocks (a block is one station or pulse), d coordinates.
+
+Source: S. Geman and D. McClure, "Statistical methods for tomographic image reconstruction", Bull. Int.
+Stat. Inst. 52 (1987).
 """
 
 from __future__ import annotations
@@ -58,7 +61,11 @@ def outliers(network: Network, seed: int) -> Array:
 
 
 def weights(residual: Array, given: Array) -> Array:
-    """Return weights of whitened residuals (S, ..., R): near 1 for small ones, falling with the fourth power."""
+    """Return weights of whitened residuals (S, ..., R): near 1 for small ones, falling with the fourth power.
+
+    `given` (..., R) marks the measured entries. The width of the weights follows the median residual of each
+    network.
+    """
     size = np.where(given, np.abs(residual), np.nan)
     axes = tuple(range(1, residual.ndim))
     width = np.maximum(_MEDIANS * np.nanmedian(size, axis=axes, keepdims=True), _LEAST)
@@ -66,15 +73,15 @@ def weights(residual: Array, given: Array) -> Array:
 
 
 def reweighted(lik: Likelihood, at: NetworkEstimate, rounds: int) -> NetworkEstimate:
-    """Return networks (S) refined in rounds of weights; without weights, gross rows dominate the steps."""
+    """Return S networks refined in `rounds` rounds of weights; without weights, gross rows dominate the steps."""
     for _ in range(rounds):
-        own = weights(lik.residual(at), lik.network.given)
-        at, _ = replace(lik, weight=own).refine(at, _STEPS)
+        row_weights = weights(lik.residual(at), lik.network.given)
+        at, _ = replace(lik, weight=row_weights).refine(at, _STEPS)
     return at
 
 
 def truncated(lik: Likelihood, at: NetworkEstimate) -> tuple[NetworkEstimate, Array]:
-    """Return networks (S) refined without rows beyond four standard deviations, and their truncated costs (S,)."""
+    """Return S networks refined without rows beyond four standard deviations, and their truncated costs (S,)."""
     for _ in range(_SETTLING):
         at, _ = replace(lik, weight=1.0 * (lik.residual(at) ** 2 < PRICE)).refine(at, 2 * _STEPS)
     square = lik.residual(at) ** 2
@@ -82,7 +89,10 @@ def truncated(lik: Likelihood, at: NetworkEstimate) -> tuple[NetworkEstimate, Ar
 
 
 def placed_anew(lik: Likelihood, starts: Starts, at: NetworkEstimate) -> NetworkEstimate:
-    """Return a network (S = 1) with pulses, then stations, moved to positions that agree with most of their rows."""
+    """Return a network (S = 1) with pulses, then stations, moved to positions that agree with most of their rows.
+
+    `starts` provides the random numbers and the size of the network.
+    """
     net, d = lik.network, lik.network.dimension
     x = _random_consensus(pulses_alone(net, at), at.pulses[0], starts)
     emission = x[:, d] if x.shape[1] > d else at.emission[0]
@@ -99,10 +109,11 @@ def placed_anew(lik: Likelihood, starts: Starts, at: NetworkEstimate) -> Network
 
 
 def _random_consensus(problem: Problem, here: Array, starts: Starts) -> Array:
-    """Return the values (B, size) with the least truncated cost of each block.
+    """Return the unknowns (B, size) of each block with the least truncated cost.
 
-    The candidates are the present position and fits to random subsets of the rows. A fit to all rows fails if
-    some rows are gross, but many small subsets have no gross row.
+    `problem` is a batch of B blocks, and `here` (B, d) are their positions, metres. The candidates are the
+    present position and fits to random subsets of the rows. A fit to all rows fails if some rows are gross,
+    but many small subsets have no gross row.
 
     Source: M. Fischler and R. Bolles, "Random sample consensus", Commun. ACM 24 (1981).
     """
@@ -117,8 +128,8 @@ def _random_consensus(problem: Problem, here: Array, starts: Starts) -> Array:
     np.put_along_axis(few, order[:, : d + _SPARE], 1.0, axis=1)
     x = minima(many.with_rows(weight=few * given), x.reshape(-1, 1, d))[0][:, 0]
     for _ in range(_ALONE):
-        own = weights(whitened(many, x), given) * given
-        x = minima(many.with_rows(weight=own), x[:, None, :d])[0][:, 0]
+        row_weights = weights(whitened(many, x), given) * given
+        x = minima(many.with_rows(weight=row_weights), x[:, None, :d])[0][:, 0]
     now = vectors(problem, here[:, None])
     x = np.concatenate([now, x.reshape(size, _PLACES, -1)], axis=1)
     cost = np.stack([np.minimum(whitened(problem, x[:, k]) ** 2, PRICE).sum(axis=-1) for k in range(1 + _PLACES)])
@@ -126,6 +137,6 @@ def _random_consensus(problem: Problem, here: Array, starts: Starts) -> Array:
 
 
 def whitened(problem: Problem, x: Array) -> Array:
-    """Return residuals (B, q) in standard deviations; 0 for absent rows."""
+    """Return residuals (B, q) of a batch in standard deviations at the vectors x (B, size); 0 for absent rows."""
     left = np.where(problem.weight > 0.0, problem.observed - predict(problem, x), 0.0)
     return np.asarray(left / np.sqrt(variances(problem.noise, problem.count)))

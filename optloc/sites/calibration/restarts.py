@@ -1,4 +1,11 @@
-"""Starts of a network without a first guess: low-rank fits and random positions, refined in rounds."""
+"""Starts of a network without a first guess: low-rank fits and random positions, refined in rounds.
+
+A low-rank fit uses that the squared distances between stations and pulses form a matrix of low rank. It
+gives all positions without a first guess, but needs many stations and pulses.
+
+Letters: S networks, M stations, N pulses, d coordinates. Times are multiplied by the propagation speed,
+metres.
+"""
 
 from __future__ import annotations
 
@@ -54,12 +61,12 @@ class RoundEnds:
         return RoundEnds(self.at.take(which), self.cost[which], self.start[which])
 
     def counted(self, which: Array) -> int:
-        """Return the number of different starts among a selection (mask) of the minima."""
+        """Return the number of different starts among the minima that the mask `which` (S,) selects."""
         return len(np.unique(self.start[which]))
 
 
 def joined(some: list[RoundEnds]) -> RoundEnds:
-    """Return the minima of several rounds as one object."""
+    """Return the minima of several rounds, `some`, as one object."""
     arrays = (np.concatenate([getattr(one, name) for one in some]) for name in ("cost", "start"))
     return RoundEnds(together(*(one.at for one in some)), *arrays)
 
@@ -90,25 +97,30 @@ def arrivals(network: Network) -> tuple[Array, Array, Array]:
             rows = np.flatnonzero(given & (kinds == kind))
             if rows.size:
                 values, deviation = network.z[j, rows], network.sigma[j, rows]
-                convert = _of_differences if kind == "tdoa" else _of_stations
+                convert = _arrivals_of_differences if kind == "tdoa" else _arrivals_of_stations
                 z[j], weight[j] = convert(ends[rows], values, 1.0 / deviation**2, m)
                 emission[j] = kind != "range"
                 break
     return z, weight, emission
 
 
-def _of_stations(ends: Array, values: Array, weight: Array, m: int) -> tuple[Array, Array]:
-    """Return the mean value (m,) of each station's rows, and its inverse standard deviation (m,)."""
+def _arrivals_of_stations(ends: Array, values: Array, weight: Array, m: int) -> tuple[Array, Array]:
+    """Return the mean value (M,) of each station's rows of one pulse, metres, and its inverse standard deviation (M,).
+
+    `ends` (q, 2) are the stations of the q rows. `values` (q,) and `weight` (q,) are their values and inverse
+    variances. `m` is the number of stations.
+    """
     total, sums = np.zeros(m), np.zeros(m)
     np.add.at(total, ends[:, 0], weight)
     np.add.at(sums, ends[:, 0], weight * values)
     return np.divide(sums, total, out=np.zeros(m), where=total > 0.0), np.sqrt(total)
 
 
-def _of_differences(ends: Array, values: Array, weight: Array, m: int) -> tuple[Array, Array]:
-    """Return the arrivals (M,) and weights (M,) of the largest group of stations that differences link.
+def _arrivals_of_differences(ends: Array, values: Array, weight: Array, m: int) -> tuple[Array, Array]:
+    """Return the arrivals (M,), metres, and weights (M,) of the largest group of stations that differences link.
 
-    The arrivals have an unknown common constant.
+    The arrivals of one pulse have an unknown common constant; stations outside the group have weight 0.
+    `ends`, `values`, `weight` and `m` are as in `_arrivals_of_stations`.
     """
     linked = np.zeros((m, m))
     np.add.at(linked, (ends[:, 0], ends[:, 1]), weight)
@@ -127,8 +139,9 @@ def _of_differences(ends: Array, values: Array, weight: Array, m: int) -> tuple[
 class Starts:
     """Generator of starts for one network, used by `rounds`.
 
-    `z`, `weight` and `emission` come from `arrivals`. `shift` (N,) is the median arrival of each pulse and
-    `spread` the size of the network, metres.
+    `lik` is the likelihood of the network. `z`, `weight` and `emission` come from `arrivals`. `shift` (N,) is
+    the median arrival of each pulse, and `spread` is the size of the network, both in metres. `rng` draws the
+    random numbers.
     """
 
     lik: Likelihood
@@ -145,7 +158,10 @@ class Starts:
         return self.lik.network.dimension
 
     def low_rank(self, count: int) -> tuple[NetworkEstimate, Array]:
-        """Return networks from the low-rank fits of `count` random starts, and the fit number of each network."""
+        """Return networks from the low-rank fits of `count` random starts, and the fit number (S,) of each network.
+
+        One fit can give several networks, or none.
+        """
         net, d = self.lik.network, self.dimension
         full = (self.weight > 0.0).sum(axis=1) >= d + 3
         relative = self.weight / self.weight.max()
@@ -171,7 +187,10 @@ class Starts:
         return made, which
 
     def _set_emission(self, made: NetworkEstimate, few: Array) -> None:
-        """Set the emission of pulses that the fit did not use (mask `few`) to the mean that fits their position."""
+        """Set the emission of pulses that the fit did not use (mask `few` (N,)) to the mean that fits their position.
+
+        `made` is changed.
+        """
         if few.any():
             apart = np.linalg.norm(made.stations[:, None] - made.pulses[:, few, None], axis=-1)
             weight = self.weight[few] / np.maximum(self.weight[few].sum(axis=1, keepdims=True), 1e-300)
@@ -192,7 +211,10 @@ class Starts:
         return NetworkEstimate(stations, np.zeros((count, net.stations)), pulses, offset * net.emission)
 
     def ends(self, at: NetworkEstimate, start: Array) -> RoundEnds:
-        """Return the minima of refined networks; both mirror images are aligned with prior coordinates, if any."""
+        """Return the minima of refined networks; both mirror images are aligned with prior coordinates, if any.
+
+        `at` are S networks, and `start` (S,) are the numbers of their starts.
+        """
         net = self.lik.network
         if np.isfinite(net.place_sigma).any():
             free = replace(net, place_sigma=np.full(net.place.shape, np.inf), place=np.zeros(net.place.shape))
@@ -209,7 +231,7 @@ def _no_estimates(net: Network) -> NetworkEstimate:
 
 
 def starts_of(lik: Likelihood, seed: int) -> Starts:
-    """Return the generator of starts for a network."""
+    """Return the generator of starts for a network; `seed` is the seed of its random numbers."""
     z, weight, emission = arrivals(lik.network)
     measured = weight > 0.0
     shift = np.where(emission, [np.median(z[j, measured[j]]) if measured[j].any() else 0.0 for j in range(len(z))], 0.0)
@@ -220,7 +242,10 @@ def starts_of(lik: Likelihood, seed: int) -> Starts:
 
 
 def rounds(starts: Starts) -> Iterator[tuple[int, RoundEnds]]:
-    """Yield the number of starts so far and the minima of each round (low-rank fits and random positions)."""
+    """Yield, for each round, the number of starts so far and the minima that the starts of this round reach.
+
+    The starts are low-rank fits and random positions. The rounds never end; the caller stops the iteration.
+    """
     net, d = starts.lik.network, starts.dimension
     full = int(((starts.weight > 0.0).sum(axis=1) >= d + 3).sum())
     able = net.stations >= d + 3 and full > 0 and max(net.stations, full) >= unknowns(d)
@@ -239,6 +264,9 @@ def rounds(starts: Starts) -> Iterator[tuple[int, RoundEnds]]:
 
 def laid(at: NetworkEstimate, net: Network, rng: np.random.Generator) -> NetworkEstimate:
     """Return networks aligned with the prior coordinates of the stations: S networks, then their S mirror images.
+
+    A free network fits in any frame, and its mirror image fits too. The prior coordinates select the frame
+    and the side.
 
     Parameters
     ----------
@@ -273,7 +301,12 @@ def laid(at: NetworkEstimate, net: Network, rng: np.random.Generator) -> Network
 
 
 def _align(points: Array, place: Array, weight: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return rotations (S, d, d) and shifts (S, d) that minimise the weighted distance from known coordinates."""
+    """Return rotations (S, d, d) and shifts (S, d) that minimise the weighted distance from known coordinates.
+
+    `points` (S, M, d) are centred stations, and `place` (M, d) are the known coordinates, metres. `weight`
+    (M, d) are inverse standard deviations, 0 for unknown coordinates. Gauss-Newton steps start from `_TURNS`
+    random rotations, because there can be several minima.
+    """
     s, m, d = points.shape
     generators = np.array([_generator(i, k, d) for i in range(d) for k in range(i)])
     turn = np.linalg.qr(rng.standard_normal((_TURNS, d, d)))[0]

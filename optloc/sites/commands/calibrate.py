@@ -59,7 +59,10 @@ def _run(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Calibrate, write the outputs and return the exit code: 0 for status ok, otherwise 1."""
+    """Calibrate, write the outputs and return the exit code: 0 for status ok, otherwise 1.
+
+    `gauge` are names of stations, separated by commas. `out` is a problem file, and `plot` is a picture.
+    """
     from optloc.cli import Screen, claim_outputs, dumps, line, say, write_picture, write_text
     from optloc.problem import Status
     from optloc.sites.calibration import calibrate as find
@@ -107,11 +110,11 @@ def _show(found: Calibration) -> None:
     with np.errstate(invalid="ignore"):
         sigma = found.sigma
     for i, name in enumerate(net.names[:_LINES]):
-        own = found.residuals[:, [i in (slot.a, slot.b) for slot in net.slots]]
-        own = own[np.isfinite(own)]
+        values = found.residuals[:, [i in (slot.a, slot.b) for slot in net.slots]]
+        values = values[np.isfinite(values)]
         cells = [f"{v:.3f} {s:.3f}" for v, s in zip(found.stations[i], sigma[i], strict=True)]
         clock = [] if net.synchronised else [f"{found.clocks[i]:.3f}"]
-        table.add_row(name, *cells, *clock, f"{np.sqrt(np.mean(own**2)):.2f}" if own.size else "-")
+        table.add_row(name, *cells, *clock, f"{np.sqrt(np.mean(values**2)):.2f}" if values.size else "-")
     console.print(table)
     for other in found.alternatives[:5]:
         say(console, f"{other.what}: cost + {other.gap:.3g}")
@@ -146,7 +149,7 @@ def _record(found: Calibration, file: Path) -> dict[str, Any]:
 
 
 def _picture(found: Calibration, title: str) -> Any:
-    """Return the figure of the network."""
+    """Return the figure of the network; at most three alternatives are drawn."""
     from optloc.sites.calibration.network_map import plot_network
 
     net = found.network

@@ -36,11 +36,11 @@ class PlaceOptions:
     choose, budget, criterion, worst, fail_one, gap, seconds
         See `SiteSelection`.
     at : str, optional
-        The only place of interest.
+        The only place of interest, for instance "1200,800,50".
     rows : bool
         Whether single rows are chosen instead of stations.
     draws : int
-        Simulated fixes at each place.
+        Simulated fixes at each place; 0: no check for ambiguity.
     """
 
     choose: int | None = None
@@ -63,11 +63,12 @@ def run_place(
     The code is 1 if the gap did not close or too many simulated fixes are ambiguous, otherwise 0.
     """
     claim_outputs(out, picture=plot, inputs=[file])
-    loaded = read_selection(file) if is_selection(file) else _of_problem(file, wanted)
-    selection = _with(loaded.selection, wanted)
+    loaded = read_selection(file) if is_selection(file) else _selection_of_problem(file, wanted)
+    selection = _with_options(loaded.selection, wanted)
     with line(quiet or as_json) as tell:
 
         def report(bound: float, value: float, nodes: int) -> None:
+            """Show the progress of the search."""
             tell(f"best {value:.5g}, no set below {bound:.5g}, {nodes} nodes")
 
         tell("searching")
@@ -92,8 +93,11 @@ def run_place(
     return 0 if found.closed and (found.draws is None or found.draws.clean) else 1
 
 
-def _of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
-    """Return the stations of a problem file as candidates, for a target at `--at` or at the fix of the file."""
+def _selection_of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
+    """Return the stations of a problem file as candidates, for a target at `--at` or at the fix of the file.
+
+    `wanted` are the options of the command line.
+    """
     loaded = read(file, values=False)
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
     problem = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
@@ -113,8 +117,8 @@ def _of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
     return LoadedSelection(SiteSelection(problem, places, choose=wanted.choose), loaded.source, loaded.title, {})
 
 
-def _with(selection: SiteSelection, wanted: PlaceOptions) -> SiteSelection:
-    """Return the selection with the options of the command line."""
+def _with_options(selection: SiteSelection, wanted: PlaceOptions) -> SiteSelection:
+    """Return the selection with the options of the command line in place of the settings of the file."""
     given: dict[str, Any] = {
         key: value
         for key in ("choose", "budget", "worst", "fail_one", "gap", "seconds")
@@ -234,7 +238,7 @@ def _losses_table(found: Placement) -> Table:
 
 
 def _remarks(selection: SiteSelection, found: Placement) -> list[str]:
-    """Return sentences about weak places, the next station, simulated fixes and the refinement."""
+    """Return sentences about weak places, the next station, simulated fixes and the refinement, for the user."""
     names, out = _names_of(selection), []
     weak = [names[i] for i in np.flatnonzero(found.share_of_prior > PRIOR)]
     if weak:

@@ -1,4 +1,7 @@
-"""Polygons of GeoJSON files, their convex parts, and lines of sight over terrain."""
+"""Polygons of GeoJSON files, their convex parts, and lines of sight over terrain.
+
+A ring is a closed polygon (v, 2): x and y of its v corners, without a repeated last corner.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,11 @@ _SAMPLES, _NODES = 200, 4
 
 
 def polygons_of(path: Path) -> list[Array]:
-    """Return the outer rings (q, 2) of the polygons of a GeoJSON file (RFC 7946), without the repeated last corner."""
+    """Return the outer rings of all polygons of a GeoJSON file (RFC 7946), each (v, 2), as in the file.
+
+    A repeated last corner is removed. Holes in the polygons are ignored. A file without a polygon, or with a
+    ring of fewer than four positions, is an error.
+    """
     source = path.name
     data = json_of(read_text(path), source)
     items = data.get("features", [data]) if isinstance(data, dict) else []
@@ -42,7 +49,12 @@ def polygons_of(path: Path) -> list[Array]:
 
 
 def corners_in_frame(ring: Array, frame: Frame, where: str) -> Array:
-    """Return corners (q, 2) in frame coordinates, metres; a geodetic frame converts longitudes and latitudes."""
+    """Return the corners (v, 2) of a ring in frame coordinates, metres.
+
+    In a geodetic frame, the corners are longitude and latitude, degrees. The frame must then be a local frame
+    with axes east and north. Other frames return the corners unchanged. `where` is the location in the file
+    for error messages.
+    """
     if not frame.geodetic:
         return ring
     if frame.kind != "enu":
@@ -53,7 +65,10 @@ def corners_in_frame(ring: Array, frame: Frame, where: str) -> Array:
 
 
 def inside(points: Array, ring: Array) -> Array:
-    """Return a mask of the points (q, 2) inside a ring (v, 2): their rays cross an odd number of edges."""
+    """Return a mask (q,) of the points (q, 2) inside a ring (v, 2).
+
+    A point is inside if a ray from it to the right crosses an odd number of edges.
+    """
     a, b = ring, np.roll(ring, -1, axis=0)
     x, y = points[:, :1], points[:, 1:]
     span = (a[:, 1] > y) != (b[:, 1] > y)
@@ -63,7 +78,11 @@ def inside(points: Array, ring: Array) -> Array:
 
 
 def visible(ground: PlacementGround, places: Array, stations: Array) -> Array:
-    """Return an array (P, s): 1 if the line between place and station stays above the ground, otherwise 0."""
+    """Return an array (P, s) for P places and s stations: 1 if their line stays above the ground, otherwise 0.
+
+    Places (P, 3) and stations (s, 3) are positions, metres. The line is compared with the ground at
+    `_SAMPLES` points.
+    """
     share = np.linspace(0.0, 1.0, _SAMPLES + 2)[1:-1, None]
     out = np.ones((len(places), len(stations)))
     for p, place in enumerate(places):
@@ -74,7 +93,10 @@ def visible(ground: PlacementGround, places: Array, stations: Array) -> Array:
 
 
 def ground_of(path: Path, where: str) -> PlacementGround:
-    """Return the terrain of a CSV file that has columns x, y, z on a full grid, metres."""
+    """Return the terrain of a CSV file that has columns x, y, z on a full grid, metres.
+
+    `where` is the location of the file name in the selection file, for error messages.
+    """
     table = table_of(DataTable(file=path.name), path.parent, where)
     x, y, z = (table.numbers(key) for key in "xyz")
     xs, ys = np.unique(x), np.unique(y)
@@ -89,19 +111,25 @@ def ground_of(path: Path, where: str) -> PlacementGround:
 
 
 def region_of(ring: Array, low: float, high: float) -> PlacementRegion:
-    """Return a convex counter-clockwise ring (v, 2) as half-planes, with heights between `low` and `high`, metres."""
+    """Return a convex counter-clockwise ring (v, 2) as a region: half-planes normal'x <= offset, and heights.
+
+    The heights are between `low` and `high`, metres.
+    """
     along = np.roll(ring, -1, axis=0) - ring
     normal = np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
     return PlacementRegion(normal, (normal * ring).sum(1), low, high)
 
 
 def _crosses(ring: Array) -> bool:
-    """Return whether two edges of a ring (v, 2) cross at a point inside both; edges that only touch do not cross."""
+    """Return whether two edges of a ring (v, 2) cross at a point inside both edges.
+
+    Edges that only touch, for instance neighbours, do not cross.
+    """
     ends = np.roll(ring, -1, axis=0)
     along = ends - ring
 
     def side(points: Array) -> Array:
-        """Return the side (-1, 0 or 1) of each point (columns) from the line through edge i (rows)."""
+        """Return the side (v, v) of point j (columns) from the line through edge i (rows): 1 left, -1 right."""
         away = points - ring[:, None]
         return np.asarray(np.sign(along[:, :1] * away[..., 1] - along[:, 1:] * away[..., 0]))
 
@@ -110,9 +138,10 @@ def _crosses(ring: Array) -> bool:
 
 
 def convex_parts(ring: Array) -> list[Array]:
-    """Return convex rings that together cover a simple polygon (v, 2).
+    """Return convex counter-clockwise rings that together cover a simple polygon (v, 2).
 
-    A convex polygon is returned unchanged; any other polygon is cut into triangles (ear clipping).
+    A region of the refinement must be convex. A convex polygon gives one ring; any other polygon is cut into
+    triangles (ear clipping). A polygon whose edges cross is an error.
 
     G. H. Meisters, "Polygons have ears", Amer. Math. Monthly 82 (1975).
     """

@@ -1,4 +1,11 @@
-"""Steps of the branch and bound in machine code: propagation of rules, score of whole sets, bound of a node."""
+"""Steps of the branch and bound in machine code: propagation of rules, score of whole sets, bound of a node.
+
+A node is a family of sets: its state (n,) marks each site as taken (IN), left out (OUT) or undecided
+(FREE). A set is 1 for each site that is taken, otherwise 0. Rules are linear: rules @ set <= limits.
+
+Letters: P places, n sites, m unknowns of the target, d of them coordinates of the position. A site has r
+rows (measurements), B is the number of sets, and R is the number of rules.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +27,7 @@ _INSIDE = 0.02
 
 @compiled
 def propagate(rules: Array, limits: Array, state: Array) -> bool:
-    """Fix in `state` all sites that the rules decide; return whether the rules still allow a set.
+    """Fix in `state` (n,) all sites that the rules decide; return False if the rules then allow no set.
 
     If all free sites fit together, the function takes them all: another site never makes a criterion worse.
     """
@@ -54,7 +61,7 @@ def propagate(rules: Array, limits: Array, state: Array) -> bool:
 
 @compiled
 def score(rows: Array, prior: Array, weight: Array, d: int, kind: int, worst: int, fail: int, chosen: Array) -> Array:
-    """Return the criterion (B,) of sets of sites (B, n), infinite where the information is singular.
+    """Return the criterion (B,) of sets of sites (B, n): m^2, or log det for VOLUME; infinite for singular information.
 
     Parameters
     ----------
@@ -63,9 +70,9 @@ def score(rows: Array, prior: Array, weight: Array, d: int, kind: int, worst: in
     prior : array (P, m, m)
         Information without any site.
     weight : array (P,)
-        Weights of the places.
+        Weights of the places, sum 1.
     d, kind, worst
-        See `optloc.sites.placement.relaxation.evaluate`.
+        See `optloc.sites.placement.criteria.evaluate`.
     fail : int
         1 for the value after the worst loss of one site, otherwise 0.
     chosen : int array (B, n)
@@ -109,7 +116,10 @@ def score(rows: Array, prior: Array, weight: Array, d: int, kind: int, worst: in
 
 @compiled
 def number_left(rule: Array, limit: float, state: Array) -> int:
-    """Return the largest number of free sites that a rule still allows."""
+    """Return the largest number of free sites that a rule still allows: the cheapest sites are counted first.
+
+    `rule` (n,) has no negative entry. `limit` is its limit, and `state` (n,) contains FREE, OUT or IN.
+    """
     left, sizes, count = limit, np.empty(rule.shape[0]), 0
     for j in range(rule.shape[0]):
         if state[j] == IN:
@@ -145,9 +155,12 @@ def expand(
 ) -> tuple[float, float, int]:
     """Return bound, criterion and number of steps of the relaxation of a node with at least one free site.
 
-    With `fail`, the failed site is unknown in advance. The rules still allow at most c free sites. By Jensen's
-    inequality, the mean of the criterion over their failures is at least the criterion at the weights (1 - 1 / c)
-    v. Sites that are already taken fail one by one.
+    The function moves the information of the taken sites into the prior, and calls `relax` with the free sites.
+
+    With `fail`, the failed site is unknown in advance. The rules still allow at most c free sites. By
+    Jensen's inequality, the mean of the criterion over their failures is at least the criterion at the
+    weights (1 - 1 / c) v, where v are the weights of the free sites. Sites that are already taken fail one by
+    one: each failure is one scenario.
 
     Parameters
     ----------
@@ -158,13 +171,14 @@ def expand(
     state : int array (n,)
         FREE, OUT or IN.
     w, cost : array (n,)
-        Start and output as in `relax`, but for all sites.
+        Start and output as in `relax`, but for all sites: w is 1 for taken sites; the cost of fixed sites is 0.
     enough, most
         See `relax`.
     """
     places, r, m, n = rows.shape
     free, taken = np.flatnonzero(state == FREE), np.flatnonzero(state == IN)
     count, sure = len(free), len(taken)
+    # `inner` are the rows of the free sites; `lines` and `left` are their rules and the limits that remain
     inner = np.empty((places, r, m, count))
     for p in range(places):
         for q in range(r):
@@ -210,7 +224,11 @@ def expand(
 
 @compiled
 def settle(bound: float, cost: Array, enough: float, state: Array) -> int:
-    """Fix in `state` the free sites whose other value raises the bound to `enough`; return their number."""
+    """Fix in `state` the free sites whose other value raises the bound to `enough`; return their number.
+
+    `bound` is the bound of the node. `cost` (n,) is its rise if a site is taken (positive) or left out
+    (negative).
+    """
     fixed = 0
     for j in range(state.shape[0]):
         if state[j] == FREE and bound + abs(cost[j]) >= enough:

@@ -41,18 +41,18 @@ _QUANTILE = {2: 5.991464547107979, 3: 7.814727903251179}
 
 @dataclass(frozen=True, slots=True)
 class Swap:
-    """The effect of the loss of one station.
+    """The effect of the loss of one station on the criterion.
 
     Parameters
     ----------
     name : str
-        The station.
+        The station that is lost.
     value : float
-        The criterion without this station, square metres.
+        The criterion without this station, m^2.
     replacement : str
         The site that replaces it best; empty if no site can.
     replaced : float
-        The criterion with the replacement, square metres.
+        The criterion with the replacement, m^2; equal to `value` without a replacement.
     """
 
     name: str
@@ -94,7 +94,7 @@ class Draws:
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """A set of sites, with a proven bound for all sets of the candidates.
+    """A set of sites, with a proven bound for all sets of the candidates (P places).
 
     Parameters
     ----------
@@ -103,11 +103,12 @@ class Placement:
     criterion : str
         "rms", "volume" or "axis".
     value, bound : float
-        The criterion of this set, and a lower bound for all sets that meet the rules, square metres. The
-        criterion is a mean over the places. It averages the squared error ("rms"), the geometric mean of the
-        variances along the axes ("volume"), or the largest variance ("axis").
+        The criterion of this set, and a lower bound for all sets that meet the rules, square metres. At each place,
+        the criterion is the squared error ("rms"), the geometric mean of the variances along the axes ("volume"),
+        or the largest variance ("axis"). The value is the mean over the places (geometric for "volume"), or their
+        maximum if the selection has `worst`. With `fail_one`, it is the value after the worst loss of one site.
     gap : float
-        Relative difference of value and bound.
+        Relative difference of value and bound: 1 - bound / value.
     closed : bool
         Whether the gap is at most the requested gap.
     reason : str
@@ -127,11 +128,11 @@ class Placement:
     swaps : tuple of Swap
         Effect of the loss of each taken site, largest first.
     alternatives : tuple of (tuple of str, float)
-        The best sets of the search, with their values, square metres.
+        New sites of the best sets of the search, with their values, square metres.
     following : tuple of (str, float)
         Sites that can be added, with the value after each addition, square metres, best first.
     course : array (q, 3)
-        Seconds, bound and value during the search.
+        Seconds, and bound and value (square metres), at q moments of the search.
     nodes : int
         Number of solved relaxations.
     draws : Draws, optional
@@ -139,9 +140,9 @@ class Placement:
     banned : tuple of tuple of str
         Better sets that were rejected because their fixes are ambiguous.
     refined : array (k, d), optional
-        Positions of the new sites after continuous refinement, metres.
+        Positions of the k new sites after continuous refinement, metres.
     refined_value : float
-        The criterion at these positions, square metres; the bound does not apply to it.
+        The criterion at these positions, square metres; the bound does not apply to it. NaN without refinement.
     """
 
     chosen: tuple[str, ...]
@@ -228,7 +229,7 @@ def place(
 
 
 def task_of(candidates: Candidates) -> SearchTask:
-    """Return the search task for the best set of the candidates."""
+    """Return the search task for the best set of the candidates: their design and rules, and the criterion."""
     selection = candidates.selection
     return SearchTask(
         candidates.design,
@@ -242,7 +243,11 @@ def task_of(candidates: Candidates) -> SearchTask:
 
 
 def _ban_sets(task: SearchTask, banned: Sequence[Array]) -> SearchTask:
-    """Return the task with one more rule for each banned set: at least one of its sites is not taken."""
+    """Return the task with one more rule for each banned set: at least one of its sites is not taken.
+
+    `banned` contains sets (n,), 1 for each taken site. A rule also excludes larger sets that contain a banned
+    set.
+    """
     rules = np.array([chosen / chosen.sum() for chosen in banned]).reshape(len(banned), len(task.state))
     limits = np.array([1.0 - 1.0 / chosen.sum() for chosen in banned])
     return replace(task, rules=np.vstack([task.rules, rules]), limits=np.concatenate([task.limits, limits]))
@@ -251,13 +256,17 @@ def _ban_sets(task: SearchTask, banned: Sequence[Array]) -> SearchTask:
 def _placement(
     candidates: Candidates, task: SearchTask, found: BestSetResult, checked: Draws | None, banned: Sequence[Array]
 ) -> Placement:
-    """Return the result of a search with its accuracy at each place, losses and next sites."""
+    """Return the result of a search with its accuracy at each place, losses and next sites.
+
+    `found` is the result of the search. `checked` are the statistics of simulated fixes, or None. `banned`
+    are the rejected sets (n,).
+    """
     selection, names = candidates.selection, candidates.names
     value, chosen = found.best[0]
     bound, reached = task.scale(found.bound), task.scale(value)
     gap = max(0.0, 1.0 - bound / reached)
-    before, sites = _before(candidates, task)
-    per_place, share = _per_place(candidates, chosen)
+    before, sites = _bounds_before(candidates, task)
+    per_place, share = _bound_and_prior_share(candidates, chosen)
     claim = f"no set of these candidates has a value more than {100 * gap:.2g} % lower"
     reason = claim if found.closed else f"the time limit ended the search: {claim}; raise the time limit or the gap"
     new = (chosen == 1) & (candidates.state != 1)
@@ -273,23 +282,23 @@ def _placement(
         found.closed,
         reason,
         per_place,
-        _failed(candidates, chosen),
+        _bounds_after_loss(candidates, chosen),
         before,
         sites,
         share,
         _redundancy(candidates, chosen),
         tuple(_swaps(task, names, chosen)),
         tuple((_select_names(names, (one == 1) & (candidates.state != 1)), task.scale(v)) for v, one in found.best),
-        tuple(_following(task, names, chosen)),
-        _course(task, found.course),
+        tuple(_next_sites(task, names, chosen)),
+        _course_in_m2(task, found.course),
         found.nodes,
         checked,
         tuple(_select_names(names, one == 1) for one in banned),
     )
 
 
-def _course(task: SearchTask, course: Array) -> Array:
-    """Return the recorded points (q, 3) with bound and value as variances, m^2."""
+def _course_in_m2(task: SearchTask, course: Array) -> Array:
+    """Return the recorded points (q, 3) of the search with bound and value as variances, m^2."""
     out = course.copy()
     out[:, 1:] = [[task.scale(v) for v in row] for row in course[:, 1:]]
     return out
@@ -300,8 +309,12 @@ def _select_names(names: Sequence[str], mask: Array) -> tuple[str, ...]:
     return tuple(names[i] for i in np.flatnonzero(mask).tolist())
 
 
-def _per_place(candidates: Candidates, chosen: Array) -> tuple[Array, Array]:
-    """Return the bound (P,) of the position error, metres, and the share (P,) of its variance from the prior."""
+def _bound_and_prior_share(candidates: Candidates, chosen: Array) -> tuple[Array, Array]:
+    """Return the bound (P,) of the position error, metres, and the share (P,) of its variance from the prior.
+
+    `chosen` (n,) is 1 for each taken site. If the share is large, the sites alone do not determine the
+    position.
+    """
     covariance = np.asarray(crlb(candidates.assembled(chosen), candidates.vectors))
     d = candidates.design.dimension
     variance = np.trace(covariance[..., :d, :d], axis1=-2, axis2=-1)
@@ -309,38 +322,51 @@ def _per_place(candidates: Candidates, chosen: Array) -> tuple[Array, Array]:
         "prmn,n,prkn->pmk", candidates.design.rows, chosen.astype(float), candidates.design.rows
     )
     inverse = np.linalg.inv(information)[:, :d]
-    owed = np.trace(inverse @ candidates.design.prior @ np.swapaxes(inverse, 1, 2), axis1=1, axis2=2)
-    return np.sqrt(variance), owed / variance
+    from_prior = np.trace(inverse @ candidates.design.prior @ np.swapaxes(inverse, 1, 2), axis1=1, axis2=2)
+    return np.sqrt(variance), from_prior / variance
 
 
-def _failed(candidates: Candidates, chosen: Array) -> Array:
-    """Return the bound (P,) at each place after the worst loss of one site there, metres."""
+def _bounds_after_loss(candidates: Candidates, chosen: Array) -> Array:
+    """Return the bound (P,) of the position error at each place after the worst loss of one site there, metres.
+
+    `chosen` (n,) is 1 for each taken site.
+    """
     lost = np.repeat(chosen[None], int(chosen.sum()), axis=0)
     lost[np.arange(len(lost)), np.flatnonzero(chosen)] = 0
     variance = np.trace(covariances(candidates.design, lost), axis1=-2, axis2=-1)
     return np.asarray(np.sqrt(variance.max(0)))
 
 
-def _before(candidates: Candidates, task: SearchTask) -> tuple[Array, tuple[str, ...]]:
-    """Return the bounds (P,) before the choice, metres, and the sites that give them: kept sites or a random set."""
+def _bounds_before(candidates: Candidates, task: SearchTask) -> tuple[Array, tuple[str, ...]]:
+    """Return the bounds (P,) of the position error before the choice, metres, and the names of their sites.
+
+    The sites are the kept sites, if they determine the position at each place. Otherwise they are the median
+    of random sets, so that the user can compare.
+    """
     kept = (candidates.state == 1).astype(np.int64)
     if kept.any():
-        per_place, share = _per_place(candidates, kept)
+        per_place, share = _bound_and_prior_share(candidates, kept)
         if (share <= PRIOR).all():
             return per_place, _select_names(candidates.names, kept)
     sets = np.array(list(random_sets(task, _RANDOM, candidates.selection.seed)))
     middle = sets[np.argsort(task.score(sets))[len(sets) // 2]]
-    return _per_place(candidates, middle)[0], _select_names(candidates.names, middle)
+    return _bound_and_prior_share(candidates, middle)[0], _select_names(candidates.names, middle)
 
 
 def _redundancy(candidates: Candidates, chosen: Array) -> Array:
-    """Return the degrees of freedom (P,) of a fix from the chosen sites, with only the given priors."""
+    """Return the degrees of freedom (P,) of a fix at each place: rows in sight and given priors minus unknowns.
+
+    `chosen` (n,) is 1 for each taken site. The default priors of the search do not count.
+    """
     problem = replace(candidates.assembled(chosen), priors=candidates.selection.problem.priors)
     return np.asarray(degrees_of_freedom(problem))
 
 
 def _swaps(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[Swap]:
-    """Yield the effect of the loss of each taken site, with the best replacement; largest loss first."""
+    """Yield the effect of the loss of each taken site, with the best replacement; largest loss first.
+
+    `names` are the n sites; `chosen` (n,) is 1 for each taken site.
+    """
     found = []
     for i in np.flatnonzero(chosen).tolist():
         without = chosen.copy()
@@ -358,8 +384,11 @@ def _swaps(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[Sw
     yield from sorted(found, key=lambda swap: -swap.value)
 
 
-def _following(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[tuple[str, float]]:
-    """Yield each site that can be added, with the criterion after the addition, m^2; best first."""
+def _next_sites(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[tuple[str, float]]:
+    """Yield each site that is not taken or forbidden, with the criterion after its addition, m^2; best first.
+
+    The rules are ignored: the list is for a user who can take more sites.
+    """
     others = np.flatnonzero((chosen == 0) & (task.state != 0)).tolist()
     if not others:
         return
@@ -370,12 +399,16 @@ def _following(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterato
 
 
 def drawn(candidates: Candidates, chosen: Array, count: int, seed: int = 0) -> Draws:
-    """Return the statistics of simulated fixes with a set (n,) of sites: `count` at each place, method "auto"."""
+    """Return the statistics of fixes from simulated measurements with a set of sites, method "auto".
+
+    `chosen` (n,) is 1 for each taken site, and `count` is the number of simulated fixes at each place. The
+    fixes have only the given priors. They show ambiguities that the bound, a local quantity, cannot show.
+    """
     from optloc.solvers import solve
 
     places, d = len(candidates.vectors), candidates.design.dimension
     flat = replace(candidates.assembled(chosen), priors=candidates.selection.problem.priors).flat()
-    bounds = _per_place(candidates, chosen)[0]
+    bounds = _bound_and_prior_share(candidates, chosen)[0]
     ambiguous, ratio, coverage = np.zeros(places), np.full(places, np.nan), np.full(places, np.nan)
     for p in range(places):
         one = flat.take(np.array([p]))
@@ -391,19 +424,24 @@ def drawn(candidates: Candidates, chosen: Array, count: int, seed: int = 0) -> D
             coverage[p] = np.mean(
                 np.einsum("qi,qij,qj->q", error[good], np.linalg.inv(cov), error[good]) <= _QUANTILE[d]
             )
-    return Draws(count, ambiguous, ratio, coverage, _flat(candidates, chosen, bounds))
+    return Draws(count, ambiguous, ratio, coverage, _thickness_over_bound(candidates, chosen, bounds))
 
 
-def _flat(candidates: Candidates, chosen: Array, bounds: Array) -> Array:
-    """Return the smallest singular value of the centred stations in sight, divided by the bound at each place (P,)."""
+def _thickness_over_bound(candidates: Candidates, chosen: Array, bounds: Array) -> Array:
+    """Return the distance of the stations in sight from their best plane, divided by the bound at each place (P,).
+
+    The distance is the smallest singular value of the centred positions, metres; in 2D, it is the distance
+    from a line. `bounds` (P,) are the bounds of the position error, metres. A small ratio means an ambiguous
+    mirror image.
+    """
     stations = candidates.problem.stations.position.reshape(-1, candidates.design.dimension)
     weight = candidates.assembled(chosen).weight
     out = np.empty(len(bounds))
     owner = np.concatenate([rows.a for rows in candidates.problem.rows])
     for p in range(len(bounds)):
         in_sight = stations[np.unique(owner[weight[p] > 0.0])]
-        off = np.linalg.svd(in_sight - in_sight.mean(0), compute_uv=False)[-1] if len(in_sight) > 1 else 0.0
-        out[p] = off / bounds[p]
+        thickness = np.linalg.svd(in_sight - in_sight.mean(0), compute_uv=False)[-1] if len(in_sight) > 1 else 0.0
+        out[p] = thickness / bounds[p]
     return out
 
 

@@ -1,9 +1,13 @@
 """Enumeration of all sets of a small node, in machine code: faster than a bound for each child.
 
-Sites are added depth first; each addition updates the inverse information. All candidates for the last site
-are compared at once. If one site may fail, the last two sites are compared: the set must be good enough
-without either of them, and few sites pass this test. A comparison by updates has a tolerance of a millionth
-for rounding errors. Values within the tolerance are recomputed from the sums.
+Sites are added depth first; each addition updates the inverse information. All candidates for the last
+site are compared at once. If one site may fail, the last two sites are compared: the set must be good
+enough without either of them, and few sites pass this test. A comparison by updates has a tolerance of a
+millionth for rounding errors. Values within the tolerance are recomputed from the sums.
+
+Letters: P places, n sites with r rows each, m unknowns, d of them coordinates of the position, R rules. g (m,) is a
+whitened row, M (m, m) the information (prior and rows of a set), C the selection of the position. The set under
+construction is the first `size` entries of an array `members` of site numbers.
 """
 
 from __future__ import annotations
@@ -36,9 +40,9 @@ class CompletionRequest(NamedTuple):
     prior : array (P, m, m)
         Information without any site.
     whole : array (P,)
-        Trace of the information of all sites.
+        Trace of the information of the prior and all sites; it bounds the condition number.
     weight : array (P,)
-        Weights of the places.
+        Weights of the places, sum 1.
     d, kind, worst, fail : int
         See `optloc.sites.placement.branching.score`.
     rules, limits : array (R, n), (R,)
@@ -63,11 +67,11 @@ class OtherSites(NamedTuple):
     Parameters
     ----------
     site : int array (q,)
-        Numbers of the sites.
+        Numbers of the q sites.
     rows : array (P, r, m, q)
         Whitened rows of the sites.
     products : array (P, m (m + 1) / 2, q)
-        Products g_a g_b, b <= a, of the first row of each site.
+        Products g_a g_b, b <= a, of the first row g of each site; `trace_with` needs them.
     """
 
     site: Array
@@ -76,7 +80,12 @@ class OtherSites(NamedTuple):
 
 
 class CompletionWorkspace(NamedTuple):
-    """Scratch arrays: two (m, m), three (d, d), one (d,); `first` (1,) is the loss that failed the last test."""
+    """Scratch arrays of the enumeration.
+
+    `matrix` and `inverse` are (m, m). `cov`, `turn` and `basis` are (d, d), and `shares` is (d,); see
+    `measure`. `first` (1,) is the index in `members` of the loss that failed the last test: it is tested
+    first in the next set.
+    """
 
     matrix: Array
     inverse: Array
@@ -89,7 +98,7 @@ class CompletionWorkspace(NamedTuple):
 
 @compiled
 def trace_of(matrix: Array, d: int) -> float:
-    """Return the trace of the leading (d, d) block."""
+    """Return the trace of the leading (d, d) block of a matrix."""
     total = 0.0
     for i in range(d):
         total += matrix[i, i]
@@ -100,9 +109,10 @@ def trace_of(matrix: Array, d: int) -> float:
 def inverse_of(
     asked: CompletionRequest, p: int, members: Array, size: int, lost: int, matrix: Array, out: Array
 ) -> bool:
-    """Write the inverse (m, m) of the information of a set without entry `lost` (or -1); return whether it exists.
+    """Write the inverse (m, m) of the information of a set at place `p` to `out`; return False if it is singular.
 
-    The set is the first `size` entries of `members`; `matrix` (m, m) is overwritten.
+    The set is the first `size` entries of `members`, without entry `lost` (-1: no loss). `matrix` (m, m) is
+    scratch.
     """
     _, _, r, m = asked.sites.shape
     for i in range(m):
@@ -122,7 +132,7 @@ def inverse_of(
 
 @compiled
 def update(inverse: Array, row: Array, s: Array) -> None:
-    """Replace the inverse of M (m, m) by the inverse of M + g g' (Sherman-Morrison)."""
+    """Replace the inverse of M (m, m) by the inverse of M + g g' (Sherman-Morrison), g = `row` (m,); `s` is scratch."""
     m, along = inverse.shape[0], 1.0
     for i in range(m):
         x = 0.0
@@ -146,10 +156,12 @@ def grow(
     out: Array,
     work: CompletionWorkspace,
 ) -> float:
-    """Write the inverses (P, m, m) of a set from `last`, without its newest member; return their condition number.
+    """Write the inverses (P, m, m) of a set with a new member to `out`; return their condition number.
 
-    If an update loses too much accuracy, the inverse is recomputed from the sums. The returned condition number
-    is an upper bound.
+    `last` (P, m, m) are the inverses of the set without its newest member, and `condition` is their condition
+    number. The inverses are updated from `last`. If an update loses too much accuracy, the inverse is
+    recomputed from the sums. The returned number is an upper bound; it is infinite if an inverse does not
+    exist.
     """
     places, _, r, m = asked.sites.shape
     most = 0.0
@@ -174,7 +186,8 @@ def worth(
 ) -> float:
     """Return the criterion of a set without member `lost` (-1: the whole set), or any number not below `enough`.
 
-    The function stops early when the criterion cannot be below `enough`.
+    The function stops early when the criterion cannot be below `enough`. The set is the first `size` entries
+    of `members`.
     """
     d, worst = asked.d, asked.worst
     total = -np.inf if worst else 0.0
@@ -196,7 +209,8 @@ def worth(
 def with_loss(asked: CompletionRequest, members: Array, size: int, enough: float, work: CompletionWorkspace) -> float:
     """Return the criterion of a set, after its worst loss if one site may fail, or any number not below `enough`.
 
-    The loss that failed the test in the previous set is tested first.
+    The set is the first `size` entries of `members`. The loss that failed the test in the previous set is
+    tested first.
     """
     if not asked.fail or not size:
         return worth(asked, members, size, -1, enough, work)
@@ -216,7 +230,8 @@ def trace_with(products: Array, inverse: Array, d: int, begin: int, along: Array
 
     tr C (M + g g')^-1 C' = tr C M^-1 C' - |C M^-1 g|^2 / (1 + g'M^-1 g)
 
-    Both quadratic forms are linear in the `products` of the rows, (m (m + 1) / 2, q).
+    C selects the d coordinates of the position; `inverse` is M^-1 (m, m). Both quadratic forms are linear in
+    the `products` of the rows, (m (m + 1) / 2, q). `along` (q,) is scratch: 1 + g'M^-1 g.
     """
     m, n, i = inverse.shape[0], products.shape[1], 0
     for j in range(begin, n):
@@ -242,7 +257,10 @@ def trace_with(products: Array, inverse: Array, d: int, begin: int, along: Array
 def one_more(
     asked: CompletionRequest, others: OtherSites, inverses: Array, begin: int, values: Array, work: CompletionWorkspace
 ) -> None:
-    """Write the criterion (q,) of a set with each other site from index `begin`, by updates of its `inverses`."""
+    """Write the criterion (q,) of a set after the addition of each other site from index `begin` to `values`.
+
+    The criterion is computed by updates of the `inverses` (P, m, m) of the set.
+    """
     d, n = asked.d, len(others.site)
     single, brought = np.empty(n), np.empty(n)
     values[begin:] = -np.inf if asked.worst else 0.0
@@ -262,7 +280,10 @@ def one_more(
 
 @compiled
 def comparable(asked: CompletionRequest, inverses: Array, condition: float, enough: float) -> bool:
-    """Return whether updates of inverses (P, m, m) are accurate enough to compare criteria with `enough`."""
+    """Return whether updates of `inverses` (P, m, m) are accurate enough to compare criteria with `enough`.
+
+    `condition` is an upper bound of the condition number of the inverses.
+    """
     if asked.kind == VOLUME:
         return condition * condition < _COMPARE
     total = 0.0
@@ -274,7 +295,10 @@ def comparable(asked: CompletionRequest, inverses: Array, condition: float, enou
 
 @compiled
 def allowed(asked: CompletionRequest, members: Array, size: int, partly: bool) -> bool:
-    """Return whether the members meet the rules; for a partial set, only rules without negative entries are tested."""
+    """Return whether the first `size` members meet the rules, up to rounding.
+
+    With `partly`, more sites follow, so only rules without negative entries are tested.
+    """
     for i in range(asked.rules.shape[0]):
         used, low = 0.0, 0.0
         for one in range(size):
@@ -302,9 +326,12 @@ def finish(
     best: Array,
     work: CompletionWorkspace,
 ) -> float:
-    """Return the least criterion below `enough` of a set with `one` or `two` more sites; write it to `best` (n,).
+    """Return the least criterion below `enough` of a set with one or two more sites; write the set to `best` (n,).
 
-    Two sites are added only if one may fail: then the set must be good enough without either of them.
+    The added sites come from `others`, from index `begin`. `one` and `two` select sets with one and with two
+    more sites. Two sites are added only if one may fail: then the set must be good enough without either of
+    them. If no set is better, the function returns `enough` and does not change `best`. `inverses` (P, m, m)
+    and `condition` describe the set of the first `size` members.
     """
     count, keep, values = 0, np.empty(len(others.site), dtype=np.int64), np.full(len(others.site), -np.inf)
     limit = enough + _WRONG * abs(enough)
@@ -329,7 +356,7 @@ def finish(
 
 @compiled
 def picked(asked: CompletionRequest, order: Array) -> OtherSites:
-    """Return the sites in the given order (q,), with the arrays for their comparison."""
+    """Return the sites `order` (q,), in this order, with the arrays for their comparison."""
     places, _, r, m = asked.sites.shape
     count = len(order)
     rows, products = np.empty((places, r, m, count)), np.empty((places, m * (m + 1) // 2, count))
@@ -347,7 +374,7 @@ def picked(asked: CompletionRequest, order: Array) -> OtherSites:
 
 @compiled
 def scratch(m: int, d: int) -> CompletionWorkspace:
-    """Return scratch arrays for `m` unknowns with `d` position coordinates."""
+    """Return the scratch arrays of the enumeration for `m` unknowns with `d` position coordinates."""
     square, small = np.empty((2, m, m)), np.empty((3, d, d))
     return CompletionWorkspace(
         square[0], square[1], small[0], small[1], small[2], np.empty(d), np.zeros(1, dtype=np.int64)
@@ -356,7 +383,10 @@ def scratch(m: int, d: int) -> CompletionWorkspace:
 
 @compiled
 def is_counted(asked: CompletionRequest, order: Array) -> bool:
-    """Return whether the only rule is the number of these sites: then no allowed full set contains another."""
+    """Return whether the number of these sites is the only rule: then no allowed full set contains another allowed set.
+
+    `order` (q,) are the free sites.
+    """
     for j in order:
         if asked.rules[0, j] != asked.rules[0, order[0]]:
             return False
@@ -373,21 +403,28 @@ def exhaust(asked: CompletionRequest, state: Array, order: Array, most: int, eno
         Rows, criterion and rules.
     state : int array (n,)
         FREE, OUT or IN.
-    order : int array (free,)
+    order : int array (q,)
         The free sites, most promising last: then sets of the first sites soon fail the test.
     most : int
         Largest number of free sites to add.
+    enough : float
+        Value to beat, in the units of the criterion.
+    best : int array (n,)
+        Output: 1 for taken sites; unchanged if no set is below `enough`.
     """
     places, n, _, m = asked.sites.shape
     room = min(most, number_left(asked.rules[0], asked.limits[0], state))
     if room < 1:
         return enough
+    # `room` is the number of sites that can be added, `sure` the number of taken sites, `deep` the largest depth. The
+    # last one or two sites are added by `finish`.
     members, sure, deep = np.empty(n + 2, dtype=np.int64), 0, max(0, room - (2 if asked.fail else 1))
     for j in range(n):
         if state[j] == IN:
             members[sure] = j
             sure += 1
     counted, others, work = is_counted(asked, order), picked(asked, order), scratch(m, asked.d)
+    # `at` is the next entry of `order` at each depth; `fresh` is True when a set is reached for the first time
     at, inverses = np.zeros(deep + 1, dtype=np.int64), np.empty((deep + 1, places, m, m))
     condition = np.empty(deep + 1)
     condition[0] = grow(asked, members, sure, inverses[0], np.inf, inverses[0], work)

@@ -36,8 +36,9 @@ def check_groups(
 ) -> None:
     """Raise if no set of sites meets the groups, or if the wanted number of sites does not fit the groups.
 
-    `members` (G, n) marks the sites of each group. `state` (n,) is -1 for free, 0 for forbidden and 1 for kept
-    sites. `choose` is the wanted number of free sites; None leaves the number to the budget.
+    `members` (G, n) marks the n sites of each of the G groups. `names` are the names of the n sites. `state`
+    (n,) is -1 for free, 0 for forbidden and 1 for kept sites. `choose` is the wanted number of free sites;
+    None leaves the number to the budget.
 
     Raises
     ------
@@ -46,7 +47,7 @@ def check_groups(
     """
     for i, group in enumerate(groups):
         _check_group(f"groups, entry {i + 1}", group, members[i], names, state)
-    most, least = (_count(groups, members, state, sign) for sign in (-1.0, 1.0))
+    most, least = (_extreme_count(groups, members, state, sign) for sign in (-1.0, 1.0))
     if most is None or least is None:
         what = f"no set of sites meets the rules of groups {_group_numbers(groups)} together"
         raise InvalidProblem(what, "groups", "raise most or lower least of a group")
@@ -63,22 +64,31 @@ def check_groups(
         raise InvalidProblem(what, "choose", f"choose {least} or more, or lower least of a group")
 
 
-def _check_group(where: str, group: CountGroup, own: Array, names: Sequence[str], state: Array) -> None:
-    """Raise if no set of sites can meet this group, independent of the other groups."""
-    kept, able, who = int((own & (state == 1)).sum()), int((own & (state != 0)).sum()), _list_names(own, names)
+def _check_group(where: str, group: CountGroup, members: Array, names: Sequence[str], state: Array) -> None:
+    """Raise if no set of sites can meet this group, independent of the other groups.
+
+    `members` (n,) marks its sites, `names` are the names of all sites, and `state` (n,) is as in
+    `check_groups`. `where` is the place in the file for the message.
+    """
+    kept, available = int((members & (state == 1)).sum()), int((members & (state != 0)).sum())
+    listed = _list_names(members, names)
     if group.most is not None and kept > group.most:
-        what = f"at most {group.most} of {who} may be taken, but {kept} of them are kept"
+        what = f"at most {group.most} of {listed} may be taken, but {kept} of them are kept"
         raise InvalidProblem(what, where, "raise most, or keep fewer")
-    if group.least is not None and group.least > able:
-        what = f"at least {group.least} of {who} are wanted, but only {able} of them can be taken"
+    if group.least is not None and group.least > available:
+        what = f"at least {group.least} of {listed} are wanted, but only {available} of them can be taken"
         raise InvalidProblem(what, where, "lower least, or add candidates")
     if group.least is not None and group.most is not None and group.least > group.most:
-        what = f"at least {group.least} and at most {group.most} of {who} are wanted"
+        what = f"at least {group.least} and at most {group.most} of {listed} are wanted"
         raise InvalidProblem(what, where, "make least no larger than most")
 
 
-def _count(groups: Sequence[CountGroup], members: Array, state: Array, sign: float) -> int | None:
-    """Return the largest (sign -1) or smallest (sign 1) number of free sites that meets the groups, or None."""
+def _extreme_count(groups: Sequence[CountGroup], members: Array, state: Array, sign: float) -> int | None:
+    """Return the largest (sign -1) or smallest (sign 1) number of free sites in a set that meets all groups.
+
+    The result is None if no set meets the groups. An integer programme finds it. `members` (G, n) marks the
+    sites of each group; `state` (n,) is as in `check_groups`.
+    """
     low = np.array([-np.inf if g.least is None else g.least for g in groups], dtype=float)
     high = np.array([np.inf if g.most is None else g.most for g in groups], dtype=float)
     rules = [LinearConstraint(members.astype(float), low, high)] if len(groups) else []
@@ -89,21 +99,21 @@ def _count(groups: Sequence[CountGroup], members: Array, state: Array, sign: flo
 
 
 def _limiting_groups(groups: Sequence[CountGroup], members: Array, state: Array, most: int) -> list[int]:
-    """Return the indices of the groups that limit the number of sites to `most`.
+    """Return the indices of the groups that limit the number of free sites to `most`, for an error message.
 
-    If the removal of one group allows more sites, the list has only this group. Otherwise it has all groups with
-    an upper limit.
+    If the removal of one group allows more sites, the list has only this group. Otherwise it has all groups
+    with an effective upper limit.
     """
     limiting = [i for i, group in enumerate(groups) if group.most is not None and group.most < members[i].sum()]
     for i in limiting:
         kept = [k for k in range(len(groups)) if k != i]
-        if (_count([groups[k] for k in kept], members[kept], state, -1.0) or 0) > most:
+        if (_extreme_count([groups[k] for k in kept], members[kept], state, -1.0) or 0) > most:
             return [i]
     return limiting
 
 
 def _list_names(mask: Array, names: Sequence[str]) -> str:
-    """Return the names at the true entries of a mask (n,) as text; at most `_NAMED` names."""
+    """Return the names at the true entries of a mask (n,) as text: at most `_NAMED`, then the number of others."""
     members = [names[i] for i in np.flatnonzero(mask).tolist()]
     return ", ".join(members[:_NAMED]) + (f" and {len(members) - _NAMED} more" if len(members) > _NAMED else "")
 

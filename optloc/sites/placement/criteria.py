@@ -1,14 +1,19 @@
 """Criteria of a relaxed choice of sites, with gradient and Hessian, as machine code.
 
-Site i has a weight 0 <= w_i <= 1 and whitened rows g_pi at place p. The information at place p is M_p = M0_p
-+ sum_i w_i g_pi g_pi'. The covariance of the position, Cov_p, is the leading block of its inverse. All
-criteria are maxima of
+Site i has a weight 0 <= w_i <= 1 and whitened rows g_pi at place p. The information at place p is M_p =
+M0_p + sum_i w_i g_pi g_pi'. The covariance of the position, Cov_p, is the leading block of its inverse.
+All criteria are maxima of
 
     L(w; lambda, W) = sum_q lambda_q tr(W_q Cov_q(w)),   lambda >= 0, sum 1,  W_q >= 0
 
-over the multipliers lambda of places and failures, and over the weights W of directions. L is convex in w;
-its gradient is -lambda_q c_i' W_q c_i with c_i = C M^-1 g_i. (For the determinant, W = Cov^-1 and the value
-is log det Cov.) `formulations.placement` contains the same functions in NumPy.
+over the multipliers lambda of places and failures, and over the weights W of directions. L is convex in
+w; its gradient is -lambda_q c_i' W_q c_i with c_i = C M^-1 g_i, where C selects the position. (For the
+determinant, W = Cov^-1 and the value is log det Cov.) `formulations.placement` contains the same
+functions in NumPy.
+
+Letters: P places, n sites with r rows each, m unknowns, d of them coordinates of the position. A scenario
+(S of them) is no loss, or the loss of one site. An item q (Q of them) is one function under the maximum:
+a place in a scenario if the criterion is the worst place, otherwise a scenario.
 """
 
 from __future__ import annotations
@@ -27,7 +32,11 @@ _SMOOTH = 5e-3
 
 @compiled
 def invert(matrix: Array, inverse: Array, lower: Array) -> float:
-    """Write the inverse of a matrix (m, m); return its log determinant, NaN if it is not positive definite."""
+    """Write the inverse of a matrix (m, m); return its log determinant, NaN if the matrix is not positive definite.
+
+    `lower` (m, m) is scratch for the Cholesky factor; it can be the matrix. Criteria need the inverse and the
+    log determinant.
+    """
     m = matrix.shape[0]
     logdet = 0.0
     for j in range(m):
@@ -58,7 +67,10 @@ def invert(matrix: Array, inverse: Array, lower: Array) -> float:
 
 @compiled
 def eigen(matrix: Array, values: Array, vectors: Array) -> None:
-    """Write eigenvalues (d,) and eigenvectors (columns) of a small symmetric matrix (d, d), by Jacobi rotations."""
+    """Write eigenvalues (d,) and eigenvectors (columns) of a small symmetric matrix (d, d), by Jacobi rotations.
+
+    The eigenvalues are not sorted.
+    """
     d = matrix.shape[0]
     a = matrix.copy()
     for i in range(d):
@@ -100,9 +112,11 @@ def eigen(matrix: Array, values: Array, vectors: Array) -> None:
 def measure(kind: int, cov: Array, weight: Array, basis: Array, shares: Array) -> tuple[float, float, float]:
     """Write the weight W (d, d) of a covariance; return criterion, smoothed criterion and tangent value tr(W Cov).
 
-    The largest eigenvalue e is smoothed to tau log sum exp(e / tau). Its weight W has the directions `basis` (d,
-    d, columns) in the `shares` (d,). tr(W Cov) is at most e; the difference is negligible if the other
-    eigenvalues are far from e.
+    `kind` is TRACE, VOLUME or AXIS, and `cov` is the covariance of the position (d, d), m^2. For TRACE and
+    VOLUME, the three numbers are equal. For AXIS, the largest eigenvalue e is smoothed to tau log sum exp(e /
+    tau). Its weight W has the directions `basis` (d, d, columns) in the `shares` (d,). tr(W Cov) is at most
+    e; the difference is negligible if the other eigenvalues are far from e. `basis` and `shares` are outputs
+    for AXIS only.
     """
     d = cov.shape[0]
     value = 0.0
@@ -137,7 +151,12 @@ def measure(kind: int, cov: Array, weight: Array, basis: Array, shares: Array) -
 
 @compiled
 def gather(rows: Array, base: Array, w: Array, off: int, scale: float, out: Array, matrix: Array) -> None:
-    """Write the rows (r, m, n) times sqrt(scale), with site `off` set to zero, and the sum base + sum w g g' (m, m)."""
+    """Write the scaled rows (r, m, n) of a place to `out`, and their information (m, m) to `matrix`.
+
+    The rows g of all sites are multiplied by sqrt(scale); the row of site `off` is set to zero (-1: no site).
+    The information is base + sum w g g', with the weights w (n,) and the information `base` (m, m) without
+    the sites.
+    """
     r, m, n = rows.shape
     root = np.sqrt(scale)
     for a in range(m):
@@ -161,7 +180,12 @@ def gather(rows: Array, base: Array, w: Array, off: int, scale: float, out: Arra
 
 @compiled
 def slope(rows: Array, inverse: Array, weight: Array, u: Array, v: Array, gradient: Array) -> None:
-    """Write u = M^-1 g and v = W C u, and subtract u'v, summed over the rows of each site, from the gradient (n,)."""
+    """Write u = M^-1 g and v = W C u of each row g, and subtract their products from the gradient (n,) of tr(W Cov).
+
+    `rows` (r, m, n) are the rows of n sites, `inverse` is M^-1 (m, m) and `weight` is W (d, d). C selects the
+    first d entries. The outputs are u (r, m, n) and v (r, d, n). The product is u'v over the first d entries,
+    summed over the rows of each site.
+    """
     r, m, n = rows.shape
     d = weight.shape[0]
     for q in range(r):
@@ -191,6 +215,7 @@ def bend(
     """Add the second derivatives of tr(W Cov) by the weights to the lower triangle of a Hessian (n, n).
 
     The entry is factor * (2 (g_i'M^-1 g_j)(c_i'W c_j) + extra (c_i'W c_j)^2); for log det Cov, `extra` is -1.
+    `slope` explains `rows` and computes `u` and `v`. `near` and `along` (n,) are scratch.
     """
     r, m, n = rows.shape
     d = v.shape[1]
@@ -217,7 +242,7 @@ def bend(
 
 @compiled
 def add_square(vector: Array, factor: float, hessian: Array) -> None:
-    """Add factor * x x' to the lower triangle of a matrix (n, n)."""
+    """Add factor * x x' to the lower triangle of a matrix (n, n), with x = `vector` (n,)."""
     n = vector.shape[0]
     for i in range(n):
         x = factor * vector[i]
@@ -308,7 +333,8 @@ def derive(
 ) -> None:
     """Write the gradients (Q, n) of the items with a positive share, and the Hessian (n, n) of their weighted sum.
 
-    Call `evaluate` first; the arguments are the same. Only the lower triangle of the Hessian is written.
+    Call `evaluate` first; the first arguments are the same, and `state` is its output. `share` (Q,) are the
+    weights of the items. The outputs are `slopes` (Q, n) and the lower triangle of `hessian` (n, n).
     """
     places, r, m, n = rows.shape
     inverse, turn, basis, shares = state
@@ -339,7 +365,12 @@ def derive(
 def turned(
     cov: Array, u: Array, basis: Array, shares: Array, gradient: Array, factor: float, hessian: Array, along: Array
 ) -> None:
-    """Add the change of eigenvectors and eigenvalue shares with w to the Hessian (n, n); tr(W Cov) omits it."""
+    """Add the change of eigenvectors and eigenvalue shares with w to the Hessian (n, n); `bend` omits this change.
+
+    `cov` (d, d) is the covariance, with the eigenvectors `basis` (d, d, columns) and their `shares` (d,); see
+    `measure`. `u` (r, m, n) is an output of `slope`, and `gradient` (n,) is the gradient of tr(W Cov).
+    `factor` is the weight of the item. `along` (n,) is scratch.
+    """
     d, n = shares.shape[0], hessian.shape[0]
     values = np.empty(d)
     top = 0.0

@@ -28,12 +28,12 @@ def plot_placement(
     course: Array,
     titles: Sequence[str],
 ) -> Figure:
-    """Return a figure: two maps of the bound on one scale, above value and bound over time.
+    """Return a figure: two maps of the bound on one scale above value and bound over time.
 
     Parameters
     ----------
     maps : sequence of 2 BoundMap
-        Before and after; their stations are all candidates.
+        Bounds of the position error before and after the choice; their stations are all candidates.
     taken : sequence of 2 bool array (s,)
         Taken stations of each map.
     places : array (P, 2)
@@ -80,7 +80,12 @@ def plot_placement(
 
 
 def _mark(axes: Axes, found: BoundMap, chosen: Array, places: Array, weights: Array, scale: float) -> None:
-    """Draw places, candidates and taken stations into a map."""
+    """Draw places, candidates and taken stations into a map.
+
+    `chosen` (s,) marks the taken stations. `places` (P, 2) are in the units of the axes: metres, km or
+    degrees. `scale` converts the positions of the stations to these units. The markers of places grow with
+    their `weights` (P,).
+    """
     stations = found.stations * scale
     size = 30.0 + 50.0 * weights / weights.max()
     axes.scatter(
@@ -123,7 +128,7 @@ def _mark(axes: Axes, found: BoundMap, chosen: Array, places: Array, weights: Ar
 
 
 def _course(axes: Axes, course: Array) -> None:
-    """Draw bound and value over time."""
+    """Draw bound and value (metres) over time; `course` (q, 3) contains seconds, bound and value."""
     seconds, bound, value = course.T
     seconds = seconds - seconds[0]
     axes.step(seconds, value, where="post", color=BLACK, linewidth=1.4, label="best set")

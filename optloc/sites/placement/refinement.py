@@ -58,13 +58,13 @@ def refined(
         regions.
     """
     candidates = candidates_of(selection)
-    _check(candidates)
+    _check_refinable(candidates)
     task, free = task_of(candidates), candidates.state != 1
     taken = np.isin(candidates.names, (*found.chosen, *found.kept)).astype(np.int64)
     sets = [taken, *(exchanged(task, one)[1] for one in random_sets(task, starts, selection.seed))]
     best: tuple[float, Array | None] = (np.inf, None)
     position = candidates.problem.stations.position.reshape(-1, candidates.design.dimension)
-    owner = _stations(candidates)
+    owner = _station_of_site(candidates)
     for chosen in sets:
         sites = np.flatnonzero((chosen == 1) & free)
         start = position[owner[sites]]
@@ -72,7 +72,7 @@ def refined(
         begin = np.array([home[1] for home in homes])
         parts = [home[0] for home in homes]
         for places in _local_optima(candidates, sites, begin, parts, ground):
-            reached = _value(candidates, sites, places)
+            reached = _criterion_at(candidates, sites, places)
             if reached < best[0]:
                 best = reached, places
     if best[1] is None:
@@ -83,7 +83,11 @@ def refined(
 def _local_optima(
     candidates: Candidates, sites: Array, begin: Array, parts: Sequence[PlacementRegion], ground: PlacementGround | None
 ) -> list[Array]:
-    """Return the start and, if the refinement ends inside the regions, the local optimum; each (k, d), metres."""
+    """Return the start and, if the refinement ends inside the regions, the local optimum; each (k, d), metres.
+
+    `sites` (k,) are the numbers of the moving sites, and `begin` (k, d) are their start positions. `parts`
+    are the regions of the sites, and `ground` is the terrain.
+    """
     selection, out = candidates.selection, [begin]
     try:
         places = refine(
@@ -106,8 +110,11 @@ def _local_optima(
     return out
 
 
-def _check(candidates: Candidates) -> None:
-    """Raise if the rows of the candidates do not allow a refinement."""
+def _check_refinable(candidates: Candidates) -> None:
+    """Raise if the rows of the candidates do not allow a refinement.
+
+    The refinement needs rows of stations that depend on positions only, with independent noise.
+    """
     kinds = {rows.kind for rows in candidates.problem.rows}
     odd = [kind for kind in kinds if MODELS[kind].velocity or MODELS[kind].ecef]
     if odd or candidates.selection.by == "row" or any(len(b.row[0]) > 1 for b in candidates.problem.noise.blocks):
@@ -115,42 +122,50 @@ def _check(candidates: Candidates) -> None:
         raise InvalidProblem(f"{what} cannot be refined", "refine", "remove the refinement")
 
 
-def _stations(candidates: Candidates) -> Array:
-    """Return the station (n,) of each site."""
+def _station_of_site(candidates: Candidates) -> Array:
+    """Return the index (n,) of the station of each site."""
     return np.unique(np.concatenate([rows.a for rows in candidates.problem.rows]))
 
 
 def _nearest_region(
     place: Array, regions: Sequence[PlacementRegion], ground: PlacementGround | None
 ) -> tuple[PlacementRegion, Array]:
-    """Return the nearest region of a position (d,), and the nearest position inside this region, metres."""
+    """Return the nearest region of a position (d,), and the nearest position inside this region (d,), metres."""
     moved = [(region, region.nearest(place, ground)) for region in regions]
     return min(moved, key=lambda pair: float(np.linalg.norm(pair[1] - place)))
 
 
 def _inside(place: Array, region: PlacementRegion, ground: PlacementGround | None) -> bool:
-    """Return whether a position (d,) is inside a region, up to rounding."""
+    """Return whether a position (d,), metres, is inside a region, up to rounding."""
     return bool((region.excess(place, ground) <= _EDGE).all())
 
 
-def _value(candidates: Candidates, sites: Array, places: Array) -> float:
-    """Return the criterion with the new sites at positions (k, d), metres; the rows are linearised there."""
+def _criterion_at(candidates: Candidates, sites: Array, places: Array) -> float:
+    """Return the criterion with the new sites at positions (k, d), metres; the rows are linearised there.
+
+    `sites` (k,) are the numbers of the new sites. The unit is m^2, except for "volume": log det of the
+    covariance.
+    """
     selection, stations = candidates.selection, candidates.selection.problem.stations
     position = np.array(stations.position)
-    position[..., _stations(candidates)[sites], :] = places
+    position[..., _station_of_site(candidates)[sites], :] = places
     moved = replace(selection, problem=replace(selection.problem, stations=replace(stations, position=position)))
     # Use the priors of the original candidates: default priors depend on the positions of the sites.
     moved = replace(moved, problem=replace(moved.problem, priors=candidates.problem.priors))
-    there = candidates_of(moved)
+    relinearised = candidates_of(moved)
     chosen = (candidates.state == 1).astype(float)
     chosen[sites] = 1.0
     return float(
-        value(there.design, chosen, LETTER[selection.criterion], worst=selection.worst, fail=selection.fail_one)
+        value(relinearised.design, chosen, LETTER[selection.criterion], worst=selection.worst, fail=selection.fail_one)
     )
 
 
 def _information(candidates: Candidates, sites: Array, symbols: Sequence[Any]) -> list[Any]:
-    """Return the information (m, m) at each place: prior and kept sites as numbers, moving sites as CasADi symbols."""
+    """Return the information (m, m) at each place as CasADi expressions, for the optimiser of the refinement.
+
+    Prior and kept sites are numbers. `symbols` are the positions of the moving sites `sites` (k,); None omits
+    a site, for instance after its failure.
+    """
     import casadi as ca
 
     design, d = candidates.design, candidates.design.dimension
@@ -175,9 +190,16 @@ def _information(candidates: Candidates, sites: Array, symbols: Sequence[Any]) -
 
 
 class _Row:
-    """A row of a site: its kind, its second station, and the parts that do not depend on the position of the site."""
+    """A row of a site: its kind, its second station, and the parts that do not depend on the position of the site.
+
+    `kind` is the kind of measurement, and `site` is the number of the site. `scale` (P,) are the whitening
+    factors at each place, 0 out of sight. `rest` (P, m - d) are the whitened derivatives by the unknowns
+    other than the position. `axes` (d, d) are the axes of the station, and `other` (d,) is the position of
+    the second station; both are empty without them.
+    """
 
     def __init__(self, candidates: Candidates, kind: str, site: int, a: int, b: int, scale: Array, rest: Array) -> None:
+        """Store the row of a site; `a` and `b` are the numbers of its stations (b < 0: no second station)."""
         stations, d = candidates.problem.stations, candidates.design.dimension
         self.kind, self.site, self.scale, self.rest = kind, site, scale, rest
         axes = stations.axes
@@ -185,15 +207,19 @@ class _Row:
         self.other = np.zeros(0) if b < 0 else stations.position.reshape(-1, stations.count, d)[0, b]
 
     def h(self, ca: Any, t: Any, a: Any) -> Any:
-        """Return the measurement of a target at symbols t by a station at symbols a."""
+        """Return the measurement of a target at t by a station at a, as an expression of the CasADi symbols t and a."""
         axes = tuple(tuple(float(v) for v in line) for line in np.atleast_2d(self.axes)) if self.axes.size else None
-        own = Point(tuple(ca.vertsplit(a)), axes=axes)
-        other = Point(tuple(map(float, self.other))) if self.other.size else own
-        return MODELS[self.kind].h(Point(tuple(ca.vertsplit(t))), own, other)
+        station = Point(tuple(ca.vertsplit(a)), axes=axes)
+        other = Point(tuple(map(float, self.other))) if self.other.size else station
+        return MODELS[self.kind].h(Point(tuple(ca.vertsplit(t))), station, other)
 
 
 def _site_rows(candidates: Candidates) -> list[_Row]:
-    """Return the rows of all sites, with whitening factors and derivatives by the unknowns other than the position."""
+    """Return the rows of all sites, with whitening factors and derivatives by the unknowns other than the position.
+
+    They are computed once at the original positions of the sites, because they do not change during the
+    refinement.
+    """
     from optloc.engine import linearise
 
     linear, d = linearise(candidates.problem, candidates.vectors), candidates.design.dimension

@@ -3,9 +3,13 @@
 A node of the branch and bound has sites that are taken, sites that are left out, and free sites. The
 relaxation gives each free site a weight between 0 and 1. At any weights w and with any multipliers, the
 tangent of L at w (`optloc.sites.placement.criteria`) is below the criterion of each choice. So the least
-value of the tangent over the node is a valid bound, even without convergence. A primal-dual interior-point
-method improves the multipliers of places, failures, rules and limits 0 <= w <= 1. Nodes that can be pruned,
-and nodes that must be branched, need only a few steps.
+value of the tangent over the node is a valid bound, even without convergence. A primal-dual
+interior-point method improves the multipliers of places, failures, rules and limits 0 <= w <= 1. Nodes
+that can be pruned, and nodes that must be branched, need only a few steps.
+
+Letters: n free sites, R rules, Q items f_q(w) under the maximum (places, scenarios of failure, or both;
+see `criteria`). The level t is an upper limit of all items: the method minimises t with f_q <= t. mu is
+the barrier parameter: the target of each product of a slack and its multiplier.
 
 S. Boyd and L. Vandenberghe, "Convex Optimization" (2004), sections 7.5 and 11.7.
 """
@@ -34,7 +38,10 @@ _ABOVE = 0.1
 
 @compiled
 def barrier_weights(values: Array, mu: float, weights: Array) -> None:
-    """Write the weights mu / (t - values), with t such that their sum is 1: the multipliers of a smoothed maximum."""
+    """Write the weights (Q,) mu / (t - values), with t such that their sum is 1: the multipliers of a smoothed maximum.
+
+    `values` (Q,) are the items. The function computes t.
+    """
     n = values.shape[0]
     top = values[0]
     for i in range(n):
@@ -65,11 +72,14 @@ def share_out(
 ) -> tuple[float, Array]:
     """Eliminate the level t from the Newton step: write the gradient (n,), add to the Hessian (n, n).
 
-    The maximum of the items is min t with t >= f_q. The slacks are s_q = t - f_q, the multipliers are `share`,
-    and a_q = share_q / s_q. The step of the level is dt = (sum mu / s_q - 1 + sum a_q g_q'dw) / sum a_q. The
-    function returns the constant part of dt and its derivative (n,) with respect to the step dw.
+    The maximum of the items is min t with t >= f_q. The slacks are s_q = t - f_q, the multipliers are
+    `share`, and a_q = share_q / s_q. The step of the level is dt = (sum mu / s_q - 1 + sum a_q g_q'dw) / sum
+    a_q, with the gradients g_q = slopes[q]. The function returns the constant part of dt and its derivative
+    (n,) with respect to the step dw. `values` (Q,) are the items f_q, `level` is t, and items with `active`
+    (Q,) 0 are omitted.
     """
     count, n = slopes.shape
+    # `pull` is sum a_q g_q, `push` is sum mu / s_q - 1, and `total` is sum a_q
     pull, push, total = np.zeros(n), -1.0, 0.0
     gradient[:] = 0.0
     for q in range(count):
@@ -92,7 +102,10 @@ def share_out(
 
 @compiled
 def cheapest(cost: Array, size: Array, most: float, at: Array) -> tuple[float, float]:
-    """Return the minimum of cost'v over 0 <= v <= 1 with size'v <= most, and the rule's multiplier; write v to `at`."""
+    """Return the minimum of cost'v over 0 <= v <= 1 with size'v <= most, and the rule's multiplier; write v to `at`.
+
+    All arrays are (n,), and no entry of `size` is negative: this is a fractional knapsack problem.
+    """
     n = cost.shape[0]
     rate = np.empty(n)
     total = 0.0
@@ -135,7 +148,7 @@ def step(
     change: Array,
     gain: Array,
 ) -> float:
-    """Write the interior-point step of w, multipliers and slacks; return its feasible length, 0 if it failed.
+    """Write the interior-point step of w, multipliers and slacks; return its feasible length (0 to 1), 0 if it failed.
 
     Parameters
     ----------
@@ -188,7 +201,7 @@ def step(
 
 @compiled
 def advance(duals: Array, change: Array) -> None:
-    """Add the change to the multipliers, shortened so that all of them stay positive."""
+    """Add `change` to the multipliers `duals` (same shape), shortened so that all of them stay positive."""
     reach = 1.0
     for i in range(duals.shape[0]):
         if change[i] < 0.0:
@@ -201,7 +214,13 @@ def advance(duals: Array, change: Array) -> None:
 def bound_at(
     x: Array, low: float, gradient: Array, duals: Array, rules: Array, limits: Array, reduced: Array, at: Array
 ) -> float:
-    """Return the least value of the tangent at x over the node; write the reduced costs (n,) of the sites."""
+    """Return the least value of the tangent at x over the node; write the reduced costs (n,) of the sites to `reduced`.
+
+    The value is a valid lower bound of the node. `low` is the value of the tangent at the weights x (n,), and
+    `gradient` (n,) is its slope. `duals`, `rules` and `limits` are as in `step`. `at` (n,) is the minimiser
+    of `cheapest`.
+    """
+    # `held` is the part of the tangent that does not depend on the weights
     n, held = x.shape[0], low
     for j in range(n):
         reduced[j] = gradient[j]
@@ -236,7 +255,8 @@ def relax(
     """Return bound, criterion and number of steps of a node; write the weights and reduced costs at the bound.
 
     The bound is L - gradient'w - limits'nu + min over 0 <= v <= 1 with rules[0]'v <= limits[0] of (gradient +
-    rules'nu)'v. It is valid for any w and any multipliers nu >= 0 of the other rules.
+    rules'nu)'v. It is valid for any w and any multipliers nu >= 0 of the other rules. The returned criterion
+    is the least one of the weights that meet the rules; infinite if none did.
 
     Parameters
     ----------
@@ -266,6 +286,8 @@ def relax(
     values, share, slopes = np.empty((2, items)), np.ones(items), np.empty((items, n))
     gradient, hessian, reduced, at = np.empty(n), np.empty((n, n)), np.empty(n), np.empty(n)
     left, duals, x, turns = np.empty(count), np.empty(2 * n + count), w.copy(), np.zeros(items)
+    # `turns` are the weights of the items, and `best` is the least criterion of weights that meet the rules. `late`
+    # counts the steps after `best` fell below `enough`, and `taken` counts all steps.
     bound, best, mu, level, late, taken = -np.inf, np.inf, -1.0, 0.0, 0, 0
     while taken < most:
         taken += 1
@@ -300,7 +322,7 @@ def relax(
 
 @compiled
 def mix(turns: Array, slopes: Array, gradient: Array) -> None:
-    """Write the gradient (n,): the sum of the item gradients (Q, n), weighted by `turns` (Q,)."""
+    """Write the gradient (n,) of the weighted sum of the items with gradients (Q, n) and weights `turns` (Q,)."""
     for j in range(gradient.shape[0]):
         gradient[j] = 0.0
         for q in range(turns.shape[0]):
@@ -309,7 +331,10 @@ def mix(turns: Array, slopes: Array, gradient: Array) -> None:
 
 @compiled
 def product(x: Array, left: Array, duals: Array, level: float, values: Array, share: Array) -> float:
-    """Return the mean product of slacks and multipliers of sites, rules and (if there are several) items."""
+    """Return the mean product of slacks and multipliers of sites, rules and (if there are several) items.
+
+    The next barrier parameter is a share of this mean. `go` explains the arguments.
+    """
     n, count, items = x.shape[0], left.shape[0], share.shape[0]
     total, terms = 0.0, 2 * n + count
     for j in range(n):
@@ -339,7 +364,27 @@ def go(
     gradient: Array,
     hessian: Array,
 ) -> tuple[float, float]:
-    """Take one interior-point step in all unknowns; return its length, 0 if it failed, and the new item level."""
+    """Take one interior-point step in all unknowns; return its length (0 to 1), 0 if it failed, and the new item level.
+
+    Parameters
+    ----------
+    x, left, duals : array (n,), (R,), (2 n + R,)
+        Weights, slacks of the rules, and multipliers of 0 <= x <= 1 and of the rules. All are updated.
+    rules, limits : array (R, n), (R,)
+        rules @ x <= limits.
+    mu, level : float
+        Barrier parameter and level t of the items.
+    values : array (Q,)
+        Items at x.
+    share : array (Q,)
+        Multipliers of the items; updated.
+    active : array (Q,)
+        Items with 0 are omitted from the elimination of the level.
+    slopes : array (Q, n)
+        Gradients of the items.
+    gradient, hessian : array (n,), (n, n)
+        Derivatives of the weighted sum of the items; overwritten.
+    """
     n, count, items = x.shape[0], left.shape[0], share.shape[0]
     move, change, gain = np.empty(n), np.empty(2 * n + count), np.empty(count)
     turn, pull, rise = np.empty(items), np.zeros(n), 0.0
@@ -370,7 +415,12 @@ def go(
 
 @compiled
 def weigh(values: Array, level: float, mu: float, share: Array, turns: Array) -> float:
-    """Write the shares (Q,), sum 1, of items with large multipliers to `turns`; return the value of their tangent."""
+    """Write the shares (Q,) of the items to `turns`, sum 1; return the value of their tangent.
+
+    Items with small multipliers get the share 0, which saves time: their derivatives are then not computed.
+    `values` (2, Q) are the smoothed items and their tangents (see `evaluate`). `level` and `mu` are as in
+    `go`. `share` (Q,) are the multipliers of the items. A single item has the share 1.
+    """
     items = share.shape[0]
     if items == 1:
         share[0] = turns[0] = 1.0
@@ -390,7 +440,7 @@ def weigh(values: Array, level: float, mu: float, share: Array, turns: Array) ->
 
 @compiled
 def meets(w: Array, rules: Array, limits: Array) -> bool:
-    """Return whether the weights (n,) meet all rules, up to rounding."""
+    """Return whether the weights (n,) meet all rules, rules @ w <= limits, up to rounding."""
     for i in range(rules.shape[0]):
         used = 0.0
         for j in range(w.shape[0]):
@@ -402,7 +452,10 @@ def meets(w: Array, rules: Array, limits: Array) -> bool:
 
 @compiled
 def begin(w: Array, left: Array, duals: Array, rules: Array, limits: Array, mu: float) -> None:
-    """Write the first slacks (R,) and multipliers (2 n + R,) at w: each product of slack and multiplier is mu."""
+    """Write the first slacks (R,) and multipliers (2 n + R,) at w: each product of slack and multiplier is mu.
+
+    A slack is at least 0.1, also if the weights violate the rule: the steps then remove the violation.
+    """
     n, count = w.shape[0], rules.shape[0]
     for j in range(n):
         duals[j] = mu / w[j]

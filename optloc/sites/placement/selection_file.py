@@ -77,7 +77,7 @@ _MANY = 10_000
 
 
 class _SelectionTable(BaseModel):
-    """A table of the file; unknown keys are an error."""
+    """A table of the selection file; unknown keys are an error."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -197,7 +197,7 @@ class LoadedSelection:
     source, title : str
         Name of the file, and its title.
     settings : dict
-        Tables of a problem file with all sites.
+        Tables of a problem file with all sites and their rows; `write_chosen` writes a part of them.
     regions : tuple of PlacementRegion
         Regions of the stations in the refinement; empty without a refinement.
     ground : PlacementGround, optional
@@ -234,7 +234,7 @@ def read_selection(path: Path) -> LoadedSelection:
         tables.append((table_of(_data_only(file.stations), folder, join(source, "[stations]")), file.stations))
     names = [table.labels("name").tolist() for table, _ in tables]
     check_once([name for own in names for name in own], "station name {!r} is used twice", source)
-    settings = _settings(file, tables, folder, source)
+    settings = _problem_tables(file, tables, folder, source)
     made = validate(settings, source)
     stations = of_rows(settings["stations"]["rows"], join(source, "[stations]"), {})
     rows = [table_of(m, folder, join(source, f"[[measurements]] {i + 1}")) for i, m in enumerate(made.measurements)]
@@ -249,15 +249,17 @@ def read_selection(path: Path) -> LoadedSelection:
         weights,
         choice.choose,
         choice.budget,
-        _column(candidates, "cost", problem) if choice.budget is not None else None,
+        _candidate_column(candidates, "cost", problem) if choice.budget is not None else None,
         (*(names[1] if len(names) > 1 else ()), *choice.kept),
         tuple(choice.forbidden),
-        tuple(_group(group, candidates, join(source, f"[[groups]] {i + 1}")) for i, group in enumerate(file.groups)),
+        tuple(
+            _count_group(group, candidates, join(source, f"[[groups]] {i + 1}")) for i, group in enumerate(file.groups)
+        ),
         choice.criterion,
         choice.worst,
         choice.fail_one,
-        _sight(file.sight, problem, places, labels, folder, source),
-        _reach(file, [len(table.columns["a"]) for table in rows], source),
+        _sight_factors(file.sight, problem, places, labels, folder, source),
+        _range_limits(file, [len(table.columns["a"]) for table in rows], source),
         choice.gap,
         choice.time,
         choice.alternatives,
@@ -274,10 +276,14 @@ def _data_only(section: StationsTable) -> DataTable:
     return DataTable(file=section.file, rows=section.rows, columns=section.columns, separator=section.separator)
 
 
-def _settings(
+def _problem_tables(
     file: SelectionFile, tables: Sequence[tuple[Table, StationsTable]], folder: Path, source: str
 ) -> dict[str, Any]:
-    """Return the tables of a problem file with all stations and the rows that each station would have."""
+    """Return the tables of a problem file with all stations and the rows that each station would have.
+
+    `tables` are the candidates and then, if the file has them, the existing stations; each with its section
+    of the file. `folder` is the folder of the file, and `source` is its name for messages.
+    """
     units = {(section.unit, section.speed_unit) for _, section in tables}
     if len(units) > 1:
         raise InvalidProblem("stations and candidates have different units", source, "use the same unit for both")
@@ -287,14 +293,14 @@ def _settings(
         survey(section.model_copy(update={"sigma": None}), _without_sigma(table), file.frame, table.source)
         for i, name in enumerate(table.labels("name")):
             rows.append({"name": str(name)} | {key: float(table.numbers(key)[i]) for key in keys if table.has(key)})
-    own = {str(n): v for n, v in zip(*_own_sigma(tables[0][0]), strict=True)}
+    sigmas = {str(n): v for n, v in zip(*_candidate_sigmas(tables[0][0]), strict=True)}
     station = file.candidates.model_dump(exclude_defaults=True, exclude=_ROWS)
     measurements = []
     for i, expected in enumerate(file.measurements):
         given = expected.model_dump(exclude_defaults=True, exclude=_ROWS | {"range_max"})
         place = join(source, f"[[measurements]] {i + 1}")
-        measurements.append(given | {"rows": _expected_rows(expected, rows, own, folder, place)})
-        if own:
+        measurements.append(given | {"rows": _expected_rows(expected, rows, sigmas, folder, place)})
+        if sigmas:
             measurements[-1].pop("sigma", None)
     out = {
         "format": 1,
@@ -316,17 +322,21 @@ def _without_sigma(table: Table) -> Table:
     return replace(table, columns=columns)
 
 
-def _own_sigma(table: Table) -> tuple[Sequence[str], Sequence[float]]:
-    """Return names and sigmas of the candidates; empty without a column sigma."""
+def _candidate_sigmas(table: Table) -> tuple[Sequence[str], Sequence[float]]:
+    """Return names and sigmas of the candidates, in the unit of the measurements; empty without a column sigma."""
     if not table.has("sigma"):
         return (), ()
     return table.labels("name").tolist(), table.numbers("sigma").tolist()
 
 
 def _expected_rows(
-    section: ExpectedTable, stations: Sequence[dict[str, Any]], own: dict[str, float], folder: Path, where: str
+    section: ExpectedTable, stations: Sequence[dict[str, Any]], sigmas: dict[str, float], folder: Path, where: str
 ) -> list[dict[str, Any]]:
-    """Return the rows that a section lists; without a list, one row for each station except its second station."""
+    """Return the rows that a section lists; without a list, one row for each station except its second station.
+
+    Each row is a dict with the columns of a problem file. `stations` are the rows of the stations. `sigmas` maps
+    a candidate to the sigma of its measurements, if the candidates have this column.
+    """
     if section.kind is None:
         raise InvalidProblem("the key 'kind' is missing", where, 'write kind = "toa"')
     kind_model(section.kind, join(where, "key 'kind'"))
@@ -339,8 +349,8 @@ def _expected_rows(
     for station in stations:
         if station["name"] not in (section.a, section.b):
             row: dict[str, Any] = {"a": station["name"]}
-            if own:
-                sigma = own.get(station["name"])
+            if sigmas:
+                sigma = sigmas.get(station["name"])
                 if sigma is None and section.sigma is None:
                     raise InvalidProblem(
                         f"station {station['name']!r} has no sigma", where, "give sigma for all stations"
@@ -350,14 +360,14 @@ def _expected_rows(
     return made
 
 
-def _column(candidates: Table, key: str, problem: Problem) -> Array:
-    """Return a candidate column (s,) for all stations of the problem, 0 for existing stations."""
+def _candidate_column(candidates: Table, key: str, problem: Problem) -> Array:
+    """Return the candidate column `key` (s,) for all s stations of the problem, 0 for existing stations."""
     given = dict(zip(candidates.labels("name").tolist(), candidates.numbers(key).tolist(), strict=True))
     return np.array([given.get(name, 0.0) for name in problem.stations.names])
 
 
-def _group(table: GroupTable, candidates: Table, where: str) -> CountGroup:
-    """Return the rule of a group table, with the names of its members."""
+def _count_group(table: GroupTable, candidates: Table, where: str) -> CountGroup:
+    """Return the rule of a group table, with the names of its members; `where` is its location for messages."""
     if (table.group is None) == (table.members is None):
         raise InvalidProblem("a group needs either the key group or the key members", where, "give one of the two")
     if table.most is None and table.least is None:
@@ -376,14 +386,18 @@ def _group(table: GroupTable, candidates: Table, where: str) -> CountGroup:
 def _places(
     section: TargetsTable, wanted: FrameTable, problem: Problem, folder: Path, source: str
 ) -> tuple[Array, tuple[str, ...], Array | None]:
-    """Return places (P, d), metres, their names, and their weights (P,); the weights are None if they are equal."""
+    """Return places (P, d), metres, their names, and their weights (P,); the weights are None if they are equal.
+
+    The places are the rows of the section, or a grid in its polygon. `wanted` is the frame of their
+    coordinates. The names default to P1, P2 and so on.
+    """
     where = join(source, "[targets]")
     if section.polygon is not None:
         if section.file is not None or section.rows is not None or section.spacing is None:
             raise InvalidProblem(
                 "an area needs a polygon and a spacing, without rows or file", where, 'write spacing = "5 m"'
             )
-        points = _area(section, problem.frame, problem.dimension, folder, where)
+        points = _grid_in_polygon(section, problem.frame, problem.dimension, folder, where)
         return points, tuple(f"P{i + 1}" for i in range(len(points))), None
     table = table_of(section, folder, where)
     if not table.has("name"):
@@ -403,8 +417,8 @@ def _places(
     return found.position, found.names, weights
 
 
-def _area(section: TargetsTable, frame: Frame, dimension: int, folder: Path, where: str) -> Array:
-    """Return places (P, d) on a square grid inside a polygon, metres."""
+def _grid_in_polygon(section: TargetsTable, frame: Frame, dimension: int, folder: Path, where: str) -> Array:
+    """Return places (P, d) on a square grid inside a polygon, metres; P is at most `_MANY`."""
     assert section.polygon is not None
     step = Units("length").plain(section.spacing or 0.0, section.unit, join(where, "key 'spacing'"))
     if not step > 0.0:
@@ -425,8 +439,11 @@ def _area(section: TargetsTable, frame: Frame, dimension: int, folder: Path, whe
     return points if dimension == 2 else np.column_stack([points, np.full(len(points), height)])
 
 
-def _reach(file: SelectionFile, counts: Sequence[int], source: str) -> Array | None:
-    """Return the largest range (m,) of each row, metres; None if no section has a limit."""
+def _range_limits(file: SelectionFile, counts: Sequence[int], source: str) -> Array | None:
+    """Return the largest range (m,) at which each row is measured, metres; None if no section has a limit.
+
+    `counts` are the numbers of rows of the sections. The m rows are in the order of the assembled problem.
+    """
     if all(section.range_max is None for section in file.measurements):
         return None
     # `assemble` orders the blocks of rows by the first appearance of their kind and joins equal kinds
@@ -440,10 +457,13 @@ def _reach(file: SelectionFile, counts: Sequence[int], source: str) -> Array | N
     return np.concatenate([np.array(values) for values in kinds.values()])
 
 
-def _sight(
+def _sight_factors(
     section: SightTable | None, problem: Problem, places: Array, labels: Sequence[str], folder: Path, source: str
 ) -> Array | None:
-    """Return the sight factor (P, s) of each place and station, 0 if out of sight; None if all pairs are in sight."""
+    """Return the sight factor (P, s) of each place and station, 0 if out of sight; None if all pairs are in sight.
+
+    The factor multiplies sigma. `places` (P, d) are positions, metres, and `labels` are their names.
+    """
     if section is None:
         return None
     where, names = join(source, "[sight]"), problem.stations.names
@@ -476,7 +496,7 @@ def _sight(
 def _regions(
     section: RefineTable | None, frame: Frame, dimension: int, folder: Path, source: str
 ) -> tuple[tuple[PlacementRegion, ...], PlacementGround | None]:
-    """Return the convex regions of the refinement, and its terrain."""
+    """Return the convex regions of the refinement, and its terrain (None without); no region without a section."""
     if section is None:
         return (), None
     where = join(source, "[refine]")
@@ -494,7 +514,11 @@ def _regions(
 
 
 def write_chosen(loaded: LoadedSelection, taken: Sequence[str], out: Path, source: Path) -> None:
-    """Write a problem file with the taken stations and their rows, as input of `crlb --map` and studies."""
+    """Write a problem file with the taken stations and their rows, as input of `crlb --map` and studies.
+
+    `taken` are the names of the stations. Second stations of rows are written too. `source` is the selection
+    file, which must not be overwritten by `out`.
+    """
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("the output is a problem file, so its name must end in .toml", str(out), "change the name")
     claim(out, inputs=[source])
@@ -504,7 +528,9 @@ def write_chosen(loaded: LoadedSelection, taken: Sequence[str], out: Path, sourc
     settings["stations"] = settings["stations"] | {"rows": stations}
     rows = [[row for row in section["rows"] if row["a"] in kept] for section in settings["measurements"]]
     settings["measurements"] = [
-        section | {"rows": own} for section, own in zip(settings["measurements"], rows, strict=True) if own
+        section | {"rows": chosen_rows}
+        for section, chosen_rows in zip(settings["measurements"], rows, strict=True)
+        if chosen_rows
     ]
     settings["title"] = f"{loaded.title}: the chosen stations"
     text = "format = 1\n" + toml_text({key: value for key, value in settings.items() if key != "format"})

@@ -112,7 +112,7 @@ class SiteSelection:
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """The candidate sites of a selection as arrays: rows at each place, rules and states.
+    """The candidate sites of a selection as arrays: rows at each place, rules and states (P places, n sites, m rows).
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ class Candidates:
     design : Design
         Whitened rows and prior information at each place.
     rules, limits : array (R, n), (R,)
-        Linear rules rules @ w <= limits; the first rule is the count or the cost.
+        Linear rules rules @ w <= limits for a set w (n,) of 0 and 1; the first rule is the count or the cost.
     state : int array (n,)
         -1 for a free site, 0 for a forbidden site, 1 for a kept site.
     """
@@ -146,7 +146,10 @@ class Candidates:
     state: Array
 
     def assembled(self, chosen: Array) -> Problem:
-        """Return the batch of P problems with the rows of the taken sites (n,), as input of `optloc.crlb`."""
+        """Return the batch of P problems with the rows of the taken sites, as input of `optloc.crlb`.
+
+        `chosen` (n,) is 1 for each taken site; the rows of other sites get the weight 0.
+        """
         taken = np.asarray(chosen, dtype=float)[self.site]
         return self.problem.with_rows(weight=self.problem.weight * taken)
 
@@ -170,10 +173,10 @@ def candidates_of(selection: SiteSelection) -> Candidates:
     vectors = np.zeros((len(places), size))
     vectors[:, : places.shape[1]] = places
     _check_apart(problem, site, names, places[:, :d])
-    batch = problem.with_rows(weight=_weights(selection, problem, places[:, :d]))
+    batch = problem.with_rows(weight=_row_weights(selection, problem, places[:, :d]))
     batch = _with_prior(batch, places[:, :d])
-    weight = _weight(selection, len(places))
-    design = Design(_rows(batch, vectors, site, len(names)), _prior(batch, vectors), weight, d)
+    weight = _place_weights(selection, len(places))
+    design = Design(_whitened_rows(batch, vectors, site, len(names)), _prior_information(batch, vectors), weight, d)
     rules, limits, state = _rules(selection, names, site)
     candidates = Candidates(selection, batch, vectors, site, names, design, rules, limits, state)
     _check_determined(candidates)
@@ -217,7 +220,7 @@ def _as_arrival_times(problem: Problem) -> Problem:
 
 
 def _sites(problem: Problem, selection: SiteSelection) -> tuple[Array, tuple[str, ...]]:
-    """Return the site (m,) of each row, and the names (n,) of the sites."""
+    """Return the site (m,) of each row, and the names (n,) of the sites: stations that measure, or single rows."""
     a, b = (np.concatenate([getattr(rows, end) for rows in problem.rows]) for end in ("a", "b"))
     stations = problem.stations.names
     if (a < 0).any():
@@ -242,24 +245,24 @@ def _sites(problem: Problem, selection: SiteSelection) -> tuple[Array, tuple[str
 
 
 def _check_apart(problem: Problem, site: Array, names: Sequence[str], places: Array) -> None:
-    """Raise if a place is at a station, or if two stations have the same position."""
+    """Raise if a place (P, d) is at a station, or if two stations have the same position."""
     stations = problem.stations.position.reshape(-1, problem.dimension)
     apart = np.linalg.norm(places[:, None] - stations[None], axis=-1)
     p, s = np.unravel_index(int(apart.argmin()), apart.shape)
     if apart[p, s] < _SAME:
         what = f"place {p + 1} is at the position of station {problem.stations.names[s]!r}"
         raise InvalidProblem(what, "places", "move the place or the station by more than a millimetre")
-    own = np.unique(stations, axis=0, return_index=True)[1]
-    twice = np.setdiff1d(np.arange(len(stations)), own)
-    if len(twice):
-        name = problem.stations.names[int(twice[0])]
+    first = np.unique(stations, axis=0, return_index=True)[1]
+    repeated = np.setdiff1d(np.arange(len(stations)), first)
+    if len(repeated):
+        name = problem.stations.names[int(repeated[0])]
         raise InvalidProblem(
             f"station {name!r} has the position of another station", "candidates", "remove one of them"
         )
 
 
-def _weight(selection: SiteSelection, count: int) -> Array:
-    """Return the weights (P,) of the places, sum 1."""
+def _place_weights(selection: SiteSelection, count: int) -> Array:
+    """Return the weights (P,) of the places, sum 1; `count` is the number P of places."""
     weight = np.ones(count) if selection.weights is None else np.asarray(selection.weights, dtype=float)
     if weight.shape != (count,) or not (weight > 0.0).all() or not np.isfinite(weight).all():
         what = f"the weights are not {count} positive numbers, one for each place"
@@ -267,8 +270,11 @@ def _weight(selection: SiteSelection, count: int) -> Array:
     return np.asarray(weight / weight.sum())
 
 
-def _weights(selection: SiteSelection, problem: Problem, places: Array) -> Array:
-    """Return the weights (P, m) of the rows: 0 out of sight or reach, and smaller where `sight` raises sigma."""
+def _row_weights(selection: SiteSelection, problem: Problem, places: Array) -> Array:
+    """Return the weights (P, m) of the rows: 0 out of sight or reach, and smaller where `sight` raises sigma.
+
+    `places` (P, d) are positions of the target, metres.
+    """
     count, stations = len(places), problem.stations.count
     weight = np.broadcast_to(problem.weight, (count, problem.count)).copy()
     end = np.concatenate([rows.a for rows in problem.rows])
@@ -292,8 +298,8 @@ def _weights(selection: SiteSelection, problem: Problem, places: Array) -> Array
 def _with_prior(problem: Problem, places: Array) -> Problem:
     """Return the problem with priors for position and emission time, so that the information is never singular.
 
-    The default prior of the position is half the extent of sites and places; for the emission time it is ten
-    times that length.
+    The default sigma of the position is half the extent of sites and places, metres. For the emission time it
+    is ten times that length. Unknowns with a given prior keep it. `places` is (P, d).
     """
     known = {prior.name for prior in problem.priors}
     points = np.concatenate([places, problem.stations.position.reshape(-1, problem.dimension)])
@@ -306,8 +312,13 @@ def _with_prior(problem: Problem, places: Array) -> Problem:
     return replace(problem, priors=tuple(priors))
 
 
-def _rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
-    """Return the whitened rows (P, r, m, n) of each site; sites with fewer than r rows are padded with zeros."""
+def _whitened_rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
+    """Return the whitened rows (P, r, m, n) of each site; sites with fewer than r rows are padded with zeros.
+
+    r is the largest number of rows of a site, m the number of unknowns, and n = `count` the number of sites.
+    `vectors` (P, m) are the unknowns at each place, and `site` gives the site of each row. A row is the
+    derivative of a measurement by the unknowns, divided by its sigma.
+    """
     linear = linearise(problem, vectors)
     jacobian = np.concatenate([linear.shared, linear.local], axis=-1)
     found: list[list[Array]] = [[] for _ in range(count)]
@@ -327,10 +338,10 @@ def _rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
     return out
 
 
-def _prior(problem: Problem, vectors: Array) -> Array:
-    """Return the prior information (P, m, m) at each place."""
+def _prior_information(problem: Problem, vectors: Array) -> Array:
+    """Return the prior information (P, m, m) at each place: the inverse covariance of the priors of the m unknowns."""
     n, length, size = problem.layout.n_shared, problem.layout.n_local, len(vectors)
-    none = Normal(
+    empty = Normal(
         np.zeros((size, n, n)),
         np.zeros((size, 1, length, length)),
         np.zeros((size, 1, n, length)),
@@ -338,7 +349,7 @@ def _prior(problem: Problem, vectors: Array) -> Array:
         np.zeros((size, 1, length)),
         np.zeros(size),
     )
-    known = with_priors(problem, vectors, none)
+    known = with_priors(problem, vectors, empty)
     out = np.zeros((size, n + length, n + length))
     out[:, :n, :n], out[:, n:, n:] = known.shared, known.local[:, 0]
     if (np.diagonal(out, axis1=1, axis2=2) <= 0.0).any():
@@ -349,22 +360,23 @@ def _prior(problem: Problem, vectors: Array) -> Array:
 
 
 def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tuple[Array, Array, Array]:
-    """Return rules (R, n), limits (R,) and states (n,) of the sites.
+    """Return rules (R, n), limits (R,) and states (n,) of the sites; a set w is allowed if rules @ w <= limits.
 
-    Only the group rules count the kept sites.
+    The rules are the number of sites, the budget and the groups. Only the group rules count the kept sites.
+    `names` are the n sites, and `site` gives the site of each row.
     """
-    n, place = len(names), {name: i for i, name in enumerate(names)}
+    n, index = len(names), {name: i for i, name in enumerate(names)}
 
-    def where(wanted: Sequence[str], argument: str) -> Array:
-        """Return the indices of sites by name, or raise for an unknown name."""
+    def indices_of(wanted: Sequence[str], argument: str) -> Array:
+        """Return the indices (k,) of sites by name; an unknown name is an error in `argument`."""
         for name in wanted:
-            if name not in place:
+            if name not in index:
                 raise InvalidProblem(f"there is no site {name!r}", argument, nearest(name, list(names)))
-        return np.array([place[name] for name in wanted], dtype=int)
+        return np.array([index[name] for name in wanted], dtype=int)
 
     state = np.full(n, -1, dtype=np.int64)
-    kept = where(selection.kept, "kept")
-    state[where(selection.forbidden, "forbidden")] = 0
+    kept = indices_of(selection.kept, "kept")
+    state[indices_of(selection.forbidden, "forbidden")] = 0
     if (state[kept] == 0).any():
         raise InvalidProblem("a site is kept and forbidden", "forbidden", "remove it from one of the two lists")
     state[kept] = 1
@@ -379,8 +391,10 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
     if selection.budget is not None:
         rules.append(_costs(selection, n, site) * free)
         limits.append(float(selection.budget))
-    own = [np.isin(np.arange(n), where(g.members, f"groups, entry {i + 1}")) for i, g in enumerate(selection.groups)]
-    inside = np.array(own, dtype=bool).reshape(-1, n)
+    marks = [
+        np.isin(np.arange(n), indices_of(g.members, f"groups, entry {i + 1}")) for i, g in enumerate(selection.groups)
+    ]
+    inside = np.array(marks, dtype=bool).reshape(-1, n)
     check_groups(selection.groups, inside, names, state, selection.choose)
     if selection.choose is not None and selection.budget is None and selection.groups:
         # Without groups, a full set is always best, so the upper limit is enough. Groups need the exact number as a
@@ -402,7 +416,7 @@ def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tup
 
 
 def _costs(selection: SiteSelection, n: int, site: Array) -> Array:
-    """Return the cost (n,) of each site."""
+    """Return the cost (n,) of each site; `site` gives the site of each row."""
     stations = np.concatenate([rows.a for rows in selection.problem.rows])
     cost = None if selection.cost is None else np.asarray(selection.cost, dtype=float)
     if cost is None or cost.shape != (selection.problem.stations.count,) or not (cost >= 0.0).all():
@@ -419,7 +433,10 @@ def _costs(selection: SiteSelection, n: int, site: Array) -> Array:
 
 
 def _check_determined(candidates: Candidates) -> None:
-    """Raise if all sites together do not determine the position at a place: then no set of sites has a fix there."""
+    """Raise if all sites together do not determine the position at a place: then no set of sites has a fix there.
+
+    The prior alone would then set the position, and the criterion would have no meaning.
+    """
     in_sight = (candidates.design.rows != 0.0).any(axis=(1, 2)) & (candidates.state != 0)
     rows = candidates.design.rows[..., candidates.state != 0]
     places, r, m, n = rows.shape

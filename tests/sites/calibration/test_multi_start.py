@@ -10,9 +10,9 @@ from optloc.sites.calibration.likelihood import likelihood, together
 from optloc.sites.calibration.multi_start import (
     AGREEING,
     NetworkSearchResult,
+    _add_round,
+    _cost_key,
     _fits,
-    _key,
-    _merge,
     _sweep_block_moves,
     frame_size,
     search,
@@ -37,11 +37,11 @@ def ends(*costs):
 
 
 def test_starts_agree_that_end_at_the_least_cost_or_lead_there():
-    found = _merge(None, ends(5.0, 5.0 + 1e-4, 9.0), 8)
+    found = _add_round(None, ends(5.0, 5.0 + 1e-4, 9.0), 8)
     assert (found.cost, found.agreeing) == (5.0, 2)
-    found.onward[_key(9.0)] = 5.0
+    found.onward[_cost_key(9.0)] = 5.0
     assert found.agreeing == 3
-    cheaper = _merge(found, ends(4.0), 16)
+    cheaper = _add_round(found, ends(4.0), 16)
     assert (cheaper.cost, cheaper.agreeing, cheaper.made) == (4.0, 1, 16)
     assert isinstance(cheaper, NetworkSearchResult)
 

@@ -7,7 +7,7 @@ from sites.placement.scenes import every_set, hall
 from formulations.placement import covariances
 from optloc import place
 from optloc.sites.placement import SiteSelection
-from optloc.sites.placement.chosen import _ban_sets, _failed, _following, _swaps, task_of
+from optloc.sites.placement.chosen import _ban_sets, _bounds_after_loss, _next_sites, _swaps, task_of
 from optloc.sites.placement.sites import candidates_of
 
 
@@ -52,11 +52,11 @@ def test_what_each_loss_costs_and_each_addition_gains_are_sets_of_their_own(sele
     task, chosen, names = task_of(candidates), np.array([1, 1, 1, 1, 1, 0, 0]), candidates.names
     lost = np.array([np.where(np.arange(7) == i, 0, chosen) for i in range(5)])
     each = variances_of(selection, lost)
-    assert _failed(candidates, chosen) == pytest.approx(np.sqrt(each.max(axis=0)), rel=1e-9)
+    assert _bounds_after_loss(candidates, chosen) == pytest.approx(np.sqrt(each.max(axis=0)), rel=1e-9)
     costs = {swap.name: swap.value for swap in _swaps(task, names, chosen)}
     assert [costs[name] for name in names[:5]] == pytest.approx(each.mean(axis=1), rel=1e-9)
     more = np.array([np.where(np.arange(7) == i, 1, chosen) for i in (5, 6)])
-    gained = dict(_following(task, names, chosen))
+    gained = dict(_next_sites(task, names, chosen))
     assert [gained[name] for name in names[5:]] == pytest.approx(variances_of(selection, more).mean(axis=1), rel=1e-9)
 
 

@@ -10,7 +10,7 @@ from sites.placement.scenes import hall
 from optloc import InvalidProblem
 from optloc.sites.placement import SiteSelection
 from optloc.sites.placement.areas import region_of
-from optloc.sites.placement.refinement import _check, _information, _inside, _nearest_region, _value
+from optloc.sites.placement.refinement import _check_refinable, _criterion_at, _information, _inside, _nearest_region
 from optloc.sites.placement.sites import candidates_of
 
 
@@ -38,7 +38,7 @@ def test_the_value_at_the_places_of_the_candidates_is_that_of_their_set(candidat
     design, chosen = candidates.design, np.array([1.0, 1, 0, 1, 1, 1])
     matrix = design.prior + np.einsum("prmn,n,prkn->pmk", design.rows, chosen, design.rows)
     wanted = np.trace(np.linalg.inv(matrix)[:, :3, :3], axis1=1, axis2=2).mean()
-    assert _value(candidates, sites, position[sites]) == pytest.approx(wanted, rel=1e-9)
+    assert _criterion_at(candidates, sites, position[sites]) == pytest.approx(wanted, rel=1e-9)
 
 
 def test_a_site_moves_to_the_nearest_region():
@@ -52,6 +52,6 @@ def test_a_site_moves_to_the_nearest_region():
 
 
 def test_single_rows_cannot_be_refined(candidates):
-    _check(candidates)
+    _check_refinable(candidates)
     with pytest.raises(InvalidProblem, match="cannot be refined"):
-        _check(candidates_of(replace(candidates.selection, by="row", kept=())))
+        _check_refinable(candidates_of(replace(candidates.selection, by="row", kept=())))
