@@ -51,13 +51,16 @@ def bound_linear(data: Array, line: Array, sense: Array, half: Array, slope: Arr
 
 @compiled
 def size_linear(data: Array, reach: float) -> float:
-    """Return the size of the terms of a linear form, which limits its accuracy."""
+    """Return the sum of the sizes of the terms of a linear form, which limits its accuracy, in the unit of the form.
+
+    `reach` is the sum of the sizes of the coordinates, m.
+    """
     size = reach + (abs(data[ORIGIN]) + abs(data[ORIGIN + 1]) + abs(data[ORIGIN + 2]))
     return float(size * (abs(data[COEFFICIENTS]) + abs(data[COEFFICIENTS + 1]) + abs(data[COEFFICIENTS + 2])))
 
 
 def linear_numbers(coefficients: Array, origin: Array | None = None) -> Array:
-    """Return the numbers (B, n) of a linear node with coefficients (B, d), zero at an origin (B, d)."""
+    """Return the numbers (B, n) of a linear node ``n.(x - o)``: coefficients n (B, d), origin o (B, d), default 0."""
     parts = {COEFFICIENTS: coefficients}
     return lay_out(parts if origin is None else parts | {ORIGIN: origin})
 
@@ -106,7 +109,7 @@ def geodetic(x: float, y: float, z: float) -> tuple[float, float, float, float]:
 
 @compiled
 def _ecef(data: Array, line: Array) -> Triple:
-    """Return Earth-centred Earth-fixed coordinates, metres, of the end of a line."""
+    """Return Earth-centred Earth-fixed coordinates, metres, of the end of a line that begins at point o of the node."""
     along, origin = triple_at(line, 0), triple_at(data, ECEF)
     return (
         inner_product(triple_at(data, ROTATION), along) + origin[0],
@@ -117,7 +120,10 @@ def _ecef(data: Array, line: Array) -> Triple:
 
 @compiled
 def normal_at(data: Array, line: Array) -> tuple[float, Triple, Triple, Triple, float]:
-    """Return height, upward, eastward and northward unit vectors in the problem's frame, and sine of the latitude."""
+    """Return height (m), upward, eastward and northward unit vectors in the problem's frame, and sine of the latitude.
+
+    The point is the end of `line`, which begins at point o of the node (see the columns of its numbers, `data`).
+    """
     e, f, g = _ecef(data, line)
     height, p, sp, cp = geodetic(e, f, g)
     ce, se = e / p, f / p
@@ -185,9 +191,10 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
 
 @compiled
 def earth_ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
-    """Return a ball around the Earth's centre for heights up to `most`.
+    """Return centre (three numbers) and radius, m, of a ball around the Earth's centre with all heights up to `most`.
 
-    A height is at least the distance from the Earth's centre minus the equatorial radius.
+    A height is at least the distance from the Earth's centre minus the equatorial radius. The lower end `least` gives
+    no ball and is not used.
     """
     origin = triple_at(data, ECEF)
     first, second, third = triple_at(data, ROTATION), triple_at(data, ROTATION + 3), triple_at(data, ROTATION + 6)
