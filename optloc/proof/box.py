@@ -34,8 +34,7 @@ from optloc.proof.nodes.range import bound_ranges
 
 # Unit in the last place of a double at 1.
 _ULP = 2.0**-52
-# A half-width covers the rounding of its centre and corners: relative to itself, and some units in the last place
-# of these.
+# A half-width covers the rounding of its centre and corners: relative to itself, and some units in their last place.
 _WIDER, _SHIFT = 1e-12, 1e-15
 # Coordinate descents towards the least-squares point of a box. Any point gives a valid bound. Over 8 fixes by range
 # differences, one descent took 6 % more boxes of an atlas than three. Ten descents took 0.6 % fewer.
@@ -273,8 +272,8 @@ def _open_side(nodes: Array, j: int) -> float:
 def _move_beyond(K: Array, weight: float, rows: Array, pull: float, side: float) -> float:
     """Return a step of a one-sided node towards its open side; after it the node only adds to the residual along v.
 
-    `weight` is the length of the node's column of K, `pull` the product of this column with v, and `side` is 1 or -1,
-    the direction in which the node has no bound. The step is in the unit of the node.
+    `weight` is the length of the node's column of K, `pull` its product with v, and `side` is 1 or -1, the open
+    direction.
     """
     length = 0.0
     for i in range(K.shape[0]):

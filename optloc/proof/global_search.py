@@ -1,4 +1,9 @@
-"""The proof for all positions: first within an enclosure if there is one, else over the atlas of all space."""
+"""The proof for all positions: first within an enclosure if there is one, else over the atlas of all space.
+
+An *enclosure* is a box around the fix that contains all points below a cost (`optloc.proof.enclosure`). The *atlas*
+covers all positions to infinity with boxes of finite size (`optloc.proof.atlas`). *Squared rows*
+(`optloc.proof.squares`) contract large boxes.
+"""
 
 from __future__ import annotations
 
@@ -168,7 +173,8 @@ def _side_of_rest(work: GlobalWorkspace, space: Space, touching: bool, rho: floa
 def _take(stack: Array, row: int, atlas: Atlas, chart: LocalAxes, corners: Array, box: Box, piece: int) -> bool:
     """Take a box off the stack and set its centre; return False if no part of it needs a search.
 
-    If the corners are known, the part of the box outside them is cut off.
+    `row` is its row in the stack, and `piece` its piece of the atlas. If `corners` (2, 3), search coordinates, are
+    known, the part of the box outside them is cut off: its cost is above the levels.
     """
     faces = 2 * atlas.dimension
     pop(stack, row, box.at, box.half)
@@ -191,7 +197,10 @@ def _take(stack: Array, row: int, atlas: Atlas, chart: LocalAxes, corners: Array
 
 @compiled
 def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box, piece: int) -> bool:
-    """Contract a box with a set centre by its squared rows, as often as that helps; return whether any part remains."""
+    """Contract a box with a set centre by its squared rows, as often as that helps.
+
+    Return whether any part remains in which the cost may be below `level`.
+    """
     if squares.groups == 0 or change_of_residual(atlas, squares, box.half) ** 2 <= _BENT * level:
         return True
     for _ in range(_LOOKS):
@@ -210,14 +219,20 @@ def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box,
 
 @compiled
 def excludes_infimum(cost: Cost, atlas: Atlas, box: Box, touching: bool, floor: float) -> bool:
-    """Return whether a box with bounded nodes contains no infimum of the cost; `touching`: the box reaches infinity."""
+    """Return whether a box with bounded nodes contains no infimum of the cost.
+
+    `touching` means that the box reaches infinity. `floor` is the result of `accuracy_floor_far`.
+    """
     reset_cut(box.half, box.cut)
     return _clips_away(cost, atlas, box, touching, rounding_error(cost.K, cost.weight, floor, box.nodes))
 
 
 @inlined
 def _clips_away(cost: Cost, atlas: Atlas, box: Box, touching: bool, noise: float) -> bool:
-    """Return the result of `excludes_infimum` for the part between the ends of ``box.cut``, which is contracted."""
+    """Return the result of `excludes_infimum` for the part between the ends of ``box.cut``, which is contracted.
+
+    `noise` bounds the rounding of a residual.
+    """
     curve_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
     sum_up(cost.K, cost.w, cost.weight, noise, box.nodes, box.curves, box.sums)
     ball = spread_of(cost.A, box.half, box.nodes, box.curves, box.sums)
@@ -394,7 +409,10 @@ def prove_atlas(
 def verdict_of(
     outcome: int, boxes: int, bound: float, shown: int, met: int, gaps: Array, least: float
 ) -> tuple[int, int, float, float, int]:
-    """Return the results of `prove_globally` for the outcome of a search; `least` is the lowest level."""
+    """Return the results of `prove_globally` for the outcome of a search; `least` is the lowest level.
+
+    `outcome`, `boxes`, `bound`, `shown` and `met` are the results of `optloc.proof.level_search.search_levels`.
+    """
     if outcome == CLEAR:
         return UNIQUE if gaps[shown] > 0.0 else VALUE, boxes, bound, gaps[shown], met
     if outcome == CHEAPER:

@@ -1,4 +1,9 @@
-"""Branch and bound around a fix: no point costs less, and no other minimum has nearly the same cost."""
+"""Branch and bound around a fix: no point costs less, and no other minimum has nearly the same cost.
+
+Boxes are in search coordinates around the fix, in standard deviations (`optloc.proof.search_space.LocalAxes`), and wait
+on a stack (`optloc.proof.box`). A box is dropped if its least cost is at least a level, or if it contains no minimum.
+Otherwise it is contracted, halved and pushed back.
+"""
 
 from __future__ import annotations
 
@@ -225,8 +230,9 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
     """Return the coordinate across which halving a box reduces the remainders in its bound most.
 
     The remainder of a range is nearly ``s'N s / 2``, so coordinate k has the share ``h_k sum_m |N_km| h_m`` in it. Its
-    weight is the pull ``|K_j.v|`` on the bound. If the centre is below the level (`inside`), no bound suffices. In
-    this case, and if ranges have no part in the bound, the result is the widest side.
+    weight is the pull ``|K_j.v|`` on the bound, with v the direction of the bound (`optloc.proof.box.least_residual`).
+    N is the Hessian of the range, and h the half-widths. If the centre is below the level (`inside`), no bound
+    suffices. In this case, and if ranges have no part in the bound, the result is the widest side.
     """
     if inside:
         return widest(half)
@@ -401,9 +407,9 @@ def prove_locally(
 def _refuting(least: float, eps: float, noise: float) -> float:
     """Return the cost below which a point refutes the claim that all costs are at least the cost of the fix less eps.
 
-    The result is halfway between the two. So a cheaper point is cheaper by more than rounding, and no box remains that
-    is cheaper by less. If eps is large, a point far below the cost of the position, but above the level, refutes
-    nothing.
+    `least` is the cost of the fix, and `noise` bounds the rounding of a residual. The result is halfway between `least`
+    and ``least - eps``. So a cheaper point is cheaper by more than rounding, and no box remains that is cheaper by
+    less. If eps is large, a point far below the cost of the position, but above the level, refutes nothing.
     """
     if eps > _MUCH:
         return least - eps + 0.5 * equal_within(_EQUAL * (1.0 + least - eps), least, noise)
@@ -412,7 +418,10 @@ def _refuting(least: float, eps: float, noise: float) -> float:
 
 @inlined
 def _holds_origin(low: Array, high: Array) -> bool:
-    """Return whether the region to search contains the position itself."""
+    """Return whether the region to search contains the fix, which is the origin of search coordinates.
+
+    `low` and `high` (3,) are the corners of the region.
+    """
     inside = True
     for k in range(3):
         inside = inside and low[k] <= 0.0 <= high[k]
@@ -421,7 +430,10 @@ def _holds_origin(low: Array, high: Array) -> bool:
 
 @inlined
 def _extent(low: Array, high: Array, sides: Array) -> float:
-    """Return the greatest ratio of the region to search to the convex box around a fix, over all axes."""
+    """Return the greatest ratio of the region to search to the convex box around a fix, over all axes.
+
+    `low` and `high` (3,) are the corners of the region, and `sides` (3,) the half-widths of the convex box.
+    """
     most = 0.0
     for k in range(3):
         if sides[k] > 0.0:
@@ -431,14 +443,20 @@ def _extent(low: Array, high: Array, sides: Array) -> float:
 
 @inlined
 def steepness(slope: tuple[float, float, float], noise: float) -> float:
-    """Return the greatest squared length of a slope, per standard deviation, if residuals are off by `noise`."""
+    """Return the greatest squared length of a slope of f/2 if residuals are off by `noise`.
+
+    `slope` has three components, per standard deviation. The Jacobian columns have length one in these units.
+    """
     a, b, c = abs(slope[0]) + noise, abs(slope[1]) + noise, abs(slope[2]) + noise
     return a * a + b * b + c * c
 
 
 @compiled
 def _laid(cost: Cost, chart: LocalAxes, box: Box) -> tuple[float, float]:
-    """Return the cost of a fix moved onto its surface (infinite if impossible), and its rounding; fill the sums."""
+    """Return the cost of a fix moved onto its surface (infinite if impossible), and its rounding; fill the sums.
+
+    The second number bounds the rounding of the length of the residual.
+    """
     box.at[:], box.half[:] = 0.0, 0.0
     there, noise = value_at(cost, chart, box), 0.0
     if there < inf:
@@ -458,7 +476,11 @@ def _search_sides(
     boxes: int,
     stack: Array,
 ) -> tuple[int, int]:
-    """Search all pieces of a surface other than the piece of the fix; return the outcome and the boxes in total."""
+    """Search all pieces of a surface other than the piece of the fix; return the outcome and the boxes in total.
+
+    `around` are the search coordinates of the fix, and `boxes` is the number of boxes before. The search ends at the
+    first piece with an outcome other than CLEAR.
+    """
     corners, outcome = np.empty((2, 3)), CLEAR
     for side in range(1, SIDES):
         chart = axes_of_next_piece(cost, around, side)
@@ -486,7 +508,8 @@ def region_of(
 ) -> bool:
     """Write the corners of the box to search: the region, or an enclosure of all points that cost less than rho^2.
 
-    Return False if there is no enclosure.
+    The corners `low` and `high` (3,) are in search coordinates. The region has the corners `lower` and `upper` (D,),
+    metres; if lower[0] is NaN, the enclosure is written. Return False if there is no enclosure.
     """
     if isnan(lower[0]):
         bounded = enclose(cost, chart, box, rho, low, high)

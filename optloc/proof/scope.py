@@ -1,4 +1,9 @@
-"""Scope of the proof: targets, kinds of rows, biases and constraints that it covers, and the definition of a run."""
+"""Scope of the proof: targets, kinds of rows, biases and constraints that it covers, and the definition of a run.
+
+Each function `_beyond_...` yields sentences, one for each property of the problem that the proof does not cover. No
+sentence means that the property is covered. A *node* is a scalar function of the position that rows are sums of, such
+as a range. A *run* is a problem with too many nodes for dense matrices.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +83,7 @@ def _beyond_motion(problem: Problem) -> Iterator[str]:
 
 
 def has_one_epoch_velocity(problem: Problem) -> bool:
-    """Return whether all rows are of one epoch and contain rates, so that they show the velocity of the target."""
+    """Return whether all rows are of one epoch and contain rates, so that the velocity of the target is an unknown."""
     motion = problem.motions[0]
     if motion.order != 1 or motion.known is not None or problem.epochs > 1:
         return False
@@ -105,7 +110,7 @@ def _beyond_velocity_at_epoch(problem: Problem) -> Iterator[str]:
 
 
 def held_height(problem: Problem) -> Band | None:
-    """Return the constraint on the height of a target that moves over ground, or None."""
+    """Return the exact constraint on the height of a target that moves over ground, or None without it."""
     for band in problem.constraints:
         if not isinstance(band, Band) or band.kind != "height" or not is_exact(band):
             continue
@@ -137,7 +142,10 @@ def is_run(problem: Problem) -> bool:
 
 
 def why_too_large(problem: Problem) -> str:
-    """Return the reason why a problem does not fit methods with dense rows, or an empty string if it fits."""
+    """Return the reason why a problem does not fit methods with dense rows, or an empty string if it fits.
+
+    Unknown factors of rows and an unknown velocity count as such reasons, whatever the size.
+    """
     number = _nodes(problem)
     if is_scaled(problem):
         return "the velocity is unknown" if has_one_epoch_velocity(problem) else "a factor of the rows is unknown"
@@ -147,7 +155,10 @@ def why_too_large(problem: Problem) -> str:
 
 
 def _nodes(problem: Problem) -> int:
-    """Return the number of different ranges, rates, angles, ratios and heights in the rows."""
+    """Return the number of different ranges, rates, angles, ratios and heights in the rows.
+
+    Rows share the range or rate of one station (at one epoch, if anything moves). Other nodes belong to one row.
+    """
     moving, own = own_epochs(problem) > 1, 0
     shared: set[tuple[bool, int, int]] = set()
     for rows in problem.rows:
@@ -195,7 +206,11 @@ def _beyond_scale(problem: Problem) -> Iterator[str]:
 
 
 def _beyond_factors(problem: Problem, factor: Array, free: Sequence[bool]) -> Iterator[str]:
-    """Yield the reasons against kinds of rows with factors `factor` (m,); `free` marks factors without a prior."""
+    """Yield the reasons against kinds of rows with unknown factors.
+
+    `factor` (m,) is the number of the factor of each row, -1 without a factor. `free` is True for each factor without a
+    prior, and ends with two values False, which the indices -1 and -2 read.
+    """
     emitting, kinds = set[int](), {rows.kind for rows in problem.rows}
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         model, own = MODELS[rows.kind], {int(one) for one in factor[start : start + rows.count]}
@@ -231,7 +246,7 @@ def _beyond_stations(problem: Problem) -> Iterator[str]:
 
 
 def _stations_move(problem: Problem) -> bool:
-    """Return whether a station of rows of several epochs has different positions at these epochs."""
+    """Return whether a station that rows of several epochs name has different positions at these epochs."""
     place = problem.stations.position
     if place.shape[-3] < 2:
         return False

@@ -1,4 +1,8 @@
-"""The proof of a run: no position costs less than a fix, and no other minimum is within a gap."""
+"""The proof of a run: no position costs less than a fix, and no other minimum is within a gap.
+
+A run has many rows, which are sparse (`optloc.proof.runs.rows`). The search is over all space (functions `..._far`), or
+in search coordinates around the fix (functions `..._near`). The last functions prove fixes of moving targets.
+"""
 
 from __future__ import annotations
 
@@ -94,7 +98,8 @@ def _convex_sides(
 ) -> bool:
     """Write half-widths (3,), at most the hull, of a box around a position on which the cost is convex.
 
-    Return False without a convex box.
+    The position has the coordinates `at` (3,) in a piece of the atlas, or in search coordinates. `margin` is the margin
+    of the Hessian of f/2. Return False without a convex box.
     """
     box, share, floor = tables.box, _WIDEST, floor_of(space, run.cost)
     for _ in range(_TRIALS):
@@ -112,7 +117,10 @@ def _convex_sides(
 
 @inlined
 def _margin(tables: RunTables, noise: float, eps: float) -> float:
-    """Return the margin of convexity of a box for which its cost falls at most eps below the cost of its centre."""
+    """Return the margin of convexity for which the cost in a box falls at most eps below the cost of its centre.
+
+    The slope is in ``box.sums``, and `noise` bounds the rounding of a residual.
+    """
     total = 0.0
     for k in range(3):
         slope = abs(tables.box.sums[G0 + k]) + tables.box.sums[LENGTH0 + k] * noise
@@ -124,7 +132,11 @@ def _margin(tables: RunTables, noise: float, eps: float) -> float:
 def _set_far(
     run: RunCost, space: Space, tables: RunTables, i: int, x: Array, value: float, eps: float, limit: float
 ) -> bool:
-    """Write a minimum and the boxes around it into an atlas; see `optloc.proof.convex_boxes.set_minimum`."""
+    """Write minimum i, at x (D,), and the boxes around it into an atlas.
+
+    Return False if x is no minimum or costs less than `value`. For `eps` and `limit` see
+    `optloc.proof.convex_boxes.set_minimum`.
+    """
     atlas, box, d, hull = space.atlas, tables.box, space.atlas.dimension, np.zeros(3)
     minima, piece = atlas.minima, 2 * d + 1 + i
     minima.home[i] = piece_of(atlas, x, minima.start[i])
@@ -162,9 +174,10 @@ def _set_near(
     eps: float,
     hidden: bool,
 ) -> bool:
-    """Write a minimum in search coordinates, and the sides of a convex box around it.
+    """Write minimum i, at x (D,), in search coordinates, and the sides of a convex box around it.
 
-    Return False if x is no minimum or costs too little.
+    `corners` (2, 3) limit the box, in which the cost falls at most eps below the cost of x. If `hidden`, the size of
+    the box is limited to `HIDDEN_REACH`. Return False if x is no minimum or costs less than `value`.
     """
     chart, box, hull, shift, at = space.chart, tables.box, np.zeros(3), np.zeros(3), space.minima[i]
     for k in range(3):
@@ -207,7 +220,7 @@ def _reaches_infinity(run: RunCost) -> bool:
 
 @compiled
 def cost_of_place(run: RunCost, x: Array, tables: RunTables) -> float:
-    """Return the cost at a position x (D,), metres."""
+    """Return the cost at a position x (D,), metres; the nodes are written into ``tables.box``."""
     cost, box, axes = run.cost, tables.box, np.zeros((3, 3))
     box.half[:], box.centre[:] = 0.0, 0.0
     for k in range(x.shape[0]):
@@ -295,7 +308,7 @@ def _blur(run: RunCost, chart: LocalAxes, x: Array, far: bool, tables: RunTables
 def _prove_far(
     run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalAxes, tables: RunTables
 ) -> tuple[int, int, float]:
-    """Prove the claim over all space."""
+    """Prove the claim over all space; return verdict, number of boxes, and lower bound of the cost."""
     none, known, place, aim = np.empty((0, 3)), zero(), np.empty(task.x.shape[0]), task.aim
     space, stack, others = Space(True, atlas, chart, none, none), np.zeros((CAPACITY, DEPTH)), task.beside.points
     for p in range(1 + others.shape[0]):
@@ -330,7 +343,11 @@ def _verdict(outcome: int, aim: Goal) -> int:
 def _prove_near(
     run: RunCost, task: ProofTask, atlas: Atlas, around: LocalAxes, tables: RunTables, lower: Array, upper: Array
 ) -> tuple[int, int, float]:
-    """Prove the claim in search coordinates around a fix: in a region, in an enclosure, or around a surface."""
+    """Prove the claim in search coordinates around a fix: in a region, in an enclosure, or around a surface.
+
+    `lower` and `upper` (D,) are the corners of the region, metres; NaN for an enclosure. Return verdict, number of
+    boxes, and lower bound of the cost.
+    """
     corners, bent, aim = np.empty((2, 3)), around.surface.shape[0] > 0, task.aim
     stack, total, bound = np.zeros((CAPACITY, DEPTH)), 0, aim.value
     rho = sqrt(max(aim.level, aim.value + task.eps))
@@ -362,7 +379,11 @@ def _prove_near(
 def _beside(
     run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalAxes, tables: RunTables, corners: Array, own: bool
 ) -> Space:
-    """Return search coordinates with their known minima, the fix (`own`) first; empty if the fix is no minimum."""
+    """Return the search coordinates of one piece of the search, with known minima that the search leaves out.
+
+    If `own`, the piece contains the fix, which is the first minimum. Each minimum has a convex box within `corners` (2,
+    3). If the fix is no minimum, the list is empty.
+    """
     others, known, place = task.beside.points, zero(), np.empty(task.x.shape[0])
     room = np.zeros((2, 1 + others.shape[0], 3))
     space = Space(False, atlas, chart, room[0], room[1])
@@ -389,6 +410,7 @@ def prove_runs(costs: Runs, asked: ProofRequest) -> ProofResult:
     found, asked = np.full((n, d), np.nan), ProofRequest(*(plainly(array) for array in asked))
 
     def prove(i: int) -> None:
+        """Write the result of proof i: for the requested region, then, if that region is open, for the fallback."""
         others = asked.others[i, : asked.known[i]]
         beside = KnownMinima(others, int(asked.hidden[i]), asked.planes[i], asked.surface[i])
         for corners in (asked.region[i], asked.fallback[i]):
@@ -420,7 +442,7 @@ def runs_lack_code(costs: Runs | CourseCosts, count: int) -> bool:
 
 
 def costs_of_runs(costs: Runs, x: Array) -> tuple[Array, Array]:
-    """Return costs (n, P) at positions x (n, P, d) and the rounding of their residuals, see `costs_at`."""
+    """Return costs (n, P) at positions x (n, P, d), m, and the rounding of their residuals, see `costs_at`."""
     out = np.zeros((2, *x.shape[:2]))
     for i, run in enumerate(costs.runs):
         tables = tables_of(run)
@@ -435,15 +457,16 @@ def costs_of_runs(costs: Runs, x: Array) -> tuple[Array, Array]:
 
 
 def prove_courses(costs: CourseCosts, asked: ProofRequest) -> ProofResult:
-    """Return the results of the proofs of n fixes of n problems of a moving target; x contains velocities as well.
+    """Return the results of the proofs of n fixes of n problems of a moving target.
 
-    Without compiled code no box is searched, as in `prove_runs`.
+    The fixes x contain position and velocity, m and m/s. Without compiled code no box is searched, as in `prove_runs`.
     """
     n, size = asked.x.shape
     verdict, boxes, bound = np.full(n, BUDGET), np.zeros(n, np.int64), np.full(n, -inf)
     found = np.full((n, size), np.nan)
 
     def prove(i: int) -> None:
+        """Write the result of proof i: within the requested region of states."""
         (whole, few), ground = _on_surface(costs.courses[i], asked.x[i])
         state, others, corners = asked.x[i], asked.others[i, : asked.known[i]], asked.region[i]
         if over_ground(ground):

@@ -1,4 +1,10 @@
-"""Enclosures of a cost with unknown factors that grows without limit: boxes around all positions of low cost."""
+"""Enclosures of a cost with unknown factors that grows without limit: boxes around all positions of low cost.
+
+The cost is ``|sum_g k_g K_g phi + K_0 phi - w|^2`` with factors k_g and nodes phi_j (`optloc.proof.scaled.reduction`).
+Group g contains the nodes of factor g; the group -1 has no factor. rho is the root of a level of the cost. Corners
+`low` and `high` (3,) are in the search coordinates of `chart`, around the fix x (D,). If a function `_meet_...` returns
+False, its method does not apply.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +62,10 @@ _LEAST_GAP = 0.03
 def first_enclosed(
     scaled: Scaled, chart: LocalAxes, x: Array, levels: Array, least: float, low: Array, high: Array
 ) -> int:
-    """Return the index of the first level whose positions are enclosed, or the number of levels; write the corners."""
+    """Return the index of the first level whose positions are enclosed, or the number of levels; write the corners.
+
+    `levels` (G,) are in descending order, and no level counts as lower than `least`, the cost of the fix.
+    """
     for k in range(levels.shape[0]):
         level = max(levels[k], least)
         if (
@@ -125,7 +134,7 @@ def _enclose(cost: Cost, chart: LocalAxes, x: Array, level: float, low: Array, h
 def _factor_at(scaled: Scaled, g: int, rho: float) -> float:
     """Return an end of a factor's range from its prior: the least for negative rho, else the greatest; 1 for no factor.
 
-    Without a prior the greatest is infinite, and the least -1.
+    The prior is the last row of the factor. Without a prior the greatest is infinite, and the least -1.
     """
     if g < 0:
         return 1.0
@@ -147,7 +156,7 @@ def _is_of_ranges(scaled: Scaled) -> bool:
 
 @compiled
 def _open(x: Array, low: Array, high: Array) -> None:
-    """Write infinite corners, which contain all positions."""
+    """Write infinite corners, which contain all positions x (D,); coordinates that do not exist get the corners 0."""
     low[:], high[:] = -inf, inf
     for k in range(x.shape[0], 3):
         low[k] = high[k] = 0.0
@@ -155,7 +164,11 @@ def _open(x: Array, low: Array, high: Array) -> None:
 
 @compiled
 def _fitted(scaled: Scaled, R: Array, j: int) -> float:
-    """Return the least-squares value of a node times its factor, with R the inverse of K'K."""
+    """Return the least-squares estimate of node j times its factor, in the unit of the node: entry j of ``R K'w``.
+
+    R (J, J) is the inverse of K'K. The radius of a ball of the enclosure is this estimate plus its uncertainty, divided
+    by the least factor.
+    """
     cost, total = scaled.cost, 0.0
     for m in range(R.shape[0]):
         for i in range(cost.w.shape[0]):
