@@ -131,7 +131,7 @@ def with_minima(middle: Array, radius: float, dimension: int, minima: AtlasMinim
 
 @compiled
 def first_minima(minima: AtlasMinima, count: int) -> AtlasMinima:
-    """Return views of the first `count` minima."""
+    """Return views of the first `count` minima: the arrays have space for more minima than were written."""
     return AtlasMinima(
         minima.home[:count],
         minima.start[:count],
@@ -255,7 +255,10 @@ _PLACED = 8.0 * 2.0**-52
 
 @compiled
 def widen_around(atlas: Atlas, i: int, half: Array) -> None:
-    """Widen a box of the piece around minimum i by the rounding of its centre: `half` (3,) is enlarged."""
+    """Widen the half-widths `half` (3,) of a box of the piece around minimum i by the rounding of its centre.
+
+    So the computed bounds are valid for the exact box.
+    """
     for k in range(atlas.dimension):
         for m in range(atlas.dimension):
             half[k] += _PLACED * abs(atlas.minima.back[i, k, m])
@@ -346,7 +349,10 @@ def _within_from_another(atlas: Atlas, half: Array, i: int) -> bool:
 
 @inlined
 def _column(m: int, level: int, face: bool, d: int) -> int:
-    """Return the component of p for coordinate m of a home, or -1 for v; a face omits its constant component."""
+    """Return the component of p for coordinate m of a home, or -1 for v.
+
+    A face (`face`) omits its constant component `level`, and its last coordinate is v. The dimension is d.
+    """
     if not face:
         return m
     if m == d - 1:
@@ -447,7 +453,7 @@ def contract_to_corners(atlas: Atlas, origin: Array, back: Array, corners: Array
 
 @inlined
 def _station(frame: AtlasFrame, data: Array, first: int) -> Triple:
-    """Return the station a at data[first:first + 3], relative to the centre and in half sides of the cube."""
+    """Return the station a at data[first:first + 3], relative to the centre and in half sides of the cube (no unit)."""
     m0, m1, m2 = frame.middle
     per = 1.0 / frame.radius
     third = (data[first + 2] - m2) * per if frame.space else 0.0

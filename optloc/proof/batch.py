@@ -252,7 +252,10 @@ def plainly(array: Array) -> Array:
 
 @compiled
 def _loop(costs: PositionCosts, asked: ProofRequest, out: ProofResult) -> None:
-    """Prove the request of each fix, and write its result into the arrays of `out`."""
+    """Prove the request of each fix, and write its result into the arrays of `out`.
+
+    The proof is first for all positions, unless a region is requested. If it is OPEN, the fallback region follows.
+    """
     # Local variables for all arrays: each access to a field of a record counts references.
     kinds, data, K, w = costs.kinds, costs.data, costs.K, costs.w
     fixes, others, known, steps, tolerances = asked.x, asked.others, asked.known, asked.gaps, asked.eps

@@ -298,7 +298,10 @@ def _look(cost: Cost, space: Space, box: Box, piece: int, level: float, floor: f
 
 @inlined
 def _side_far(cost: Cost, space: Space, box: Box, piece: int, level: float, here: float, floor: float) -> int:
-    """Return the side to halve of a box of the atlas, or -1 if it contains no minimum; the box is not contracted."""
+    """Return the side to halve of a box of the atlas, or -1 if it contains no minimum; the box is not contracted.
+
+    `here` is the cost at the centre of the box, and `floor` the result of `optloc.proof.space.floor_of`.
+    """
     atlas, d = space.atlas, space.atlas.dimension
     touching = piece < 2 * d and box.at[d - 1] <= box.half[d - 1]
     if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY:
@@ -311,7 +314,10 @@ def _side_far(cost: Cost, space: Space, box: Box, piece: int, level: float, here
 
 @inlined
 def _cut(cost: Cost, space: Space, box: Box, level: float, here: float) -> int:
-    """Write the ends of the part of a box that may contain a minimum below a level; return the side to halve, or -1."""
+    """Write the ends of the part of a box that may contain a minimum below a level; return the side to halve, or -1.
+
+    The result is -1 if no part remains. `here` is the cost at the centre of the box.
+    """
     chart = space.chart
     gram = box.gram if chart.surface.shape[0] > 0 else chart.gram
     noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)

@@ -274,7 +274,10 @@ def widen_core(atlas: Atlas, i: int, limit: float) -> None:
 
 @compiled
 def set_hull(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
-    """Write the greatest half-widths (3,) of convex boxes around minimum i, within a limit in metres."""
+    """Write the greatest half-widths `hull` (3,) of convex boxes around minimum i of an atlas.
+
+    No box reaches infinity, and no coordinate is farther than `limit` metres from the minimum.
+    """
     minima, d = atlas.minima, atlas.dimension
     # v falls along the last axis only, or along all axes.
     ways = 1 if infinity_coordinate(atlas, 2 * d + 1 + i) > -inf else d
@@ -376,7 +379,7 @@ def _set_triangular(information: Array, d: int, axes: Array, back: Array) -> boo
 
 @inlined
 def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
-    """Fill the tables of a box with half-widths (3,) around minimum i."""
+    """Fill the tables of a box with half-widths `half` (3,) around minimum i of an atlas."""
     box.at[:] = 0.0
     put(half, box.half)
     set_centre(atlas, 2 * atlas.dimension + 1 + i, box.at)
@@ -388,7 +391,7 @@ def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
 
 @compiled
 def _convex(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array, margin: float) -> bool:
-    """Return whether the Hessian of f/2 exceeds `margin` over a box with half-widths (3,) around minimum i."""
+    """Return whether the Hessian of f/2 exceeds `margin` over a box with half-widths `half` (3,) around minimum i."""
     _tables(cost, box, atlas, i, half)
     # Here ranges are differences, whose Hessians have no fixed sign, so the test must treat them as any node.
     return is_convex_over_box(np.full_like(cost.kinds, ANY), cost.A, box.half, box.nodes, box.curves, box.sums, margin)

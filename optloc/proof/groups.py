@@ -54,7 +54,7 @@ def empty_groups(J: int) -> Groups:
 
 @compiled
 def set_groups(kinds: Array, A: Array, groups: Groups) -> None:
-    """Write the groups of nodes with codes `kinds` (J,) and products of rows ``A = K'K`` (J, J)."""
+    """Write the groups of nodes with codes `kinds` (J,) and products of rows ``A = K'K`` (J, J) into `groups`."""
     J, order = kinds.shape[0], groups.order
     first = number = zero()
     for j in range(J):

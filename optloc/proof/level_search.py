@@ -224,7 +224,10 @@ def _meet(
 
 @compiled
 def _at_infinity(work: Any, atlas: Atlas, piece: int) -> float:
-    """Return the cost at infinity next to the centre of a box that reaches infinity; its tables are overwritten."""
+    """Return the cost at infinity next to the centre of a box that reaches infinity; its tables are overwritten.
+
+    It is the cost at v = 0, with the other coordinates of the centre.
+    """
     at = work.box.at.copy()
     at[atlas.dimension - 1] = infinity_coordinate(atlas, piece)
     set_centre(atlas, piece, at)
@@ -257,7 +260,10 @@ def _first_below(levels: Array, first: int, ends: float) -> int:
 
 @compiled
 def _take_back(stack: Array, aside: Array, waiting: int, level: float) -> tuple[int, int]:
-    """Move the boxes whose bound is below a level from `aside` to the stack; return the numbers of boxes on both."""
+    """Move the boxes whose bound is below a level from `aside` to the empty stack; return the numbers of boxes on both.
+
+    `waiting` is the number of boxes on `aside`, where they wait for this level.
+    """
     size, left = zero(), zero()
     for i in range(waiting):
         if aside[i, LEAST] * aside[i, LEAST] < level:

@@ -60,13 +60,19 @@ def push_or_defer(
 
 @compiled
 def touches_infinity(box: Box, last: int, end: float) -> bool:
-    """Return whether a box reaches infinity, where the last coordinate has the value `end`."""
+    """Return whether a box reaches infinity, where the last coordinate has the value `end` (-inf: it never does).
+
+    `last` is the index of the last coordinate.
+    """
     return bool(end > -inf and box.at[last] - end <= box.half[last])
 
 
 @compiled
 def contract_at_infinity(box: Box, last: int, end: float) -> None:
-    """Cut off the part of a box that rounding has put beyond infinity, where the inverse range would be negative."""
+    """Cut off the part of a box that rounding has put beyond infinity, where the inverse range would be negative.
+
+    `last` is the index of the last coordinate, and `end` its value at infinity, -inf if the piece does not end there.
+    """
     if end > -inf and box.at[last] - end < box.half[last]:
         box.half[last] = 0.5 * (box.at[last] - end + box.half[last]) * (1.0 + _BEYOND)
         box.at[last] = end + box.half[last]
@@ -108,7 +114,10 @@ def is_left(atlas: Atlas, box: Box, piece: int) -> bool:
 
 @compiled
 def is_listed(atlas: Atlas, x: Array) -> bool:
-    """Return whether a position x (D,) is inside the convex box of a known minimum, or next to the minimum."""
+    """Return whether a position x (D,), metres, is inside the convex box of a known minimum, or next to the minimum.
+
+    If so, the end of a descent is no new minimum.
+    """
     d, minima, u = atlas.dimension, atlas.minima, np.zeros(3)
     for i in range(minima.home.shape[0]):
         inside = coordinates_on(atlas, minima.home[i], x, u)

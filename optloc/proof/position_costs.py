@@ -176,10 +176,7 @@ def _number_of(nodes: CostColumns, row: NodeRow, node: str | Node) -> int:
 
 
 def own_epochs(problem: Problem) -> int:
-    """Return the number of epochs at which stations or the target have a separate position or velocity.
-
-    1 if none moves.
-    """
+    """Return the number of epochs at which stations or the target have a separate position or velocity, at least 1."""
     stations = problem.stations
     if problem.motions[0].order > 0:
         return problem.epochs

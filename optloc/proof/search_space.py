@@ -401,7 +401,10 @@ def widen_by_rounding(chart: LocalAxes, centre: Array, half: Array) -> None:
 
 @inlined
 def is_bounded(cost: Cost, chart: LocalAxes, box: Box) -> bool:
-    """Bound the nodes over a box; return False if the box is so large that a surface is no graph over it."""
+    """Bound the nodes over a box and write them into ``box.nodes``.
+
+    Return False if the box is so large that a surface is no graph over it.
+    """
     write_centre(chart.origin, chart.sense, box.at, box.centre)
     if chart.surface.shape[0] == 0:
         bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
@@ -462,7 +465,7 @@ def _inside_of(cost: Cost, chart: LocalAxes, box: Box) -> Atlas:
 
 @compiled
 def _set_inside(inside: Atlas, box: Box) -> None:
-    """Write the centre and axes of a box on a surface into the inside of an atlas."""
+    """Write the centre and axes of a box on a surface into the working memory of an atlas (`_inside_of`)."""
     inside.scale[0] = 1.0
     for m in range(3):
         inside.point[m] = (box.centre[m] - inside.middle[m]) / inside.radius

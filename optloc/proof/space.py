@@ -141,7 +141,7 @@ def set_curves(space: Space, cost: Cost, box: Box) -> None:
 
 @compiled
 def place_of(space: Space, box: Box, x: Array) -> None:
-    """Write the position x (D,), metres, of the centre of a box whose centre is set."""
+    """Write the position x (D,), metres, of the centre of a box; `set_place` must have run."""
     if space.far:
         write_position(space.atlas, x)
     else:

@@ -289,7 +289,10 @@ def _most_residual(cost: Cost, box: Box) -> float:
 
 @compiled
 def _bends(cost: Cost, box: Box) -> float:
-    """Return a bound of the nonlinear part of the residual over a box: half the widths of the remainders, weighted."""
+    """Return a bound of the nonlinear part of the residual over a box: half the widths of the remainders, weighted.
+
+    The result is infinite if a remainder has no bound.
+    """
     total = 0.0
     for j in range(cost.weight.shape[0]):
         total += 0.5 * cost.weight[j] * (box.nodes[j, HIGH] - box.nodes[j, LOW])

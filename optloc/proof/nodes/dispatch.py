@@ -220,7 +220,7 @@ def _cases(name: str, nodes: list[Node]) -> Iterator[str]:
 
 
 def text_of(name: str, nodes: list[Node]) -> str:
-    """Return the source of a function that chooses by the codes of nodes."""
+    """Return the source of the generated function `name`, which chooses by the code of a node."""
     if name in _PROPERTIES:
         return _property_source(name, nodes)
     return _LOOPS[name].format(cases="\n".join(_cases(name, nodes)))
@@ -251,10 +251,10 @@ def _generated(name: str, nodes: list[Node]) -> Callable[..., Any]:
         **{column: getattr(columns, column) for column in _COLUMNS},
     }
     space |= {function.__name__: function for function in _NAMED}
-    space |= {f"{field}_{code}": kernel for code, own in enumerate(nodes) for field, kernel in _kernels(own)}
+    space |= {f"{field}_{code}": kernel for code, node in enumerate(nodes) for field, kernel in _kernels(node)}
     exec(compile(text_of(name, nodes), __file__, "exec"), space)  # noqa: S102  # generated text
-    made: Callable[..., Any] = space[name]
-    return made
+    function: Callable[..., Any] = space[name]
+    return function
 
 
 bound_others = compiled(_generated("bound_others", NODES))

@@ -65,12 +65,12 @@ def linear_numbers(coefficients: Array, origin: Array | None = None) -> Array:
     return lay_out(parts if origin is None else parts | {ORIGIN: origin})
 
 
-def _of_row(row: NodeRow) -> Array:
+def _numbers_of_row(row: NodeRow) -> Array:
     """Raise an error: no measurement is linear in the position. Priors make linear nodes directly."""
     raise NotImplementedError("a row of measurements does not name a linear form")
 
 
-LINEAR_FORM = Node("linear", _NUMBERS, 1, _of_row, bound_linear, shape=FLAT, size=size_linear)
+LINEAR_FORM = Node("linear", _NUMBERS, 1, _numbers_of_row, bound_linear, shape=FLAT, size=size_linear)
 
 # Geodetic heights.
 

@@ -272,7 +272,10 @@ def largest_row_value(matrix: Array, k: int, h: Triple) -> float:
 
 @compiled
 def product(u: Triple, v: Triple, h: Triple) -> tuple[float, float]:
-    """Return an enclosure of ``(u.s)(v.s)`` over a box, which uses the sign of squares."""
+    """Return an enclosure (least, greatest) of ``(u.s)(v.s)`` over the box with half-widths h.
+
+    The terms in squares s_k^2 are bounded with their sign; they are never negative.
+    """
     low = high = 0.0
     for k in range(3):
         square = u[k] * v[k] * h[k] * h[k]
@@ -420,7 +423,7 @@ def add_symmetric(a: Symmetric, b: Symmetric) -> Symmetric:
 
 @compiled
 def write_symmetric(matrix: Symmetric, out: Array) -> None:
-    """Write a symmetric matrix into an array (3, 3)."""
+    """Write a symmetric matrix, given as six entries, into an array (3, 3)."""
     out[0, 0], out[1, 1], out[2, 2] = matrix[0], matrix[3], matrix[5]
     out[0, 1] = out[1, 0] = matrix[1]
     out[0, 2] = out[2, 0] = matrix[2]

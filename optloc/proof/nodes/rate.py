@@ -37,7 +37,10 @@ STATION, VELOCITY, RATE_WIDTH = 0, 3, 6
 
 @compiled
 def bound_rate(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
-    """Bound a range rate over a box (see `optloc.proof.nodes.node`): as a quotient, or by the cone of directions."""
+    """Bound a range rate over a box, m/s (see `optloc.proof.nodes.node`), in two ways: as a quotient, and by a cone.
+
+    The cone contains the directions from the station to the points of the box. The narrower bound is the result.
+    """
     h, n, w = triple_at(half, 0), triple_at(line, 0), triple_at(data, VELOCITY)
     r, u, least, most, far = range_form(line, sense, h)
     phi = inner_product(w, n) / r if r > 0.0 else 0.0

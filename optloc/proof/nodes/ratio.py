@@ -135,7 +135,10 @@ def curve_ratio(
     curvature: Array,
     turn: Array,
 ) -> float:
-    """Bound the second derivatives of a ratio over a box (`optloc.proof.nodes.node`), in two steps like the ratio."""
+    """Bound the second derivatives of a ratio over a box (`optloc.proof.nodes.node`).
+
+    As in `bound_ratio`, there are two quotients: the difference of the ranges first, then the ratio.
+    """
     h = triple_at(half, 0)
     bound_ratio(data, line, sense, line_b, sense_b, half, turn)
     ra, ua, least_a, qa, _ = range_form(line, sense, h)

@@ -295,7 +295,7 @@ def prove_run(
 
 @compiled
 def _blur(run: RunCost, chart: LocalAxes, x: Array, far: bool, tables: RunTables) -> float:
-    """Return a bound of the rounding of a residual, as a length, at a fix or in the atlas of all positions."""
+    """Return a bound of the rounding of a residual, as a length, at the fix x or (`far`) in the atlas."""
     middle, radius = station_cube(run.cost.kinds, run.cost.data, x)
     atlas, none = atlas_of(middle, radius, x.shape[0], 0), np.empty((0, 3))
     space = Space(False, atlas, chart, none, none)
@@ -329,7 +329,7 @@ def _prove_far(
 
 @compiled
 def _verdict(outcome: int, aim: Goal) -> int:
-    """Return the verdict of a proof for the outcome of its search."""
+    """Return the verdict of a proof (UNIQUE, VALUE, BETTER, OTHER, BUDGET, UNBOUNDED) for the outcome of its search."""
     if outcome == CLEAR:
         return UNIQUE if aim.level > aim.value else VALUE
     if outcome == SPENT:
@@ -467,7 +467,7 @@ def prove_courses(costs: CourseCosts, asked: ProofRequest) -> ProofResult:
 
     def prove(i: int) -> None:
         """Write the result of proof i: within the requested region of states."""
-        (whole, few), ground = _on_surface(costs.courses[i], asked.x[i])
+        (whole, few), ground = _with_axes_around(costs.courses[i], asked.x[i])
         state, others, corners = asked.x[i], asked.others[i, : asked.known[i]], asked.region[i]
         if over_ground(ground):
             state, others, corners = state_on(ground, state), state_on(ground, others), corners_on(ground, corners)
@@ -486,10 +486,13 @@ def prove_courses(costs: CourseCosts, asked: ProofRequest) -> ProofResult:
     return without_rivals(verdict, boxes, bound, np.zeros(n, np.bool_), asked, found)
 
 
-def _on_surface(
+def _with_axes_around(
     courses: tuple[ConstantVelocityCost, ConstantVelocityCost], state: Array
 ) -> tuple[tuple[ConstantVelocityCost, ConstantVelocityCost], Ground]:
-    """Return courses whose axes of states are set around one state, and the surface on which they move."""
+    """Return courses whose axes of states are set around one state, and the surface on which they move.
+
+    The two courses are the cost of all rows and the cost of few rows. In the plane they stay as they are.
+    """
     if not over_ground(courses[0].ground):
         return courses, courses[0].ground
     axes = axes_at(courses[0].ground.data, state[:3])
@@ -498,7 +501,7 @@ def _on_surface(
 
 
 def costs_of_courses(costs: CourseCosts, states: Array) -> tuple[Array, Array]:
-    """Return costs (n, P) of states (n, P, 2 d) and the rounding of their residuals, see `costs_at`."""
+    """Return costs (n, P) of states (n, P, 2 d), m and m/s, and the rounding of their residuals, see `costs_at`."""
     out = np.zeros((2, *states.shape[:2]))
     for i, (whole, _) in enumerate(costs.courses):
         for p, state in enumerate(plainly(states[i])):

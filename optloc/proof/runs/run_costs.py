@@ -142,7 +142,7 @@ def _run_cost(problem: Problem) -> tuple[RunCost, float]:
     priors = position_prior(problem, nodes)
     kinds = np.array(nodes.kinds)
     value = np.where(counts_from_measured(problem), 0.0, known)[0]
-    prior = _rows_at(priors, len(kinds))
+    prior = _rows_of_single_nodes(priors, len(kinds))
     whole = _WhitenedRows.of(problem, usable[0], nodes, others, value, prior)
     data = whole.marked(kinds, nodes.numbers[:1])
     few = _WhitenedRows.of(problem, usable[0] & _are_few(problem, len(kinds)), nodes, others, value, prior)
@@ -339,7 +339,7 @@ class _WhitenedRows:
         return RunRows(start, column, *map(plainly, arrays))
 
 
-def _rows_at(nodes: list[int], size: int) -> Any:
+def _rows_of_single_nodes(nodes: list[int], size: int) -> Any:
     """Return sparse rows (n, size), each of which contains one of the n nodes with the factor 1."""
     from scipy import sparse
 

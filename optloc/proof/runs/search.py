@@ -223,7 +223,11 @@ def _is_flat_out(run: RunCost, space: Space, tables: RunTables, level: float) ->
 
 @compiled
 def _bound(run: RunCost, space: Space, tables: RunTables, floor: float, level: float) -> tuple[float, float]:
-    """Return the cost at the centre of a box, and a lower bound of the residual over it, negative without a bound."""
+    """Return the cost at the centre of a box, and a lower bound of the residual over it, negative without a bound.
+
+    All rows are used. Second derivatives are computed only if the bound without them is below `level`. `floor` is the
+    result of `floor_of`.
+    """
     box, sheet, rows = tables.box, tables.sheet, run.rows
     if not set_nodes(space, run.cost, box):
         return inf, -1.0

@@ -301,7 +301,7 @@ def has_no_minimum(table: StateTable, ball: float, noise: float) -> bool:
 
 @compiled
 def hessian_of_state(course: ConstantVelocityCost, state: Array) -> Array:
-    """Return the Hessian (4, 4) of f/2 at a state (4,)."""
+    """Return the Hessian (4, 4) of f/2 at a state (4,), with respect to position (m) and velocity (m/s)."""
     table = table_of(course)
     table.unit[:] = 1.0
     axes = StateAxes(state, np.eye(STATE), np.eye(STATE), np.zeros((2, STATE)))

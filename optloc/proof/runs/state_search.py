@@ -176,7 +176,10 @@ def _curve(search: Search, table: StateTable) -> tuple[float, float]:
 
 @compiled
 def _where(axes: StateAxes, at: Array, half: Array) -> int:
-    """Return -1 if no state of a box is in the region, 1 if all are inside it, and 0 otherwise."""
+    """Return -1 if no state of a box is in the region, 1 if all are inside it, and 0 otherwise.
+
+    The box has the centre `at` and the half-widths `half` (n,); the region is in `axes`.
+    """
     inside = 1
     for i in range(at.shape[0]):
         middle, reach = axes.origin[i], 0.0

@@ -347,7 +347,10 @@ def set_bends(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) 
 
 @compiled
 def _pull_back(curve: Array, lever: Array, out: Array) -> None:
-    """Add ``L'N L`` to the lower triangle of a matrix (n, n), with N the Hessian of a node and L the lever."""
+    """Add ``L'N L`` to the lower triangle of a matrix (n, n): the Hessian of a node with respect to the state.
+
+    N, in `curve`, is its Hessian with respect to the position, and L (d, n) the lever.
+    """
     d, n = lever.shape
     for m in range(n):
         for i in range(d):

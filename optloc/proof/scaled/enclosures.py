@@ -80,7 +80,7 @@ def first_enclosed(
 
 @compiled
 def _without_factors(scaled: Scaled) -> Cost:
-    """Return the cost of the rows whose nodes have no factors."""
+    """Return the cost of the rows whose nodes have no factors; it is nowhere more than the cost of all rows."""
     K, rows, columns = scaled.cost.K, zero(), zero()
     row, column = np.zeros(K.shape[0], dtype=np.int64), np.zeros(K.shape[1], dtype=np.int64)
     for j in range(K.shape[1]):
@@ -121,7 +121,10 @@ def _without_factors(scaled: Scaled) -> Cost:
 
 @compiled
 def _enclose(cost: Cost, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
-    """Write the corners of a box around all positions whose cost is below a level; return False without a box."""
+    """Write the corners of a box around all positions whose cost is below a level; return False without a box.
+
+    `cost` is the cost of rows without factors (`_without_factors`).
+    """
     q, J = cost.K.shape
     if q == 0 or J == 0:
         return False

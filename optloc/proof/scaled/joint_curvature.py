@@ -176,7 +176,10 @@ def _set_turn(scaled: Scaled, j: int, box: Box, sheet: ScaledWorkspace) -> None:
 
 @inlined
 def _add_information(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorkspace) -> None:
-    """Add ``E'E`` and the gradient to the sums, and their rounding to the bounds of change."""
+    """Add ``E'E`` and the gradient to the sums, and their rounding to the bounds of change.
+
+    `noise` bounds the rounding of a residual.
+    """
     sums, E, weight, share, longest = box.sums, sheet.E, scaled.cost.weight, relative_rounding(scaled.cost.K), 0.0
     for i in range(E.shape[0]):
         longest += sheet.w[i] * sheet.w[i]
@@ -258,7 +261,10 @@ def _add_node(scaled: Scaled, noise: float, j: int, box: Box, sheet: ScaledWorks
 
 @inlined
 def _add_third(box: Box, sheet: ScaledWorkspace) -> None:
-    """Add the linear changes of forces to the bounds of the Hessian's change, summed over the nodes."""
+    """Add the linear changes of forces to the bounds of the Hessian's change along s, ``sums[C00:]``.
+
+    They were summed over the nodes into ``sheet.third``, because they partly cancel.
+    """
     G = sheet.back.shape[0]
     for at in range(6):
         for n in range(3 + G):
@@ -269,7 +275,10 @@ def _add_third(box: Box, sheet: ScaledWorkspace) -> None:
 
 @inlined
 def _add_mixed(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> None:
-    """Add the linear changes of forces to the bounds of the change of entries between offsets and factors."""
+    """Add the linear changes of forces to the bounds of the change of entries between offsets and factors.
+
+    These bounds are ``sheet.cross`` (G, 3 + G).
+    """
     G = sheet.back.shape[0]
     for h in range(G):
         for k in range(3):
@@ -359,7 +368,11 @@ def clip_stationary(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> bool:
 
 @compiled
 def slope_of(box: Box, eps: float) -> float:
-    """Return the margin of convexity for which the slope at the centre of a box lowers the cost by at most eps."""
+    """Return the margin of convexity for which the slope at the centre of a box lowers the cost by at most eps.
+
+    If the Hessian of f/2 exceeds this margin over the box, no point of the box costs less than the centre by more than
+    eps.
+    """
     total = 0.0
     for k in range(3):
         slope = abs(box.sums[G0 + k]) + box.sums[NOISE0 + k]

@@ -171,9 +171,6 @@ def workspace_of(scaled: Scaled) -> ScaledWorkspace:
     )
 
 
-# The centre of a box.
-
-
 @compiled
 def reduce_rows(scaled: Scaled, floor: float, box: Box, sheet: ScaledWorkspace) -> None:
     """Project the factors out of the rows at the centre of a box whose nodes are bounded.
@@ -244,7 +241,7 @@ def _orthogonalise(sheet: ScaledWorkspace) -> None:
 
 @inlined
 def _project(scaled: Scaled, sheet: ScaledWorkspace) -> None:
-    """Write the projected rows and measurements, the factors at the centre, and the cost there."""
+    """Write the projected rows and measurements, the factors at the centre, and the cost there (``span[HERE]``)."""
     K, unit, back, w, here = scaled.cost.K, sheet.unit, sheet.back, sheet.w, 0.0
     (q, J), G = K.shape, unit.shape[1]
     for g in range(G):
@@ -291,9 +288,6 @@ def _forwards(sheet: ScaledWorkspace) -> float:
     for g in range(G):
         cost += sheet.spin[g] ** 2
     return cost
-
-
-# Ranges of the factors.
 
 
 @compiled
@@ -453,7 +447,10 @@ def _solve_swing(free: bool, sheet: ScaledWorkspace, blur: float) -> bool:
 
 @inlined
 def _set_slopes(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> None:
-    """Write the derivatives of the columns of the factors along each coordinate, before their projection."""
+    """Write the derivatives of the columns of the factors along each coordinate into the last columns of ``sheet.K``.
+
+    They are not projected yet.
+    """
     K, nodes, J = scaled.cost.K, box.nodes, box.nodes.shape[0]
     sheet.K[:, J:] = 0.0
     for j in range(J):
@@ -481,9 +478,6 @@ def _turn(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> None:
             sheet.spin[h] += abs(back[g, h]) * change
     for h in range(G):
         sheet.spin[h] = rho * min(sheet.spin[h] * (1.0 + _ROUNDED), 1.0)
-
-
-# Bounds of the residual.
 
 
 @compiled
@@ -524,7 +518,10 @@ def _length_of(sheet: ScaledWorkspace, j: int) -> float:
 
 @inlined
 def _has_signs(scaled: Scaled, sheet: ScaledWorkspace) -> bool:
-    """Return whether nodes without a lower bound only add to the residual along its direction, beyond rounding."""
+    """Return whether nodes without a lower bound only add to the residual along its direction, beyond rounding.
+
+    Otherwise the bound of the residual is not valid.
+    """
     good = True
     for j in range(scaled.cost.K.shape[1]):
         if sheet.nodes[j, LOW] == -inf:

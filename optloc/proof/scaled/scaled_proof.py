@@ -86,7 +86,7 @@ class ScaledCosts(NamedTuple):
         return float(min(len(self.kinds), _MOST_COUNTED if self.free else len(self.kinds)))
 
     def take(self, items: Array | slice) -> ScaledCosts:
-        """Return the costs of some of the problems."""
+        """Return the costs of the problems with the indices `items`."""
 
         def chosen(array: Array) -> Array:
             return array if len(array) == 1 else array[items]
@@ -104,7 +104,7 @@ class ScaledCosts(NamedTuple):
 def scaled_costs(problem: Problem) -> ScaledCosts:
     """Return the costs of a flat batch of problems whose rows have unknown factors, see `optloc.proof.scope`."""
     costs, group = costs_of_groups(problem, factors_of_rows(problem))
-    root, known = _priors(problem, len(costs.w))
+    root, known = _factor_priors(problem, len(costs.w))
     G, (rows, J) = len(root), costs.K.shape[1:]
     K = np.concatenate([costs.K, np.zeros((len(costs.K), G, J))], axis=1)
     lift = np.zeros((rows + G, G))
@@ -113,7 +113,7 @@ def scaled_costs(problem: Problem) -> ScaledCosts:
     return ScaledCosts(plainly(costs.kinds), costs.data, K, w, costs.level, lift[None], plainly(group))
 
 
-def _priors(problem: Problem, count: int) -> tuple[Array, Array]:
+def _factor_priors(problem: Problem, count: int) -> tuple[Array, Array]:
     """Return the inverse standard deviations (G,) of the factors, zero without a prior, and their means (N, G).
 
     `count` is the number N of problems. A mean is 1 plus the mean of the scale error.

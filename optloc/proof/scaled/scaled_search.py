@@ -343,7 +343,7 @@ def rest_of(scaled: Scaled) -> Cost:
 
 @inlined
 def _bound_rest(work: ScaledSearchWorkspace, space: Space, box: Box) -> float:
-    """Return a lower bound of the residual from the rows without factors; negative if no bound is known."""
+    """Return a lower bound of the residual over a box from the rows without factors; negative if no bound is known."""
     rest = work.rest
     if rest.w.shape[0] == 0:
         return -1.0
@@ -355,7 +355,10 @@ def _bound_rest(work: ScaledSearchWorkspace, space: Space, box: Box) -> float:
 
 @compiled
 def _bound_row(work: ScaledSearchWorkspace, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
-    """Return the result of `optloc.proof.level_search.bound_row` for a cost with unknown factors."""
+    """Return a bound of the residual in a box of the stack, infinite if excluded, and the cost at its centre.
+
+    This is `optloc.proof.level_search.bound_row` for a cost with unknown factors.
+    """
     scaled, box, sheet, piece = work.scaled, work.box, work.tables.sheet, int(stack[row, PIECE])
     pop(stack, row, box.at, box.half)
     contract_at_infinity(box, space.atlas.dimension - 1, infinity_coordinate(space.atlas, piece) if space.far else -inf)
@@ -375,7 +378,10 @@ def _bound_row(work: ScaledSearchWorkspace, space: Space, stack: Array, row: int
 
 @compiled
 def _side_of_rest(work: ScaledSearchWorkspace, space: Space, touching: bool, rho: float, sound: bool) -> int:
-    """Return the result of `optloc.proof.level_search.side_of_rest` for a cost with unknown factors."""
+    """Contract a box and return the side across which to halve the rest; -1 if no part remains.
+
+    This is `optloc.proof.level_search.side_of_rest` for a cost with unknown factors.
+    """
     scaled, box, sheet, d = work.scaled, work.box, work.tables.sheet, space.atlas.dimension
     if not is_bounded(sheet):
         return _side_of_rows(work, rho, d)
@@ -400,7 +406,11 @@ def _side_of_rest(work: ScaledSearchWorkspace, space: Space, touching: bool, rho
 
 @inlined
 def _side_of_rows(work: ScaledSearchWorkspace, rho: float, d: int) -> int:
-    """Contract a box whose factors have no bound by the rows without factors; return the result of `side_of_rest`."""
+    """Contract a box by the rows without factors and return the side across which to halve the rest.
+
+    -1 if no part remains.
+    It is for boxes whose factors have no bound. Residuals longer than rho are cut off, and d is the dimension.
+    """
     rest, box = work.rest, work.box
     reset_cut(box.half, box.cut)
     if rest.w.shape[0] == 0:
@@ -413,7 +423,10 @@ def _side_of_rows(work: ScaledSearchWorkspace, rho: float, d: int) -> int:
 
 @compiled
 def _descend_near(work: ScaledSearchWorkspace, chart: LocalAxes) -> float:
-    """Return the result of `optloc.proof.level_search.descend_near` for a cost with unknown factors."""
+    """Move the box around a position to a minimum; return its cost, or infinity if no minimum is reached.
+
+    This is `optloc.proof.level_search.descend_near` for a cost with unknown factors.
+    """
     return descend_scaled(work.scaled, chart, work.tables)
 
 
@@ -428,13 +441,19 @@ def _set_rival(
     eps: float,
     rho: float,
 ) -> bool:
-    """Return the result of `optloc.proof.level_search.set_rival` for a cost with unknown factors."""
+    """Write minimum i, at x, and the boxes around it into an atlas; return False if it is no minimum.
+
+    This is `optloc.proof.level_search.set_rival` for a cost with unknown factors.
+    """
     return set_scaled_minimum(work.scaled, work.tables, atlas, chart, i, x, value, eps, rho)
 
 
 @compiled
 def _cost_set(work: ScaledSearchWorkspace, atlas: Atlas) -> float:
-    """Return the result of `optloc.proof.level_search.cost_set` for a cost with unknown factors."""
+    """Return the cost at the current centre of the atlas; the tables of the box are overwritten.
+
+    This is `optloc.proof.level_search.cost_set` for a cost with unknown factors.
+    """
     bound_pieces(atlas, work.scaled.cost.kinds, work.scaled.cost.data, work.box.half, work.box.nodes)
     if work.scaled.free and not work.scaled.lift.any():  # the columns of factors vanish at infinity
         return float(cost_at(work.rest.K, work.rest.w, work.box.nodes))
