@@ -4,8 +4,8 @@ The centres of promising boxes descend to minima, and boxes that cost more than 
 The search ends when no box is left or the budget is spent, and lists all minima that it met within the gap. The search
 proves nothing about them. The proof begins afterwards, at the best minimum.
 
-In the functions here, `count` is the number of minima in the list, `level` the cost of the best one plus the gap,
-`size` the number of boxes on the stack, and `near` the working memory of descents.
+In the functions here, `count` is the number of minima in the list, and `level` the cost of the best minimum plus the
+gap. `size` is the number of boxes on the stack, and `near` is the working memory of descents.
 """
 
 from __future__ import annotations
@@ -172,9 +172,9 @@ def search_minima(
     """Return the number of known minima and the number of boxes of a search for minima.
 
     The minima are written into `aim`. On a surface, the search goes all around it. Otherwise, if the cost stays finite
-    at infinity, all positions are searched. In other cases the search is between corners. The corners come from an
-    enclosure of the positions that cost less than x (D,), or from the region (2, D), metres, if there is no enclosure.
-    `box` and `near` are working memory, and `budget` is the greatest number of boxes.
+    at infinity, all positions are searched. In other cases the search is between corners. They are the corners of an
+    enclosure of the positions that cost less than x (D,). Without an enclosure they are the corners of the region (2,
+    D), metres. `box` and `near` are working memory, and `budget` is the greatest number of boxes.
     """
     around, _ = chart_on(cost, x, box, aim.planes, aim.surface)
     level, d, bent = cost_at(cost.K, cost.w, box.nodes) + aim.gap, x.shape[0], aim.surface.shape[0] > 0

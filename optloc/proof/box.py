@@ -512,7 +512,7 @@ def _wide(half: float, size: float) -> float:
 
 @compiled
 def least_left(stack: Array, size: int) -> float:
-    """Return a lower bound of the cost over the first `size` boxes of the stack; infinity if there are none."""
+    """Return a lower bound of the cost over the first `size` boxes of the stack; infinity for an empty stack."""
     least = inf
     for i in range(size):
         low = stack[i, LEAST]

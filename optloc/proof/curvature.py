@@ -1,11 +1,11 @@
 """Second derivatives of the cost over a box: where the cost is convex, and where its gradient cannot vanish.
 
 The cost is ``f = |K phi - w|^2`` with nodes phi (J,), such as ranges; A is K'K (J, J). The *force* on a node is its
-component of K'(K phi - w), and its *pull* is its row of K'J, with J the Jacobian of the residuals. A box has
-half-widths `half` (3,) in search coordinates, in standard deviations. Tables of the box: `nodes` and `curves`
-(`optloc.proof.nodes.node`), and `sums` (SUMS,), described below. `cut` (6,) contains the lower and upper ends of the
-remaining part of the box, relative to its centre. `ball` bounds the spectral norm of the part of the Hessian's change
-that has no bounds for single entries.
+component of K'(K phi - w). Its *pull* is its row of K'J, with J the Jacobian of the residuals. A box has half-widths
+`half` (3,) in search coordinates, whose unit is a standard deviation. Tables of the box are `nodes` and `curves`
+(`optloc.proof.nodes.node`), and `sums` (SUMS,), whose columns are below. `cut` (6,) contains the lower and upper ends
+of the remaining part of the box, relative to its centre. A part of the Hessian's change has no bounds for single
+entries: `ball` bounds its spectral norm.
 """
 
 from __future__ import annotations
@@ -98,9 +98,9 @@ def sum_up(K: Array, w: Array, weight: Array, noise: float, nodes: Array, curves
     Parameters
     ----------
     K, w, weight : array (q, J), (q,), (J,)
-        Whitened rows, and the lengths of the columns of K.
+        Whitened rows and measurements, and the lengths of the columns of K.
     noise : float
-        Bound of the rounding of a residual, see `rounding`.
+        Bound of the rounding of a residual, see `optloc.proof.box.rounding_error`.
     nodes, curves : array (J, NODE_WIDTH), (J, CURVE_WIDTH)
         Tables of the box; forces and pulls are written into `curves`.
     sums : array (SUMS,)
@@ -166,10 +166,10 @@ def is_convex_over_box(
 ) -> bool:
     """Return whether the Hessian of f/2 exceeds `margin` times the identity over the whole box.
 
-    The Hessian is H = Phi'A Phi + sum_j g_j N_j. With B = A Phi and E the changes of the gradients, the first part
-    changes by at least ``-(B'E + E'B)``: the term ``dPhi'A dPhi`` is positive. A node whose Hessian is positive
-    semidefinite counts with its least force. Changes that are bounded by entries only are subtracted from the
-    diagonal, row by row (Gershgorin).
+    The Hessian is H = Phi'A Phi + sum_j g_j N_j. Here Phi (J, 3) are the gradients of the nodes, g_j is the force on
+    node j, and N_j its Hessian. With B = A Phi and E the changes of the gradients, the first part changes by at least
+    ``-(B'E + E'B)``: the term ``dPhi'A dPhi`` is positive. A node whose Hessian is positive semidefinite counts with
+    its least force. Changes that are bounded by entries only are subtracted from the diagonal, row by row (Gershgorin).
 
     Parameters
     ----------
@@ -225,8 +225,8 @@ def is_convex_over_box(
 def spread_of(A: Array, half: Array, nodes: Array, curves: Array, sums: Array) -> float:
     """Write bounds of the change of the Hessian's entries into sums[C00:]; return a bound of the norm of the rest.
 
-    The arguments are as in `is_convex_over_box`. The Hessian is the one of f/2, and the change is from the centre of
-    the box to any other point.
+    The arguments are as in `is_convex_over_box`. The Hessian is half of the Hessian of f, and the change is from the
+    centre of the box to any other point.
     """
     l0, l1, l2, u0, u1, u2 = sums[LENGTH0], sums[LENGTH1], sums[LENGTH2], sums[BLUR0], sums[BLUR1], sums[BLUR2]
     # The rounding of J'J counts as change. It is doubled, because the mean over a line takes half of each change.
@@ -319,8 +319,8 @@ def _clip_along(a: float, d: float, f: float, plane: bool, sums: Array, ball: fl
     """Contract each coordinate to where the same component of the gradient may vanish; return whether any part remains.
 
     If the Hessian is nearly singular, its inverse gives no bound, but a steep coordinate still gives one. Arguments are
-    as in `contract_newton`. a, d and f are the diagonal of the Hessian, `plane` means that there is no third
-    coordinate, and `ball` is multiplied by half of the diagonal of the box.
+    as in `contract_newton`. a, d and f are the diagonal of the Hessian. `plane` means that there is no third
+    coordinate. `ball` is multiplied by half of the diagonal of the box.
     """
     for _ in range(_SWEEPS):
         for k in range(2 if plane else 3):

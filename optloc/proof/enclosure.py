@@ -294,8 +294,8 @@ def _sums(R: Array, member: Array, ties: Array, near: float, middle: float) -> t
 
     The weights are in column WEIGHT of `ties`, `near` is the reference range at the fix, and `middle` the middle of its
     interval. The second and third number are ``sqrt(m'R m)``, for weights times (first + middle second) and for weights
-    times second. Times rho, they bound the linear part of the errors. The last number is the sum of ``|weight| third
-    R_ii``. Times rho squared, it bounds the quadratic part.
+    times second. Times rho, they bound the linear part of the errors. The last number bounds the quadratic part, times
+    rho squared: it is the sum of ``|weight| third R_ii``.
     """
     value = linear = slope = square = 0.0
     for i in range(member.shape[0]):
@@ -327,10 +327,10 @@ def _sums(R: Array, member: Array, ties: Array, near: float, middle: float) -> t
 def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, lower: Array, upper: Array) -> None:
     """Contract a box of search coordinates by angles that differ little from the angles of the fix.
 
-    Let n be the horizontal unit vector across the direction from a station to the fix, and v the other one. A point at
-    distance r whose azimuth and elevation differ by at most a and e obeys ``|n.(x - x^)| <= r sin a`` and
-    ``|v.(x - x^)| <= r (sin e + 1 - cos a)``. The distance r is at most the distance of the fix plus ``y = |x - x^|``.
-    A left inverse of these rows bounds y first, then each coordinate.
+    Let n be the horizontal unit vector across the direction from a station to the fix, and v the unit vector across
+    both. A point y at distance r whose azimuth and elevation differ by at most a and e obeys ``|n.(y - x)| <= r sin a``
+    and ``|v.(y - x)| <= r (sin e + 1 - cos a)``. The distance r is at most the distance of the fix plus ``|y - x|``. A
+    left inverse of these rows bounds |y - x| first, then each coordinate.
 
     Parameters
     ----------

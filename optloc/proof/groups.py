@@ -96,7 +96,7 @@ def _solve(kinds: Array, A: Array, member: Array, first: int, count: int, R: Arr
     """
     if _ties(kinds, A, member, first, count, count, R, tie):
         return NONE
-    # The rows determine differences only. Any range can be the reference; the first one is taken.
+    # The rows determine differences only. Any range can be the reference; the function takes the first range.
     for i in range(first, first + count):
         if kinds[member[i]] == RANGE:
             last, reference = first + count - 1, member[i]

@@ -200,8 +200,8 @@ def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Goal, eno
 
     `minima` and `sides` (P, 3) are the known minima and the half-widths of their convex boxes. A convex box contains no
     second minimum, but it may contain a point of lower cost. If `enough`, the convex box of any known minimum finishes
-    the box. Otherwise only those of the fix and of hidden minima do. If the search has no open boundary, the box of the
-    fix contains nothing cheaper.
+    the box. Otherwise only convex boxes of the fix and of hidden minima do. If the search has no open boundary, the box
+    of the fix contains nothing cheaper.
     """
     first = 0 if aim.whole else aim.own
     if is_known(at, half, minima[first : aim.free], sides[first : aim.free]):

@@ -199,9 +199,9 @@ def roots(precision: Array) -> Array:
 
 
 def compress(K: Array, w: Array) -> tuple[Array, Array]:
-    """Return rows with the same sum of squares ``|K phi - w|^2`` for every phi; at most one more than nodes.
+    """Return at most J + 1 rows with the same sum of squares ``|K phi - w|^2`` for every phi.
 
-    K (B, q, J) are whitened rows over the nodes, with B = 1 or N, and w (N, q) are whitened measurements.
+    K (B, q, J) are whitened rows over the J nodes, with B = 1 or N, and w (N, q) are whitened measurements.
     """
     q, nodes = K.shape[-2:]
     if q <= nodes + 1:
@@ -248,8 +248,8 @@ def mark_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
 def mark_nodes(kinds: Array, data: Array, alone: Array, size: Array, force: Array, w: Array) -> Array:
     """Return the numbers (B, J, width) of nodes with a mark on nodes that are alone in their rows, see `mark_alone`.
 
-    `alone` (B, J) is true for nodes that share no row with another node or unknown, and `size` (B, J) has the lengths
-    of the columns of K. `force` (N, J) is ``K'w``.
+    `alone` (B, J) is true for nodes that share no row with another node or unknown. `size` (B, J) has the lengths of
+    the columns of K, and `force` (N, J) is ``K'w``.
     """
     centred = (np.abs(force) <= _ORTHOGONAL * size * np.linalg.norm(w, axis=-1, keepdims=True)).all(0)
     out = np.array(data)

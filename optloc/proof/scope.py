@@ -145,7 +145,7 @@ def is_run(problem: Problem) -> bool:
 def why_too_large(problem: Problem) -> str:
     """Return the reason why a problem does not fit methods with dense rows, or an empty string if it fits.
 
-    Unknown factors of rows and an unknown velocity count as such reasons, whatever the size.
+    Unknown factors of rows and an unknown velocity are reasons, too, at any number of rows.
     """
     number = _node_count(problem)
     if is_scaled(problem):

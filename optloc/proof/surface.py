@@ -39,7 +39,7 @@ from optloc.proof.nodes.node import (
 )
 
 # Numbers of a surface: its height, the numbers of the height node, the Earth's centre, and three orthonormal axes of a
-# piece, the last one upward. An array of length zero means no surface.
+# piece, of which the last is upward. An array of length zero means no surface.
 LEVEL, DATA, MIDDLE, FIRST, SECOND, UP = 0, 1, 1 + HEIGHT_WIDTH, 4 + HEIGHT_WIDTH, 7 + HEIGHT_WIDTH, 10 + HEIGHT_WIDTH
 SURFACE_WIDTH, SIDES = 13 + HEIGHT_WIDTH, 6
 # Numbers of a graph over a box: greatest distance below the tangent plane, and greatest distance of the centre from

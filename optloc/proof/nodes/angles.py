@@ -80,9 +80,10 @@ def atan_remainder(back: float, ahead: float, aside: float, bilinear: tuple[floa
 
 @compiled
 def vector_angles(left: float, right: float, down: float, up: float) -> tuple[float, float]:
-    """Return the least and greatest angle in a rectangle, radians; -pi and pi if it touches the cut or the origin.
+    """Return the least and greatest angle of the points of a rectangle, seen from the origin, radians.
 
-    The rectangle is [left, right] along the first axis and [down, up] along the second.
+    The rectangle is [left, right] along the first axis and [down, up] along the second. If it touches the origin or the
+    half-axis at which angles jump from pi to -pi, the results are -pi and pi.
     """
     if left <= 0.0 and down <= 0.0 <= up:
         return -pi, pi
@@ -152,7 +153,8 @@ def _flat_azimuth(
 def curve_azimuth(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
     """Bound the second derivatives of an azimuth over a box (see `optloc.proof.nodes.node`).
 
-    With gamma = radial + i around, the gradient is ``Im(gamma/(1+w))`` and the Hessian ``-Im(gamma gamma'/(1+w)^2)``.
+    The azimuth is the imaginary part of log z. With gamma the gradient of log z at the centre, the gradient of the
+    azimuth is ``Im(gamma/(1+w))`` and the Hessian ``-Im(gamma gamma'/(1+w)^2)``.
     """
     x, y, along, beside = horizontal_line(data, line, sense)
     h = triple_at(half, 0)
@@ -311,8 +313,8 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
     """Bound the second derivatives of an elevation over a box (see `optloc.proof.nodes.node`).
 
     The unit vectors along the line (a), upwards across it (b) and sideways (c) are mapped to search coordinates and
-    divided by the range. The gradient is b, and the Hessian is ``-(a b' + b a') - tan(elevation) c c'``. The frame
-    turns over the box.
+    divided by the range. The gradient is b, and the Hessian is ``-(a b' + b a') - tan(elevation) c c'``. The bounds
+    follow from bounds of the changes of a, b and c over the box.
     """
     bound_elevation(data, line, sense, half, turn)  # for its slope only: `turn` is overwritten below
     if is_zero_slope(turn):
@@ -353,7 +355,7 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
 def _swung(u: Triple, v: Triple, tangent: float, more: Triple, near: float, stretch: float) -> Triple:
     """Return bounds of the change of u when it turns towards v, changes further by `more`, and the range changes.
 
-    All triples are components along the search coordinates. For an angle whose tangent is at most `tangent`, ``u cos +
+    All triples are components along the search coordinates. If the tangent of an angle is at most `tangent`, ``u cos +
     v sin - u`` is at most ``tangent^2/2 |u| + tangent |v|``. With r' the range elsewhere in the box, `near` bounds r/r'
     and `stretch` bounds its difference from 1.
     """

@@ -117,7 +117,7 @@ def curve_others(kinds, data, centre, sense, half, line, second, nodes, curves):
             line[k] = centre[k] - data[j, k]
         own, turn = data[j], curves[j, TURN0 : TURN2 + 1]
 {cases}
-        # A slope of zero may stand for one that was not used: then the gradient is not that of the node.
+        # A slope may be zero because the bound does not use it. It is then not the gradient of the node.
         flat = nodes[j, SLOPE0] == 0.0 and nodes[j, SLOPE1] == 0.0 and nodes[j, SLOPE2] == 0.0
         curves[j, CHI] = inf if flat else chi
         column = 0

@@ -136,8 +136,8 @@ def normal_at(data: Array, line: Array) -> tuple[float, Triple, Triple, Triple, 
 def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
     """Bound a geodetic height over a box (see `optloc.proof.nodes.node`), metres.
 
-    Deep in the Earth the model's formula is not an exact height. There the height is between ``-|x| - a`` and
-    ``|x| - b``.
+    Deep in the Earth the model's formula is not an exact height. With x the position from the Earth's centre and a, b
+    the semi-axes of the ellipsoid, the height there is between ``-|x| - a`` and ``|x| - b``.
     """
     height, up, _, _, _ = normal_at(data, line)
     h = triple_at(half, 0)
@@ -156,12 +156,13 @@ def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Arr
 
 @compiled
 def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
-    """Bound the second derivatives of a geodetic height over a box (see `optloc.proof.nodes.node`).
+    """Bound the second derivatives of a geodetic height h over a box (see `optloc.proof.nodes.node`).
 
-    The Hessian is ``e e'/(N + h) + n n'/(M + h)`` with e east, n north, and M, N the radii of curvature of meridian
-    and prime vertical. Its derivative is at most 1.2 / (b^2/a + h)^2. The bound covers ``3 p q^2`` with
-    ``p^2 + q^2 = 1`` (1.155), for the turning normal and the stretching tangents, and ``3/2 e^2 (1 + e^2)`` (0.01),
-    for curvature that changes with latitude.
+    The Hessian is ``u u'/(N + h) + v v'/(M + h)``: u is east, v is north, and M and N are the radii of curvature of the
+    meridian and the prime vertical. With a and b the semi-axes of the ellipsoid and e its eccentricity, the derivative
+    of the Hessian is at most 1.2 / (b^2/a + h)^2. The factor 1.2 covers ``3 p q^2`` with ``p^2 + q^2 = 1`` (1.155), for
+    the turning normal and the stretching tangents. It also covers ``3/2 e^2 (1 + e^2)`` (0.01), for curvature that
+    changes with latitude.
     """
     height, up, east, north, sp = normal_at(data, line)
     h = triple_at(half, 0)

@@ -379,11 +379,11 @@ def range_hessian(
     Returns
     -------
     hessian : symmetric
-        ``sense' P sense / r``.
+        ``sense' P sense / r``, with P the projection across the line.
     turn : triple
-        Bound of the change of each component of the gradient.
+        Bound of the change of each component of the gradient over the box.
     change : float
-        Bound of the change of the Hessian.
+        Bound of the spectral norm of the change of the Hessian over the box.
     norm : float
         Trace of the Hessian, which bounds its norm.
     """

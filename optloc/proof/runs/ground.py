@@ -273,9 +273,9 @@ def curvature_bounds(ground: Ground, state: Array, half: Array) -> tuple[bool, f
 def errors_of(third: float) -> tuple[float, float]:
     """Return bounds of the errors of slopes and second derivatives, as norms over (q, w), from the third derivatives.
 
-    A first difference has an error of ``b3 h^2 / 6``. The error of a second difference is ``b3 h / 3`` along one
-    number, and ``(2 2^1.5 + 4) b3 h / 12`` along two. Four orthogonal numbers double the first error, and quadruple
-    the others.
+    With h the step, m, and b3 the bound of the third derivatives (`third`, 1/m^2), the error of a first difference is
+    ``b3 h^2 / 6``. The error of a second difference is ``b3 h / 3`` along one number, and ``(2 2^1.5 + 4) b3 h / 12``
+    along two. Four orthogonal numbers double the first error, and quadruple the others.
     """
     first = 2.0 * (third * _STEP * _STEP / 6.0 + _ROUNDED / _STEP)
     return first, 4.0 * (0.6 * third * _STEP + 4.0 * _ROUNDED / (_STEP * _STEP))

@@ -271,7 +271,7 @@ def prove_run(
     """Prove the claim of `optloc.proof.local_search.prove_locally` for a run; for arguments and result see there.
 
     If the cost stays finite at infinity, the search is over all space. Otherwise it is within a region, around a
-    surface, or within an enclosure of the level of the cost of few rows.
+    surface, or within an enclosure of all positions at which the few rows cost less than the level.
     """
     tables, D = tables_of(run), x.shape[0]
     chart, good = chart_on(run.look, x, tables.small, beside.planes, beside.surface)

@@ -130,8 +130,8 @@ def least_length(course: ConstantVelocityCost, table: StateTable, cost: float, c
 def sum_up(course: ConstantVelocityCost, table: StateTable, noise: float) -> tuple[float, float]:
     """Write gradient, Hessian and its first-order change; return bounds of the rest and of the gradient's rounding.
 
-    The method is `optloc.proof.runs.rows.sum_up_rows`, in units of the half-widths of the box. Nodes, Hessians of
-    nodes, residual and Jacobian must be set; `noise` is the rounding of a residual.
+    The method is `optloc.proof.runs.rows.sum_up_rows`, in the units `table.unit`. Nodes, Hessians of nodes, residual
+    and Jacobian must be set; `noise` bounds the rounding of a residual.
     """
     rows, sheet, lines, pulls, n = course.rows, table.sheet, table.lines, table.pulls, table.at.shape[0]
     multiply_transposed(rows, sheet.residual, sheet.force)

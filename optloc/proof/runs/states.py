@@ -363,7 +363,7 @@ def _pull_back(curve: Array, lever: Array, out: Array) -> None:
 
 @compiled
 def _carry_beside(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
-    """Write the positions over ground beside the centre, from which second derivatives are computed as differences."""
+    """Write the positions over ground around the centre, from which second derivatives are computed as differences."""
     state = np.zeros(STATE)
     for i in range(STATE):
         state[i] = axes.origin[i]

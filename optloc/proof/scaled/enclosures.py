@@ -202,11 +202,11 @@ def _meet_balls(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: A
 
 @compiled
 def _meet_differences(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
-    """Write the corners of a box around stations with two waves of one emission time; return False without any.
+    """Write the corners of a box around stations that receive two waves of one emission.
 
-    The difference of both arrivals is the range times the difference of the factors. The null space of K'K is the
-    vector of ones, and differences of nodes do not depend on it. So a multiple of its square is added, which makes K'K
-    regular.
+    Return False without these stations. The difference of both arrivals is the range times the difference of the
+    factors. The null space of K'K is the vector of ones, and differences of nodes do not depend on it. So a multiple of
+    its square is added, which makes K'K regular.
     """
     cost, found = scaled.cost, False
     R, J, rho, size = cost.A.copy(), cost.kinds.shape[0], np.sqrt(level), 0.0
@@ -238,10 +238,11 @@ def _meet_differences(scaled: Scaled, chart: LocalAxes, x: Array, level: float, 
 def _meet_field(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
     """Write the corners of a box outside which levels with a free exponent cost too much; or return False.
 
-    Let all stations s_j be within D/2 of their middle. For a position at distance D in direction u, ``log r_j`` is
-    ``log D - u.s_j / D`` within ``(s_j / D)^2``. With ``q = k u / D`` and ``M = K s``, the residual is ``w + M q``
-    within |q| B / D, where B is the sum of ``|K_j| s_j^2``. Let r be the length of the residual of the best field, and
-    m the least singular value of M. For ``D > B (|w| + r) / (m (r - rho))`` each q leaves a residual longer than rho.
+    Let the stations s_j, counted from their middle, be closer to it than D/2, and let k be the exponent. For a position
+    at distance D in direction u, ``log r_j`` is ``log D - u.s_j / D`` within ``(s_j / D)^2``. With ``q = k u / D`` and
+    ``M = K s``, the residual is ``w + M q`` within |q| B / D, where B is the sum of ``|K_j| s_j^2``. Let r be the
+    length of the residual of the best q, and m the least singular value of M. For ``D > B (|w| + r) / (m (r - rho))``
+    each q leaves a residual longer than rho.
     """
     cost, J, rho = scaled.cost, scaled.cost.kinds.shape[0], np.sqrt(level)
     d, middle, widest, bend, whole = x.shape[0], np.zeros(3), 0.0, 0.0, 0.0

@@ -416,8 +416,8 @@ def _narrow(free: bool, sheet: ScaledWorkspace, blur: float) -> bool:
 def _solve_swing(free: bool, sheet: ScaledWorkspace, blur: float) -> bool:
     """Bound the greatest factors by ``(1 - N) k <= best + reach``; return False if there is no solution k >= 0.
 
-    If factors may be negative, k are their sizes. If all pivots are positive, the inverse of 1 - N has no negative
-    entry (an M-matrix). The elimination has no pivoting.
+    N is `sheet.fall`. If factors may be negative, k are their sizes. If all pivots are positive, the inverse of 1 - N
+    has no negative entry (an M-matrix). The elimination has no pivoting.
     """
     G, most = sheet.best.shape[0], sheet.most
     matrix, right = sheet.cross, sheet.reach  # unused memory

@@ -148,9 +148,10 @@ def largest_rate(problem: Problem) -> float:
 def velocity_costs(problem: Problem) -> ScaledCosts:
     """Return the costs of a flat batch of problems of a target of unknown velocity at one epoch.
 
-    Rates are linear in the velocity, whose components are factors of the components of unit vectors. An orthogonal
-    transform of the rows removes these components from the last rows, which bound the position at every velocity. The
-    factors are in units of the largest rate, so that bounds of rounding do not depend on the unit of length.
+    Rates are linear in the velocity: its components are the factors, and they multiply components of unit vectors from
+    the stations. An orthogonal transform of the rows removes the factors from the last rows, which bound the position
+    at every velocity. The factors are in units of the largest rate, so that bounds of rounding do not depend on the
+    unit of length.
     """
     costs, group = costs_of_velocity(problem)
     w, d, speed = costs.w, problem.dimension, largest_rate(problem)

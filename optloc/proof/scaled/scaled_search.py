@@ -69,7 +69,7 @@ from optloc.proof.space import Space, floor_of, in_atlas, set_box, set_curves, s
 class ScaledTables(NamedTuple):
     """Working memory of a search.
 
-    `box` is a box of the atlas and `sheet` its reduced rows, `near` is a box around a position, and `look` has rows
+    `box` is a box of the atlas, and `sheet` its reduced rows. `near` is a box around a position, and `look` has rows
     without factors (see `look_at`).
     """
 
