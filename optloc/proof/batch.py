@@ -124,8 +124,8 @@ def prove_all(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
     for first in range(0, n, FEW):
         # If compiled code becomes available meanwhile, it continues with the rest.
         last = n if first > 0 and may_use_code(_loop, n) else min(first + FEW, n)
-        some = slice(first, last)
-        parts.append((_prove if last - first > FEW else _prove_few)(costs.take(some), asked.take(some)))
+        part = slice(first, last)
+        parts.append((_prove if last - first > FEW else _prove_few)(costs.take(part), asked.take(part)))
         if last == n:
             break
     return parts[0] if len(parts) == 1 else ProofResult(*map(np.concatenate, zip(*parts, strict=True)))

@@ -195,7 +195,7 @@ def search_minima(
         if far:
             size = push_faces(stack, d)
         else:
-            size = push_around(stack, 0, corners[0], corners[1], np.zeros(3), 0)
+            size = push_around(stack, 0, corners[0], corners[1], np.zeros(3), 0)  # no hole
             space = _with_known(cost, space, near, aim, corners, count)
         count, more = _search(cost, space, box, near, aim, corners, stack, size, most, count)
         boxes += more
@@ -335,6 +335,7 @@ def _cut(cost: Cost, space: Space, box: Box, level: float, here: float) -> int:
 def _with_known(cost: Cost, space: Space, near: Box, aim: SearchGoal, corners: Array, count: int) -> Space:
     """Return search coordinates with the known minima and convex boxes around them, which the search leaves out."""
     known = KnownMinima(aim.points[:count], 0, aim.planes, aim.surface)
+    # No margin of convexity, no least cost, and no fix among the minima.
     minima, sides, number, _ = known_minima(cost, space.chart, near, known, corners[0], corners[1], 0.0, -inf, False)
     return Space(False, space.atlas, space.chart, minima[:number], sides[:number])
 

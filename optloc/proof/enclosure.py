@@ -397,7 +397,7 @@ def _span(back: Array, axes: Array, turned: Array) -> int:
         length = 0.0
         for m in range(3):
             axes[k, m] = back[k, m]
-        for _ in range(2):  # twice is exact (Parlett)
+        for _ in range(2):  # twice is exact (Parlett 1980)
             for other in range(k):
                 along = axes[k, 0] * axes[other, 0] + axes[k, 1] * axes[other, 1] + axes[k, 2] * axes[other, 2]
                 for m in range(3):

@@ -273,6 +273,7 @@ def lay_or_halve(cost: Cost, chart: LocalAxes, box: Box, stack: Array, size: int
         return -1
     first = (sense[0, 0] * sense[0, 0] + sense[1, 0] * sense[1, 0] + sense[2, 0] * sense[2, 0]) * half[0] * half[0]
     second = (sense[0, 1] * sense[0, 1] + sense[1, 1] * sense[1, 1] + sense[2, 1] * sense[2, 1]) * half[1] * half[1]
+    # Without a bound of the parent box, in piece 0, and with rounding of the halves.
     return push_halves(stack, size, 0 if first >= second else 1, box.at, half, 0.0, 0, False)
 
 

@@ -240,8 +240,8 @@ def mark_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
     size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
     # Relative to the lengths of both columns: relative to a long column alone, any coupling of a short column would
     # vanish.
-    across = size[..., :, None] * size[..., None, :]
-    alone = (np.abs(information) <= _ORTHOGONAL * across + across * np.eye(len(kinds)) * 2.0).all(-1)
+    scale = size[..., :, None] * size[..., None, :]
+    alone = (np.abs(information) <= _ORTHOGONAL * scale + scale * np.eye(len(kinds)) * 2.0).all(-1)
     return mark_nodes(kinds, data, alone, size, (np.swapaxes(K, -1, -2) @ w[..., None])[..., 0], w)
 
 
@@ -529,11 +529,11 @@ def _without_other_unknowns(
     if used.any():
         # A prior is a row for the unknown itself; an unknown without a prior has a row of zeros.
         size = max(len(geometry), len(precision))
-        tail = np.zeros((size, coefficients.shape[1], J + coefficients.shape[1]))
-        tail[..., J:] = roots(precision)
-        geometry = np.concatenate([np.broadcast_to(geometry, (size, *geometry.shape[1:])), tail], axis=1)
-        none = np.zeros((len(measured), coefficients.shape[1], measured.shape[-1]))
-        measured = np.concatenate([measured, none], axis=1)
+        prior_rows = np.zeros((size, coefficients.shape[1], J + coefficients.shape[1]))
+        prior_rows[..., J:] = roots(precision)
+        geometry = np.concatenate([np.broadcast_to(geometry, (size, *geometry.shape[1:])), prior_rows], axis=1)
+        zeros = np.zeros((len(measured), coefficients.shape[1], measured.shape[-1]))
+        measured = np.concatenate([measured, zeros], axis=1)
         unknowns = geometry[..., J:]
         geometry, measured = project_out(unknowns, geometry[..., :J]), project_out(unknowns, measured)
     return geometry[..., :J], np.ascontiguousarray(measured[0].T) if shared else measured[..., 0]
@@ -581,14 +581,14 @@ def turned_level(problem: Problem, others: OtherRows, known: Array) -> Array:
     if biased.any():
         covariance = np.linalg.pinv(others.precision, hermitian=True)
         variance = variance + np.einsum("rn,bnm,rm->br", coefficients, covariance, coefficients)
-    counted = counts_from_measured(problem)[rows]
+    relative = counts_from_measured(problem)[rows]
     most, turn = _of_rows(problem, _greatest_size)[rows], period[rows]
     # Distance from the measured value to the farthest value of the node. Beyond half a turn the residual is the
     # shorter way.
-    size = np.where(counted, 0.0, np.abs(known[:, rows]))
-    apart = turn - most - size
-    able = biased | (~counted & (size >= 0.5 * turn - most))
-    return np.asarray(np.where(able, apart * np.abs(apart) / variance, np.inf).min(1))
+    size = np.where(relative, 0.0, np.abs(known[:, rows]))
+    distance = turn - most - size
+    may_turn = biased | (~relative & (size >= 0.5 * turn - most))
+    return np.asarray(np.where(may_turn, distance * np.abs(distance) / variance, np.inf).min(1))
 
 
 def _greatest_size(model: Model) -> float:

@@ -173,7 +173,7 @@ def _halve(cost: Cost, space: Space, box: Box, level: float, most: int, lists: A
         for i in range(size):
             fate, piece = _look(cost, space, box, lists[0], i, level, floor), int(lists[0, i, PIECE])
             if fate == _IN or (last and fate != _OUT):
-                count = push(lists[2], count, box.at, box.half, 0.0, piece)
+                count = push(lists[2], count, box.at, box.half, 0.0, piece)  # subpavings use no bound of a parent
             elif fate == _SMALLER:
                 following = push(lists[1], following, box.at, box.half, 0.0, piece)
             elif fate == _ACROSS:

@@ -317,7 +317,7 @@ def _set_axis(axes: Array, k: int, start: tuple[float, float, float]) -> float:
     length = 0.0
     for m in range(3):
         axes[m, k] = start[m]
-    for _ in range(2):  # twice is exact (Parlett)
+    for _ in range(2):  # twice is exact (Parlett 1980)
         for other in range(k + 1, 3):
             along = axes[0, k] * axes[0, other] + axes[1, k] * axes[1, other] + axes[2, k] * axes[2, other]
             for m in range(3):

@@ -284,6 +284,7 @@ def prove_run(
     if not eps <= most:
         return COARSE, 0, -inf
     level = least + kappa if kappa > 0.0 else least - eps
+    # The search of a run does not read the last two fields, the numbers of minima that do not count.
     aim = Goal(level, least - eps, least - 0.5 * eps, beside.hidden == 0 and isnan(lower[0]), 0, 0)
     task = ProofTask(x, beside, aim, eps, budget, found)
     if far:
@@ -406,18 +407,18 @@ def prove_runs(costs: Runs, asked: ProofRequest) -> ProofResult:
     Plain Python would take a second for ten boxes. Without compiled code no box is searched.
     """
     n, d = asked.x.shape
-    verdict, boxes, bound, whole = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.ones(n, np.bool_)
+    verdict, boxes, bound, everywhere = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.ones(n, np.bool_)
     found, asked = np.full((n, d), np.nan), ProofRequest(*(plainly(array) for array in asked))
 
     def prove(i: int) -> None:
         """Write the result of proof i: for the requested region, then, if that region is open, for the fallback."""
         others = asked.others[i, : asked.known[i]]
-        beside = KnownMinima(others, int(asked.hidden[i]), asked.planes[i], asked.surface[i])
+        known = KnownMinima(others, int(asked.hidden[i]), asked.planes[i], asked.surface[i])
         for corners in (asked.region[i], asked.fallback[i]):
             verdict[i], boxes[i], bound[i] = prove_run(
                 costs.runs[i],
                 asked.x[i],
-                beside,
+                known,
                 asked.gaps[i, 0],
                 asked.eps[i],
                 int(asked.budget[i]),
@@ -425,15 +426,15 @@ def prove_runs(costs: Runs, asked: ProofRequest) -> ProofResult:
                 corners[1],
                 found[i],
             )
-            whole[i] = np.isnan(corners[0, 0])
-            if verdict[i] != OPEN or not whole[i]:
+            everywhere[i] = np.isnan(corners[0, 0])
+            if verdict[i] != OPEN or not everywhere[i]:
                 break
 
     if may_use_code(prove_run, n):
         map_on_threads(prove, range(n))
     else:
         verdict[:], bound[:] = BUDGET, -inf
-    return without_rivals(verdict, boxes, bound, whole, asked, found)
+    return without_rivals(verdict, boxes, bound, everywhere, asked, found)
 
 
 def runs_lack_code(costs: Runs | CourseCosts, count: int) -> bool:
@@ -471,15 +472,15 @@ def prove_courses(costs: CourseCosts, asked: ProofRequest) -> ProofResult:
         state, others, corners = asked.x[i], asked.others[i, : asked.known[i]], asked.region[i]
         if over_ground(ground):
             state, others, corners = state_on(ground, state), state_on(ground, others), corners_on(ground, corners)
-        state, another = plainly(state), np.full(STATE, np.nan)
+        state, found_state = plainly(state), np.full(STATE, np.nan)
         axes = axes_of(hessian_of_state(whole, state), state, plainly(corners))
         if axes is None:
             verdict[i] = STATIONARY
             return
         verdict[i], boxes[i], bound[i] = prove_course(
-            whole, few, axes, plainly(others), asked.gaps[i, 0], asked.eps[i], int(asked.budget[i]), another
+            whole, few, axes, plainly(others), asked.gaps[i, 0], asked.eps[i], int(asked.budget[i]), found_state
         )
-        found[i] = state_off(ground, another) if over_ground(ground) else another
+        found[i] = state_off(ground, found_state) if over_ground(ground) else found_state
 
     if may_use_code(prove_course, n):
         map_on_threads(prove, range(n))

@@ -132,7 +132,7 @@ def multiply_transposed(rows: RunRows, values: Array, out: Array) -> None:
 @compiled
 def project_out_unknowns(rows: RunRows, values: Array) -> None:
     """Subtract from values (q,) their part that the other unknowns can explain."""
-    for _ in range(2):  # twice is exact (Parlett)
+    for _ in range(2):  # twice is exact (Parlett 1980)
         for k in range(rows.basis.shape[0]):
             along, own = 0.0, rows.basis[k]
             for i in range(values.shape[0]):

@@ -143,14 +143,14 @@ def _run_cost(problem: Problem) -> tuple[RunCost, float]:
     kinds = np.array(nodes.kinds)
     value = np.where(counts_from_measured(problem), 0.0, known)[0]
     prior = _rows_of_single_nodes(priors, len(kinds))
-    whole = _WhitenedRows.of(problem, usable[0], nodes, others, value, prior)
-    data = whole.marked(kinds, nodes.numbers[:1])
-    few = _WhitenedRows.of(problem, usable[0] & _are_few(problem, len(kinds)), nodes, others, value, prior)
-    used = np.bincount(few.nodes.indices, minlength=len(kinds)) > 0
-    dense = project_out(few.unknowns, np.column_stack([few.nodes[:, used].toarray(), few.measured]))
-    present = (dense != 0.0).any(1)
-    look = cost_of(kinds[used], plainly(data[used]), plainly(dense[present, :-1]), plainly(dense[present, -1]))
-    rows = whole.rows()
+    all_rows = _WhitenedRows.of(problem, usable[0], nodes, others, value, prior)
+    data = all_rows.marked(kinds, nodes.numbers[:1])
+    few_rows = _WhitenedRows.of(problem, usable[0] & _are_few(problem, len(kinds)), nodes, others, value, prior)
+    used = np.bincount(few_rows.nodes.indices, minlength=len(kinds)) > 0
+    dense = project_out(few_rows.unknowns, np.column_stack([few_rows.nodes[:, used].toarray(), few_rows.measured]))
+    nonzero = (dense != 0.0).any(1)
+    look = cost_of(kinds[used], plainly(data[used]), plainly(dense[nonzero, :-1]), plainly(dense[nonzero, -1]))
+    rows = all_rows.rows()
     none = np.empty((0, len(kinds)))
     cost = Cost(kinds, plainly(data), none, rows.w, np.empty((0, 0)), rows.weight, empty_groups(0))
     return RunCost(cost, rows, look), float(turned_level(problem, others, known)[0])

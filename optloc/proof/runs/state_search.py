@@ -417,6 +417,7 @@ def prove_course(
     if not eps <= most:
         return COARSE, 0, -inf
     level = least + kappa if kappa > 0.0 else least - eps
+    # The search of states does not read the last three fields.
     aim = Goal(level, least - eps, least - 0.5 * eps, False, 0, 0)
     known, place = zero(), x.copy()
     for p in range(1 + (others.shape[0] if kappa > 0.0 else 0)):

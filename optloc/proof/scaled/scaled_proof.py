@@ -104,12 +104,12 @@ class ScaledCosts(NamedTuple):
 def scaled_costs(problem: Problem) -> ScaledCosts:
     """Return the costs of a flat batch of problems whose rows have unknown factors, see `optloc.proof.scope`."""
     costs, group = costs_of_groups(problem, factors_of_rows(problem))
-    root, known = _factor_priors(problem, len(costs.w))
-    G, (rows, J) = len(root), costs.K.shape[1:]
+    inverse_sigma, means = _factor_priors(problem, len(costs.w))
+    G, (rows, J) = len(inverse_sigma), costs.K.shape[1:]
     K = np.concatenate([costs.K, np.zeros((len(costs.K), G, J))], axis=1)
     lift = np.zeros((rows + G, G))
-    lift[rows + np.arange(G), np.arange(G)] = root
-    w = np.concatenate([costs.w, root * known], axis=1)
+    lift[rows + np.arange(G), np.arange(G)] = inverse_sigma
+    w = np.concatenate([costs.w, inverse_sigma * means], axis=1)
     return ScaledCosts(plainly(costs.kinds), costs.data, K, w, costs.level, lift[None], plainly(group))
 
 
@@ -118,15 +118,15 @@ def _factor_priors(problem: Problem, count: int) -> tuple[Array, Array]:
 
     `count` is the number N of problems. A mean is 1 plus the mean of the scale error.
     """
-    root, known = [], []
-    given = {name: (mean, precision) for name, mean, precision in prior_parts(problem)}
+    inverse_sigma, means = [], []
+    priors = {name: (mean, precision) for name, mean, precision in prior_parts(problem)}
     for bias in problem.biases:
         if form_of(bias).enters == "scales":
             n = len(bias.members)
-            mean, precision = given.get(bias.name, (np.zeros(n), np.zeros((n, n))))
-            root.append(np.sqrt(np.diagonal(precision, axis1=-2, axis2=-1).reshape(-1, n)[0]))
-            known.append(np.broadcast_to(1.0 + mean, (count, n)))
-    return np.concatenate(root), np.concatenate(known, axis=1)
+            mean, precision = priors.get(bias.name, (np.zeros(n), np.zeros((n, n))))
+            inverse_sigma.append(np.sqrt(np.diagonal(precision, axis1=-2, axis2=-1).reshape(-1, n)[0]))
+            means.append(np.broadcast_to(1.0 + mean, (count, n)))
+    return np.concatenate(inverse_sigma), np.concatenate(means, axis=1)
 
 
 # Share of the longest column below which entries are rounding, in rows without a velocity: whitening loses some
@@ -157,16 +157,16 @@ def velocity_costs(problem: Problem) -> ScaledCosts:
     w, d, speed = costs.w, problem.dimension, largest_rate(problem)
     K = np.where(group >= 0, speed, 1.0) * costs.K
     basis, size, _ = np.linalg.svd(K[:, :, group >= 0])
-    back = np.swapaxes(basis, -1, -2)
-    K, w = back @ K, (back @ w[..., None])[..., 0]
+    transform = np.swapaxes(basis, -1, -2)
+    K, w = transform @ K, (transform @ w[..., None])[..., 0]
     rank = int((size > _NOTHING * size.max(initial=0.0)).sum(-1).max(initial=0))
     K[:, rank:, group >= 0] = 0.0
     length = np.linalg.norm(K, axis=1, keepdims=True)
     K[:, rank:] = np.where(np.abs(K[:, rank:]) > _NOTHING * length, K[:, rank:], 0.0)
     order = np.argsort(~K[:, rank:].any((0, 1)), kind="stable")
-    known = [(roots(precision), mean) for name, mean, precision in prior_parts(problem) if name == "velocity"]
+    priors = [(roots(precision), mean) for name, mean, precision in prior_parts(problem) if name == "velocity"]
     lift = np.zeros((1, K.shape[1], d))
-    for root, mean in known:
+    for root, mean in priors:
         whole = speed * (root if root.ndim == 3 else root[None])
         lift = np.concatenate([np.zeros((len(whole), K.shape[1], d)), whole], axis=1)
         K = np.concatenate([K, np.zeros((len(K), d, K.shape[2]))], axis=1)
