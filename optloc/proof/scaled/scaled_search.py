@@ -378,10 +378,8 @@ def _bound_row(work: ScaledSearchWorkspace, space: Space, stack: Array, row: int
 
 @compiled
 def _side_of_rest(work: ScaledSearchWorkspace, space: Space, touching: bool, rho: float, sound: bool) -> int:
-    """Contract a box and return the side across which to halve the rest; -1 if no part remains.
-
-    This is `optloc.proof.level_search.side_of_rest` for a cost with unknown factors.
-    """
+    # Contracts a box and returns the side across which to halve the rest; -1 if no part remains. This is
+    # `optloc.proof.level_search.side_of_rest` for a cost with unknown factors.
     scaled, box, sheet, d = work.scaled, work.box, work.tables.sheet, space.atlas.dimension
     if not is_bounded(sheet):
         return _side_of_rows(work, rho, d)
