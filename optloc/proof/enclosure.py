@@ -184,8 +184,9 @@ def _rows(
 ) -> tuple[int, bool]:
     """Write the coefficients of the squared rows of a group; return their number, and whether any is a range.
 
-    An error e changes a row by ``e (first + second r_p + third e)``. For the arguments see `around_squares`; columns of
-    `ties` are written.
+    Stations are counted from the station of the reference, or from the first station without a reference. An error e
+    changes a row by ``e (first + second r_p + third e)``. For the arguments see `around_squares`; columns of `ties` are
+    written.
     """
     origin, count, ranges = reference, 0, False
     for j in member:

@@ -213,7 +213,8 @@ def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Goal, eno
 def _follow(cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array, aim: Goal) -> int:
     """Descend from the centre of a box to a minimum; return CHEAPER, or ANOTHER for an unknown minimum, or CLEAR.
 
-    Afterwards the box is the minimum. After CLEAR, centre and half-widths are restored, but not the tables.
+    CHEAPER means that the minimum costs less than `aim.better`, and ANOTHER that it costs less than `aim.level`. The
+    centre of the box is then at the minimum. After CLEAR, centre and half-widths are restored, but not the tables.
     """
     at, half = box.at.copy(), box.half.copy()
     least = descend(cost, chart, box)

@@ -290,7 +290,10 @@ class PositionCosts(NamedTuple):
 
     @property
     def dense(self) -> float:
-        """Return the number of nodes; the time of a box is proportional to its square."""
+        """Return the weight of a box in the budget of boxes: the number of nodes.
+
+        The time of a box grows with the square of this number.
+        """
         return float(len(self.kinds))
 
     def take(self, items: Array | slice) -> PositionCosts:

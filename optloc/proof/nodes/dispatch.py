@@ -174,7 +174,7 @@ def curve_pieces(atlas, kinds, data, half, nodes, curves):
 
 
 def _near_case(node: Node, code: int, call: str) -> list[str]:
-    """Return the source lines that bound or curve a node over a box in search coordinates around a fix.
+    """Return the source lines that call `bound` or `curve` of a node over a box in search coordinates around a fix.
 
     `call` is a template of the call, with gaps for the code of the node and for the arguments that contain its lines.
     """
@@ -185,7 +185,7 @@ def _near_case(node: Node, code: int, call: str) -> list[str]:
 
 
 def _far_case(node: Node, code: int, call: str) -> list[str]:
-    """Return the source lines that bound or curve a node over a box of an atlas; for `call` see `_near_case`.
+    """Return the source lines that call `bound` or `curve` of a node over a box of an atlas; `call` as in `_near_case`.
 
     The list is empty if the node does not work with scaled lines.
     """

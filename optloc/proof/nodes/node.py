@@ -274,7 +274,7 @@ def largest_row_value(matrix: Array, k: int, h: Triple) -> float:
 def product(u: Triple, v: Triple, h: Triple) -> tuple[float, float]:
     """Return an enclosure (least, greatest) of ``(u.s)(v.s)`` over the box with half-widths h.
 
-    The terms in squares s_k^2 are bounded with their sign; they are never negative.
+    A square s_k^2 is between 0 and h_k^2, so its term has a known sign. This makes the enclosure tighter.
     """
     low = high = 0.0
     for k in range(3):

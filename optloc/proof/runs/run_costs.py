@@ -89,9 +89,9 @@ class Runs:
 
     @property
     def dense(self) -> float:
-        """Return the number of dense nodes that a box of this run counts as in the budget of boxes.
+        """Return the weight of a box in the budget of boxes, as a number of dense nodes.
 
-        A larger number gives a smaller budget. Long runs take fewer boxes than short ones, so the number grows only
+        A larger number gives a smaller budget. Long runs take fewer boxes than short runs, so the number grows only
         with a root of the time for a box.
         """
         return float(_DENSE * max(1.0, len(self.runs[0].cost.kinds) / _LONG) ** 0.25)
@@ -176,7 +176,7 @@ class CourseCosts:
 
     @property
     def dense(self) -> float:
-        """Return the number of dense nodes that a box counts as in the budget of boxes (see `Runs.dense`)."""
+        """Return the weight of a box in the budget of boxes, as a number of dense nodes (see `Runs.dense`)."""
         return float(_DENSE)
 
     def take(self, items: Array | slice) -> CourseCosts:

@@ -331,7 +331,10 @@ def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) 
 
 @inlined
 def _bound_by_priors(scaled: Scaled, rho: float, sheet: ScaledWorkspace) -> None:
-    """Narrow the ranges of the factors by the rows of priors: the last rows, one for each factor."""
+    """Narrow the ranges of the factors by the rows of priors: the last rows, one for each factor.
+
+    The residual of each of these rows is at most rho.
+    """
     lift, w = scaled.lift, scaled.cost.w
     q, G = lift.shape
     for g in range(G):

@@ -78,10 +78,9 @@ class ScaledCosts(NamedTuple):
 
     @property
     def dense(self) -> float:
-        """Return the number of nodes that counts for the budget of boxes.
+        """Return the weight of a box in the budget of boxes: the number of nodes.
 
-        The time of a box is proportional to its square. With an unknown velocity (`free`) it is at most
-        `_MOST_COUNTED`.
+        The time of a box grows with its square. With an unknown velocity (`free`) it is at most `_MOST_COUNTED`.
         """
         return float(min(len(self.kinds), _MOST_COUNTED if self.free else len(self.kinds)))
 
@@ -102,7 +101,10 @@ class ScaledCosts(NamedTuple):
 
 
 def scaled_costs(problem: Problem) -> ScaledCosts:
-    """Return the costs of a flat batch of problems whose rows have unknown factors, see `optloc.proof.scope`."""
+    """Return the costs of a flat batch of problems whose rows have unknown factors, see `optloc.proof.scope`.
+
+    The priors on the factors are the last G rows.
+    """
     costs, group = costs_of_groups(problem, factors_of_rows(problem))
     inverse_sigma, means = _factor_priors(problem, len(costs.w))
     G, (rows, J) = len(inverse_sigma), costs.K.shape[1:]
