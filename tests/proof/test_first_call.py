@@ -87,7 +87,7 @@ def test_who_ran_out_of_few_boxes_goes_on(monkeypatch):
 
     monkeypatch.setattr(batch, "_prove", proved)
     monkeypatch.setattr(batch, "enabled", lambda: True)
-    monkeypatch.setattr(batch, "usable", lambda kernel, count: True)
+    monkeypatch.setattr(batch, "may_use_code", lambda kernel, count: True)
     n = 3
     asked = batch.ProofRequest(*(np.zeros((n, 2)) for _ in batch.ProofRequest._fields))._replace(
         budget=np.array([3000, 3000, 60])
