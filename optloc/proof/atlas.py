@@ -9,7 +9,9 @@ A position is ``x = m + R p / v``, with m the centre and R half the side of a cu
   minimum. Home coordinates u and coordinates s of the piece are related by ``u = start + axes s``. On a face, v
   changes along the last axis only.
 
-The line to a station at ``m + R a`` is ``p - v a``, times R/v.
+D is 2 or 3. The line to a station at ``m + R a`` is ``p - v a``, times R/v. A box of a piece has a centre `at` and
+half-widths `half` (3,) in the coordinates of the piece; `set_centre` computes p and v of its centre. The boxes around a
+minimum have coordinates in standard deviations.
 """
 
 from __future__ import annotations
@@ -106,7 +108,7 @@ def atlas_of(middle: Array, radius: float, dimension: int, count: int) -> Atlas:
 
 @compiled
 def with_minima(middle: Array, radius: float, dimension: int, minima: AtlasMinima) -> Atlas:
-    """Return the pieces around a cube and around known minima."""
+    """Return the pieces around a cube (centre `middle` (3,), half-width `radius`, m) and around known minima."""
     # One array for all vectors and one for all matrices: each fix needs an atlas, and allocations take time.
     vectors, matrices = np.zeros((3, 3)), np.zeros((5, 3, 3))
     return Atlas(
@@ -129,7 +131,7 @@ def with_minima(middle: Array, radius: float, dimension: int, minima: AtlasMinim
 
 @compiled
 def first_minima(minima: AtlasMinima, count: int) -> AtlasMinima:
-    """Return views of the first `count` minima."""
+    """Return views of the first `count` minima: the arrays have space for more minima than were written."""
     return AtlasMinima(
         minima.home[:count],
         minima.start[:count],
@@ -188,6 +190,7 @@ def set_centre(atlas: Atlas, piece: int, at: Array) -> None:
 
 @compiled
 def _set_home(atlas: Atlas, home: int) -> None:
+    # Writes p, v and their derivatives; `place` and `linear` are home coordinates, `home` is a face or the inside.
     d, place, linear, scale, slant = atlas.dimension, atlas.place, atlas.linear, atlas.scale, atlas.slant
     column = 0
     for k in range(d):
@@ -217,7 +220,10 @@ def piece_of(atlas: Atlas, x: Array, u: Array) -> int:
 
 @compiled
 def coordinates_on(atlas: Atlas, home: int, x: Array, u: Array) -> bool:
-    """Write the coordinates u (3,) of a position x (D,) on a face or inside; return False if x has none there."""
+    """Write the coordinates u (3,) of a position x (D,), metres, on the face `home` or inside.
+
+    Return False if the position has none: the face is on the other side of the centre of the cube.
+    """
     d, v, column = atlas.dimension, 1.0, 0
     u[:] = 0.0
     if home < 2 * d:
@@ -249,7 +255,10 @@ _PLACED = 8.0 * 2.0**-52
 
 @compiled
 def widen_around(atlas: Atlas, i: int, half: Array) -> None:
-    """Widen a box of the piece around minimum i by the rounding of its centre."""
+    """Widen the half-widths `half` (3,) of a box of the piece around minimum i by the rounding of its centre.
+
+    So the computed bounds are valid for the exact box.
+    """
     for k in range(atlas.dimension):
         for m in range(atlas.dimension):
             half[k] += _PLACED * abs(atlas.minima.back[i, k, m])
@@ -257,9 +266,10 @@ def widen_around(atlas: Atlas, i: int, half: Array) -> None:
 
 @compiled
 def infinity_coordinate(atlas: Atlas, piece: int) -> float:
-    """Return the last coordinate of infinity in a piece, or -inf if the last coordinate alone does not reach infinity.
+    """Return the last coordinate of infinity (v = 0) in a piece.
 
-    Around a minimum the result is slightly beyond infinity, where v rounds to zero.
+    The result is -inf if the last coordinate alone does not reach infinity. Around a minimum the result is slightly
+    beyond infinity, where v rounds to zero.
     """
     d, around = atlas.dimension, piece - 2 * atlas.dimension - 1
     if around < 0 or atlas.minima.home[around] == 2 * d:
@@ -272,7 +282,11 @@ def infinity_coordinate(atlas: Atlas, piece: int) -> float:
 
 @compiled
 def is_near_minimum(atlas: Atlas, half: Array, i: int) -> tuple[bool, bool]:
-    """Return whether the current box is inside the convex box of minimum i, and whether it is inside its core."""
+    """Return whether the current box is inside the convex box of minimum i, and whether it is inside its core.
+
+    The current box has its centre in the working memory of the atlas (`set_centre`) and half-widths `half` (3,). The
+    search leaves these boxes out: the first contains no second minimum, and the second is searched along other axes.
+    """
     minima, d = atlas.minima, atlas.dimension
     if minima.home[i] != atlas.place[0]:
         return _within_from_another(atlas, half, i), False
@@ -300,8 +314,9 @@ def is_near_minimum(atlas: Atlas, half: Array, i: int) -> tuple[bool, bool]:
 def _within_from_another(atlas: Atlas, half: Array, i: int) -> bool:
     """Return whether a box around the current centre is inside the convex box of a minimum that has another home.
 
-    Sums of its home coordinates are quotients N/D of linear functions of the box's coordinates. Their difference from
-    the value q at the centre is ``(dN - q dD) / D'``.
+    Coordinates of the box around minimum i are sums of its home coordinates. As functions of the box's coordinates they
+    are quotients N/D of linear functions. At a point of the box with denominator D', their difference from the value q
+    at the centre is ``(dN - q dD) / D'``.
     """
     minima, d, home = atlas.minima, atlas.dimension, int(atlas.minima.home[i])
     level, face = home // 2, home < 2 * d
@@ -334,7 +349,10 @@ def _within_from_another(atlas: Atlas, half: Array, i: int) -> bool:
 
 @inlined
 def _column(m: int, level: int, face: bool, d: int) -> int:
-    """Return the component of p for coordinate m of a home, or -1 for v; a face omits its constant component."""
+    """Return the component of p for coordinate m of a home, or -1 for v.
+
+    A face (`face`) omits its constant component `level`, and its last coordinate is v. The dimension is d.
+    """
     if not face:
         return m
     if m == d - 1:
@@ -372,7 +390,7 @@ class AtlasFrame(NamedTuple):
 
 @inlined
 def frame_of(atlas: Atlas) -> AtlasFrame:
-    """Return the position of the centre that `set_centre` has set, as plain numbers."""
+    """Return the position of the current centre (`set_centre`) as plain numbers, which calls pass on faster."""
     slant = (triple_at(atlas.slant[0], 0), triple_at(atlas.slant[1], 0), triple_at(atlas.slant[2], 0))
     point, rise = triple_at(atlas.point, 0), triple_at(atlas.scale, 1)
     return AtlasFrame(
@@ -435,7 +453,7 @@ def contract_to_corners(atlas: Atlas, origin: Array, back: Array, corners: Array
 
 @inlined
 def _station(frame: AtlasFrame, data: Array, first: int) -> Triple:
-    """Return the station a at data[first:first + 3], relative to the centre and in half sides of the cube."""
+    """Return the station a at data[first:first + 3], relative to the centre and in half sides of the cube (no unit)."""
     m0, m1, m2 = frame.middle
     per = 1.0 / frame.radius
     third = (data[first + 2] - m2) * per if frame.space else 0.0
@@ -444,7 +462,7 @@ def _station(frame: AtlasFrame, data: Array, first: int) -> Triple:
 
 @inlined
 def set_line(frame: AtlasFrame, data: Array, first: int, away: Array, sense: Array) -> None:
-    """Write the scaled line p - v a to the station at data[first:first + 3], and its derivative."""
+    """Write the scaled line p - v a to the station data[first:first + 3] to `away`, and its derivative to `sense`."""
     a0, a1, a2 = _station(frame, data, first)
     write_triple(sum_of_forms(1.0, frame.point, -frame.scale, (a0, a1, a2)), away)
     s0, s1, s2 = frame.slant
@@ -455,7 +473,11 @@ def set_line(frame: AtlasFrame, data: Array, first: int, away: Array, sense: Arr
 
 @inlined
 def scaled_station(frame: AtlasFrame, data: Array) -> tuple[float, float, Triple]:
-    """Return ``|a|`` of a station a, and ``N = -2 a.p + v |a|^2`` with its constant gradient."""
+    """Return ``|a|`` of a station a, and ``N = -2 a.p + v |a|^2`` with its constant gradient (3 numbers).
+
+    N is the numerator of the range minus the distance to the centre (`optloc.proof.nodes.range`). `data` begins with
+    the position of the station, m.
+    """
     a = _station(frame, data, 0)
     squared = inner_product(a, a)
     s0, s1, s2 = frame.slant

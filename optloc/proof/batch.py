@@ -1,4 +1,8 @@
-"""Proofs of many fixes: a compiled loop over a part of a batch, called from Python threads."""
+"""Proofs of many fixes: a compiled loop over a part of a batch, called from Python threads.
+
+Loading compiled code takes longer than most proofs. So a few small proofs begin in plain Python with a small budget of
+boxes.
+"""
 
 from __future__ import annotations
 
@@ -120,26 +124,29 @@ def prove_all(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
     for first in range(0, n, FEW):
         # If compiled code becomes available meanwhile, it continues with the rest.
         last = n if first > 0 and may_use_code(_loop, n) else min(first + FEW, n)
-        some = slice(first, last)
-        parts.append((_prove if last - first > FEW else _prove_few)(costs.take(some), asked.take(some)))
+        part = slice(first, last)
+        parts.append((_prove if last - first > FEW else _prove_few)(costs.take(part), asked.take(part)))
         if last == n:
             break
     return parts[0] if len(parts) == 1 else ProofResult(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _prove_few(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
-    """Return the results of a few proofs that begin in plain Python; proofs that need more boxes begin again."""
+    """Return the results of a few proofs that begin in plain Python; proofs that need more boxes begin again.
+
+    They begin again with compiled code if it is available, otherwise in plain Python with more boxes.
+    """
     n = len(asked.x)
-    few = max(_AT_LEAST, FIRST_BOXES // max(n, 1))
-    out = _prove_plainly(costs, asked, few)
+    first_boxes = max(_AT_LEAST, FIRST_BOXES // max(n, 1))
+    out = _prove_plainly(costs, asked, first_boxes)
     # More boxes may prove a larger gap and find minima. So a proof is complete only if it used less than its share.
-    short = np.flatnonzero((out.boxes >= few) & (asked.budget > few))
-    if len(short) and enabled():
-        costs, asked = costs.take(short), asked.take(short)
-        plenty = max(_AT_LEAST, PLAIN_BOXES // len(short))
-        more = _prove(costs, asked) if may_use_code(_loop, n) else _prove_plainly(costs, asked, plenty)
-        for array, found in zip(out, more, strict=True):
-            array[short] = found
+    unfinished = np.flatnonzero((out.boxes >= first_boxes) & (asked.budget > first_boxes))
+    if len(unfinished) and enabled():
+        costs, asked = costs.take(unfinished), asked.take(unfinished)
+        more_boxes = max(_AT_LEAST, PLAIN_BOXES // len(unfinished))
+        second = _prove(costs, asked) if may_use_code(_loop, n) else _prove_plainly(costs, asked, more_boxes)
+        for array, better in zip(out, second, strict=True):
+            array[unfinished] = better
     return out
 
 
@@ -155,7 +162,7 @@ def lacks_code(count: int) -> bool:
 
 
 def empty_answer(n: int, d: int) -> ProofResult:
-    """Return result arrays for n proofs in d dimensions."""
+    """Return result arrays for n proofs in d dimensions, filled with zeros and NaN, for the proofs to write."""
     return ProofResult(
         verdict=np.zeros(n, dtype=np.int64),
         boxes=np.zeros(n, dtype=np.int64),
@@ -171,7 +178,10 @@ def empty_answer(n: int, d: int) -> ProofResult:
 def without_rivals(
     verdict: Array, boxes: Array, bound: Array, everywhere: Array, asked: ProofRequest, found: Array
 ) -> ProofResult:
-    """Return the results of proofs that try the first gap only, and begin again after each minimum that they find."""
+    """Return the results of proofs that try the first gap only, and begin again after each minimum that they find.
+
+    The arrays (n,) and `found` (n, d) are as in `ProofResult`. The lists of rivals are empty.
+    """
     n, d = found.shape
     none = np.zeros(n, dtype=np.int64)
     return ProofResult(verdict, boxes, bound, everywhere, asked.gaps[:, 0], none, np.full((n, 0, d), np.nan), found)
@@ -187,16 +197,16 @@ def _prove(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
     )
     length = max(_STRETCH[0], min(_STRETCH[1], n // _PARTS))
 
-    def stretch(first: int) -> None:
+    def prove_part(first: int) -> None:
         part = slice(first, min(first + length, n))
         with np.errstate(all="ignore"):  # plain Python would warn of values without a bound
             _loop(costs.take(part), asked.take(part), out.take(part))
 
     if enabled():
-        map_on_threads(stretch, range(0, n, length))
+        map_on_threads(prove_part, range(0, n, length))
         return out
     for first in range(0, n, length):  # plain Python holds the interpreter lock, so threads would wait for each other
-        stretch(first)
+        prove_part(first)
     return out
 
 
@@ -214,7 +224,10 @@ def is_code_loaded() -> bool:
 
 
 def costs_at(costs: PositionCosts, x: Array) -> tuple[Array, Array]:
-    """Return costs (n, P) at positions x (n, P, d), and bounds of the rounding of their residuals (n, P)."""
+    """Return costs (n, P) at positions x (n, P, d), metres, and bounds of the rounding of their residuals (n, P).
+
+    The second result bounds the error of the length of a whitened residual.
+    """
     out = np.zeros((2, *x.shape[:2]))
     if worth_loading(_evaluate, len(x)):
         _evaluate(PositionCosts(*(plainly(array) for array in costs)), plainly(x), out)
@@ -225,7 +238,10 @@ def costs_at(costs: PositionCosts, x: Array) -> tuple[Array, Array]:
 
 
 def cost_here(costs: PositionCosts, x: Array, out: Array) -> None:
-    """Write costs and their rounding at positions x (n, P, d) to (2, n, P), by compiled code; see `prove_here`."""
+    """Write costs and their rounding at positions x (n, P, d) to `out` (2, n, P), by compiled code.
+
+    See `prove_here`.
+    """
     _evaluate(costs, x, out)
 
 
@@ -236,7 +252,10 @@ def plainly(array: Array) -> Array:
 
 @compiled
 def _loop(costs: PositionCosts, asked: ProofRequest, out: ProofResult) -> None:
-    """Prove the request of each fix, and write its result."""
+    """Prove the request of each fix, and write its result into the arrays of `out`.
+
+    The proof is first for all positions, unless a region is requested. If it is OPEN, the fallback region follows.
+    """
     # Local variables for all arrays: each access to a field of a record counts references.
     kinds, data, K, w = costs.kinds, costs.data, costs.K, costs.w
     fixes, others, known, steps, tolerances = asked.x, asked.others, asked.known, asked.gaps, asked.eps
@@ -280,7 +299,10 @@ def _loop(costs: PositionCosts, asked: ProofRequest, out: ProofResult) -> None:
 
 @compiled
 def without_unused_nodes(cost: Cost) -> Cost:
-    """Return a cost without the nodes that no row uses: the time of a proof grows with the square of the nodes."""
+    """Return a cost without the nodes that no row uses, and without empty rows.
+
+    The time of a proof grows with the square of the nodes.
+    """
     K, w = cost.K, cost.w
     nodes, rows = np.empty(K.shape[1], dtype=np.int64), np.empty(K.shape[0], dtype=np.int64)
     J = q = 0
@@ -302,7 +324,7 @@ def without_unused_nodes(cost: Cost) -> Cost:
 
 @compiled
 def _evaluate(costs: PositionCosts, x: Array, out: Array) -> None:
-    """Write costs, and bounds of the rounding of residuals, as lengths."""
+    """Write costs (n, P) at positions x (n, P, d) to out[0], and bounds of the rounding of residuals to out[1]."""
     J, q = costs.K.shape[2], costs.K.shape[1]
     box, weight, axes, origin = empty_box(q, J), np.empty(J), np.eye(3), np.zeros(3)
     for k in range(x.shape[2], 3):

@@ -3,6 +3,9 @@
 The centres of promising boxes descend to minima, and boxes that cost more than the best minimum by a gap are dropped.
 The search ends when no box is left or the budget is spent, and lists all minima that it met within the gap. The search
 proves nothing about them. The proof begins afterwards, at the best minimum.
+
+In the functions here, `count` is the number of minima in the list, and `level` the cost of the best minimum plus the
+gap. `size` is the number of boxes on the stack, and `near` is the working memory of descents.
 """
 
 from __future__ import annotations
@@ -154,7 +157,11 @@ def _least(aim: SearchGoal, count: int) -> float:
 
 @compiled
 def _is_due(lows: int, low: bool, boxes: int) -> bool:
-    """Return whether a centre descends: number 1, 2, 4, 8 and so on of the low centres, or of all centres."""
+    """Return whether a centre descends: number 1, 2, 4, 8 and so on of the low centres, or of all centres.
+
+    `lows` is the number of low centres so far, `low` whether this one is low (below the level), `boxes` the number of
+    all.
+    """
     return bool((low and lows & (lows - 1) == 0) or boxes & (boxes - 1) == 0)
 
 
@@ -164,9 +171,10 @@ def search_minima(
 ) -> tuple[int, int]:
     """Return the number of known minima and the number of boxes of a search for minima.
 
-    On a surface, the search goes all around it. Otherwise, if the cost stays finite at infinity, all positions are
-    searched. In other cases the search is between corners. The corners come from an enclosure of the positions that
-    cost less than x (D,), or from the region (2, D) if there is no enclosure.
+    The minima are written into `aim`. On a surface, the search goes all around it. Otherwise, if the cost stays finite
+    at infinity, all positions are searched. In other cases the search is between corners. They are the corners of an
+    enclosure of the positions that cost less than x (D,). Without an enclosure they are the corners of the region (2,
+    D), metres. `box` and `near` are working memory, and `budget` is the greatest number of boxes.
     """
     around, _ = chart_on(cost, x, box, aim.planes, aim.surface)
     level, d, bent = cost_at(cost.K, cost.w, box.nodes) + aim.gap, x.shape[0], aim.surface.shape[0] > 0
@@ -187,7 +195,7 @@ def search_minima(
         if far:
             size = push_faces(stack, d)
         else:
-            size = push_around(stack, 0, corners[0], corners[1], np.zeros(3), 0)
+            size = push_around(stack, 0, corners[0], corners[1], np.zeros(3), 0)  # no hole
             space = _with_known(cost, space, near, aim, corners, count)
         count, more = _search(cost, space, box, near, aim, corners, stack, size, most, count)
         boxes += more
@@ -207,7 +215,10 @@ def _search(
     budget: int,
     count: int,
 ) -> tuple[int, int]:
-    """Search the boxes of a stack for minima; return the number of known minima, and the number of boxes."""
+    """Search the boxes of a stack for minima; return the number of known minima, and the number of boxes.
+
+    `corners` (2, 3) are the corners of the region in search coordinates, and `budget` is the greatest number of boxes.
+    """
     at, boxes, lows, cheapest, floor = np.empty(aim.points.shape[1]), zero(), zero(), inf, floor_of(space, cost)
     queue = [(0.0, i) for i in range(size)]
     while len(queue) > 0 and boxes < budget:
@@ -251,7 +262,10 @@ def _split(
     low: float,
     piece: int,
 ) -> int:
-    """Push the halves of the remaining part of a box; return the size of the stack."""
+    """Push the halves of the remaining part of a box; return the size of the stack.
+
+    `side` is the side to halve, and `low` a lower bound of the cost over the box, by which the queue is ordered.
+    """
     if not cut_out(box.cut, box.at, box.half) > 0.0:
         return size
     exact = space.far and piece <= 2 * space.atlas.dimension
@@ -261,7 +275,7 @@ def _split(
 
 @compiled
 def _queue_up(queue: list[tuple[float, int]], low: float, first: int, last: int) -> None:
-    """Put boxes of a stack into the queue, ordered by their bound."""
+    """Put boxes first to last - 1 of a stack into the queue, ordered by their bound `low` of the cost."""
     for i in range(first, last):
         heappush(queue, (low, i))
 
@@ -271,7 +285,7 @@ def _look(cost: Cost, space: Space, box: Box, piece: int, level: float, floor: f
     """Return the bound of the cost over a box with bounded nodes, the cost at its centre, and the side to halve.
 
     The side is -1 if the box contains no minimum below a level. Otherwise the ends of the part that may contain a
-    minimum are written into ``box.cut``.
+    minimum are written into ``box.cut``. `floor` is the result of `optloc.proof.space.floor_of`.
     """
     linearise_rows(cost.K, cost.w, box.nodes, box.rows)
     low = least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
@@ -284,7 +298,10 @@ def _look(cost: Cost, space: Space, box: Box, piece: int, level: float, floor: f
 
 @inlined
 def _side_far(cost: Cost, space: Space, box: Box, piece: int, level: float, here: float, floor: float) -> int:
-    """Return the side to halve of a box of the atlas, or -1 if it contains no minimum; the box is not contracted."""
+    """Return the side to halve of a box of the atlas, or -1 if it contains no minimum; the box is not contracted.
+
+    `here` is the cost at the centre of the box, and `floor` the result of `optloc.proof.space.floor_of`.
+    """
     atlas, d = space.atlas, space.atlas.dimension
     touching = piece < 2 * d and box.at[d - 1] <= box.half[d - 1]
     if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY:
@@ -297,7 +314,10 @@ def _side_far(cost: Cost, space: Space, box: Box, piece: int, level: float, here
 
 @inlined
 def _cut(cost: Cost, space: Space, box: Box, level: float, here: float) -> int:
-    """Write the ends of the part of a box that may contain a minimum below a level; return the side to halve, or -1."""
+    """Write the ends of the part of a box that may contain a minimum below a level; return the side to halve, or -1.
+
+    The result is -1 if no part remains. `here` is the cost at the centre of the box.
+    """
     chart = space.chart
     gram = box.gram if chart.surface.shape[0] > 0 else chart.gram
     noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
@@ -313,8 +333,9 @@ def _cut(cost: Cost, space: Space, box: Box, level: float, here: float) -> int:
 
 @compiled
 def _with_known(cost: Cost, space: Space, near: Box, aim: SearchGoal, corners: Array, count: int) -> Space:
-    """Return search coordinates with the known minima, and convex boxes around them."""
+    """Return search coordinates with the known minima and convex boxes around them, which the search leaves out."""
     known = KnownMinima(aim.points[:count], 0, aim.planes, aim.surface)
+    # No margin of convexity, no least cost, and no fix among the minima.
     minima, sides, number, _ = known_minima(cost, space.chart, near, known, corners[0], corners[1], 0.0, -inf, False)
     return Space(False, space.atlas, space.chart, minima[:number], sides[:number])
 
@@ -331,7 +352,7 @@ def _push_minimum(cost: Cost, space: Space, near: Box, x: Array, stack: Array, s
 
 
 class FoundPlaces(NamedTuple):
-    """Where to search for the minima of n costs.
+    """Data of the searches for the minima of n costs.
 
     Parameters
     ----------
@@ -362,7 +383,7 @@ def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: i
     costs : PositionCosts
         The costs.
     places : FoundPlaces
-        Where to search.
+        Data of the searches: positions, regions, planes or surfaces.
     gap : float
         Greatest cost of a minimum above the best one.
     budget : int
@@ -405,7 +426,10 @@ def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: i
 
 
 def _minima_of(costs: PositionCosts, place: FoundPlaces, gap: float, budget: int, most: int) -> tuple[Array, int]:
-    """Return the minima (most, d) of one cost, and the number of boxes; `place` has no first axis."""
+    """Return the minima (most, d), metres, of one cost in order of cost, and the number of boxes.
+
+    `place` has no first axis. Rows of NaN follow the last minimum.
+    """
     cost = without_unused_nodes(cost_of(costs.kinds, costs.data[0], costs.K[0], costs.w[0]))
     _, radius = station_cube(cost.kinds, cost.data, place.x)
     found, least = np.zeros((most, len(place.x))), np.full(most, inf)

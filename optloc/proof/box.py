@@ -1,7 +1,10 @@
 """Bounds over a box: bounds of all nodes, a lower bound of the residual's length, and the stack of boxes to search.
 
-A node is one scalar function of the position that rows are made of, such as a range or an angle. Over a box each node
-is linear up to a remainder, and an interval encloses this remainder.
+The cost is ``f(x) = |K phi(x) - w|^2``, with whitened rows K (q, J) and measurements w (q,). A node phi_j is one scalar
+function of the position x that rows are sums of, such as a range. Over a box each node is linear up to a remainder, and
+an interval encloses this remainder. A box has a centre `at` and half-widths `half` (3,) in search coordinates s, with x
+= origin + T s; their unit is a standard deviation. `cut` (6,) contains the lower and upper ends of the part of the box
+that remains to be searched, relative to its centre.
 """
 
 from __future__ import annotations
@@ -29,11 +32,9 @@ from optloc.proof.nodes.node import (
 )
 from optloc.proof.nodes.range import bound_ranges
 
-# Each half-width grows by the rounding of its centre and corners: a share of the half-width, and a few units in the
-# last place of centre and corners.
+# Unit in the last place of a double at 1.
 _ULP = 2.0**-52
-# A half-width covers the rounding of its centre and corners: relative to itself, and some units in the last place
-# of these.
+# A half-width covers the rounding of its centre and corners: relative to itself, and some units in their last place.
 _WIDER, _SHIFT = 1e-12, 1e-15
 # Coordinate descents towards the least-squares point of a box. Any point gives a valid bound. Over 8 fixes by range
 # differences, one descent took 6 % more boxes of an atlas than three. Ten descents took 0.6 % fewer.
@@ -76,7 +77,7 @@ def bound_nodes(
 def linearise_rows(K: Array, w: Array, nodes: Array, rows: Array) -> None:
     """Write residuals and Jacobian into the table of rows (q, ROW_WIDTH), each remainder at the middle of its interval.
 
-    A remainder with one finite bound counts with this bound.
+    A remainder with one finite bound counts with this bound. The middles are written into column BETWEEN of `nodes`.
     """
     for j in range(K.shape[1]):
         nodes[j, BETWEEN] = middle_of(nodes[j, LOW], nodes[j, HIGH])
@@ -109,7 +110,7 @@ def size_within(low: float, high: float) -> float:
 
 @inlined
 def cost_at(K: Array, w: Array, nodes: Array) -> float:
-    """Return the cost f at the centre of a box from its filled table of nodes."""
+    """Return the cost f at the centre of a box (no unit) from the values of its nodes."""
     total = 0.0
     for i in range(K.shape[0]):
         residual = -w[i]
@@ -171,7 +172,10 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
 
 @inlined
 def exceeds_level(low: float, level: float) -> bool:
-    """Return whether a residual of at least `low` implies a cost of at least `level`; costs are never negative."""
+    """Return whether a residual of at least `low` implies a cost of at least `level`, which is a value of f.
+
+    Costs are never negative, so a level of 0 or less is always exceeded.
+    """
     return level <= 0.0 or (low > 0.0 and low * low >= level)
 
 
@@ -186,14 +190,17 @@ def rounding_error(K: Array, weight: Array, floor: float, nodes: Array) -> float
 
 @inlined
 def relative_rounding(K: Array) -> float:
-    """Return the relative rounding error of sums over the nodes and rows of K (q, J)."""
+    """Return the relative rounding error of a sum over the nodes and rows of K (q, J); it covers all sums of a box."""
     # One rounding for each term of the sums, and 32 for the terms inside a node and in its slopes.
     return float((32 + K.shape[0] + K.shape[1]) * _ULP)
 
 
 @compiled
 def normal_of(rows: Array) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Return the entries (00, 01, 02, 11, 12, 22) of J'J, and the vector J' middle (3 numbers)."""
+    """Return the entries (00, 01, 02, 11, 12, 22) of J'J, and the vector J' middle (3 numbers).
+
+    J is the Jacobian of the residuals and `middle` the residuals in the table of rows: the terms of least squares.
+    """
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(rows.shape[0]):
         middle, j0, j1, j2 = rows[i, MIDDLE], rows[i, J0], rows[i, J1], rows[i, J2]
@@ -219,7 +226,7 @@ def clamp(s: float, half: float) -> float:
 
 @inlined
 def _nearest(half: Array, rows: Array) -> None:
-    """Write the direction v = middle + J s, where s is nearly the least-squares solution inside the box."""
+    """Write the direction v = middle + J s into `rows`; s is nearly the least-squares solution inside the box."""
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = normal_of(rows)
     d0, d1 = 1.0 / a00 if a00 > 0.0 else 0.0, 1.0 / a11 if a11 > 0.0 else 0.0
     d2 = 1.0 / a22 if a22 > 0.0 else 0.0
@@ -234,7 +241,7 @@ def _nearest(half: Array, rows: Array) -> None:
 
 @compiled
 def _absorb(K: Array, weight: Array, nodes: Array, rows: Array) -> None:
-    """Remove from the direction v the parts that nodes without slope can explain.
+    """Remove from the direction v the parts that nodes without slope can explain (arguments as in `least_residual`).
 
     An example is a range over a box around its station.
     """
@@ -263,7 +270,11 @@ def _open_side(nodes: Array, j: int) -> float:
 
 @compiled
 def _move_beyond(K: Array, weight: float, rows: Array, pull: float, side: float) -> float:
-    """Return a step of a one-sided node towards its open side; after it the node only adds to the residual along v."""
+    """Return a step of a one-sided node towards its open side; after it the node only adds to the residual along v.
+
+    `weight` is the length of the node's column of K, `pull` its product with v, and `side` is 1 or -1, the open
+    direction.
+    """
     length = 0.0
     for i in range(K.shape[0]):
         length += rows[i, DIRECTION] * rows[i, DIRECTION]
@@ -341,14 +352,14 @@ def contract_box(
 
 @inlined
 def reset_cut(half: Array, cut: Array) -> None:
-    """Write the ends of the whole box into `cut`."""
+    """Write the ends of the whole box into `cut` (6,): the remaining part is then the whole box."""
     for k in range(3):
         cut[k], cut[3 + k] = -half[k], half[k]
 
 
 @compiled
 def contract_coordinate(cut: Array, k: int, centre: float, reach: float) -> None:
-    """Contract coordinate k of a box to ``|s - centre| <= reach``, with slack for rounding."""
+    """Contract coordinate k of `cut` to ``|s - centre| <= reach``, with slack for rounding."""
     reach += 1e-9 * (abs(centre) + reach)
     if not reach < inf:  # NaN as well: with infinite bounds the coordinate is not restricted
         return
@@ -357,7 +368,7 @@ def contract_coordinate(cut: Array, k: int, centre: float, reach: float) -> None
 
 @inlined
 def share_left(cut: Array, half: Array) -> float:
-    """Return the share of a box's volume that remains between the ends of a cut."""
+    """Return the share, 0 to 1, of a box's volume that remains between the ends of a cut."""
     share = 1.0
     for k in range(3):
         if cut[k] > cut[3 + k]:
@@ -369,7 +380,7 @@ def share_left(cut: Array, half: Array) -> float:
 
 @inlined
 def cut_out(cut: Array, at: Array, half: Array) -> float:
-    """Replace a box by its part between the ends of a cut; return the share of the volume that remains."""
+    """Replace a box by its part between the ends of a cut; return the share, 0 to 1, of the volume that remains."""
     share = 1.0
     for k in range(3):
         low, high, old = cut[k], cut[3 + k], half[k]
@@ -385,7 +396,7 @@ def cut_out(cut: Array, at: Array, half: Array) -> float:
 
 @compiled
 def is_empty(cut: Array) -> bool:
-    """Return whether the cut leaves no part of a box."""
+    """Return whether the cut leaves no part of a box: the lower end of a coordinate exceeds the upper end."""
     return bool(cut[0] > cut[3] or cut[1] > cut[4] or cut[2] > cut[5])
 
 
@@ -396,10 +407,10 @@ _ALIKE = 0.1
 
 @compiled
 def steepest_side(half: Array, rows: Array, dimension: int) -> int:
-    """Return the side along which the residual changes most.
+    """Return the number k of the side along which the residual changes most over the box: the best side to halve.
 
-    Each side also counts with a share of the greatest change. Nodes that are only enclosed have no slope, although
-    they depend on the position.
+    Each side also counts with a share of the greatest change. Nodes that are only enclosed have no slope, although they
+    depend on the position.
     """
     steepest, best, k = 0.0, -1.0, 0
     for m in range(dimension):
@@ -413,7 +424,7 @@ def steepest_side(half: Array, rows: Array, dimension: int) -> int:
 
 @inlined
 def widest(half: Array) -> int:
-    """Return the number of the widest side of a box."""
+    """Return the number (0, 1 or 2) of the widest side of a box."""
     if half[0] >= half[1] and half[0] >= half[2]:
         return 0
     return 1 if half[1] >= half[2] else 2
@@ -439,8 +450,8 @@ CENTRE, HALF, LEAST, PIECE, DEPTH = 0, 3, 6, 7, 8
 def push_around(stack: Array, size: int, low: Array, high: Array, hole: Array, piece: int) -> int:
     """Push the box between two corners without the box |s_k| <= hole_k around the origin; return the size of the stack.
 
-    The hole is cut out along its faces, which leaves at most two slabs for each dimension. The slabs overlap the hole
-    by a rounding error.
+    The corners are `low` and `high`, and the hole is the convex box around a minimum, all (3,). The hole is cut out
+    along its faces, which leaves at most two slabs for each dimension. The slabs overlap the hole by a rounding error.
     """
     low, high = low.copy(), high.copy()
     for k in range(3):
@@ -468,7 +479,7 @@ def pop(stack: Array, row: int, at: Array, half: Array) -> None:
 
 @compiled
 def push(stack: Array, size: int, at: Array, half: Array, low: float, piece: int) -> int:
-    """Push a box; return the size of the stack."""
+    """Push a box, with lower bound `low` of the residual over it; return the number of boxes on the stack."""
     for k in range(3):
         stack[size, CENTRE + k], stack[size, HALF + k] = at[k], half[k]
     stack[size, LEAST], stack[size, PIECE] = low, piece
@@ -477,9 +488,10 @@ def push(stack: Array, size: int, at: Array, half: Array, low: float, piece: int
 
 @compiled
 def push_halves(stack: Array, size: int, k: int, at: Array, half: Array, low: float, piece: int, exact: bool) -> int:
-    """Push the two halves of a box that is cut across side k; return the size of the stack.
+    """Push the two halves of a box that is cut across side k; return the number of boxes on the stack.
 
-    `exact`: centres and half-widths are sums of powers of two, so that halving does not round them.
+    `low` bounds the residual over the box. `exact`: centres and half-widths are sums of powers of two, so that halving
+    does not round them.
     """
     for side in range(2):
         for m in range(3):
@@ -500,7 +512,7 @@ def _wide(half: float, size: float) -> float:
 
 @compiled
 def least_left(stack: Array, size: int) -> float:
-    """Return a lower bound of the cost over all boxes that remain on the stack."""
+    """Return a lower bound of the cost over the first `size` boxes of the stack; infinity for an empty stack."""
     least = inf
     for i in range(size):
         low = stack[i, LEAST]

@@ -1,4 +1,9 @@
-"""Boxes around known minima on which the cost is convex, so that they contain no second minimum."""
+"""Boxes around known minima on which the cost is convex, so that they contain no second minimum.
+
+A search leaves these *convex boxes* out. Their half-widths are called `sides`, the greatest useful half-widths `hull`,
+both (3,), in standard deviations along the axes of the minimum. On a box whose Hessian of f/2 exceeds a `margin`, the
+cost falls below the cost of its centre by at most slope^2 / margin.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +59,10 @@ def set_convex(cost: Cost, chart: LocalAxes, box: Box, hull: Array, margin: floa
 
 @compiled
 def is_known(at: Array, half: Array, minima: Array, sides: Array) -> bool:
-    """Return whether a box is inside the convex box (half-widths `sides`) of a known minimum."""
+    """Return whether a box (centre `at`, half-widths `half`) is inside the convex box of a known minimum.
+
+    `minima` (P, 3) are the minima, and `sides` (P, 3) the half-widths of their convex boxes.
+    """
     for p in range(minima.shape[0]):
         inside = True
         for k in range(3):
@@ -80,8 +88,9 @@ def known_minima(
 
     The first count is the number of minima, 0 if the cost is not convex around the fix. The second count is the number
     of minima that are the fix, which comes first, or hidden. Points that are no minima are left out. A minimum whose
-    box contains a point below `value` is left out unless it is hidden. Without the fix (`own` is False), minima of
-    other pieces of a surface are left out too.
+    box contains a point below the cost `value` is left out unless it is hidden. Without the fix (`own` is False),
+    minima of other pieces of a surface are left out too. `low` and `high` (3,) are the corners of the region to search,
+    which limits the boxes. `margin` is the margin of the Hessian for the fix.
     """
     others = known.points
     count, free, size = 0, 0, 1 + others.shape[0]
@@ -131,7 +140,10 @@ _ASIDE = 1e5
 
 @inlined
 def is_elsewhere(chart: LocalAxes, box: Box, place_of: Array) -> bool:
-    """Return whether a point (D,) of a surface is on the other side of the Earth, behind its search coordinates."""
+    """Return whether a point (D,) of a surface is on the other side of the Earth, behind its search coordinates.
+
+    The point is `place_of`, m, and the box is at its search coordinates.
+    """
     apart = 0.0
     for m in range(place_of.shape[0]):
         apart = max(apart, abs(place_of[m] - box.centre[m]))
@@ -140,7 +152,10 @@ def is_elsewhere(chart: LocalAxes, box: Box, place_of: Array) -> bool:
 
 @compiled
 def limit_half_widths(sense: Array, hull: Array) -> None:
-    """Reduce half-widths (3,) so that no coordinate is farther than `HIDDEN_REACH` metres from the centre."""
+    """Reduce half-widths `hull` (3,) so that no coordinate is farther than `HIDDEN_REACH` metres from the centre.
+
+    `sense` (3, 3) is the derivative of the position with respect to search coordinates.
+    """
     share = 1.0
     for k in range(3):
         reach = 0.0
@@ -160,7 +175,10 @@ def limit_half_widths(sense: Array, hull: Array) -> None:
 
 @compiled
 def accuracy_floor_far(cost: Cost, atlas: Atlas) -> float:
-    """Return the sizes of measurements and of the cube in residuals, without the sizes of the nodes."""
+    """Return the sizes of measurements and of the cube in residuals, without the sizes of the nodes.
+
+    The result is for boxes of an atlas what `optloc.proof.search_space.accuracy_floor` is around a fix.
+    """
     total = 0.0
     for i in range(cost.w.shape[0]):
         total += cost.w[i] * cost.w[i]
@@ -256,7 +274,10 @@ def widen_core(atlas: Atlas, i: int, limit: float) -> None:
 
 @compiled
 def set_hull(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
-    """Write the greatest half-widths (3,) of convex boxes around minimum i, within a limit in metres."""
+    """Write the greatest half-widths `hull` (3,) of convex boxes around minimum i of an atlas.
+
+    No box reaches infinity, and no coordinate is farther than `limit` metres from the minimum.
+    """
     minima, d = atlas.minima, atlas.dimension
     # v falls along the last axis only, or along all axes.
     ways = 1 if infinity_coordinate(atlas, 2 * d + 1 + i) > -inf else d
@@ -296,7 +317,10 @@ _PIVOT = 1e-14
 
 @compiled
 def set_axes(cost: Cost, box: Box, atlas: Atlas, i: int) -> bool:
-    """Write axes of minimum i in its home coordinates, in standard deviations; return False if they do not exist."""
+    """Write axes of minimum i in its home coordinates, in standard deviations; return False if they do not exist.
+
+    The home and the start of the minimum must be set. They do not exist if the rows do not determine a coordinate.
+    """
     minima, d = atlas.minima, atlas.dimension
     axes, back = minima.axes[i], minima.back[i]
     axes[:], back[:] = 0.0, 0.0
@@ -355,7 +379,7 @@ def _set_triangular(information: Array, d: int, axes: Array, back: Array) -> boo
 
 @inlined
 def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
-    """Fill the tables of a box with half-widths (3,) around minimum i."""
+    """Fill the tables of a box with half-widths `half` (3,) around minimum i of an atlas."""
     box.at[:] = 0.0
     put(half, box.half)
     set_centre(atlas, 2 * atlas.dimension + 1 + i, box.at)
@@ -367,7 +391,7 @@ def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
 
 @compiled
 def _convex(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array, margin: float) -> bool:
-    """Return whether the Hessian of f/2 exceeds `margin` over a box with half-widths (3,) around minimum i."""
+    """Return whether the Hessian of f/2 exceeds `margin` over a box with half-widths `half` (3,) around minimum i."""
     _tables(cost, box, atlas, i, half)
     # Here ranges are differences, whose Hessians have no fixed sign, so the test must treat them as any node.
     return is_convex_over_box(np.full_like(cost.kinds, ANY), cost.A, box.half, box.nodes, box.curves, box.sums, margin)
@@ -377,7 +401,8 @@ def _convex(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array, margin: flo
 def _grow(cost: Cost, box: Box, atlas: Atlas, i: int, hull: Array, margin: float) -> bool:
     """Write half-widths of a box around minimum i on which the cost is convex; return False if none is found.
 
-    A cube shrinks or doubles, then each side grows separately, all within the hull (3,).
+    `margin` is the margin of the Hessian. A cube shrinks or doubles, then each side grows separately, all within `hull`
+    (3,).
     """
     sides, size = atlas.minima.sides[i], _FIRST
     trial = np.minimum(hull, size)

@@ -1,4 +1,12 @@
-"""Second derivatives of the cost over a box: where the cost is convex, and where its gradient cannot vanish."""
+"""Second derivatives of the cost over a box: where the cost is convex, and where its gradient cannot vanish.
+
+The cost is ``f = |K phi - w|^2`` with nodes phi (J,), such as ranges; A is K'K (J, J). The *force* on a node is its
+component of K'(K phi - w). Its *pull* is its row of K'J, with J the Jacobian of the residuals. A box has half-widths
+`half` (3,) in search coordinates, whose unit is a standard deviation. Tables of the box are `nodes` and `curves`
+(`optloc.proof.nodes.node`), and `sums` (SUMS,), whose columns are below. `cut` (6,) contains the lower and upper ends
+of the remaining part of the box, relative to its centre. A part of the Hessian's change has no bounds for single
+entries: `ball` bounds its spectral norm.
+"""
 
 from __future__ import annotations
 
@@ -71,9 +79,10 @@ def curve_nodes(
     nodes: Array,
     curves: Array,
 ) -> None:
-    """Write the table of second derivatives (J, CURVE_WIDTH) over a box.
+    """Write the table of second derivatives (J, CURVE_WIDTH) of all nodes over a box.
 
-    `bound_nodes` must have run for the same box, and its arguments are the same. `second` (3, 3) is working memory.
+    `optloc.proof.box.bound_nodes` must have run for the same box, and its arguments are the same. `second` (3, 3) is
+    working memory.
     """
     curve_ranges(kinds, gram, half, nodes, curves)
     for j in range(kinds.shape[0]):
@@ -89,9 +98,9 @@ def sum_up(K: Array, w: Array, weight: Array, noise: float, nodes: Array, curves
     Parameters
     ----------
     K, w, weight : array (q, J), (q,), (J,)
-        Whitened rows, and the lengths of the columns of K.
+        Whitened rows and measurements, and the lengths of the columns of K.
     noise : float
-        Bound of the rounding of a residual, see `rounding`.
+        Bound of the rounding of a residual, see `optloc.proof.box.rounding_error`.
     nodes, curves : array (J, NODE_WIDTH), (J, CURVE_WIDTH)
         Tables of the box; forces and pulls are written into `curves`.
     sums : array (SUMS,)
@@ -138,9 +147,9 @@ def sum_up(K: Array, w: Array, weight: Array, noise: float, nodes: Array, curves
 
 @inlined
 def force_change(A: Array, half: Array, nodes: Array, curves: Array, j: int) -> tuple[float, float]:
-    """Return the greatest fall and rise of component j of K'(K phi - w) over the box; A = K'K (J, J).
+    """Return the greatest fall (negative) and rise (positive) of the force on node j over the box; A = K'K (J, J).
 
-    Rounding of the component at the centre counts as change.
+    Rounding of the force at the centre counts as change.
     """
     spread = abs(curves[j, PULL0]) * half[0] + abs(curves[j, PULL1]) * half[1] + abs(curves[j, PULL2]) * half[2]
     fall, rise = -spread - curves[j, BLUR], spread + curves[j, BLUR]
@@ -157,10 +166,10 @@ def is_convex_over_box(
 ) -> bool:
     """Return whether the Hessian of f/2 exceeds `margin` times the identity over the whole box.
 
-    The Hessian is H = Phi'A Phi + sum_j g_j N_j. With B = A Phi and E the changes of the gradients, the first part
-    changes by at least ``-(B'E + E'B)``: the term ``dPhi'A dPhi`` is positive. A node whose Hessian is positive
-    semidefinite counts with its least force. Changes that are bounded by entries only are subtracted from the
-    diagonal, row by row (Gershgorin).
+    The Hessian is H = Phi'A Phi + sum_j g_j N_j. Here Phi (J, 3) are the gradients of the nodes, g_j is the force on
+    node j, and N_j its Hessian. With B = A Phi and E the changes of the gradients, the first part changes by at least
+    ``-(B'E + E'B)``: the term ``dPhi'A dPhi`` is positive. A node whose Hessian is positive semidefinite counts with
+    its least force. Changes that are bounded by entries only are subtracted from the diagonal, row by row (Gershgorin).
 
     Parameters
     ----------
@@ -214,7 +223,11 @@ def is_convex_over_box(
 
 @compiled
 def spread_of(A: Array, half: Array, nodes: Array, curves: Array, sums: Array) -> float:
-    """Write bounds of the change of the Hessian's entries into sums[C00:]; return a bound of the norm of the rest."""
+    """Write bounds of the change of the Hessian's entries into sums[C00:]; return a bound of the norm of the rest.
+
+    The arguments are as in `is_convex_over_box`. The Hessian is half of the Hessian of f, and the change is from the
+    centre of the box to any other point.
+    """
     l0, l1, l2, u0, u1, u2 = sums[LENGTH0], sums[LENGTH1], sums[LENGTH2], sums[BLUR0], sums[BLUR1], sums[BLUR2]
     # The rounding of J'J counts as change. It is doubled, because the mean over a line takes half of each change.
     sums[C00], sums[C01], sums[C02] = 4.0 * l0 * u0, 2.0 * (l0 * u1 + l1 * u0), 2.0 * (l0 * u2 + l2 * u0)
@@ -266,7 +279,10 @@ def contract_to_minima(
 
 @inlined
 def contract_newton(half: Array, sums: Array, ball: float, cut: Array, solve: Array) -> None:
-    """Contract a box to the part in which the gradient may vanish; `ball` and sums[C00:] bound the Hessian's change."""
+    """Contract a box to the part in which the gradient may vanish (see `contract_to_minima`).
+
+    `ball` and sums[C00:] bound the Hessian's change, as `spread_of` returns and writes them.
+    """
     if not ball < inf:
         return
     # The mean of the Hessian changes by half of the bounds of change, which grow with the box at least linearly.
@@ -302,9 +318,9 @@ def contract_newton(half: Array, sums: Array, ball: float, cut: Array, solve: Ar
 def _clip_along(a: float, d: float, f: float, plane: bool, sums: Array, ball: float, cut: Array) -> bool:
     """Contract each coordinate to where the same component of the gradient may vanish; return whether any part remains.
 
-    If the Hessian is nearly singular, its inverse gives no bound, but a steep coordinate still gives one. Arguments
-    are as in `contract_newton`. a, d and f are the diagonal of the Hessian, and `ball` is multiplied by half of the
-    diagonal of the box.
+    If the Hessian is nearly singular, its inverse gives no bound, but a steep coordinate still gives one. Arguments are
+    as in `contract_newton`. a, d and f are the diagonal of the Hessian. `plane` means that there is no third
+    coordinate. `ball` is multiplied by half of the diagonal of the box.
     """
     for _ in range(_SWEEPS):
         for k in range(2 if plane else 3):
@@ -369,9 +385,10 @@ def has_no_infimum(
 
 @compiled
 def most_curved_side(half: Array, sums: Array, dimension: int) -> int:
-    """Return the side along which the unknown part of the Hessian changes the slope most, or -1 without any.
+    """Return the side (0, 1, 2) along which the uncertain part of the Hessian changes the slope most, or -1.
 
-    Over 70 fixes that took many boxes, halving this side took an eighth fewer boxes than halving the steepest side.
+    A search halves this side. The result is -1 if no side has a finite change above zero. Over 70 fixes that took many
+    boxes, halving this side took an eighth fewer boxes than halving the steepest side.
     """
     most, side = 0.0, -1
     for m in range(dimension):
@@ -386,7 +403,11 @@ def most_curved_side(half: Array, sums: Array, dimension: int) -> int:
 
 @compiled
 def is_concave_along(sums: Array, ball: float, hessian: Array) -> bool:
-    """Return whether the cost has a direction of negative curvature over the whole box, as around a saddle."""
+    """Return whether the cost has a direction of negative curvature over the whole box, as around a saddle.
+
+    No minimum is in a box of this kind. `sums` and `ball` are as in `has_no_infimum`, and `hessian` (3, 3) is working
+    memory.
+    """
     # No eigenvalue is less than a diagonal entry less the sizes of the other entries of its row (Gershgorin). This
     # decides the common case.
     a, b, c = abs(sums[H01]), abs(sums[H02]), abs(sums[H12])
@@ -414,7 +435,7 @@ def is_concave_along(sums: Array, ball: float, hessian: Array) -> bool:
 
 @compiled
 def least_diagonal(information: Array, dimension: int) -> float:
-    """Return the least diagonal entry of an information matrix."""
+    """Return the least of the first `dimension` diagonal entries of an information matrix (3, 3)."""
     least = inf
     for k in range(dimension):
         least = min(least, information[k, k])

@@ -1,4 +1,8 @@
-"""Descents: damped Newton steps from a point of low cost to the minimum that it belongs to."""
+"""Descents: damped Newton steps from a point of low cost to the minimum that it belongs to.
+
+Steps are in search coordinates (`optloc.proof.search_space`). The box of a descent is a point: its half-widths are
+zero.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +70,8 @@ def descend(cost: Cost, chart: LocalAxes, box: Box) -> float:
 def newton_step(box: Box, damping: float) -> float:
     """Write the damped step into the first row of box.solve; return its squared length in squared standard deviations.
 
-    The result is NaN if there is no step.
+    The step is subtracted from the coordinates. `damping` is the share by which the diagonal of the Hessian grows. The
+    result is NaN if there is no step.
     """
     sums = box.sums
     h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]
@@ -87,7 +92,10 @@ def newton_step(box: Box, damping: float) -> float:
 
 @inlined
 def damped_step(box: Box, h0: float, h1: float, h2: float, h3: float, h4: float, h5: float, damping: float) -> float:
-    """Write the step of a Hessian (00, 01, 02, 11, 12, 22) like `newton_step`; return its squared length, or NaN."""
+    """Write the step of a Hessian (00, 01, 02, 11, 12, 22) like `newton_step`; return its squared length, or NaN.
+
+    The gradient is in ``box.sums``. The damping multiplies the diagonal by 1 + damping.
+    """
     sums, solve, more = box.sums, box.solve, 1.0 + damping
     if not inverse(h0 * more, h1, h2, h3 * more, h4, h5 * more, solve):
         return float("nan")

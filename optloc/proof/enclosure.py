@@ -1,7 +1,10 @@
 """Enclosures: a box around all points that cost less than a level, computed from the measurements alone.
 
-Each residual of such a point is bounded, so each node of the point is within an interval. Intervals of nodes give
-balls, ellipsoids, bounds of squared rows and bounds of directions. The box is the intersection of all of them.
+The cost is |K phi - w|^2 with nodes phi_j, such as ranges and azimuths; rho is the root of the level. Each residual of
+a point inside is bounded, so each node of the point is within an interval. Intervals of nodes give balls, ellipsoids,
+bounds of squared rows and bounds of directions. The box is the intersection of all of them. It is in search coordinates
+s around a fix, with corners `lower` and `upper` (3,), in standard deviations. Nodes are solved in groups with a
+reference range r_p (`optloc.proof.groups`): a node is ``r_j = n_j r_p + z_j + e_j`` with measured z_j and error e_j.
 """
 
 from __future__ import annotations
@@ -121,9 +124,25 @@ def around_squares(
 ) -> None:
     """Contract the box of search coordinates by the squared rows of one group of nodes.
 
-    Squaring ``r_j = n_j r_p + z_j + e_j`` with n_j = +-1 gives ``2 a_j.(x - s_p) + 2 z_j n_j r_p = const - phi_j``
-    with ``phi_j = e_j (2 z_j + 2 n_j r_p + e_j)``. Without a reference range, the second unknown is |x - s_p|^2 and
-    n_j = 0. Differences to the fix remove the constants. The last unknown is bounded first, because phi contains it.
+    Squaring ``r_j = n_j r_p + z_j + e_j`` with n_j = +-1 gives ``2 a_j.(x - s_p) + 2 z_j n_j r_p = const - phi_j`` with
+    ``phi_j = e_j (2 z_j + 2 n_j r_p + e_j)``. Here s_p is the station of the reference, and a_j the station of node j
+    from s_p. Without a reference range, the second unknown is |x - s_p|^2 and n_j = 0. Differences to the fix remove
+    the constants. The last unknown is bounded first, because phi contains it.
+
+    Parameters
+    ----------
+    kinds, data, A, nodes, sense
+        Nodes of the cost, ``A = K'K``, the table of nodes at the fix, and T with x = origin + T s.
+    rho : float
+        Longest residual of points inside the box.
+    member, reference : int array, int
+        Nodes of the group without the reference, and the reference; negative without a reference.
+    R, tie : array
+        Covariance of the errors of the group, and the factors n_j of all nodes.
+    ties : array (J, TIE_WIDTH)
+        Table with the errors at the fix; the other columns are written.
+    lower, upper : array (3,)
+        Corners of the box, contracted in place.
     """
     count, ranges = _rows(kinds, data, nodes, sense, member, reference, tie, ties)
     for k in range(3):
@@ -163,9 +182,11 @@ def around_squares(
 def _rows(
     kinds: Array, data: Array, nodes: Array, sense: Array, member: Array, reference: int, tie: Array, ties: Array
 ) -> tuple[int, bool]:
-    """Write the coefficients of the squared rows; return the number of rows, and whether any is a range.
+    """Write the coefficients of the squared rows of a group; return their number, and whether any is a range.
 
-    An error e changes a row by ``e (first + second r_p + third e)``.
+    Stations are counted from the station of the reference, or from the first station without a reference. An error e
+    changes a row by ``e (first + second r_p + third e)``. For the arguments see `around_squares`; columns of `ties` are
+    written.
     """
     origin, count, ranges = reference, 0, False
     for j in member:
@@ -195,7 +216,10 @@ def _rows(
 
 @inlined
 def _left_inverse(A: Array, member: Array, ties: Array, ranges: bool, lower: Array, upper: Array) -> bool:
-    """Write the left inverse of the rows that has the least errors at the fix; return False if it does not exist."""
+    """Write the left inverse of the rows that has the least errors at the fix; return False if it does not exist.
+
+    `ranges` is the second result of `_rows`. Coordinates with lower = upper = 0 do not exist.
+    """
     normal = np.zeros((4, 4))
     for j in member:
         t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
@@ -269,9 +293,10 @@ def _inverts_well(member: Array, ties: Array, bound: Array, last: float, more: f
 def _sums(R: Array, member: Array, ties: Array, near: float, middle: float) -> tuple[float, float, float, float]:
     """Return the value of a weighted sum of squared rows at the fix, and three numbers that bound its errors.
 
-    The second and third number are ``sqrt(m'R m)``, for weights times (first + middle second) and for weights times
-    second. Times rho, they bound the linear part of the errors. The last number is the sum of ``|weight| third R_ii``.
-    Times rho squared, it bounds the quadratic part.
+    The weights are in column WEIGHT of `ties`, `near` is the reference range at the fix, and `middle` the middle of its
+    interval. The second and third number are ``sqrt(m'R m)``, for weights times (first + middle second) and for weights
+    times second. Times rho, they bound the linear part of the errors. The last number bounds the quadratic part, times
+    rho squared: it is the sum of ``|weight| third R_ii``.
     """
     value = linear = slope = square = 0.0
     for i in range(member.shape[0]):
@@ -303,10 +328,10 @@ def _sums(R: Array, member: Array, ties: Array, near: float, middle: float) -> t
 def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, lower: Array, upper: Array) -> None:
     """Contract a box of search coordinates by angles that differ little from the angles of the fix.
 
-    Let n be the horizontal unit vector across the direction from a station to the fix, and v the other one. A point at
-    distance r whose azimuth and elevation differ by at most a and e obeys ``|n.(x - x^)| <= r sin a`` and
-    ``|v.(x - x^)| <= r (sin e + 1 - cos a)``. The distance r is at most the distance of the fix plus ``y = |x - x^|``.
-    A left inverse of these rows bounds y first, then each coordinate.
+    Let n be the horizontal unit vector across the direction from a station to the fix, and v the unit vector across
+    both. A point y at distance r whose azimuth and elevation differ by at most a and e obeys ``|n.(y - x)| <= r sin a``
+    and ``|v.(y - x)| <= r (sin e + 1 - cos a)``. The distance r is at most the distance of the fix plus ``|y - x|``. A
+    left inverse of these rows bounds |y - x| first, then each coordinate.
 
     Parameters
     ----------
@@ -366,14 +391,14 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
 def _span(back: Array, axes: Array, turned: Array) -> int:
     """Write orthonormal axes (3, 3) of the rows of a matrix, and the matrix along them; return the number of axes.
 
-    Rows of zeros must come last.
+    `back` (3, 3) is the matrix, and `turned` (3, 3) is ``back axes'``. Rows of zeros must come last.
     """
     count = 0
     for k in range(3):
         length = 0.0
         for m in range(3):
             axes[k, m] = back[k, m]
-        for _ in range(2):  # twice is exact (Parlett)
+        for _ in range(2):  # twice is exact (Parlett 1980)
             for other in range(k):
                 along = axes[k, 0] * axes[other, 0] + axes[k, 1] * axes[other, 1] + axes[k, 2] * axes[other, 2]
                 for m in range(3):
@@ -392,7 +417,9 @@ def _span(back: Array, axes: Array, turned: Array) -> int:
 def _weighted_inverse(rows: Array, reach: Array, far: Array, count: int, span: int, gamma: Array, off: Array) -> bool:
     """Write the left inverse of rows weighted by their widths; return False if they do not determine a position.
 
-    The bounds of its errors are written into `off` (3, 3), entry by entry.
+    The first `count` of `rows` are unit vectors (3,) along `span` axes. The width of a row is reach times far: the
+    share of the distance, times the distance of the fix, m. The left inverse is `gamma` (3, count). The bounds of its
+    errors are written into `off` (3, 3), entry by entry.
     """
     solve, normal = np.empty((3, 3)), np.zeros((3, 3))
     for i in range(count):
@@ -416,7 +443,10 @@ def _weighted_inverse(rows: Array, reach: Array, far: Array, count: int, span: i
 
 @compiled
 def _inverts(gamma: Array, rows: Array, count: int, span: int, off: Array) -> bool:
-    """Write bounds of |gamma rows - 1|, entry by entry; return whether all are as small as rounding."""
+    """Write bounds of the entries of |gamma rows - 1| into `off` (3, 3).
+
+    Return whether all are as small as rounding.
+    """
     off[:] = 0.0
     for k in range(span):
         for m in range(span):

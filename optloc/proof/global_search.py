@@ -1,4 +1,9 @@
-"""The proof for all positions: first within an enclosure if there is one, else over the atlas of all space."""
+"""The proof for all positions: first within an enclosure if there is one, else over the atlas of all space.
+
+An *enclosure* is a box around the fix that contains all points below a cost (`optloc.proof.enclosure`). The *atlas*
+covers all positions to infinity with boxes of finite size (`optloc.proof.atlas`). *Squared rows*
+(`optloc.proof.squares`) contract large boxes.
+"""
 
 from __future__ import annotations
 
@@ -127,7 +132,10 @@ class GlobalWorkspace(NamedTuple):
 
 @compiled
 def _bound_row(work: GlobalWorkspace, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
-    """Return the result of `optloc.proof.level_search.bound_row` for a cost without unknown scales."""
+    """Return a bound of the residual in a box of the stack, infinite if excluded, and the cost at its centre.
+
+    This is `optloc.proof.level_search.bound_row` for a cost without unknown factors.
+    """
     atlas, box, cost, piece = space.atlas, work.box, work.cost, int(stack[row, PIECE])
     if not _take(stack, row, atlas, space.chart, work.corners, box, piece):
         return inf, inf
@@ -139,7 +147,10 @@ def _bound_row(work: GlobalWorkspace, space: Space, stack: Array, row: int, leve
 
 @inlined
 def _bound(cost: Cost, atlas: Atlas, box: Box, floor: float) -> float:
-    """Return a lower bound of the residual's length over a box whose centre is set; fill the tables of the box."""
+    """Return a lower bound of the residual's length over a box whose centre is set; fill the tables of the box.
+
+    A negative result means that no bound is known.
+    """
     bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
     linearise_rows(cost.K, cost.w, box.nodes, box.rows)
     return least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
@@ -147,7 +158,10 @@ def _bound(cost: Cost, atlas: Atlas, box: Box, floor: float) -> float:
 
 @inlined
 def _side_of_rest(work: GlobalWorkspace, space: Space, touching: bool, rho: float, sound: bool) -> int:
-    """Return the result of `optloc.proof.level_search.side_of_rest` for a cost without unknown scales."""
+    """Contract a box and return the side across which to halve the rest; -1 if no part remains.
+
+    This is `optloc.proof.level_search.side_of_rest` for a cost without unknown factors.
+    """
     cost, atlas, box = work.cost, space.atlas, work.box
     noise = rounding_error(cost.K, cost.weight, work.floor, box.nodes)
     reset_cut(box.half, box.cut)
@@ -168,7 +182,8 @@ def _side_of_rest(work: GlobalWorkspace, space: Space, touching: bool, rho: floa
 def _take(stack: Array, row: int, atlas: Atlas, chart: LocalAxes, corners: Array, box: Box, piece: int) -> bool:
     """Take a box off the stack and set its centre; return False if no part of it needs a search.
 
-    If the corners are known, the part of the box outside them is cut off.
+    `row` is its row in the stack, and `piece` its piece of the atlas. If `corners` (2, 3), search coordinates, are
+    known, the part of the box outside them is cut off: its cost is above the levels.
     """
     faces = 2 * atlas.dimension
     pop(stack, row, box.at, box.half)
@@ -191,7 +206,10 @@ def _take(stack: Array, row: int, atlas: Atlas, chart: LocalAxes, corners: Array
 
 @compiled
 def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box, piece: int) -> bool:
-    """Contract a box with a set centre by its squared rows, as often as that helps; return whether any part remains."""
+    """Contract a box with a set centre by its squared rows, as often as that helps.
+
+    Return whether any part remains in which the cost may be below `level`.
+    """
     if squares.groups == 0 or change_of_residual(atlas, squares, box.half) ** 2 <= _BENT * level:
         return True
     for _ in range(_LOOKS):
@@ -210,14 +228,20 @@ def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box,
 
 @compiled
 def excludes_infimum(cost: Cost, atlas: Atlas, box: Box, touching: bool, floor: float) -> bool:
-    """Return whether a box with bounded nodes contains no infimum of the cost; `touching`: the box reaches infinity."""
+    """Return whether a box with bounded nodes contains no infimum of the cost.
+
+    `touching` means that the box reaches infinity. `floor` is the result of `accuracy_floor_far`.
+    """
     reset_cut(box.half, box.cut)
     return _clips_away(cost, atlas, box, touching, rounding_error(cost.K, cost.weight, floor, box.nodes))
 
 
 @inlined
 def _clips_away(cost: Cost, atlas: Atlas, box: Box, touching: bool, noise: float) -> bool:
-    """Return the result of `excludes_infimum` for the part between the ends of ``box.cut``, which is contracted."""
+    """Return the result of `excludes_infimum` for the part between the ends of ``box.cut``, which is contracted.
+
+    `noise` bounds the rounding of a residual.
+    """
     curve_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
     sum_up(cost.K, cost.w, cost.weight, noise, box.nodes, box.curves, box.sums)
     ball = spread_of(cost.A, box.half, box.nodes, box.curves, box.sums)
@@ -226,7 +250,10 @@ def _clips_away(cost: Cost, atlas: Atlas, box: Box, touching: bool, noise: float
 
 @compiled
 def _descend_near(work: GlobalWorkspace, chart: LocalAxes) -> float:
-    """Return the result of `optloc.proof.level_search.descend_near` for a cost without unknown scales."""
+    """Move the box around a position to a minimum; return its cost, or infinity if no minimum is reached.
+
+    This is `optloc.proof.level_search.descend_near` for a cost without unknown factors.
+    """
     return descend(work.cost, chart, work.near)
 
 
@@ -241,13 +268,19 @@ def _set_rival(
     eps: float,
     _rho: float,
 ) -> bool:
-    """Return the result of `optloc.proof.level_search.set_rival` for a cost without unknown scales."""
+    """Write minimum i, at x, and the boxes around it into an atlas; return False if it is no minimum.
+
+    This is `optloc.proof.level_search.set_rival` for a cost without unknown factors.
+    """
     return set_minimum(work.cost, work.near, atlas, i, x, value, eps, inf)
 
 
 @compiled
 def _cost_set(work: GlobalWorkspace, atlas: Atlas) -> float:
-    """Return the result of `optloc.proof.level_search.cost_set` for a cost without unknown scales."""
+    """Return the cost at the current centre of the atlas; the tables of the box are overwritten.
+
+    This is `optloc.proof.level_search.cost_set` for a cost without unknown factors.
+    """
     bound_pieces(atlas, work.cost.kinds, work.cost.data, work.box.half, work.box.nodes)
     return cost_at(work.cost.K, work.cost.w, work.box.nodes)
 
@@ -333,7 +366,10 @@ def prove_globally(
 
 @compiled
 def _reach_of(cost: Cost, x: Array) -> float:
-    """Return the greatest size of an enclosure to search, as a multiple of the convex box around a fix x (D,)."""
+    """Return the greatest size of an enclosure to search, as a multiple of the convex box around a fix x (D,).
+
+    It is larger for a fix between the stations. A larger enclosure takes more boxes than the atlas.
+    """
     middle, radius = station_cube(cost.kinds, cost.data, x)
     between = True
     for k in range(x.shape[0]):
@@ -353,7 +389,10 @@ def prove_atlas(
     rivals: Array,
     found: Array,
 ) -> tuple[int, int, float, float, int]:
-    """Prove the same as `prove_globally` with the atlas alone; `optloc.proof.box.reaches_infinity` must hold."""
+    """Prove the same as `prove_globally` with the atlas alone, and return the same results.
+
+    The cost must stay finite at infinity (`optloc.proof.box.reaches_infinity`).
+    """
     chart, _ = chart_at(cost, x, box)
     least, corners, nowhere = cost_at(cost.K, cost.w, box.nodes), np.empty((2, 3)), np.full(x.shape[0], nan)
     noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
@@ -394,7 +433,10 @@ def prove_atlas(
 def verdict_of(
     outcome: int, boxes: int, bound: float, shown: int, met: int, gaps: Array, least: float
 ) -> tuple[int, int, float, float, int]:
-    """Return the results of `prove_globally` for the outcome of a search; `least` is the lowest level."""
+    """Return the results of `prove_globally` for the outcome of a search; `least` is the lowest level.
+
+    `outcome`, `boxes`, `bound`, `shown` and `met` are the results of `optloc.proof.level_search.search_levels`.
+    """
     if outcome == CLEAR:
         return UNIQUE if gaps[shown] > 0.0 else VALUE, boxes, bound, gaps[shown], met
     if outcome == CHEAPER:
@@ -406,7 +448,11 @@ def verdict_of(
 
 @compiled
 def _listed(x: Array, others: Array, found: Array) -> bool:
-    """Return whether a found minimum is one of the others; around it no box along the axes of x is convex."""
+    """Return whether the point `found` (D,) is one of the known minima `others` (P, D).
+
+    X (D,) is the fix, all in metres. A search in the axes of x may find a known minimum again, if no box along these
+    axes is convex around it.
+    """
     for p in range(others.shape[0]):
         apart = away = 0.0
         for k in range(x.shape[0]):

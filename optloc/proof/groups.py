@@ -1,4 +1,9 @@
-"""Groups of nodes that correlated rows connect: each group is solved for its single nodes."""
+"""Groups of nodes that correlated rows connect: each group is solved for its single nodes.
+
+A node is a scalar function of the position, such as a range; whitened rows are K phi - w. Differences of ranges
+determine nodes only up to a common *reference* range. The enclosure of a fix (`optloc.proof.enclosure`) then bounds
+each node.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +54,7 @@ def empty_groups(J: int) -> Groups:
 
 @compiled
 def set_groups(kinds: Array, A: Array, groups: Groups) -> None:
-    """Write the groups of nodes with codes `kinds` (J,) and products of rows ``A = K'K`` (J, J)."""
+    """Write the groups of nodes with codes `kinds` (J,) and products of rows ``A = K'K`` (J, J) into `groups`."""
     J, order = kinds.shape[0], groups.order
     first = number = zero()
     for j in range(J):
@@ -65,7 +70,11 @@ def set_groups(kinds: Array, A: Array, groups: Groups) -> None:
 
 @compiled
 def _gather(A: Array, member: Array, first: int) -> int:
-    """Move the nodes that are coupled to the node at `first` directly behind it; return the size of the group."""
+    """Move the nodes that are coupled to the node at `first` directly behind it; return the size of the group.
+
+    `member` (J,) is the list of nodes, in any order from `first` on. Nodes are coupled if their entry of A is not
+    rounding, directly or through other nodes.
+    """
     seen, end = first, first + 1
     while seen < end:
         j = member[seen]
@@ -80,10 +89,14 @@ def _gather(A: Array, member: Array, first: int) -> int:
 
 @compiled
 def _solve(kinds: Array, A: Array, member: Array, first: int, count: int, R: Array, tie: Array) -> int:
-    """Solve the rows of a group for its nodes; return the reference, which is moved to the end of the group."""
+    """Solve the rows of a group for its nodes; return its reference, which is moved to the end of the group.
+
+    The result is NONE if the group needs no reference, and LOOSE if its rows are too few. The group is
+    member[first:first + count]. `R` and `tie` are written as in `Groups`.
+    """
     if _ties(kinds, A, member, first, count, count, R, tie):
         return NONE
-    # The rows determine differences only. Any range can be the reference; the first one is taken.
+    # The rows determine differences only. Any range can be the reference; the function takes the first range.
     for i in range(first, first + count):
         if kinds[member[i]] == RANGE:
             last, reference = first + count - 1, member[i]
@@ -94,9 +107,9 @@ def _solve(kinds: Array, A: Array, member: Array, first: int, count: int, R: Arr
 
 @compiled
 def _ties(kinds: Array, A: Array, member: Array, first: int, size: int, count: int, R: Array, tie: Array) -> bool:
-    """Write the covariance of the errors, and the factors n_j; return False if the rows do not have this form.
+    """Write the covariance R of the errors, and the factors n_j; return False if the rows do not have this form.
 
-    If the group has more nodes than the `size` solved nodes, the last node is the reference.
+    The first `size` of the `count` nodes of the group are solved. If count is larger, the last node is the reference.
     """
     own = R[first : first + size, first : first + size]
     for i in range(size):

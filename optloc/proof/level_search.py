@@ -36,7 +36,10 @@ _NEAR = 10.0
 
 @compiled
 def bound_row(work: Any, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
-    """Return a bound of the residual in a box of the stack, infinite if excluded, and the cost at its centre."""
+    """Return a bound of the residual in a box of the stack, infinite if excluded, and the cost at its centre.
+
+    `row` is the row of the box in the stack. `level` is the cost from which a box is excluded.
+    """
     raise NotImplementedError
 
 
@@ -44,8 +47,8 @@ def bound_row(work: Any, space: Space, stack: Array, row: int, level: float) -> 
 def side_of_rest(work: Any, space: Space, touching: bool, rho: float, sound: bool) -> int:
     """Return the side across which to halve a contracted box; -1 if no part of the box remains.
 
-    The box is contracted to residuals shorter than rho, and if `sound`, to points that may be minima. The ends of the
-    remaining part are in ``box.cut``.
+    The box is contracted to residuals shorter than rho, and if `sound`, to points that may be minima. `touching` means
+    that it reaches infinity. The ends of the remaining part are in ``box.cut``.
     """
     raise NotImplementedError
 
@@ -60,7 +63,11 @@ def descend_near(work: Any, chart: LocalAxes) -> float:
 def set_rival(
     work: Any, atlas: Atlas, chart: LocalAxes, i: int, x: Array, value: float, eps: float, rho: float
 ) -> bool:
-    """Write a minimum and the boxes around it into an atlas, see `optloc.proof.convex_boxes.set_minimum`."""
+    """Write minimum i, at x (D,), and the boxes around it into an atlas.
+
+    Return False if x is no minimum or costs too little. For `value` and `eps` see
+    `optloc.proof.convex_boxes.set_minimum`; rho is the root of the first level.
+    """
     raise NotImplementedError
 
 
@@ -186,6 +193,8 @@ def _meet(
     """Descend from the current centre; if the descent ends in an unknown minimum, store it and push boxes around it.
 
     Returns the number of rivals (-1 if no boxes can be made around the minimum), the size of the stack, and the space.
+    The arguments are as in `search_levels`; `first` is the index of the first level that can still be shown, and `met`
+    the number of rivals before.
     """
     atlas, chart, near, d = space.atlas, space.chart, work.near, space.atlas.dimension
     place_of(space, work.box, found)
@@ -215,7 +224,10 @@ def _meet(
 
 @compiled
 def _at_infinity(work: Any, atlas: Atlas, piece: int) -> float:
-    """Return the cost at infinity next to the centre of a box that reaches infinity; its tables are overwritten."""
+    """Return the cost at infinity next to the centre of a box that reaches infinity; its tables are overwritten.
+
+    It is the cost at v = 0, with the other coordinates of the centre.
+    """
     at = work.box.at.copy()
     at[atlas.dimension - 1] = infinity_coordinate(atlas, piece)
     set_centre(atlas, piece, at)
@@ -237,7 +249,10 @@ def _last_above_zero(levels: Array) -> int:
 
 @compiled
 def _first_below(levels: Array, first: int, ends: float) -> int:
-    """Return the index of the first level, from `first` on, that a cost reaches, or the number of levels."""
+    """Return the index of the first level, from `first` on, that the cost `ends` reaches, or the number of levels.
+
+    The levels are in descending order. Levels above the cost at infinity cannot be shown.
+    """
     while first < levels.shape[0] and ends < levels[first]:
         first += 1
     return first
@@ -245,7 +260,10 @@ def _first_below(levels: Array, first: int, ends: float) -> int:
 
 @compiled
 def _take_back(stack: Array, aside: Array, waiting: int, level: float) -> tuple[int, int]:
-    """Move the boxes whose bound is below a level from `aside` to the stack; return the numbers of boxes on both."""
+    """Move the boxes whose bound is below a level from `aside` to the empty stack; return the numbers of boxes on both.
+
+    `waiting` is the number of boxes on `aside`, where they wait for this level.
+    """
     size, left = zero(), zero()
     for i in range(waiting):
         if aside[i, LEAST] * aside[i, LEAST] < level:

@@ -1,4 +1,9 @@
-"""Branch and bound around a fix: no point costs less, and no other minimum has nearly the same cost."""
+"""Branch and bound around a fix: no point costs less, and no other minimum has nearly the same cost.
+
+Boxes are in search coordinates around the fix, in standard deviations (`optloc.proof.search_space.LocalAxes`), and wait
+on a stack (`optloc.proof.box`). A box is dropped if its least cost is at least a level, or if it contains no minimum.
+Otherwise it is contracted, halved and pushed back.
+"""
 
 from __future__ import annotations
 
@@ -191,11 +196,12 @@ def search_boxes(
 
 @inlined
 def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Goal, enough: bool) -> bool:
-    """Return whether a box is inside the convex box of a known minimum for which no condition is open.
+    """Return whether a box needs no further search because it is in the convex box of a known minimum.
 
-    The convex box of a known minimum contains no second minimum, but it may contain a point of lower cost. `enough`:
-    any known minimum finishes the box. If the search has no open boundary, the box of the fix contains nothing
-    cheaper.
+    `minima` and `sides` (P, 3) are the known minima and the half-widths of their convex boxes. A convex box contains no
+    second minimum, but it may contain a point of lower cost. If `enough`, the convex box of any known minimum finishes
+    the box. Otherwise only convex boxes of the fix and of hidden minima do. If the search has no open boundary, the box
+    of the fix contains nothing cheaper.
     """
     first = 0 if aim.whole else aim.own
     if is_known(at, half, minima[first : aim.free], sides[first : aim.free]):
@@ -207,7 +213,8 @@ def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Goal, eno
 def _follow(cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array, aim: Goal) -> int:
     """Descend from the centre of a box to a minimum; return CHEAPER, or ANOTHER for an unknown minimum, or CLEAR.
 
-    Afterwards the box is the minimum. After CLEAR, centre and half-widths are restored, but not the tables.
+    CHEAPER means that the minimum costs less than `aim.better`, and ANOTHER that it costs less than `aim.level`. The
+    centre of the box is then at the minimum. After CLEAR, centre and half-widths are restored, but not the tables.
     """
     at, half = box.at.copy(), box.half.copy()
     least = descend(cost, chart, box)
@@ -225,8 +232,9 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
     """Return the coordinate across which halving a box reduces the remainders in its bound most.
 
     The remainder of a range is nearly ``s'N s / 2``, so coordinate k has the share ``h_k sum_m |N_km| h_m`` in it. Its
-    weight is the pull ``|K_j.v|`` on the bound. If the centre is below the level (`inside`), no bound suffices. In
-    this case, and if ranges have no part in the bound, the result is the widest side.
+    weight is the pull ``|K_j.v|`` on the bound, with v the direction of the bound (`optloc.proof.box.least_residual`).
+    N is the Hessian of the range, and h the half-widths. If the centre is below the level (`inside`), no bound
+    suffices. In this case, and if ranges have no part in the bound, the result is the widest side.
     """
     if inside:
         return widest(half)
@@ -266,6 +274,7 @@ def lay_or_halve(cost: Cost, chart: LocalAxes, box: Box, stack: Array, size: int
         return -1
     first = (sense[0, 0] * sense[0, 0] + sense[1, 0] * sense[1, 0] + sense[2, 0] * sense[2, 0]) * half[0] * half[0]
     second = (sense[0, 1] * sense[0, 1] + sense[1, 1] * sense[1, 1] + sense[2, 1] * sense[2, 1]) * half[1] * half[1]
+    # Without a bound of the parent box, in piece 0, and with rounding of the halves.
     return push_halves(stack, size, 0 if first >= second else 1, box.at, half, 0.0, 0, False)
 
 
@@ -401,9 +410,9 @@ def prove_locally(
 def _refuting(least: float, eps: float, noise: float) -> float:
     """Return the cost below which a point refutes the claim that all costs are at least the cost of the fix less eps.
 
-    The result is halfway between the two. So a cheaper point is cheaper by more than rounding, and no box remains that
-    is cheaper by less. If eps is large, a point far below the cost of the position, but above the level, refutes
-    nothing.
+    `least` is the cost of the fix, and `noise` bounds the rounding of a residual. The result is halfway between `least`
+    and ``least - eps``. So a cheaper point is cheaper by more than rounding, and no box remains that is cheaper by
+    less. If eps is large, a point far below the cost of the position, but above the level, refutes nothing.
     """
     if eps > _MUCH:
         return least - eps + 0.5 * equal_within(_EQUAL * (1.0 + least - eps), least, noise)
@@ -412,7 +421,10 @@ def _refuting(least: float, eps: float, noise: float) -> float:
 
 @inlined
 def _holds_origin(low: Array, high: Array) -> bool:
-    """Return whether the region to search contains the position itself."""
+    """Return whether the region to search contains the fix, which is the origin of search coordinates.
+
+    `low` and `high` (3,) are the corners of the region.
+    """
     inside = True
     for k in range(3):
         inside = inside and low[k] <= 0.0 <= high[k]
@@ -421,7 +433,10 @@ def _holds_origin(low: Array, high: Array) -> bool:
 
 @inlined
 def _extent(low: Array, high: Array, sides: Array) -> float:
-    """Return the greatest ratio of the region to search to the convex box around a fix, over all axes."""
+    """Return the greatest ratio of the region to search to the convex box around a fix, over all axes.
+
+    `low` and `high` (3,) are the corners of the region, and `sides` (3,) the half-widths of the convex box.
+    """
     most = 0.0
     for k in range(3):
         if sides[k] > 0.0:
@@ -431,14 +446,20 @@ def _extent(low: Array, high: Array, sides: Array) -> float:
 
 @inlined
 def steepness(slope: tuple[float, float, float], noise: float) -> float:
-    """Return the greatest squared length of a slope, per standard deviation, if residuals are off by `noise`."""
+    """Return the greatest squared length of a slope of f/2 if residuals are off by `noise`.
+
+    `slope` has three components, per standard deviation. The Jacobian columns have length one in these units.
+    """
     a, b, c = abs(slope[0]) + noise, abs(slope[1]) + noise, abs(slope[2]) + noise
     return a * a + b * b + c * c
 
 
 @compiled
 def _laid(cost: Cost, chart: LocalAxes, box: Box) -> tuple[float, float]:
-    """Return the cost of a fix moved onto its surface (infinite if impossible), and its rounding; fill the sums."""
+    """Return the cost of a fix moved onto its surface (infinite if impossible), and its rounding; fill the sums.
+
+    The second number bounds the rounding of the length of the residual.
+    """
     box.at[:], box.half[:] = 0.0, 0.0
     there, noise = value_at(cost, chart, box), 0.0
     if there < inf:
@@ -458,7 +479,11 @@ def _search_sides(
     boxes: int,
     stack: Array,
 ) -> tuple[int, int]:
-    """Search all pieces of a surface other than the piece of the fix; return the outcome and the boxes in total."""
+    """Search all pieces of a surface other than the piece of the fix; return the outcome and the boxes in total.
+
+    `around` are the search coordinates of the fix, and `boxes` is the number of boxes before. The search ends at the
+    first piece with an outcome other than CLEAR.
+    """
     corners, outcome = np.empty((2, 3)), CLEAR
     for side in range(1, SIDES):
         chart = axes_of_next_piece(cost, around, side)
@@ -486,7 +511,8 @@ def region_of(
 ) -> bool:
     """Write the corners of the box to search: the region, or an enclosure of all points that cost less than rho^2.
 
-    Return False if there is no enclosure.
+    The corners `low` and `high` (3,) are in search coordinates. The region has the corners `lower` and `upper` (D,),
+    metres; if lower[0] is NaN, the enclosure is written. Return False if there is no enclosure.
     """
     if isnan(lower[0]):
         bounded = enclose(cost, chart, box, rho, low, high)

@@ -1,4 +1,11 @@
-"""Boxes on the pieces of an atlas: the stacks of a search, the ends at infinity, and the boxes of known minima."""
+"""Boxes on the pieces of an atlas: the stacks of a search, the ends at infinity, and the boxes of known minima.
+
+The pieces and their numbers are in `optloc.proof.atlas`: 2 d faces, the inside, then one piece around each known
+minimum, with d dimensions. A stack has one row for each box (`optloc.proof.box`: centre, half-widths, lower bound of
+the residual, piece), and `size` is its number of boxes. `low` is a lower bound of the residual's length over a box. The
+*convex box* of a minimum contains no second minimum; its *core* is a wider box that is searched along the axes of the
+minimum.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +48,11 @@ def is_tiny(box: Box, piece: int, d: int) -> bool:
 def push_or_defer(
     stack: Array, size: int, aside: Array, waiting: int, box: Box, side: int, low: float, piece: int, level: float
 ) -> tuple[int, int]:
-    """Push the remaining part of a box, or postpone it if it costs more than a level; return both stack sizes."""
+    """Push the remaining part of a box, or postpone it if it costs more than a level; return both stack sizes.
+
+    The stack `aside` with `waiting` boxes is for postponed boxes. `side` is the side to halve. If `aside` is nearly
+    full, the box is pushed at once.
+    """
     if low > 0.0 and low * low >= level and waiting + SPARE <= _WAITING:
         return size, push_rest(aside, waiting, box.cut, box.at, box.half, side, low, piece)
     return push_rest(stack, size, box.cut, box.at, box.half, side, low, piece), waiting
@@ -49,13 +60,19 @@ def push_or_defer(
 
 @compiled
 def touches_infinity(box: Box, last: int, end: float) -> bool:
-    """Return whether a box reaches infinity, where the last coordinate has the value `end`."""
+    """Return whether a box reaches infinity, where the last coordinate has the value `end` (-inf: it never does).
+
+    `last` is the index of the last coordinate.
+    """
     return bool(end > -inf and box.at[last] - end <= box.half[last])
 
 
 @compiled
 def contract_at_infinity(box: Box, last: int, end: float) -> None:
-    """Cut off the part of a box that rounding has put beyond infinity, where the inverse range would be negative."""
+    """Cut off the part of a box that rounding has put beyond infinity, where the inverse range would be negative.
+
+    `last` is the index of the last coordinate, and `end` its value at infinity, -inf if the piece does not end there.
+    """
     if end > -inf and box.at[last] - end < box.half[last]:
         box.half[last] = 0.5 * (box.at[last] - end + box.half[last]) * (1.0 + _BEYOND)
         box.at[last] = end + box.half[last]
@@ -63,7 +80,10 @@ def contract_at_infinity(box: Box, last: int, end: float) -> None:
 
 @inlined
 def push_rest(stack: Array, size: int, cut: Array, at: Array, half: Array, side: int, low: float, piece: int) -> int:
-    """Push the remaining part of a box, whole or halved across a side; return the size of the stack."""
+    """Push the part of a box between the ends of `cut`, whole or halved across a side; return the size of the stack.
+
+    The part is pushed whole if it is less than the share `SHRUNK` of the box, and not at all if it is empty.
+    """
     share = cut_out(cut, at, half)
     if 0.0 < share < SHRUNK:
         return push(stack, size, at, half, low, piece)
@@ -72,7 +92,10 @@ def push_rest(stack: Array, size: int, cut: Array, at: Array, half: Array, side:
 
 @compiled
 def is_left(atlas: Atlas, box: Box, piece: int) -> bool:
-    """Return whether a box is inside the convex box of a known minimum, or inside a box that is searched elsewhere."""
+    """Return whether a search leaves a box out: it is inside the convex box of a known minimum, or inside another core.
+
+    Such a core is searched as a piece with another number. The centre of the box is the current centre of the atlas.
+    """
     d, minima = atlas.dimension, atlas.minima
     for i in range(minima.home.shape[0]):
         # A box around one minimum is left only to minima with lower numbers, never to its own core.
@@ -91,7 +114,10 @@ def is_left(atlas: Atlas, box: Box, piece: int) -> bool:
 
 @compiled
 def is_listed(atlas: Atlas, x: Array) -> bool:
-    """Return whether a position x (D,) is inside the convex box of a known minimum, or next to the minimum."""
+    """Return whether a position x (D,), metres, is inside the convex box of a known minimum, or next to the minimum.
+
+    If so, the end of a descent is no new minimum.
+    """
     d, minima, u = atlas.dimension, atlas.minima, np.zeros(3)
     for i in range(minima.home.shape[0]):
         inside = coordinates_on(atlas, minima.home[i], x, u)
@@ -119,7 +145,7 @@ def push_pieces(stack: Array, atlas: Atlas) -> int:
 
 @compiled
 def push_faces(stack: Array, d: int) -> int:
-    """Push all faces of the cube, and its inside; return the size of the stack."""
+    """Push all faces of the cube, and its inside, as whole pieces onto an empty stack; return the number of boxes."""
     for piece in range(2 * d + 1):
         stack[piece] = 0.0
         for k in range(d):

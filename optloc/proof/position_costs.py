@@ -1,6 +1,8 @@
 """From a batch of problems to the costs ``f(x) = |K phi(x) - w|^2`` of the position, which proofs bound.
 
-Each row of measurements is a sum of nodes phi. Other unknowns are projected out or added to the covariance.
+Each row of measurements is a sum of nodes phi: scalar functions of the position, such as ranges. Other unknowns, such
+as clock offsets, are projected out or added to the covariance. Letters: N problems (B is N, or 1 if all share), m rows,
+q whitened rows, J nodes, d coordinates, n unknowns; `width` numbers define a node.
 """
 
 from __future__ import annotations
@@ -23,8 +25,6 @@ from optloc.proof.nodes.dispatch import NODES, code_of, named, width
 from optloc.proof.nodes.level import linear_numbers
 from optloc.proof.nodes.node import LINEAR, RATE, Node, NodeRow
 from optloc.proof.nodes.rate import RATE_WIDTH, STATION, VELOCITY
-
-# From rows of measurements to nodes: the scalar functions that sum to the rows, and their numbers.
 
 # Cosine below which two columns of whitened rows count as orthogonal: whitening loses some digits of a double.
 _ORTHOGONAL = 1e-9
@@ -64,15 +64,18 @@ class CostColumns:
     shared: dict[tuple[int, int, int], int] = field(default_factory=dict)
 
     def add(self, kind: int, data: Array, station: int = -1, epoch: int = -1) -> int:
-        """Add a node and return its number."""
+        """Add a node with numbers `data` (B, n) and return its index.
+
+        `station` and `epoch` are as in the fields of these names.
+        """
         self.kinds.append(kind)
         self.data.append(data)
         self.station.append(station)
         self.epoch.append(epoch)
         return len(self.kinds) - 1
 
-    def touch(self, row: int, column: int, coefficient: float) -> None:
-        """Add a node, times a coefficient, to a row of the problem."""
+    def add_to_row(self, row: int, column: int, coefficient: float) -> None:
+        """Add ``coefficient * node`` to a row of the problem; `column` is the index of the node."""
         self.row.append(row)
         self.column.append(column)
         self.coefficient.append(coefficient)
@@ -87,8 +90,8 @@ class CostColumns:
             key = (column, int(group[row]))
             if key not in new:
                 new[key] = out.add(self.kinds[column], self.data[column], self.station[column], self.epoch[column])
-            out.touch(row, new[key], coefficient)
-        return out, np.array([own for _, own in new])
+            out.add_to_row(row, new[key], coefficient)
+        return out, np.array([number for _, number in new])
 
     def with_velocity(self) -> Array:
         """Add the components of lines of sight that multiply the target's velocity; return the group of each node (J,).
@@ -104,7 +107,7 @@ class CostColumns:
                 if (column, k) not in new:
                     new[column, k] = self.add(RATE, _along_axis(self.data[column], k))
                     group.append(k)
-                self.touch(row, new[column, k], coefficient)
+                self.add_to_row(row, new[column, k], coefficient)
         return np.array(group)
 
     @property
@@ -141,18 +144,18 @@ def columns_of(problem: Problem, observed: Array) -> CostColumns:
 
     `observed` (N, m) has the measurements minus all known additions; azimuth nodes are relative to them.
     """
-    made = CostColumns(problem)
+    nodes = CostColumns(problem)
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         model = MODELS[rows.kind]
         for i in range(rows.count):
             row = NodeRow(problem, int(rows.a[i]), int(rows.b[i]), int(rows.epoch[i]), observed[:, start + i])
             for factor, node, station in _terms(model, row):
-                made.touch(start + i, _number_of(made, replace(row, a=station), node), factor)
-    return made
+                nodes.add_to_row(start + i, _number_of(nodes, replace(row, a=station), node), factor)
+    return nodes
 
 
 def _terms(model: Model, row: NodeRow) -> Iterator[tuple[float, str | Node, int]]:
-    """Yield the terms of a row: factor, node, and station."""
+    """Yield the terms that sum to the prediction of a row: factor, node (or its name), and station."""
     nodes = ((1.0, "range"),) if model.ranges is not None else model.nodes
     # If each station measures separately, its terms have a sign. Other nodes belong to the row as a whole.
     for sign, station in zip(model.signs or (1,), (row.a, row.b), strict=False):
@@ -160,20 +163,20 @@ def _terms(model: Model, row: NodeRow) -> Iterator[tuple[float, str | Node, int]
             yield from ((sign * factor, node, station) for factor, node in nodes)
 
 
-def _number_of(made: CostColumns, row: NodeRow, node: str | Node) -> int:
-    """Return the number of a node of one row; a node of one station and epoch is added once and shared."""
-    code, own = code_of(node), named(node)
-    if not own.of_station:
-        return made.add(code, own.numbers(row))
-    epoch = row.epoch if own_epochs(made.problem) > 1 else 0
+def _number_of(nodes: CostColumns, row: NodeRow, node: str | Node) -> int:
+    """Return the index of a node of one row in `nodes`; a node of one station and epoch is added once and shared."""
+    code, entry = code_of(node), named(node)
+    if not entry.of_station:
+        return nodes.add(code, entry.numbers(row))
+    epoch = row.epoch if own_epochs(nodes.problem) > 1 else 0
     key = (code, row.a, epoch)
-    if key not in made.shared:
-        made.shared[key] = made.add(code, own.numbers(row), row.a, epoch)
-    return made.shared[key]
+    if key not in nodes.shared:
+        nodes.shared[key] = nodes.add(code, entry.numbers(row), row.a, epoch)
+    return nodes.shared[key]
 
 
 def own_epochs(problem: Problem) -> int:
-    """Return the number of epochs at which stations or the target have a separate position or velocity."""
+    """Return the number of epochs at which stations or the target have a separate position or velocity, at least 1."""
     stations = problem.stations
     if problem.motions[0].order > 0:
         return problem.epochs
@@ -181,9 +184,9 @@ def own_epochs(problem: Problem) -> int:
     return max(int(array.shape[-3]) for array in given)
 
 
-def add_linear(made: CostColumns, rows: Array, origin: Array | None = None) -> list[int]:
-    """Add linear nodes with coefficients (B, q, d), zero at an origin (B, d), and return their numbers."""
-    return [made.add(LINEAR, linear_numbers(rows[:, i], origin)) for i in range(rows.shape[1])]
+def add_linear(nodes: CostColumns, rows: Array, origin: Array | None = None) -> list[int]:
+    """Add linear nodes with coefficients `rows` (B, q, d), zero at an origin (B, d), and return their indices."""
+    return [nodes.add(LINEAR, linear_numbers(rows[:, i], origin)) for i in range(rows.shape[1])]
 
 
 # Least squares over the position alone: other unknowns that enter linearly take their best values.
@@ -196,9 +199,9 @@ def roots(precision: Array) -> Array:
 
 
 def compress(K: Array, w: Array) -> tuple[Array, Array]:
-    """Return rows with the same sum of squares ``|K phi - w|^2`` for every phi; at most one more than nodes.
+    """Return at most J + 1 rows with the same sum of squares ``|K phi - w|^2`` for every phi.
 
-    K (B, q, J) are whitened rows over the nodes, with B = 1 or N, and w (N, q) are whitened measurements.
+    K (B, q, J) are whitened rows over the J nodes, with B = 1 or N, and w (N, q) are whitened measurements.
     """
     q, nodes = K.shape[-2:]
     if q <= nodes + 1:
@@ -210,11 +213,14 @@ def compress(K: Array, w: Array) -> tuple[Array, Array]:
     upper = np.where(np.abs(upper) > _DEPENDENT * length, upper, 0.0)
     # A separate row contains the residual that no position can fit, so that the cost keeps its value.
     upper = np.concatenate([upper, np.zeros((*upper.shape[:-2], 1, nodes))], axis=-2)
-    return upper, _fold(basis, w)
+    return upper, _along_and_rest(basis, w)
 
 
-def _fold(basis: Array, w: Array) -> Array:
-    """Return measurements (N, q) along orthonormal columns (B, q, J), and the length of the rest: (N, J + 1)."""
+def _along_and_rest(basis: Array, w: Array) -> Array:
+    """Return measurements along orthonormal columns `basis` (B, q, J), and the length of the rest: (N, J + 1).
+
+    The measurements w are (N, q). The sum of squares stays the same.
+    """
     inside = (np.swapaxes(basis, -1, -2) @ w[..., None])[..., 0]
     rest = w - (basis @ inside[..., None])[..., 0]
     return np.concatenate([inside, np.sqrt((rest**2).sum(-1, keepdims=True))], axis=-1)
@@ -234,25 +240,25 @@ def mark_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
     size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
     # Relative to the lengths of both columns: relative to a long column alone, any coupling of a short column would
     # vanish.
-    across = size[..., :, None] * size[..., None, :]
-    alone = (np.abs(information) <= _ORTHOGONAL * across + across * np.eye(len(kinds)) * 2.0).all(-1)
+    scale = size[..., :, None] * size[..., None, :]
+    alone = (np.abs(information) <= _ORTHOGONAL * scale + scale * np.eye(len(kinds)) * 2.0).all(-1)
     return mark_nodes(kinds, data, alone, size, (np.swapaxes(K, -1, -2) @ w[..., None])[..., 0], w)
 
 
 def mark_nodes(kinds: Array, data: Array, alone: Array, size: Array, force: Array, w: Array) -> Array:
-    """Return the numbers of nodes with a mark on nodes that are alone in their rows, see `mark_alone`.
+    """Return the numbers (B, J, width) of nodes with a mark on nodes that are alone in their rows, see `mark_alone`.
 
-    `alone` (B, J) is true for nodes that share no row with another node or unknown, and `size` (B, J) has the lengths
-    of the columns of K. `force` (N, J) is ``K'w``.
+    `alone` (B, J) is true for nodes that share no row with another node or unknown. `size` (B, J) has the lengths of
+    the columns of K, and `force` (N, J) is ``K'w``.
     """
     centred = (np.abs(force) <= _ORTHOGONAL * size * np.linalg.norm(w, axis=-1, keepdims=True)).all(0)
     out = np.array(data)
     for kind in {int(kind) for kind in kinds}:
-        mark, own = NODES[kind].mark, kinds == kind
+        mark, of_kind = NODES[kind].mark, kinds == kind
         if mark is not None:
-            numbers = out[:, own]
-            mark(numbers, alone[:, own] & centred[own])
-            out[:, own] = numbers
+            numbers = out[:, of_kind]
+            mark(numbers, alone[:, of_kind] & centred[of_kind])
+            out[:, of_kind] = numbers
     return out
 
 
@@ -284,7 +290,10 @@ class PositionCosts(NamedTuple):
 
     @property
     def dense(self) -> float:
-        """Return the number of nodes; the time of a box is proportional to its square."""
+        """Return the weight of a box in the budget of boxes: the number of nodes.
+
+        The time of a box grows with the square of this number.
+        """
         return float(len(self.kinds))
 
     def take(self, items: Array | slice) -> PositionCosts:
@@ -292,10 +301,10 @@ class PositionCosts(NamedTuple):
         if not isinstance(items, slice) and np.array_equal(items, np.arange(len(self.w))):
             return self
 
-        def own(array: Array) -> Array:
+        def chosen(array: Array) -> Array:
             return array if len(array) == 1 else array[items]
 
-        return self._replace(data=own(self.data), K=own(self.K), w=self.w[items], level=self.level[items])
+        return self._replace(data=chosen(self.data), K=chosen(self.K), w=self.w[items], level=self.level[items])
 
 
 def position_costs(problem: Problem) -> PositionCosts:
@@ -322,16 +331,16 @@ def costs_of_groups(problem: Problem, group: Array) -> tuple[PositionCosts, Arra
     The rows must be sums of ranges and of logarithms of ranges. `group` (m,) has the group of each row, and -1 for
     rows without a factor, such as priors.
     """
-    kinds, numbers, K, w, level, own = _rows_of(problem, group)
+    kinds, numbers, K, w, level, group_of_node = _rows_of(problem, group)
     K, w = compress(K, w)
-    return PositionCosts(kinds, numbers, K, w, level), own
+    return PositionCosts(kinds, numbers, K, w, level), group_of_node
 
 
 def costs_of_velocity(problem: Problem) -> tuple[PositionCosts, Array]:
     """Return costs and groups like `costs_of_groups`; the factors are components of the target's velocity."""
-    kinds, numbers, K, w, level, own = _rows_of(problem, None)
+    kinds, numbers, K, w, level, group_of_node = _rows_of(problem, None)
     K, w = compress(K, w)
-    return PositionCosts(kinds, numbers, K, w, level), own
+    return PositionCosts(kinds, numbers, K, w, level), group_of_node
 
 
 def factors_of_rows(problem: Problem) -> Array:
@@ -348,42 +357,45 @@ def factors_of_rows(problem: Problem) -> Array:
 def _rows_of(problem: Problem, group: Array | None) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Return kinds and numbers of the nodes, rows over them, measurements (N, q), levels (N,), and groups of nodes.
 
-    `group` has the group of each row (m,). None makes groups of the components of the target's velocity.
+    The rows K are (B, q, J), and the levels are as in `PositionCosts`. `group` has the group of each row (m,). None
+    makes groups of the components of the target's velocity. Nodes of priors on the position have the group -1.
     """
     problem = with_station_noise(problem)
     others = OtherRows.of(problem)
-    known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
+    known = problem.observed - (others.coefficients @ others.mean[..., None])[..., 0]
     # Absent rows have weight zero, so any finite value is valid.
     usable = (problem.weight > 0.0) & np.isfinite(known)
     known = np.where(usable, known, 0.0)
-    made = columns_of(problem, known)
+    nodes = columns_of(problem, known)
     if group is None:
-        own = made.with_velocity()
+        group_of_node = nodes.with_velocity()
     else:
-        made, own = made.split(group) if len(set(group.tolist())) > 1 else (made, np.full(len(made.kinds), group[0]))
-    others = others.with_stations(problem, made)
+        nodes, group_of_node = (
+            nodes.split(group) if len(set(group.tolist())) > 1 else (nodes, np.full(len(nodes.kinds), group[0]))
+        )
+    others = others.with_stations(problem, nodes)
     value = np.where(counts_from_measured(problem), 0.0, known)
-    K, w = _projected(problem, made, others, value)
-    prior = position_prior(problem, made)
+    K, w = _without_other_unknowns(problem, nodes, others, value)
+    prior = position_prior(problem, nodes)
     K, w = _with_rows_of(prior, K, w)
     size, level = problem.batch_shape[0], turned_level(problem, others, known)
     w, level = np.broadcast_to(w, (size, w.shape[-1])), np.broadcast_to(level, (size,))
-    return np.array(made.kinds), made.numbers, K, w, level, np.concatenate([own, np.full(len(prior), -1)])
+    return np.array(nodes.kinds), nodes.numbers, K, w, level, np.concatenate([group_of_node, np.full(len(prior), -1)])
 
 
 class Affine(NamedTuple):
-    """The costs of all problems that differ in their measurements z only, as an affine function; see `PositionCosts`.
+    """The costs of all problems that differ in their measurements z (m,) only, as an affine function of z.
 
     Parameters
     ----------
     kinds, data, K : int array (J,), array (1, J, width), array (1, q, J)
         As in `PositionCosts`; `data` is for z = 0.
     base, slope : array (p,), (p, m)
-        Whitened measurements for z = 0, and their derivative with respect to z.
+        The p whitened measurements for z = 0, and their derivative with respect to z.
     basis : array (p, J), optional
         Orthonormal columns onto which measurements are folded (`compress`); None if they are not folded.
     place, first, gain : int array (e,), array (e,), array (e, m)
-        Indices of the node numbers that change with z, their values for z = 0, and their slopes. Each angle or ratio
+        Indices of the e node numbers that change with z, their values for z = 0, and their slopes. Each angle or ratio
         has one such number; ranges and rates have none.
     """
 
@@ -398,7 +410,7 @@ class Affine(NamedTuple):
     gain: Array
 
     def room(self, count: int) -> PositionCosts:
-        """Return arrays for the costs of a number of problems; `write` fills them."""
+        """Return uninitialised arrays for the costs of `count` problems; `write` fills them."""
         data = np.repeat(self.data, count, axis=0) if len(self.place) else self.data
         return PositionCosts(self.kinds, data, self.K, np.empty((count, self.K.shape[1])), np.full(count, np.inf))
 
@@ -409,7 +421,7 @@ class Affine(NamedTuple):
             np.dot(self.slope, z, out=w)
             w += self.base
         else:
-            w[:] = _fold(self.basis, self.slope @ z + self.base)
+            w[:] = _along_and_rest(self.basis, self.slope @ z + self.base)
         if len(self.place):
             costs.data[item].reshape(-1)[self.place] = self.gain @ z + self.first
 
@@ -417,7 +429,8 @@ class Affine(NamedTuple):
 def affine_costs(problem: Problem) -> Affine | None:
     """Return the cost of a problem as an affine function of its measurements, or None if it is not affine.
 
-    The problem has no batch axes and is within the scope of the proof. Its measurements are ignored.
+    The problem has no batch axes and is within the scope of the proof. Its measurements are ignored. The result is None
+    if the cost has a finite level (see `PositionCosts`) or the rows K depend on measurements.
     """
     # an affine map is determined by its values at zero and at the unit vectors
     probes = np.concatenate([np.zeros((1, problem.count)), np.eye(problem.count)])
@@ -438,104 +451,125 @@ def affine_costs(problem: Problem) -> Affine | None:
 
 @dataclass(frozen=True, slots=True)
 class OtherRows:
-    """Unknowns other than the target's state: coefficients in rows (m, n), precision (B, n, n) and mean (B, n)."""
+    """Gaussian unknowns other than the target's state, such as clock offsets and biases.
 
-    touch: Array
+    They enter the m rows linearly. `coefficients` (m, n) are the derivatives of the rows with respect to the n
+    unknowns. `precision` (B, n, n) is the inverse covariance of their priors, zero without a prior, and `mean` (B, n)
+    the mean.
+    """
+
+    coefficients: Array
     precision: Array
     mean: Array
 
     @classmethod
     def of(cls, problem: Problem) -> OtherRows:
-        """Return the unknowns of a problem other than the target's state, without station errors."""
+        """Return coefficients and priors of the unknowns other than position and velocity, without station errors.
+
+        The n columns are all unknowns of the problem's layout. The columns of unknowns that do not enter are zero.
+        """
         size = problem.layout.size
-        touch = np.zeros((problem.count, size))
+        coefficients = np.zeros((problem.count, size))
         for links, start in zip(block_links(problem), problem.starts, strict=True):
-            np.add.at(touch, (start + links.adds.row, links.adds.column), links.adds.coefficient)
+            np.add.at(coefficients, (start + links.adds.row, links.adds.column), links.adds.coefficient)
         parts = [part for part in prior_parts(problem) if part[0] not in ("position", "velocity")]
-        wide = max(
+        batch = max(
             (len(array) for _, m, p in parts for array, core in ((m, 1), (p, 2)) if array.ndim > core), default=1
         )
-        precision, mean = np.zeros((wide, size, size)), np.zeros((wide, size))
+        precision, mean = np.zeros((batch, size, size)), np.zeros((batch, size))
         for name, centre, information in parts:
             shared = problem.layout.find(name)[1]
             for epoch in range(1 if shared else problem.epochs):
-                own = columns(problem.layout, name, np.array([epoch]))[0]
-                precision[:, own[:, None], own] += information if shared else information[..., 0, :, :]
-                mean[:, own] = centre
-        return cls(touch, precision, mean)
+                place = columns(problem.layout, name, np.array([epoch]))[0]
+                precision[:, place[:, None], place] += information if shared else information[..., 0, :, :]
+                mean[:, place] = centre
+        return cls(coefficients, precision, mean)
 
-    def with_stations(self, problem: Problem, made: CostColumns) -> OtherRows:
-        """Return the unknowns with station errors along the line to the target as their first coordinates."""
+    def with_stations(self, problem: Problem, nodes: CostColumns) -> OtherRows:
+        """Return the same unknowns with coefficients of the station errors; `nodes` are the nodes of the rows.
+
+        An isotropic station error counts only along the line to the target.
+        """
         if problem.stations.covariance is None:
             return self
-        touch, d = self.touch.copy(), problem.dimension
+        coefficients, d = self.coefficients.copy(), problem.dimension
         epoch = problem.epoch
-        for row, node, coefficient in zip(made.row, made.column, made.coefficient, strict=True):
-            own = columns(problem.layout, "stations", epoch[row : row + 1])[0]
+        for row, node, coefficient in zip(nodes.row, nodes.column, nodes.coefficient, strict=True):
+            place = columns(problem.layout, "stations", epoch[row : row + 1])[0]
             # Errors are isotropic, so any axis can represent the line to the target: the first of the station's d
             # axes.
-            touch[row, own[made.station[node] * d]] += coefficient
-        return OtherRows(touch, self.precision, self.mean)
+            coefficients[row, place[nodes.station[node] * d]] += coefficient
+        return OtherRows(coefficients, self.precision, self.mean)
 
 
 def _of_rows(problem: Problem, of_model: Callable[[Model], Any]) -> Array:
-    """Return the value (m,) of a function of the kind of each row."""
+    """Return an array (m,) with the value of a function of the measurement kind (its `Model`) of each row."""
     return np.concatenate([np.full(rows.count, of_model(MODELS[rows.kind])) for rows in problem.rows])
 
 
 def counts_from_measured(problem: Problem) -> Array:
-    """Return whether each row (m,) has a node that is relative to its measured value."""
+    """Return a bool array (m,): whether the row has a node that is relative to its measured value, as azimuths have."""
     return _of_rows(problem, lambda model: any(named(node).counts_from_measured for _, node in model.nodes))
 
 
-def _projected(problem: Problem, made: CostColumns, others: OtherRows, value: Array) -> tuple[Array, Array]:
-    """Return whitened rows (B, q, J) over the nodes and measurements (N, q), with other unknowns projected out."""
-    noise, J = whiten(problem.noise, problem.weight), len(made.kinds)
-    used = others.touch.any(0) | others.precision.any((0, 1))
-    touch, precision = others.touch[:, used], others.precision[:, used][:, :, used]
-    geometry = whiten_rows(noise, np.concatenate([made.design, touch], axis=1))
+def _without_other_unknowns(
+    problem: Problem, nodes: CostColumns, others: OtherRows, value: Array
+) -> tuple[Array, Array]:
+    """Return whitened rows (B, q, J) over the nodes and measurements (N, q), with other unknowns projected out.
+
+    `value` (N, m) contains the measurements minus known additions. The cost of the result is the least cost over the
+    other unknowns, with their priors.
+    """
+    noise, J = whiten(problem.noise, problem.weight), len(nodes.kinds)
+    used = others.coefficients.any(0) | others.precision.any((0, 1))
+    coefficients, precision = others.coefficients[:, used], others.precision[:, used][:, :, used]
+    geometry = whiten_rows(noise, np.concatenate([nodes.design, coefficients], axis=1))
     geometry = geometry if geometry.ndim == 3 else geometry[None]
     shared = len(geometry) == len(precision) == 1  # one template, many measurements: the usual batch
     # If all else is shared, the measurements of all problems are the columns of one matrix.
-    seen = whiten_rows(noise, value.T if shared else value[..., None])
-    seen = seen if seen.ndim == 3 else seen[None]
+    measured = whiten_rows(noise, value.T if shared else value[..., None])
+    measured = measured if measured.ndim == 3 else measured[None]
     if used.any():
         # A prior is a row for the unknown itself; an unknown without a prior has a row of zeros.
         size = max(len(geometry), len(precision))
-        tail = np.zeros((size, touch.shape[1], J + touch.shape[1]))
-        tail[..., J:] = roots(precision)
-        geometry = np.concatenate([np.broadcast_to(geometry, (size, *geometry.shape[1:])), tail], axis=1)
-        none = np.zeros((len(seen), touch.shape[1], seen.shape[-1]))
-        seen = np.concatenate([seen, none], axis=1)
+        prior_rows = np.zeros((size, coefficients.shape[1], J + coefficients.shape[1]))
+        prior_rows[..., J:] = roots(precision)
+        geometry = np.concatenate([np.broadcast_to(geometry, (size, *geometry.shape[1:])), prior_rows], axis=1)
+        zeros = np.zeros((len(measured), coefficients.shape[1], measured.shape[-1]))
+        measured = np.concatenate([measured, zeros], axis=1)
         unknowns = geometry[..., J:]
-        geometry, seen = project_out(unknowns, geometry[..., :J]), project_out(unknowns, seen)
-    return geometry[..., :J], np.ascontiguousarray(seen[0].T) if shared else seen[..., 0]
+        geometry, measured = project_out(unknowns, geometry[..., :J]), project_out(unknowns, measured)
+    return geometry[..., :J], np.ascontiguousarray(measured[0].T) if shared else measured[..., 0]
 
 
-def position_prior(problem: Problem, made: CostColumns) -> list[int]:
-    """Add the nodes of a Gaussian prior on the position, one for each of its rows, and return their numbers."""
+def position_prior(problem: Problem, nodes: CostColumns) -> list[int]:
+    """Add the nodes of a Gaussian prior on the position, one for each coordinate, and return their indices."""
     out: list[int] = []
     for name, mean, precision in prior_parts(problem):
         if name == "position":
             whole = precision if precision.ndim == 3 else precision[None]
-            out += add_linear(made, roots(whole), mean if mean.ndim == 2 else mean[None])
+            out += add_linear(nodes, roots(whole), mean if mean.ndim == 2 else mean[None])
     return out
 
 
 def _with_rows_of(nodes: list[int], K: Array, w: Array) -> tuple[Array, Array]:
-    """Return the rows with one more row for each of the last nodes, which has a measured value of zero."""
+    """Return K (B, q + e, J + e) and w (N, q + e) with one more row for each of the last e nodes: its prior.
+
+    Each new row contains its node (`nodes`) alone, and the measured value is zero.
+    """
     if not nodes:
         return K, w
-    own = np.zeros((len(K), len(nodes), K.shape[2] + len(nodes)))
-    own[:, np.arange(len(nodes)), nodes] = 1.0
+    new_rows = np.zeros((len(K), len(nodes), K.shape[2] + len(nodes)))
+    new_rows[:, np.arange(len(nodes)), nodes] = 1.0
     wider = np.zeros((*K.shape[:2], len(nodes)))
-    K = np.concatenate([np.concatenate([K, wider], axis=2), own], axis=1)
+    K = np.concatenate([np.concatenate([K, wider], axis=2), new_rows], axis=1)
     return K, np.concatenate([w, np.zeros((len(w), len(nodes)))], axis=1)
 
 
 def turned_level(problem: Problem, others: OtherRows, known: Array) -> Array:
     """Return the cost (N,) above which the sum of an angle and its bias may be wrong by a full turn.
 
+    `known` (N, m) contains the measurements minus known additions. Without angles of this kind the level is infinite.
     Residuals are wrapped together with their bias, but nodes without it. A row can differ only if noise and bias
     together are half a turn. The chi-square of the row is then at least that angle squared over their variance.
     """
@@ -545,21 +579,21 @@ def turned_level(problem: Problem, others: OtherRows, known: Array) -> Array:
     if not len(rows):
         return level
     variance = variances(problem.noise, problem.count)[..., rows]
-    touch = others.touch[rows]
-    biased = touch.any(1)
+    coefficients = others.coefficients[rows]
+    biased = coefficients.any(1)
     if biased.any():
         covariance = np.linalg.pinv(others.precision, hermitian=True)
-        variance = variance + np.einsum("rn,bnm,rm->br", touch, covariance, touch)
-    counted = counts_from_measured(problem)[rows]
-    most, turn = _of_rows(problem, _most)[rows], period[rows]
+        variance = variance + np.einsum("rn,bnm,rm->br", coefficients, covariance, coefficients)
+    relative = counts_from_measured(problem)[rows]
+    most, turn = _of_rows(problem, _greatest_size)[rows], period[rows]
     # Distance from the measured value to the farthest value of the node. Beyond half a turn the residual is the
     # shorter way.
-    size = np.where(counted, 0.0, np.abs(known[:, rows]))
-    apart = turn - most - size
-    able = biased | (~counted & (size >= 0.5 * turn - most))
-    return np.asarray(np.where(able, apart * np.abs(apart) / variance, np.inf).min(1))
+    size = np.where(relative, 0.0, np.abs(known[:, rows]))
+    distance = turn - most - size
+    may_turn = biased | (~relative & (size >= 0.5 * turn - most))
+    return np.asarray(np.where(may_turn, distance * np.abs(distance) / variance, np.inf).min(1))
 
 
-def _most(model: Model) -> float:
+def _greatest_size(model: Model) -> float:
     """Return the greatest size of the node of a kind with a period, radians."""
     return sum(abs(factor) * named(node).most for factor, node in model.nodes)

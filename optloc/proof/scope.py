@@ -1,4 +1,9 @@
-"""Scope of the proof: targets, kinds of rows, biases and constraints that it covers, and the definition of a run."""
+"""Scope of the proof: targets, kinds of rows, biases and constraints that it covers, and the definition of a run.
+
+Each function `_reasons_against_...` yields sentences, one for each property of the problem that the proof does not
+cover. No sentence means that the property is covered. A *node* is a scalar function of the position that rows are sums
+of, such as a range. A *run* is a problem with too many nodes for dense matrices.
+"""
 
 from __future__ import annotations
 
@@ -42,13 +47,13 @@ def _reasons(problem: Problem) -> Iterator[str]:
     if motion.known is not None or not problem.layout.shares("position"):
         yield "the rows do not share one position"
     if motion.order > 0:
-        yield from _beyond_motion(problem)
-    yield from _beyond_rows(problem)
-    yield from _beyond_biases(problem)
+        yield from _reasons_against_motion(problem)
+    yield from _reasons_against_rows(problem)
+    yield from _reasons_against_biases(problem)
     if is_scaled(problem) and not has_one_epoch_velocity(problem):
-        yield from _beyond_scale(problem)
-    yield from _beyond_stations(problem)
-    yield from _beyond_constraints(problem)
+        yield from _reasons_against_scale(problem)
+    yield from _reasons_against_stations(problem)
+    yield from _reasons_against_constraints(problem)
     known = {"position", "velocity", *(bias.name for bias in problem.biases)}
     known |= {name for name, _, _ in problem.stations.errors}
     # `optloc.proof.position_costs` writes priors on known names as rows. Other priors would silently be left out of
@@ -58,13 +63,13 @@ def _reasons(problem: Problem) -> Iterator[str]:
             yield f"the prior on {name} is not covered"
 
 
-def _beyond_motion(problem: Problem) -> Iterator[str]:
+def _reasons_against_motion(problem: Problem) -> Iterator[str]:
     """Yield the reasons against a moving target: a node at an epoch must depend on the position at that epoch."""
     motion = problem.motions[0]
     if motion.order > 1:
         yield "the target accelerates, but the proof covers fixed targets and uniform motion"
     if has_one_epoch_velocity(problem):
-        yield from _beyond_velocity_at_epoch(problem)
+        yield from _reasons_against_velocity_at_epoch(problem)
         return
     if problem.epochs < 2:
         yield "the target moves, and the proof then needs several epochs"
@@ -78,14 +83,14 @@ def _beyond_motion(problem: Problem) -> Iterator[str]:
 
 
 def has_one_epoch_velocity(problem: Problem) -> bool:
-    """Return whether all rows are of one epoch and contain rates, so that they show the velocity of the target."""
+    """Return whether all rows are of one epoch and contain rates, so that the velocity of the target is an unknown."""
     motion = problem.motions[0]
     if motion.order != 1 or motion.known is not None or problem.epochs > 1:
         return False
     return any(MODELS[rows.kind].velocity for rows in problem.rows)
 
 
-def _beyond_velocity_at_epoch(problem: Problem) -> Iterator[str]:
+def _reasons_against_velocity_at_epoch(problem: Problem) -> Iterator[str]:
     """Yield the reasons against rates of one epoch: the proof needs rates that are linear in the velocity."""
     motion = problem.motions[0]
     if motion.over != "space" or motion.rise is not None:
@@ -105,7 +110,7 @@ def _beyond_velocity_at_epoch(problem: Problem) -> Iterator[str]:
 
 
 def held_height(problem: Problem) -> Band | None:
-    """Return the constraint on the height of a target that moves over ground, or None."""
+    """Return the exact constraint on the height of a target that moves over ground, or None without it."""
     for band in problem.constraints:
         if not isinstance(band, Band) or band.kind != "height" or not is_exact(band):
             continue
@@ -114,7 +119,7 @@ def held_height(problem: Problem) -> Band | None:
     return None
 
 
-def _beyond_rows(problem: Problem) -> Iterator[str]:
+def _reasons_against_rows(problem: Problem) -> Iterator[str]:
     """Yield the reasons against the kinds of rows, and against the numbers of nodes and unknowns."""
     for rows in problem.rows:
         model = MODELS[rows.kind]
@@ -123,9 +128,10 @@ def _beyond_rows(problem: Problem) -> Iterator[str]:
         elif model.ranges is None and not model.nodes:
             yield f"{rows.kind} rows are neither sums of ranges or rates nor a kind with known bounds"
     most = MOST_NODES if enabled() else MOST_NODES_PLAIN
-    if problem.count > most and _nodes(problem) > most:
+    if problem.count > most and _node_count(problem) > most:
         without = "" if enabled() else " without compiled code"
-        yield f"there are {_nodes(problem)} different ranges, rates and angles, but the proof covers {most}{without}"
+        count = _node_count(problem)
+        yield f"there are {count} different ranges, rates and angles, but the proof covers {most}{without}"
     if problem.layout.size - problem.dimension > MOST_UNKNOWNS:
         yield f"there are {problem.layout.size} unknowns, but the proof covers {MOST_UNKNOWNS}"
 
@@ -133,12 +139,15 @@ def _beyond_rows(problem: Problem) -> Iterator[str]:
 def is_run(problem: Problem) -> bool:
     """Return whether a proof uses the method for runs (`optloc.proof.runs`): too many nodes for dense rows."""
     most = SHORT if own_epochs(problem) > 1 else MOST_DENSE
-    return 2 * problem.count > most and _nodes(problem) > most
+    return 2 * problem.count > most and _node_count(problem) > most
 
 
 def why_too_large(problem: Problem) -> str:
-    """Return the reason why a problem does not fit methods with dense rows, or an empty string if it fits."""
-    number = _nodes(problem)
+    """Return the reason why a problem does not fit methods with dense rows, or an empty string if it fits.
+
+    Unknown factors of rows and an unknown velocity are reasons, too, at any number of rows.
+    """
+    number = _node_count(problem)
     if is_scaled(problem):
         return "the velocity is unknown" if has_one_epoch_velocity(problem) else "a factor of the rows is unknown"
     return (
@@ -146,22 +155,25 @@ def why_too_large(problem: Problem) -> str:
     )
 
 
-def _nodes(problem: Problem) -> int:
-    """Return the number of different ranges, rates, angles, ratios and heights in the rows."""
-    moving, own = own_epochs(problem) > 1, 0
+def _node_count(problem: Problem) -> int:
+    """Return the number of different ranges, rates, angles, ratios and heights in the rows.
+
+    Rows share the range or rate of one station (at one epoch, if anything moves). Other nodes belong to one row.
+    """
+    moving, unshared = own_epochs(problem) > 1, 0
     shared: set[tuple[bool, int, int]] = set()
     for rows in problem.rows:
         model = MODELS[rows.kind]
         if model.signs is None:
-            own += rows.count * len(model.nodes)
+            unshared += rows.count * len(model.nodes)
             continue
         when = rows.epoch if moving else np.zeros_like(rows.epoch)
         for index in (rows.a, rows.b)[: model.stations]:
             shared.update((model.ranges is None, *key) for key in zip(index.tolist(), when.tolist(), strict=True))
-    return own + len(shared)
+    return unshared + len(shared)
 
 
-def _beyond_biases(problem: Problem) -> Iterator[str]:
+def _reasons_against_biases(problem: Problem) -> Iterator[str]:
     """Yield the reasons against the biases."""
     angular = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
     for bias in problem.biases:
@@ -176,7 +188,7 @@ def is_scaled(problem: Problem) -> bool:
     return any(form_of(bias).enters == "scales" for bias in problem.biases) or has_one_epoch_velocity(problem)
 
 
-def _beyond_scale(problem: Problem) -> Iterator[str]:
+def _reasons_against_scale(problem: Problem) -> Iterator[str]:
     """Yield the reasons against unknown factors: the proof covers a few factors, each of a group of rows."""
     scales = [bias for bias in problem.biases if form_of(bias).enters == "scales"]
     name, count, factor = scales[0].name, sum(len(bias.members) for bias in scales), factors_of_rows(problem)
@@ -185,7 +197,7 @@ def _beyond_scale(problem: Problem) -> Iterator[str]:
     elif (factor < -1).any():
         yield "rows have several scales, or a multiple of a scale, but the proof covers one scale for each row"
     free = np.concatenate([np.full(len(bias.members), bias.sigma is None) for bias in scales])
-    yield from _beyond_factors(problem, factor, [*free, False, False])
+    yield from _reasons_against_factors(problem, factor, [*free, False, False])
     if problem.constraints:
         yield f"the scale {name!r} is unknown, and the proof then covers no constraints"
     if problem.stations.unknown_for:
@@ -194,24 +206,28 @@ def _beyond_scale(problem: Problem) -> Iterator[str]:
         yield f"the scale {name!r} belongs to a long run, but the proof covers {MOST_DENSE} different ranges"
 
 
-def _beyond_factors(problem: Problem, factor: Array, free: Sequence[bool]) -> Iterator[str]:
-    """Yield the reasons against kinds of rows with factors `factor` (m,); `free` marks factors without a prior."""
+def _reasons_against_factors(problem: Problem, factor: Array, free: Sequence[bool]) -> Iterator[str]:
+    """Yield the reasons against kinds of rows with unknown factors.
+
+    `factor` (m,) is the number of the factor of each row, -1 without a factor. `free` is True for each factor without a
+    prior, and ends with two values False, which the indices -1 and -2 read.
+    """
     emitting, kinds = set[int](), {rows.kind for rows in problem.rows}
     for rows, start in zip(problem.rows, problem.starts, strict=True):
-        model, own = MODELS[rows.kind], {int(one) for one in factor[start : start + rows.count]}
-        emitting |= own if model.emission else set()
-        without_prior = any(free[one] for one in own)
+        model, factors = MODELS[rows.kind], {int(number) for number in factor[start : start + rows.count]}
+        emitting |= factors if model.emission else set()
+        without_prior = any(free[number] for number in factors)
         if model.ranges is None and {node for _, node in model.nodes} != {"log range"}:
             yield f"a scale is unknown; the proof then covers times, ranges and levels, but no {rows.kind} rows"
-        elif model.ranges is None and without_prior and (len(kinds) > 1 or len(own) > 1):
+        elif model.ranges is None and without_prior and (len(kinds) > 1 or len(factors) > 1):
             yield f"the scale of {rows.kind} rows has no prior, and other rows do not have this scale"
         elif without_prior and sum(model.ranges or ()) != 0 and not model.emission:
             yield f"the scale of {rows.kind} rows has no prior, so that nothing bounds the position"
-    if len(emitting) > 1 and any(free[one] for one in emitting):
+    if len(emitting) > 1 and any(free[number] for number in emitting):
         yield "rows with different scales share an unknown emission time, and a scale has no prior"
 
 
-def _beyond_stations(problem: Problem) -> Iterator[str]:
+def _reasons_against_stations(problem: Problem) -> Iterator[str]:
     """Yield the reasons against the errors of station positions and velocities."""
     if problem.stations.velocity_covariance is not None:
         rates = [rows.kind for rows in problem.rows if MODELS[rows.kind].velocity]
@@ -231,25 +247,25 @@ def _beyond_stations(problem: Problem) -> Iterator[str]:
 
 
 def _stations_move(problem: Problem) -> bool:
-    """Return whether a station of rows of several epochs has different positions at these epochs."""
-    place = problem.stations.position
-    if place.shape[-3] < 2:
+    """Return whether a station that rows of several epochs name has different positions at these epochs."""
+    position = problem.stations.position
+    if position.shape[-3] < 2:
         return False
-    named = np.concatenate([(rows.a, rows.b)[k] for rows in problem.rows for k in range(MODELS[rows.kind].stations)])
+    stations = np.concatenate([(rows.a, rows.b)[k] for rows in problem.rows for k in range(MODELS[rows.kind].stations)])
     when = np.concatenate([rows.epoch for rows in problem.rows for k in range(MODELS[rows.kind].stations)])
-    for station in np.unique(named):
-        seen = place[..., np.unique(when[named == station]), station, :]
-        if (seen != seen[..., :1, :]).any():
+    for station in np.unique(stations):
+        positions = position[..., np.unique(when[stations == station]), station, :]
+        if (positions != positions[..., :1, :]).any():
             return True
     return False
 
 
-def _beyond_constraints(problem: Problem) -> Iterator[str]:
+def _reasons_against_constraints(problem: Problem) -> Iterator[str]:
     """Yield the reasons against the constraints."""
-    levels = [constraint for constraint in problem.constraints if is_exact(constraint)]
-    if len(levels) > 1 and any(isinstance(level, Band) and level.kind == "height" for level in levels):
+    equalities = [constraint for constraint in problem.constraints if is_exact(constraint)]
+    if len(equalities) > 1 and any(isinstance(equality, Band) and equality.kind == "height" for equality in equalities):
         yield "a known height and another equality leave a line, which the proof does not follow"
-    if len(levels) >= problem.dimension:
+    if len(equalities) >= problem.dimension:
         yield "the equalities leave no free direction"
     for constraint in problem.constraints:
         if is_exact(constraint) and isinstance(constraint, Band) and constraint.kind not in ("height", "plane"):

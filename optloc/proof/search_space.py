@@ -1,4 +1,8 @@
-"""Data of a proof: the cost, search coordinates around a fix, and tables for one box."""
+"""Data of a proof: the cost, search coordinates around a fix, and tables for one box.
+
+Letters: J nodes (scalar functions of the position, such as ranges), q whitened rows, D coordinates of a position.
+Search coordinates s (3,) are along principal axes of the fix, and their unit is one standard deviation.
+"""
 
 from __future__ import annotations
 
@@ -68,14 +72,14 @@ _SHARP = 0.02
 
 
 class Cost(NamedTuple):
-    """The cost ``f(x) = |K phi(x) - w|^2`` of a position x, as a function of nodes phi.
+    """The cost ``f(x) = |K phi(x) - w|^2`` of a position x, as a function of nodes phi: chi-square, without a unit.
 
     Parameters
     ----------
     kinds, data : array (J,), (J, width)
         The nodes: their codes and their numbers.
     K, w : array (q, J), (q,)
-        Whitened rows.
+        Whitened rows and whitened measurements.
     A : array (J, J)
         ``K'K``.
     weight : array (J,)
@@ -160,7 +164,7 @@ class Box(NamedTuple):
     Parameters
     ----------
     at, half : array (3,)
-        Centre and half-widths, search coordinates.
+        Centre and half-widths, search coordinates (or coordinates of a piece of an atlas).
     centre : array (3,)
         Centre, metres.
     line : array (6,)
@@ -171,7 +175,7 @@ class Box(NamedTuple):
     solve : array (3, 3)
         Working memory.
     cut : array (6,)
-        Ends of the remaining part of the box, relative to its centre.
+        Lower, then upper ends of the remaining part of the box, relative to its centre.
     sense, gram, graph, lean : array (3, 3), (3, 3), (GRAPH_WIDTH,), (J,)
         For a box on a surface: its T and T'T, the graph of the surface, and slopes along the upward axis.
     inside : array (10, 3, 3)
@@ -197,7 +201,7 @@ class Box(NamedTuple):
 
 @compiled
 def cost_of(kinds: Array, data: Array, K: Array, w: Array) -> Cost:
-    """Return the cost of nodes and whitened rows."""
+    """Return the cost of nodes (`kinds`, `data`), whitened rows K (q, J) and whitened measurements w (q,)."""
     A, weight, groups = np.empty((K.shape[1], K.shape[1])), np.empty(K.shape[1]), empty_groups(K.shape[1])
     set_geometry(kinds, K, A, weight, groups)
     return Cost(kinds, data, K, w, A, weight, groups)
@@ -205,7 +209,10 @@ def cost_of(kinds: Array, data: Array, K: Array, w: Array) -> Cost:
 
 @compiled
 def set_geometry(kinds: Array, K: Array, A: Array, weight: Array, groups: Groups) -> None:
-    """Write the parts of a cost that depend on its rows only: `A`, `weight` and `groups` of `Cost`."""
+    """Write the parts of a cost that depend on its rows K only: `A`, `weight` and `groups` of `Cost`.
+
+    Costs that differ in their measurements only share these parts.
+    """
     for j in range(K.shape[1]):
         for m in range(j, K.shape[1]):
             total = 0.0
@@ -221,7 +228,7 @@ def set_geometry(kinds: Array, K: Array, A: Array, weight: Array, groups: Groups
 
 @compiled
 def empty_box(q: int, J: int) -> Box:
-    """Return tables for boxes of J nodes and q rows."""
+    """Return uninitialised tables for boxes of costs with J nodes and q rows; centre and half-widths are zero."""
     return Box(
         np.zeros(3),
         np.zeros(3),
@@ -253,7 +260,11 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[LocalAxes, bool]:
 
 @compiled
 def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> tuple[LocalAxes, bool]:
-    """Return the search coordinates around a fix on planes or a surface (see `KnownMinima`), as `chart_at` does."""
+    """Return the search coordinates around a fix on planes or a surface (see `KnownMinima`).
+
+    The second result is True if the rows determine these coordinates. Like `chart_at`, the function fills the tables of
+    the box for the fix x (D,), metres.
+    """
     D = x.shape[0]
     vectors, numbers = np.zeros((2, 3)), np.zeros((3, 3, 3))
     origin, slip, sense, back, gram = vectors[0], vectors[1], numbers[0], numbers[1], numbers[2]
@@ -318,7 +329,10 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
 
 @compiled
 def _length_of_lines(cost: Cost, surface: Array, middle: Array) -> float:
-    """Return the weighted sizes of lines from any point of a surface, which limit the accuracy of differences."""
+    """Return the weighted sizes of lines from any point of a surface, which limit the accuracy of range differences.
+
+    `middle` (3,) is the reference position, m. The result has the unit of a whitened residual, like `accuracy_floor`.
+    """
     size, total = WGS84_A + abs(surface[LEVEL]) + abs(middle[0]) + abs(middle[1]) + abs(middle[2]), 0.0
     for j in range(cost.kinds.shape[0]):
         if cost.kinds[j] == RANGE:
@@ -328,7 +342,7 @@ def _length_of_lines(cost: Cost, surface: Array, middle: Array) -> float:
 
 @compiled
 def without_differences(chart: LocalAxes) -> LocalAxes:
-    """Return the same search coordinates with ranges that are bounded one by one."""
+    """Return the same search coordinates, with ranges that are bounded one by one instead of as differences."""
     origin = chart.origin
     return LocalAxes(origin, chart.sense, chart.back, chart.gram, chart.slip, chart.floor, chart.surface, False, origin)
 
@@ -336,6 +350,9 @@ def without_differences(chart: LocalAxes) -> LocalAxes:
 @compiled
 def accuracy_floor(kinds: Array, data: Array, weight: Array, w: Array, origin: Array, share: float) -> float:
     """Return the sizes of measurements and coordinates in residuals, without the sizes of the nodes.
+
+    It is the length of w plus the size of the coordinates in each node times its weight, in the unit of whitened
+    residuals. Times a relative rounding, it bounds this part of the rounding of a residual.
 
     Parameters
     ----------
@@ -363,7 +380,7 @@ def accuracy_floor(kinds: Array, data: Array, weight: Array, w: Array, origin: A
 
 @inlined
 def write_centre(origin: Array, sense: Array, at: Array, centre: Array) -> None:
-    """Write the centre of a box at search coordinates `at`, in metres."""
+    """Write ``origin + sense at``, the position of search coordinates `at` in metres, into `centre` (3,)."""
     s0, s1, s2 = at[0], at[1], at[2]
     for k in range(3):
         centre[k] = origin[k] + (sense[k, 0] * s0 + sense[k, 1] * s1 + sense[k, 2] * s2)
@@ -371,7 +388,10 @@ def write_centre(origin: Array, sense: Array, at: Array, centre: Array) -> None:
 
 @inlined
 def widen_by_rounding(chart: LocalAxes, centre: Array, half: Array) -> None:
-    """Widen a box by the rounding of its centre, metres, so that all bounds hold for the exact box."""
+    """Widen a box by the rounding of its centre, metres, so that all bounds hold for the exact box.
+
+    `half` (3,) are the half-widths in search coordinates, enlarged in place.
+    """
     size = abs(centre[0]) + abs(centre[1]) + abs(centre[2])
     # The term that is added to the origin may be larger than the sum.
     size += 2.0 * (abs(chart.origin[0]) + abs(chart.origin[1]) + abs(chart.origin[2]))
@@ -381,7 +401,10 @@ def widen_by_rounding(chart: LocalAxes, centre: Array, half: Array) -> None:
 
 @inlined
 def is_bounded(cost: Cost, chart: LocalAxes, box: Box) -> bool:
-    """Bound the nodes over a box; return False if the box is so large that a surface is no graph over it."""
+    """Bound the nodes over a box and write them into ``box.nodes``.
+
+    Return False if the box is so large that a surface is no graph over it.
+    """
     write_centre(chart.origin, chart.sense, box.at, box.centre)
     if chart.surface.shape[0] == 0:
         bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
@@ -391,7 +414,11 @@ def is_bounded(cost: Cost, chart: LocalAxes, box: Box) -> bool:
 
 @compiled
 def lay_on_surface(cost: Cost, chart: LocalAxes, box: Box) -> bool:
-    """Move a box from the plane of its coordinates onto the surface, and bound its nodes; return False if too large."""
+    """Move a box from the plane of its coordinates onto the surface, and bound its nodes.
+
+    Return False if the box is too large. ``box.sense``, ``box.graph`` and ``box.lean`` are written. The third
+    half-width, across the surface, is zero afterwards.
+    """
     put_rows(chart.sense, box.sense)
     if not lay_box(chart.surface, box.centre, box.half, box.sense, box.gram, box.graph, box.solve):
         box.half[2] = 0.0
@@ -438,7 +465,7 @@ def _inside_of(cost: Cost, chart: LocalAxes, box: Box) -> Atlas:
 
 @compiled
 def _set_inside(inside: Atlas, box: Box) -> None:
-    """Write the centre and axes of a box on a surface into the inside of an atlas."""
+    """Write the centre and axes of a box on a surface into the working memory of an atlas (`_inside_of`)."""
     inside.scale[0] = 1.0
     for m in range(3):
         inside.point[m] = (box.centre[m] - inside.middle[m]) / inside.radius
@@ -449,7 +476,7 @@ def _set_inside(inside: Atlas, box: Box) -> None:
 
 @compiled
 def curve_along(cost: Cost, chart: LocalAxes, box: Box) -> None:
-    """Write the table of second derivatives along a surface for a box on it."""
+    """Write the table of second derivatives along a surface for a box on it whose nodes are bounded."""
     unfold_slopes(box.lean, box.nodes)
     box.half[2] = box.graph[SAG] + box.graph[SLIP]
     sense, gram, half, line, nodes, curves = box.sense, box.gram, box.half, box.line, box.nodes, box.curves
@@ -463,7 +490,7 @@ def curve_along(cost: Cost, chart: LocalAxes, box: Box) -> None:
 
 @inlined
 def curve_at(cost: Cost, chart: LocalAxes, box: Box) -> None:
-    """Bound second derivatives of the nodes over a box whose nodes are bounded."""
+    """Bound second derivatives of the nodes over a box whose nodes are bounded, and write them into ``box.curves``."""
     if chart.surface.shape[0] > 0:
         curve_along(cost, chart, box)
         return
@@ -473,7 +500,7 @@ def curve_at(cost: Cost, chart: LocalAxes, box: Box) -> None:
 
 @inlined
 def curve_box(cost: Cost, chart: LocalAxes, box: Box) -> None:
-    """Write the tables of second derivatives of a box whose nodes are bounded."""
+    """Write the tables of second derivatives, ``box.curves`` and ``box.sums``, of a box whose nodes are bounded."""
     curve_at(cost, chart, box)
     noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
     sum_up(cost.K, cost.w, cost.weight, noise, box.nodes, box.curves, box.sums)
@@ -514,7 +541,10 @@ COARSEST = 1.0
 
 @compiled
 def equal_within(eps: float, least: float, noise: float) -> float:
-    """Return the tolerance of equal costs below the cost `least` of a fix: eps, or more if rounding is coarse."""
+    """Return the tolerance of equal costs below the cost `least` of a fix: eps, or more if rounding is coarse.
+
+    `noise` bounds the rounding of a residual's length. All are values of f or its root, without a unit.
+    """
     return float(max(eps, noise * (_COSTS * sqrt(max(least, 0.0)) + _SLOPES * noise)))
 
 
@@ -526,7 +556,10 @@ def shapes_of(cost: Cost, chart: LocalAxes) -> Array:
 
 @compiled
 def is_convex(cost: Cost, chart: LocalAxes, box: Box, margin: float) -> bool:
-    """Return whether the Hessian of f/2 exceeds `margin` over a whole box; fill the tables of the box."""
+    """Return whether the Hessian of f/2 exceeds `margin` times the identity over a whole box.
+
+    The tables of the box are filled. If the surface is no graph over the box, the result is False.
+    """
     if not is_bounded(cost, chart, box):
         return False
     curve_box(cost, chart, box)

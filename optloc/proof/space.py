@@ -1,6 +1,8 @@
 """The space of a branch and bound: search coordinates around a fix, or an atlas of all positions.
 
-Searches for starts and covers use the same loop for both spaces.
+Searches for starts and subpavings use the same loop for both spaces. A box has a centre ``box.at`` and half-widths
+``box.half`` (3,), and `piece` is the number of the piece of the atlas that contains it, 0 around a fix. The nodes of a
+cost are the scalar functions, such as ranges, whose values the cost combines (`optloc.proof.nodes.node`).
 """
 
 from __future__ import annotations
@@ -42,7 +44,8 @@ class Space(NamedTuple):
     chart : LocalAxes
         The search coordinates, along planes or on a piece of a surface.
     minima, sides : array (P, 3)
-        Known minima in search coordinates, and half-widths of boxes around them in which the cost is convex.
+        P known minima in search coordinates, and half-widths of boxes around them in which the cost is convex. A search
+        leaves these boxes out.
     """
 
     far: bool
@@ -61,7 +64,11 @@ def in_atlas(atlas: Atlas, chart: LocalAxes) -> Space:
 
 @compiled
 def floor_of(space: Space, cost: Cost) -> float:
-    """Return the sizes of measurements and coordinates in a residual, without the sizes of the nodes."""
+    """Return the part of the rounding of residuals that is the same for all boxes, as a size in whitened units.
+
+    It is the length of w plus the sizes of coordinates, each times the weight of its node. The values of nodes are
+    added for each box (`optloc.proof.box.rounding_error`), which multiplies the sum by a relative rounding.
+    """
     if space.far:
         return accuracy_floor_far(cost, space.atlas)
     if space.chart.differs:  # lines to stations come from anywhere on a surface
@@ -71,7 +78,7 @@ def floor_of(space: Space, cost: Cost) -> float:
 
 @inlined
 def set_place(space: Space, box: Box, piece: int) -> None:
-    """Compute the position, and in the atlas its derivatives, of the centre of a box."""
+    """Compute the position of the centre of a box: ``box.centre`` (m), or in the atlas p, v and their derivatives."""
     if space.far:
         set_centre(space.atlas, piece, box.at)
     else:
@@ -80,7 +87,7 @@ def set_place(space: Space, box: Box, piece: int) -> None:
 
 @inlined
 def set_box(space: Space, box: Box, piece: int) -> None:
-    """Compute the position of the centre of a box, and widen the box by the rounding of its centre."""
+    """Compute the position of the centre of a box like `set_place`, and widen the box by the rounding of the centre."""
     set_place(space, box, piece)
     if not space.far:
         widen_by_rounding(space.chart, box.centre, box.half)
@@ -90,7 +97,10 @@ def set_box(space: Space, box: Box, piece: int) -> None:
 
 @compiled
 def set_nodes(space: Space, cost: Cost, box: Box) -> bool:
-    """Bound the nodes of a cost over a box whose centre is set; return False if a surface is no graph over the box."""
+    """Bound the nodes of a cost over a box whose centre is set; return False if a surface is no graph over the box.
+
+    The bounds are written into ``box.nodes``.
+    """
     if space.far:
         bound_pieces(space.atlas, cost.kinds, cost.data, box.half, box.nodes)
         return True
@@ -102,7 +112,8 @@ def bound_or_halve(space: Space, cost: Cost, box: Box, piece: int, stack: Array,
     """Bound the nodes of a cost over a box from the stack; return -1, or the stack's size if it is dropped or halved.
 
     A box around a known minimum is dropped, and so is a box that belongs to another piece of a surface. A box over
-    which the surface is no graph is halved.
+    which the surface is no graph is halved: its halves are pushed onto the stack (rows of centre, half-widths, bound
+    and piece). `size` is the number of boxes on the stack before.
     """
     set_box(space, box, piece)
     chart, half, line = space.chart, box.half, box.line
@@ -121,7 +132,7 @@ def bound_or_halve(space: Space, cost: Cost, box: Box, piece: int, stack: Array,
 
 @compiled
 def set_curves(space: Space, cost: Cost, box: Box) -> None:
-    """Bound second derivatives of the nodes over a box whose nodes are bounded."""
+    """Bound second derivatives of the nodes over a box whose nodes are bounded, and write them into ``box.curves``."""
     if space.far:
         curve_pieces(space.atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
     else:
@@ -130,7 +141,7 @@ def set_curves(space: Space, cost: Cost, box: Box) -> None:
 
 @compiled
 def place_of(space: Space, box: Box, x: Array) -> None:
-    """Write the position x (D,), metres, of the centre of a box whose centre is set."""
+    """Write the position x (D,), metres, of the centre of a box; `set_place` must have run."""
     if space.far:
         write_position(space.atlas, x)
     else:

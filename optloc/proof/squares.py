@@ -84,7 +84,10 @@ class Squares(NamedTuple):
 
 @compiled
 def squares_of(cost: Cost, box: Box, middle: Array, radius: float) -> Squares:
-    """Return the squared rows of a cost; the tables of the box must be the tables of a fix (`chart_at`)."""
+    """Return the squared rows of a cost; the tables of the box must be the tables of a fix (`chart_at`).
+
+    `middle` (3,) and `radius` are centre and half-width, m, of the cube of the atlas.
+    """
     kinds, groups, nodes = cost.kinds, cost.groups, box.nodes
     J, order, R, tie = kinds.shape[0], groups.order, groups.R, groups.tie
     group, late, spread, sizes = np.full(J, -1), np.zeros(J), np.zeros((J, J)), np.zeros(J)
@@ -130,12 +133,11 @@ def squares_of(cost: Cost, box: Box, middle: Array, radius: float) -> Squares:
 
 @compiled
 def _set_late(cost: Cost, box: Box, own: Array, R: Array, late: Array) -> float:
-    """Write the measured range differences of a group, reference last; return a bound of their error.
+    """Write the measured range differences of a group, m, into `late`; return a bound of their error.
 
-    The bound is the length of a residual.
-
-    Errors at the fix are e = R f, with f the forces K'(K phi - w). Exact errors obey A e = f. The length of the
-    remaining difference bounds the error of the result.
+    The bound is the length of a residual. `own` are the nodes of the group, reference last, and R is the covariance of
+    their errors. Errors at the fix are e = R f, with f the forces K'(K phi - w). Exact errors obey A e = f. The length
+    of the remaining difference bounds the error of the result.
     """
     last, nodes, curves = own.shape[0] - 1, box.nodes, box.curves
     reference = own[last]
@@ -157,9 +159,10 @@ def _set_late(cost: Cost, box: Box, own: Array, R: Array, late: Array) -> float:
 
 @compiled
 def _set_spread(own: Array, R: Array, spread: Array) -> None:
-    """Write the standard deviations of the range differences of a group.
+    """Write the standard deviations, m, of the differences of two ranges of a group into `spread` (J, J).
 
-    A share of the terms is added, because the difference of variances cancels digits.
+    `own` are the nodes of the group, reference last, and R is the covariance of their errors. A share of the terms is
+    added, because the difference of variances cancels digits.
     """
     last = own.shape[0] - 1
     for i in range(last + 1):
@@ -199,7 +202,7 @@ def clip_to_squares(cost: Cost, atlas: Atlas, squares: Squares, rho: float, box:
 
 @compiled
 def _fill_lines(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> None:
-    """Write the table of lines over a box."""
+    """Write the table of scaled lines from the stations over the current box of the atlas into ``squares.lines``."""
     frame, h, lines = frame_of(atlas), triple_at(half, 0), squares.lines
     for j in range(lines.shape[0]):
         if squares.group[j] < 0:
@@ -215,7 +218,10 @@ def _fill_lines(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> None
 
 @compiled
 def _fill_rows(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> tuple[float, float]:
-    """Write the table of squared rows; return the share by which they may exceed a residual, and sizes of terms."""
+    """Write the table of squared rows; return the share by which they may exceed a residual, and sizes of terms.
+
+    The sizes are for `optloc.proof.box.least_residual`: sums of terms, times their weights, that limit the accuracy.
+    """
     lines, rows, K, radius, scale = squares.lines, squares.rows, cost.K, atlas.radius, atlas.scale
     swing = abs(scale[1]) * half[0] + abs(scale[2]) * half[1] + abs(scale[3]) * half[2]
     far, most = abs(scale[0]) + swing, 0.0
@@ -269,8 +275,8 @@ def _fill_rows(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> tuple
 def _deflate(squares: Squares, longest: float) -> None:
     """Shorten the rows along the directions of the reference ranges by the best factor; no residual becomes longer.
 
-    This is close to least squares with the errors of rows and references as noise. The closer it is, the more of the
-    box is cut off.
+    `longest` is the greatest residual of interest. This is close to least squares with the errors of rows and
+    references as noise. The closer it is, the more of the box is cut off.
     """
     rows, K = squares.rows, squares.K
     for g in range(squares.groups):

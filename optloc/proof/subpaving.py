@@ -2,7 +2,9 @@
 
 The regions may be curved and reach infinity. The bounds are the bounds of a proof, without its tests for minima: a box
 is left out only if its least cost is above the level. All boxes of a generation are halved before the next generation,
-so that their sizes are about equal everywhere.
+so that their sizes are about equal everywhere. The boxes are in search coordinates around a fix, or on the pieces of an
+atlas of all space (`optloc.proof.space`). A node is one scalar function of the position, such as a range; rows
+(residuals) are sums of nodes, and a node over a box is linear plus a bounded remainder.
 """
 
 from __future__ import annotations
@@ -122,7 +124,10 @@ def cover_region(
 
 @compiled
 def _push_enclosure(cost: Cost, chart: LocalAxes, box: Box, longest: float, boxes: Array) -> int:
-    """Write a box around all points with residuals shorter than `longest`; return the number of boxes, 0 or 1."""
+    """Write a box around all points with residuals shorter than `longest` into `boxes`; return the number, 0 or 1.
+
+    The residual is the whitened vector K phi - w. The result is 0 if the measurements do not enclose these points.
+    """
     corners = np.empty((2, 3))
     low, high = corners[0], corners[1]
     if not enclose(cost, chart, box, longest, low, high):
@@ -138,9 +143,10 @@ def _push_enclosure(cost: Cost, chart: LocalAxes, box: Box, longest: float, boxe
 
 @compiled
 def _push_atlas(cost: Cost, atlas: Atlas, box: Box, x: Array, level: float, boxes: Array) -> tuple[int, Atlas]:
-    """Write all pieces of an atlas, and a box around the fix; return the number of boxes, and the atlas.
+    """Write all pieces of an atlas, and a box around the fix x, into `boxes`; return their number, and the atlas.
 
-    If the fix has axes, a long thin region is cut along them.
+    The box around the fix exists only if the fix has axes (is a minimum); with them, a long thin region is cut along
+    them.
     """
     size, wider = push_faces(boxes, atlas.dimension), with_room_for_minimum(atlas)
     if not set_minimum(cost, box, wider, 0, x, 0.0, 1e-6 * (1.0 + level), inf):
@@ -154,7 +160,11 @@ def _push_atlas(cost: Cost, atlas: Atlas, box: Box, x: Array, level: float, boxe
 
 @compiled
 def _halve(cost: Cost, space: Space, box: Box, level: float, most: int, lists: Array, size: int) -> tuple[int, int]:
-    """Halve the boxes of the first list by generations; return the numbers of boxes in the last list, and inside."""
+    """Halve the boxes of the first list by generations; return the number of final boxes, and how many are inside.
+
+    `lists` (3, capacity, DEPTH) contains the present generation (`size` boxes), the next generation, and the final
+    boxes. The final boxes inside the region come first. `most` is the greatest number of boxes in all.
+    """
     floor, count, inside = floor_of(space, cost), zero(), zero()
     for generation in range(_GENERATIONS + 1):
         # The next generation may be twice as large, and needs space: a box leaves one box inside, or two to test.
@@ -163,7 +173,7 @@ def _halve(cost: Cost, space: Space, box: Box, level: float, most: int, lists: A
         for i in range(size):
             fate, piece = _look(cost, space, box, lists[0], i, level, floor), int(lists[0, i, PIECE])
             if fate == _IN or (last and fate != _OUT):
-                count = push(lists[2], count, box.at, box.half, 0.0, piece)
+                count = push(lists[2], count, box.at, box.half, 0.0, piece)  # subpavings use no bound of a parent
             elif fate == _SMALLER:
                 following = push(lists[1], following, box.at, box.half, 0.0, piece)
             elif fate == _ACROSS:
@@ -180,7 +190,11 @@ def _halve(cost: Cost, space: Space, box: Box, level: float, most: int, lists: A
 
 @inlined
 def _look(cost: Cost, space: Space, box: Box, front: Array, i: int, level: float, floor: float) -> int:
-    """Test box i of a list, and return the result; a box across the edge of the region is contracted."""
+    """Return the result of the test of box i of the list `front`; a box across the edge of the region is contracted.
+
+    Inside means that the greatest residual is below the root of `level`, outside that the least residual is above it.
+    `floor` is the result of `optloc.proof.space.floor_of`.
+    """
     piece, faces = int(front[i, PIECE]), 2 * space.atlas.dimension
     pop(front, i, box.at, box.half)
     set_box(space, box, piece)
@@ -240,7 +254,7 @@ def _clip(cost: Cost, box: Box, longest: float) -> int:
 
 @inlined
 def _bound(cost: Cost, space: Space, box: Box) -> None:
-    """Bound the nodes over a box whose centre is set. Covers have no surfaces."""
+    """Bound the nodes over a box whose centre is set; subpavings are not made along surfaces."""
     if space.far:
         bound_pieces(space.atlas, cost.kinds, cost.data, box.half, box.nodes)
     else:
@@ -252,13 +266,17 @@ def _bound(cost: Cost, space: Space, box: Box) -> None:
 
 @compiled
 def _bound_near(cost: Cost, chart: LocalAxes, box: Box) -> None:
+    # Bounds the nodes over a box in search coordinates around a fix.
     write_centre(chart.origin, chart.sense, box.at, box.centre)
     bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
 
 
 @compiled
 def _most_residual(cost: Cost, box: Box) -> float:
-    """Return an upper bound of ``|K phi - w|`` over a box whose rows are linearised; rounding is not included."""
+    """Return an upper bound of the residual's length ``|K phi - w|`` over a box; rounding is not included.
+
+    The rows of the box must be linearised: column MIDDLE is the residual at the centre.
+    """
     middle, j0, j1, j2 = 0.0, 0.0, 0.0, 0.0
     for i in range(box.rows.shape[0]):
         middle += box.rows[i, MIDDLE] ** 2
@@ -271,7 +289,10 @@ def _most_residual(cost: Cost, box: Box) -> float:
 
 @compiled
 def _bends(cost: Cost, box: Box) -> float:
-    """Return a bound of the nonlinear part of the residual over a box: half the widths of the remainders, weighted."""
+    """Return a bound of the nonlinear part of the residual over a box: half the widths of the remainders, weighted.
+
+    The result is infinite if a remainder has no bound.
+    """
     total = 0.0
     for j in range(cost.weight.shape[0]):
         total += 0.5 * cost.weight[j] * (box.nodes[j, HIGH] - box.nodes[j, LOW])
@@ -280,7 +301,10 @@ def _bends(cost: Cost, box: Box) -> float:
 
 @compiled
 def _is_bent(cost: Cost, box: Box, dimension: int) -> bool:
-    """Return whether curvature changes the residual over a box more than the steepest side does."""
+    """Return whether curvature changes the residual over a box more than the steepest side does.
+
+    If a remainder has no bound, the result is False.
+    """
     most = 0.0
     for m in range(dimension):
         steep = 0.0
@@ -293,7 +317,11 @@ def _is_bent(cost: Cost, box: Box, dimension: int) -> bool:
 
 @compiled
 def _side(cost: Cost, space: Space, box: Box, piece: int) -> int:
-    """Return the side to halve: the steepest side, or if curvature dominates, the best side to reduce remainders."""
+    """Return the side to halve: the steepest side, or if curvature dominates, the side that reduces it most.
+
+    The second choice needs the sum of remainders to fall to a share of `_STRAIGHTER`; the nodes are bounded for each
+    side.
+    """
     dimension = space.atlas.dimension
     side = steepest_side(box.half, box.rows, dimension)
     if _is_bent(cost, box, dimension):
@@ -310,7 +338,10 @@ def _side(cost: Cost, space: Space, box: Box, piece: int) -> int:
 
 @compiled
 def _write_cell(cost: Cost, space: Space, box: Box, boxes: Array, i: int, cells: Array, ends: Array) -> None:
-    """Write a box in homogeneous coordinates, and the cost at infinity in its direction if it reaches infinity."""
+    """Write box i in homogeneous coordinates, as `cover_region` returns it, and the cost at infinity in its direction.
+
+    `ends[i]` is infinite for a box that does not reach infinity.
+    """
     atlas, sense, d, piece = space.atlas, space.chart.sense, space.atlas.dimension, int(boxes[i, PIECE])
     pop(boxes, i, box.at, box.half)
     set_place(space, box, piece)

@@ -39,7 +39,7 @@ from optloc.proof.nodes.node import (
 )
 
 # Numbers of a surface: its height, the numbers of the height node, the Earth's centre, and three orthonormal axes of a
-# piece, the last one upward. An array of length zero means no surface.
+# piece, of which the last is upward. An array of length zero means no surface.
 LEVEL, DATA, MIDDLE, FIRST, SECOND, UP = 0, 1, 1 + HEIGHT_WIDTH, 4 + HEIGHT_WIDTH, 7 + HEIGHT_WIDTH, 10 + HEIGHT_WIDTH
 SURFACE_WIDTH, SIDES = 13 + HEIGHT_WIDTH, 6
 # Numbers of a graph over a box: greatest distance below the tangent plane, and greatest distance of the centre from
@@ -94,7 +94,7 @@ def lay_box(surface: Array, centre: Array, half: Array, sense: Array, gram: Arra
         T of the local coordinates, whose third column is the upward axis; turned into the tangent plane. T'T is
         written.
     graph : array (GRAPH_WIDTH,)
-        Written.
+        Written: the numbers of the graph over the box, see the columns above.
     second : array (3, 3)
         Working memory.
     """
@@ -157,7 +157,12 @@ def _write_graph(
     second: Array,
     found: tuple[float, float, float, float, float],
 ) -> None:
-    """Write slopes and curvature of a surface over a box, from the derivatives of ``height(x(s)) = value``."""
+    """Write slopes and curvature of a surface over a box, from the derivatives of ``height(x(s)) = value``.
+
+    `data` are the numbers of the height node, and the other arrays are as in `lay_box`. `found` contains the sag (m),
+    the cosine between normal and upward axis at the centre, the least such cosine over the box, the greatest curvature
+    of the height (1/m), and the sum of the squared lengths of the two tangents.
+    """
     sag, rise, least, bend, size = found
     for k in range(3):
         for m in range(3):
@@ -183,7 +188,10 @@ def _write_graph(
 
 @compiled
 def fold_bounds(graph: Array, lean: Array, nodes: Array) -> None:
-    """Turn bounds over a box of (s, t) into bounds along the surface; write slopes along the upward axis to `lean`."""
+    """Turn bounds of nodes over a box of (s, t) into bounds along the surface, where -(SAG + SLIP) <= t <= SLIP.
+
+    The slopes along the upward axis are moved from `nodes` to `lean` (J,).
+    """
     sag, slip = graph[SAG] + graph[SLIP], graph[SLIP]
     for j in range(nodes.shape[0]):
         slope = nodes[j, SLOPE2]
@@ -194,14 +202,17 @@ def fold_bounds(graph: Array, lean: Array, nodes: Array) -> None:
 
 @compiled
 def unfold_slopes(lean: Array, nodes: Array) -> None:
-    """Restore the slopes of nodes along the upward axis, which their second derivatives need."""
+    """Restore the slopes of nodes along the upward axis from `lean` (J,); their second derivatives need them."""
     for j in range(nodes.shape[0]):
         nodes[j, SLOPE2] = lean[j]
 
 
 @compiled
 def fold_curves(graph: Array, lean: Array, nodes: Array, curves: Array) -> None:
-    """Turn second derivatives over a box of (s, t) into second derivatives along the surface, by the chain rule."""
+    """Turn second derivatives over a box of (s, t) into second derivatives along the surface, by the chain rule.
+
+    `graph` and `lean` are the results of `lay_box` and `fold_bounds`. The table `curves` (J, CURVE_WIDTH) is changed.
+    """
     steep = sqrt(graph[_STEEP0] * graph[_STEEP0] + graph[_STEEP1] * graph[_STEEP1])
     for j in range(nodes.shape[0]):
         slope, turn, chi = lean[j], curves[j, TURN2], curves[j, CHI]
@@ -218,7 +229,10 @@ def fold_curves(graph: Array, lean: Array, nodes: Array, curves: Array) -> None:
 
 @compiled
 def reach_of_piece(surface: Array, origin: Array, sense: Array, low: Array, high: Array) -> None:
-    """Contract corners (3,) of search coordinates to this piece of the surface; set the third coordinate to 0."""
+    """Contract corners (3,) of search coordinates to this piece of the surface; set the third coordinate to 0.
+
+    `origin` (m) and `sense` define the search coordinates: x = origin + sense s.
+    """
     # A point of this piece is farthest along the third axis. So each other coordinate is at most sqrt(1/2) of its
     # distance from the centre: the squares sum to the squared distance.
     most = sqrt(0.5) * (WGS84_A + abs(surface[LEVEL])) * (1.0 + 1e-9)
@@ -233,7 +247,10 @@ def reach_of_piece(surface: Array, origin: Array, sense: Array, low: Array, high
 
 @compiled
 def is_one_side(surface: Array, origin: Array, sense: Array, low: Array, high: Array) -> bool:
-    """Return whether the whole part of a surface between corners (3,) of search coordinates belongs to one piece."""
+    """Return whether the whole part of a surface between corners (3,) of search coordinates belongs to one piece.
+
+    `origin` (m) and `sense` define the search coordinates: x = origin + sense s. If True, other pieces need no search.
+    """
     aside, below = 0.0, 0.0
     for m in range(3):
         below += surface[UP + m] * (origin[m] - surface[MIDDLE + m])
@@ -263,7 +280,8 @@ _PARALLEL = 1e-8
 def set_tangents(D: int, planes: Array, surface: Array, axes: Array) -> int:
     """Write orthonormal axes (3, 3): first those along planes or a surface, then across; return the number along.
 
-    The result is 0 if planes are nearly parallel, because the common directions are then unknown.
+    The axes are columns, D is the dimension, and `planes` (e, 3) contains normals. The result is 0 if planes are nearly
+    parallel, because the common directions are then unknown.
     """
     bent, apart = int(surface.shape[0] > 0), True
     across = planes.shape[0] + bent + 3 - D
@@ -292,11 +310,14 @@ def set_tangents(D: int, planes: Array, surface: Array, axes: Array) -> int:
 
 @compiled
 def _set_axis(axes: Array, k: int, start: tuple[float, float, float]) -> float:
-    """Write the unit vector of the part of `start` across the axes behind k as axis k; return the part's length."""
+    """Write the unit vector of the part of `start` across the axes behind k as axis k.
+
+    Return the length of this part.
+    """
     length = 0.0
     for m in range(3):
         axes[m, k] = start[m]
-    for _ in range(2):  # twice is exact (Parlett)
+    for _ in range(2):  # twice is exact (Parlett 1980)
         for other in range(k + 1, 3):
             along = axes[0, k] * axes[0, other] + axes[1, k] * axes[1, other] + axes[2, k] * axes[2, other]
             for m in range(3):
@@ -309,7 +330,10 @@ def _set_axis(axes: Array, k: int, start: tuple[float, float, float]) -> float:
 
 @compiled
 def principal_along(information: Array, axes: Array, count: int) -> None:
-    """Turn the first `count` axes so that information (3, 3) is nearly diagonal along them; overwrite it so."""
+    """Turn the first `count` axes (columns) so that information (3, 3) is nearly diagonal along them.
+
+    The information along the new axes replaces `information`.
+    """
     own, turned, vectors = np.zeros((3, 3)), axes.copy(), np.zeros((3, 3))
     for k in range(count):
         for m in range(count):

@@ -1,8 +1,11 @@
 """Azimuths and elevations over a box: value, slope, remainder and curvature, and enclosures from several stations.
 
-The horizontal part of a line of sight is the complex number z = X + iY. With ``z = z_c (1 + w)`` and ``w = r + i t``,
-the azimuth changes by ``atan(t/(1+r))``, whose linear part is t. For an elevation the complex number is rho + iZ, with
-rho the horizontal distance. Its argument changes in the same way, and rho is itself a range.
+X, Y and Z are the components of the line of sight, from the station to a point, along the axes of the station. The
+horizontal part is the complex number z = X + iY, with the value z_c at the centre of the box. With ``z = z_c (1 + w)``
+and ``w = r + i t``, the azimuth changes by ``atan(t/(1+r))``, whose linear part is t. So r and t are the relative
+changes along and across the line of sight. For an elevation the complex number is rho + iZ, with rho the horizontal
+distance. Its argument changes in the same way, and rho is itself a range. The calling conventions of `bound` and
+`curve` functions are in `optloc.proof.nodes.node`.
 """
 
 from __future__ import annotations
@@ -46,8 +49,8 @@ _ROUNDING = 1e-15
 def atan_remainder_bound(back: float, ahead: float, aside: float) -> float:
     """Return the greatest ``|atan(t/(1+r)) - t|`` over ``-back <= r <= ahead, |t| <= aside``; back must be below 1.
 
-    For t > 0 the difference decreases with r. At r = -back it is greatest at ``t^2 = back (1 - back)``. At r = ahead
-    it decreases with t.
+    This is the greatest remainder of an angle, radians, rounding included. For t > 0 the difference decreases with r.
+    At r = -back it is greatest at ``t^2 = back (1 - back)``. At r = ahead it decreases with t.
     """
     best = min(aside, sqrt(back * (1.0 - back)))
     above = atan(best / (1.0 - back)) - best
@@ -57,12 +60,12 @@ def atan_remainder_bound(back: float, ahead: float, aside: float) -> float:
 
 @compiled
 def atan_remainder(back: float, ahead: float, aside: float, bilinear: tuple[float, float]) -> tuple[float, float]:
-    """Return an enclosure of ``atan(t/(1+r)) - t``.
+    """Return an enclosure of ``atan(t/(1+r)) - t``: the least and the greatest remainder of an angle, radians.
 
     Parameters
     ----------
     back, ahead, aside : float
-        ``-back <= r <= ahead, |t| <= aside``; back below 1.
+        Limits of the relative changes: ``-back <= r <= ahead, |t| <= aside``; back below 1.
     bilinear : pair of float
         An enclosure of the leading term ``-r t``; the rest is at most ``|w|^3 / (3 (1 - |w|))``.
     """
@@ -77,9 +80,10 @@ def atan_remainder(back: float, ahead: float, aside: float, bilinear: tuple[floa
 
 @compiled
 def vector_angles(left: float, right: float, down: float, up: float) -> tuple[float, float]:
-    """Return the least and greatest angle in a rectangle, radians; -pi and pi if it touches the cut or the origin.
+    """Return the least and greatest angle of the points of a rectangle, seen from the origin, radians.
 
-    The rectangle is [left, right] along the first axis and [down, up] along the second.
+    The rectangle is [left, right] along the first axis and [down, up] along the second. If it touches the origin or the
+    half-axis at which angles jump from pi to -pi, the results are -pi and pi.
     """
     if left <= 0.0 and down <= 0.0 <= up:
         return -pi, pi
@@ -90,7 +94,11 @@ def vector_angles(left: float, right: float, down: float, up: float) -> tuple[fl
 
 @compiled
 def horizontal_line(data: Array, line: Array, sense: Array) -> tuple[float, float, Triple, Triple]:
-    """Return the line's components along the first two axes, turned by the measured angle, and their gradients."""
+    """Return the horizontal line of sight in axes along and across the measured direction.
+
+    The four results are the component along the measured direction, the component across it, and the gradients of both.
+    `data` holds the numbers of an azimuth node; for `line` and `sense` see `optloc.proof.nodes.node`.
+    """
     c, s = cos(data[MEASURED]), sin(data[MEASURED])
     first, second = triple_at(data, AXES), triple_at(data, AXES + 3)
     ahead, aside = sum_of_forms(c, first, s, second), sum_of_forms(c, second, -s, first)
@@ -126,7 +134,11 @@ def bound_azimuth(data: Array, line: Array, sense: Array, half: Array, slope: Ar
 def _flat_azimuth(
     value: float, ahead: tuple[float, float], aside: tuple[float, float], alone: bool, slope: Array
 ) -> tuple[float, float, float]:
-    """Enclose an azimuth by a constant interval; each component is a pair of centre and half-width."""
+    """Return value, least and greatest change of an azimuth that is enclosed by a constant interval, radians.
+
+    `ahead` and `aside` are the components along and across the measured direction, each a pair of centre and
+    half-width. If `alone`, the absolute value replaces the angle. The slope (3,) is set to zero.
+    """
     slope[0] = slope[1] = slope[2] = 0.0
     right, up, down = ahead[0] + ahead[1], aside[0] + aside[1], aside[0] - aside[1]
     if alone and ahead[0] - ahead[1] <= 0.0 and down <= 0.0 <= up:
@@ -141,7 +153,8 @@ def _flat_azimuth(
 def curve_azimuth(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
     """Bound the second derivatives of an azimuth over a box (see `optloc.proof.nodes.node`).
 
-    With gamma = radial + i around, the gradient is ``Im(gamma/(1+w))`` and the Hessian ``-Im(gamma gamma'/(1+w)^2)``.
+    The azimuth is the imaginary part of log z. With gamma the gradient of log z at the centre, the gradient of the
+    azimuth is ``Im(gamma/(1+w))`` and the Hessian ``-Im(gamma gamma'/(1+w)^2)``.
     """
     x, y, along, beside = horizontal_line(data, line, sense)
     h = triple_at(half, 0)
@@ -175,7 +188,7 @@ def curve_azimuth(data: Array, line: Array, sense: Array, half: Array, curvature
 
 @compiled
 def line_of_sight(data: Array, x: Array) -> Triple:
-    """Return the line from a station to a fix in the station's axes, metres."""
+    """Return the three components, metres, of the line from a station to the fix x along the axes of the station."""
     line = (x[0] - data[0], x[1] - data[1], x[2] - data[2])
     return (
         inner_product(triple_at(data, AXES), line),
@@ -186,9 +199,11 @@ def line_of_sight(data: Array, x: Array) -> Triple:
 
 @compiled
 def _ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row: Array) -> tuple[float, float]:
-    """Write the horizontal unit vector n across the sight: ``|n.(x' - x)| <= r sin(swing)`` at distance r.
+    """Write the horizontal unit vector n (3,) across the sight into `row`: ``|n.(x' - x)| <= r sin(swing[j])``.
 
-    Return sin(swing) and the distance of the fix.
+    Here x is the fix, x' another point at distance r, and swing[j] the greatest change of azimuth j, radians. Return
+    sin(swing[j]) and the distance of the fix from the station, m. The result is (-1, 0), no bound, if the fix is on the
+    vertical of the station.
     """
     p, q, r = line_of_sight(data[j], x)
     flat = hypot(p, q)
@@ -232,7 +247,11 @@ _UPRIGHT_WIDTH = 16
 
 @compiled
 def _upright(data: Array, line: Array, sense: Array) -> tuple[float, float, Triple, Triple, Triple]:
-    """Return horizontal distance and rise of a line, and gradients along outward, sideways and upward unit vectors."""
+    """Return horizontal distance and rise of a line, and gradients along outward, sideways and upward unit vectors.
+
+    "Outward" is the horizontal direction from the station to the point, and "sideways" is the horizontal direction
+    across.
+    """
     x, y, along, beside = horizontal_line(data, line, sense)
     rho = sqrt(x * x + y * y)
     # On the station's vertical any direction is outward; the bounds there are not used.
@@ -281,7 +300,10 @@ def bound_elevation(data: Array, line: Array, sense: Array, half: Array, slope: 
 
 @compiled
 def _flat_elevation(rise: tuple[float, float], near: float, far: float) -> tuple[float, float]:
-    """Enclose an elevation by a constant interval: rise is centre and half-width, near and far horizontal distances."""
+    """Return the least and the greatest elevation, radians, over a box, without a slope.
+
+    `rise` is the vertical component as a pair of centre and half-width; `near` and `far` limit the horizontal distance.
+    """
     down, up = rise[0] - rise[1], rise[0] + rise[1]
     return atan2(down, near if down < 0.0 else far), atan2(up, far if up < 0.0 else near)
 
@@ -291,8 +313,8 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
     """Bound the second derivatives of an elevation over a box (see `optloc.proof.nodes.node`).
 
     The unit vectors along the line (a), upwards across it (b) and sideways (c) are mapped to search coordinates and
-    divided by the range. The gradient is b, and the Hessian is ``-(a b' + b a') - tan(elevation) c c'``. The frame
-    turns over the box.
+    divided by the range. The gradient is b, and the Hessian is ``-(a b' + b a') - tan(elevation) c c'``. The bounds
+    follow from bounds of the changes of a, b and c over the box.
     """
     bound_elevation(data, line, sense, half, turn)  # for its slope only: `turn` is overwritten below
     if is_zero_slope(turn):
@@ -333,8 +355,9 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
 def _swung(u: Triple, v: Triple, tangent: float, more: Triple, near: float, stretch: float) -> Triple:
     """Return bounds of the change of u when it turns towards v, changes further by `more`, and the range changes.
 
-    For an angle whose tangent is at most `tangent`, ``u cos + v sin - u`` is at most
-    ``tangent^2/2 |u| + tangent |v|``. `near` and `stretch` bound r/r' and its difference from 1.
+    All triples are components along the search coordinates. If the tangent of an angle is at most `tangent`, ``u cos +
+    v sin - u`` is at most ``tangent^2/2 |u| + tangent |v|``. With r' the range elsewhere in the box, `near` bounds r/r'
+    and `stretch` bounds its difference from 1.
     """
     bent = 0.5 * tangent * tangent
     return (
@@ -355,7 +378,9 @@ def _frame_turn(
 ) -> float:
     """Write the change of an elevation's gradient and return the change of its Hessian, from the change of its frame.
 
-    `steep` is the tangent of the elevation and a bound of its change.
+    `frame` contains the vectors a, b and c of `curve_elevation`, and `change` bounds of their changes. `steep` is the
+    tangent of the elevation and a bound of its change. `curvature` is the Hessian at the centre, and `turn` (3,) is
+    written.
     """
     (a, b, c), (da, db, dc) = frame, change
     tan = steep[0] + steep[1]
@@ -375,8 +400,9 @@ def _frame_turn(
 def _upright_ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row: Array) -> tuple[float, float]:
     """Write the unit vector v across the sight and the horizontal: ``|v.(x' - x)| <= r (sin e + 1 - cos a)``.
 
-    Here r is the distance, and e is the greatest change of the elevation. The greatest change of the azimuth from the
-    same station is a, below a quarter turn.
+    Here r is the distance of the point x' from the station, and e = swing[j] the greatest change of the elevation. The
+    greatest change of the azimuth from the same station is a, below a quarter turn. Return the factor of r and the
+    distance of the fix x, m; (-1, 0), no bound, without this azimuth.
     """
     turn = _azimuth_beside(kinds, data, swing, j)
     p, q, r = line_of_sight(data[j], x)
@@ -392,7 +418,10 @@ def _upright_ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row:
 
 @compiled
 def _azimuth_beside(kinds: Array, data: Array, swing: Array, j: int) -> float:
-    """Return the greatest change of the azimuth from the station of elevation j; pi without this azimuth."""
+    """Return the greatest change, radians, of the azimuth from the station of elevation j; pi without this azimuth.
+
+    `swing` (J,) contains the greatest change of each node. Azimuth and elevation must have the same station and axes.
+    """
     least = pi
     for m in range(kinds.shape[0]):
         if kinds[m] == AZIMUTH:

@@ -36,7 +36,10 @@ _NAMES = {node.name: node for node in NODES}
 
 
 def named(node: str | Node) -> Node:
-    """Return the node with a name that a `Model` uses, or the node itself if the model contains it."""
+    """Return the node with a name that a `Model` uses, or the node itself if the model contains it.
+
+    An unknown name raises `InvalidProblem` with the nearest known names.
+    """
     if isinstance(node, Node):
         return node
     if node not in _NAMES:
@@ -50,12 +53,15 @@ _Writer = Callable[[Node, int], str]
 
 
 def _call(field: str, arguments: str) -> _Writer:
-    """Return a writer of calls of a node's function, or of an empty text for nodes without the function."""
+    """Return a writer of source text: for a node and its code, the text is a call of the node's function `field`.
+
+    The text is empty if the node does not have this function.
+    """
     return lambda node, code: "" if getattr(node, field) is None else f"{field}_{code}({arguments})"
 
 
 def _constant(field: str) -> _Writer:
-    """Return a writer of the value of a node's field."""
+    """Return a writer of source text: for a node, the text is the value of the node's field."""
     return lambda node, code: repr(getattr(node, field))
 
 
@@ -71,7 +77,10 @@ _PROPERTIES: dict[str, tuple[str, _Writer, str]] = {
 
 
 def _property_source(name: str, nodes: list[Node]) -> str:
-    """Return the source of a function that returns one property of a node."""
+    """Return the source of the function `name`, which returns one property of a node by its code.
+
+    `nodes` are in the order of their codes.
+    """
     arguments, write, default = _PROPERTIES[name]
     lines = [f"def {name}({arguments}):"]
     for code, node in enumerate(nodes):
@@ -108,7 +117,7 @@ def curve_others(kinds, data, centre, sense, half, line, second, nodes, curves):
             line[k] = centre[k] - data[j, k]
         own, turn = data[j], curves[j, TURN0 : TURN2 + 1]
 {cases}
-        # A slope of zero may stand for one that was not used: then the gradient is not that of the node.
+        # A slope may be zero because the bound does not use it. It is then not the gradient of the node.
         flat = nodes[j, SLOPE0] == 0.0 and nodes[j, SLOPE1] == 0.0 and nodes[j, SLOPE2] == 0.0
         curves[j, CHI] = inf if flat else chi
         column = 0
@@ -165,7 +174,10 @@ def curve_pieces(atlas, kinds, data, half, nodes, curves):
 
 
 def _near_case(node: Node, code: int, call: str) -> list[str]:
-    """Return the source lines that bound or curve a node over a box in search coordinates around a fix."""
+    """Return the source lines that call `bound` or `curve` of a node over a box in search coordinates around a fix.
+
+    `call` is a template of the call, with gaps for the code of the node and for the arguments that contain its lines.
+    """
     if node.points == 1:
         return [call.format(code, "line[:3], sense")]
     second = ["for k in range(3):", "    line[3 + k] = centre[k] - data[j, 3 + k]"]
@@ -173,7 +185,10 @@ def _near_case(node: Node, code: int, call: str) -> list[str]:
 
 
 def _far_case(node: Node, code: int, call: str) -> list[str]:
-    """Return the source lines that bound or curve a node over a box of an atlas, if it works with scaled lines."""
+    """Return the source lines that call `bound` or `curve` of a node over a box of an atlas; `call` as in `_near_case`.
+
+    The list is empty if the node does not work with scaled lines.
+    """
     if node.infinity not in (SCALED, BALANCED):
         return []
     if node.points == 1:
@@ -182,7 +197,7 @@ def _far_case(node: Node, code: int, call: str) -> list[str]:
 
 
 def _cases(name: str, nodes: list[Node]) -> Iterator[str]:
-    """Yield the source lines of the cases of a loop, in the order of the codes."""
+    """Yield the source lines of the cases of the loop `name`, in the order of the codes; the last case has no bound."""
     near, bounds = name.endswith("others"), name.startswith("bound")
     if bounds:
         call = "value, low, high = bound_{}(own, {}, half, slope)"
@@ -205,7 +220,7 @@ def _cases(name: str, nodes: list[Node]) -> Iterator[str]:
 
 
 def text_of(name: str, nodes: list[Node]) -> str:
-    """Return the source of a function that chooses by the codes of nodes."""
+    """Return the source of the generated function `name`, which chooses by the code of a node."""
     if name in _PROPERTIES:
         return _property_source(name, nodes)
     return _LOOPS[name].format(cases="\n".join(_cases(name, nodes)))
@@ -226,17 +241,20 @@ def _kernels(node: Node) -> Iterator[tuple[str, Any]]:
 
 
 def _generated(name: str, nodes: list[Node]) -> Callable[..., Any]:
-    """Return a generated function with the name of this file, because stored compiled code belongs to a file."""
+    """Return the generated function `name` for these nodes, not yet compiled.
+
+    Its file is this file, because stored machine code belongs to a file.
+    """
     space: dict[str, Any] = {
         "__name__": __name__,
         "inf": inf,
         **{column: getattr(columns, column) for column in _COLUMNS},
     }
     space |= {function.__name__: function for function in _NAMED}
-    space |= {f"{field}_{code}": kernel for code, own in enumerate(nodes) for field, kernel in _kernels(own)}
+    space |= {f"{field}_{code}": kernel for code, node in enumerate(nodes) for field, kernel in _kernels(node)}
     exec(compile(text_of(name, nodes), __file__, "exec"), space)  # noqa: S102  # generated text
-    made: Callable[..., Any] = space[name]
-    return made
+    function: Callable[..., Any] = space[name]
+    return function
 
 
 bound_others = compiled(_generated("bound_others", NODES))
@@ -273,8 +291,8 @@ def _regenerate() -> None:
 
 
 def width(kinds: Iterable[int]) -> int:
-    """Return the number of columns for the numbers of nodes.
+    """Return the number of columns for the numbers of nodes with these codes, `kinds`.
 
-    The result is the greatest width, so that a million problems of ranges take little memory.
+    The result is the greatest width of these kinds, so that a million problems of ranges take little memory.
     """
     return max((NODES[kind].width for kind in kinds), default=DISTANCE.width)

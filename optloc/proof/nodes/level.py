@@ -51,23 +51,26 @@ def bound_linear(data: Array, line: Array, sense: Array, half: Array, slope: Arr
 
 @compiled
 def size_linear(data: Array, reach: float) -> float:
-    """Return the size of the terms of a linear form, which limits its accuracy."""
+    """Return the sum of the sizes of the terms of a linear form, which limits its accuracy, in the unit of the form.
+
+    `reach` is the sum of the sizes of the coordinates, m.
+    """
     size = reach + (abs(data[ORIGIN]) + abs(data[ORIGIN + 1]) + abs(data[ORIGIN + 2]))
     return float(size * (abs(data[COEFFICIENTS]) + abs(data[COEFFICIENTS + 1]) + abs(data[COEFFICIENTS + 2])))
 
 
 def linear_numbers(coefficients: Array, origin: Array | None = None) -> Array:
-    """Return the numbers (B, n) of a linear node with coefficients (B, d), zero at an origin (B, d)."""
+    """Return the numbers (B, n) of a linear node ``n.(x - o)``: coefficients n (B, d), origin o (B, d), default 0."""
     parts = {COEFFICIENTS: coefficients}
     return lay_out(parts if origin is None else parts | {ORIGIN: origin})
 
 
-def _of_row(row: NodeRow) -> Array:
+def _numbers_of_row(row: NodeRow) -> Array:
     """Raise an error: no measurement is linear in the position. Priors make linear nodes directly."""
     raise NotImplementedError("a row of measurements does not name a linear form")
 
 
-LINEAR_FORM = Node("linear", _NUMBERS, 1, _of_row, bound_linear, shape=FLAT, size=size_linear)
+LINEAR_FORM = Node("linear", _NUMBERS, 1, _numbers_of_row, bound_linear, shape=FLAT, size=size_linear)
 
 # Geodetic heights.
 
@@ -106,7 +109,7 @@ def geodetic(x: float, y: float, z: float) -> tuple[float, float, float, float]:
 
 @compiled
 def _ecef(data: Array, line: Array) -> Triple:
-    """Return Earth-centred Earth-fixed coordinates, metres, of the end of a line."""
+    """Return Earth-centred Earth-fixed coordinates, metres, of the end of a line that begins at point o of the node."""
     along, origin = triple_at(line, 0), triple_at(data, ECEF)
     return (
         inner_product(triple_at(data, ROTATION), along) + origin[0],
@@ -117,7 +120,10 @@ def _ecef(data: Array, line: Array) -> Triple:
 
 @compiled
 def normal_at(data: Array, line: Array) -> tuple[float, Triple, Triple, Triple, float]:
-    """Return height, upward, eastward and northward unit vectors in the problem's frame, and sine of the latitude."""
+    """Return height (m), upward, eastward and northward unit vectors in the problem's frame, and sine of the latitude.
+
+    The point is the end of `line`, which begins at point o of the node (see the columns of its numbers, `data`).
+    """
     e, f, g = _ecef(data, line)
     height, p, sp, cp = geodetic(e, f, g)
     ce, se = e / p, f / p
@@ -130,8 +136,8 @@ def normal_at(data: Array, line: Array) -> tuple[float, Triple, Triple, Triple, 
 def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
     """Bound a geodetic height over a box (see `optloc.proof.nodes.node`), metres.
 
-    Deep in the Earth the model's formula is not an exact height. There the height is between ``-|x| - a`` and
-    ``|x| - b``.
+    Deep in the Earth the model's formula is not an exact height. With x the position from the Earth's centre and a, b
+    the semi-axes of the ellipsoid, the height there is between ``-|x| - a`` and ``|x| - b``.
     """
     height, up, _, _, _ = normal_at(data, line)
     h = triple_at(half, 0)
@@ -150,12 +156,13 @@ def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Arr
 
 @compiled
 def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
-    """Bound the second derivatives of a geodetic height over a box (see `optloc.proof.nodes.node`).
+    """Bound the second derivatives of a geodetic height h over a box (see `optloc.proof.nodes.node`).
 
-    The Hessian is ``e e'/(N + h) + n n'/(M + h)`` with e east, n north, and M, N the radii of curvature of meridian
-    and prime vertical. Its derivative is at most 1.2 / (b^2/a + h)^2. The bound covers ``3 p q^2`` with
-    ``p^2 + q^2 = 1`` (1.155), for the turning normal and the stretching tangents, and ``3/2 e^2 (1 + e^2)`` (0.01),
-    for curvature that changes with latitude.
+    The Hessian is ``u u'/(N + h) + v v'/(M + h)``: u is east, v is north, and M and N are the radii of curvature of the
+    meridian and the prime vertical. With a and b the semi-axes of the ellipsoid and e its eccentricity, the derivative
+    of the Hessian is at most 1.2 / (b^2/a + h)^2. The factor 1.2 covers ``3 p q^2`` with ``p^2 + q^2 = 1`` (1.155), for
+    the turning normal and the stretching tangents. It also covers ``3/2 e^2 (1 + e^2)`` (0.01), for curvature that
+    changes with latitude.
     """
     height, up, east, north, sp = normal_at(data, line)
     h = triple_at(half, 0)
@@ -185,9 +192,10 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
 
 @compiled
 def earth_ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
-    """Return a ball around the Earth's centre for heights up to `most`.
+    """Return centre (three numbers) and radius, m, of a ball around the Earth's centre with all heights up to `most`.
 
-    A height is at least the distance from the Earth's centre minus the equatorial radius.
+    A height is at least the distance from the Earth's centre minus the equatorial radius. The lower end `least` gives
+    no ball and is not used.
     """
     origin = triple_at(data, ECEF)
     first, second, third = triple_at(data, ROTATION), triple_at(data, ROTATION + 3), triple_at(data, ROTATION + 6)

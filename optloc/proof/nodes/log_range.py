@@ -36,8 +36,8 @@ _LEAST = 1e-300
 def bound_logarithm(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
     """Bound the logarithm of a range over a box (see `optloc.proof.nodes.node`).
 
-    For a range r' = r (1 + t) in the box, ``log r' = log r + t + (log(1 + t) - t)``. The bracket is never positive,
-    and decreases with |t|. In a box that may contain the station, the logarithm has no lower bound.
+    For a range r' = r (1 + t) in the box, with r at the centre, ``log r' = log r + t + (log(1 + t) - t)``. The bracket
+    is never positive, and decreases with |t|. In a box that may contain the station, the logarithm has no lower bound.
     """
     h = triple_at(half, 0)
     r, u, least, most, far = range_form(line, sense, h)

@@ -1,8 +1,10 @@
 """Nodes: scalar functions of the position that residuals are sums of, and the functions that bound a node over a box.
 
-Residuals are ``K phi(x) - w``, whitened, with one column for each node phi_j. Each kind of node is a file of this
-folder with one `Node`; `optloc.proof.nodes.dispatch` lists them. A measurement kind names its nodes in its
-`optloc.models.Model`.
+A node is for instance a range or an azimuth. Residuals are ``K phi(x) - w``, whitened: K (q, J) has one row for each
+measurement or prior, and one column for each node phi_j. Each kind of node is a file of this folder with one `Node`;
+`optloc.proof.nodes.dispatch` lists them. A measurement kind names its nodes in its `optloc.models.Model`.
+
+Letters in shapes: N problems, d coordinates, J nodes; B is N, or 1 if all problems share the numbers.
 
 All vectors here have three numbers. In the plane the third number of a point, of a line and of every axis is 0, and so
 is the third half-width. `sense` has a column and a row of zeros. So nothing depends on the third search coordinate.
@@ -72,9 +74,9 @@ class NodeRow:
     problem : Problem
         The problems.
     a, b, epoch : int
-        Stations and epoch of the row; -1 for a station that the row does not have.
+        Indices of the row's stations and of its epoch; -1 for a station that the row does not have.
     measured : array (N,)
-        Measured values of the row minus all known additions.
+        Measured values of the row minus all known additions, in the unit of the kind (m, rad, m/s).
     """
 
     problem: Problem
@@ -90,14 +92,18 @@ class NodeRow:
         return picked if picked.ndim == 2 else picked[None]
 
     def velocity(self, station: int) -> Array:
-        """Return the velocity (B, d), m/s, of a station."""
+        """Return the velocity (B, d), m/s, of a station at the epoch of the row."""
         velocity = self.problem.stations.velocity
         assert velocity is not None  # problems with velocity kinds have station velocities
         picked = velocity[..., self.epoch if velocity.shape[-3] > 1 else 0, station, :]
         return picked if picked.ndim == 2 else picked[None]
 
     def axes(self, station: int) -> Array:
-        """Return the axes (B, 9) of a station, row by row."""
+        """Return the axes (B, 9) of a station: three unit vectors, row by row.
+
+        Stations without axes get the axes of the frame. In the plane, the third row and column are zero if axes are
+        given.
+        """
         axes, d = self.problem.stations.axes, self.problem.dimension
         if axes is None:
             return np.eye(3).reshape(1, 9)
@@ -109,7 +115,10 @@ class NodeRow:
 
 
 def lay_out(parts: dict[int, Array]) -> Array:
-    """Return the numbers (B, n) of a node from parts (B or 1, k), keyed by first column; other columns are zero."""
+    """Return the numbers (B, n) of a node, put together from parts (B or 1, k).
+
+    The key of each part is its first column. Columns without a part are zero.
+    """
     last = max(start + part.shape[1] for start, part in parts.items())
     out = np.zeros((max(len(part) for part in parts.values()), last))
     for start, part in parts.items():
@@ -198,7 +207,10 @@ def triple_at(numbers: Array, at: int) -> Triple:
 
 @compiled
 def turned_form(n: Triple, sense: Array) -> Triple:
-    """Return the linear form ``n.(sense s)``."""
+    """Return the linear form ``n.(sense s)`` as the triple ``sense' n``.
+
+    For a unit vector n, this is the gradient of a line's component along n with respect to s.
+    """
     return (
         n[0] * sense[0, 0] + n[1] * sense[1, 0] + n[2] * sense[2, 0],
         n[0] * sense[0, 1] + n[1] * sense[1, 1] + n[2] * sense[2, 1],
@@ -248,7 +260,7 @@ def unbounded_curvature(curvature: Array, turn: Array) -> float:
 
 @compiled
 def reach(u: Triple, h: Triple) -> float:
-    """Return the greatest value of ``|u.s|`` over a box."""
+    """Return the greatest value of ``|u.s|`` over the box with half-widths h."""
     return abs(u[0]) * h[0] + abs(u[1]) * h[1] + abs(u[2]) * h[2]
 
 
@@ -260,7 +272,10 @@ def largest_row_value(matrix: Array, k: int, h: Triple) -> float:
 
 @compiled
 def product(u: Triple, v: Triple, h: Triple) -> tuple[float, float]:
-    """Return an enclosure of ``(u.s)(v.s)`` over a box, which uses the sign of squares."""
+    """Return an enclosure (least, greatest) of ``(u.s)(v.s)`` over the box with half-widths h.
+
+    A square s_k^2 is between 0 and h_k^2, so its term has a known sign. This makes the enclosure tighter.
+    """
     low = high = 0.0
     for k in range(3):
         square = u[k] * v[k] * h[k] * h[k]
@@ -282,7 +297,11 @@ def scaled(low: float, high: float, least: float, most: float) -> tuple[float, f
 
 @inlined
 def hypot_excess(along: float, across: float) -> float:
-    """Return a bound of ``hypot(a, b) - a``, which decreases with a, for all a >= along and |b| <= across."""
+    """Return a bound of ``hypot(a, b) - a`` for all a >= along and |b| <= across.
+
+    The difference decreases with a. For a range, it is the greatest remainder: a is the component along the line of
+    sight.
+    """
     whole = sqrt(along * along + across * across)
     # A difference of two nearly equal numbers would lose all digits; the quotient loses none.
     return across * across / (whole + along) if along > 0.0 else whole - along
@@ -328,7 +347,9 @@ def length_across(sense: Array, u: Triple, h: Triple) -> float:
 def range_form(line: Array, sense: Array, h: Triple) -> RangeForm:
     """Return a range over a box: value r, slope u, least r + u.s, greatest remainder, and greatest value.
 
-    The range is ``r + u.s + q`` with ``0 <= q <= remainder``.
+    `line` (3,) is the line from the station to the centre of the box, `sense` (3, 3) its derivative, and h the
+    half-widths. The range is ``r + u.s + q`` with ``0 <= q <= remainder``. If the third number is positive, the box
+    does not contain the station.
     """
     n = triple_at(line, 0)
     r = length(n)
@@ -358,11 +379,11 @@ def range_hessian(
     Returns
     -------
     hessian : symmetric
-        ``sense' P sense / r``.
+        ``sense' P sense / r``, with P the projection across the line.
     turn : triple
-        Bound of the change of each component of the gradient.
+        Bound of the change of each component of the gradient over the box.
     change : float
-        Bound of the change of the Hessian.
+        Bound of the spectral norm of the change of the Hessian over the box.
     norm : float
         Trace of the Hessian, which bounds its norm.
     """
@@ -402,7 +423,7 @@ def add_symmetric(a: Symmetric, b: Symmetric) -> Symmetric:
 
 @compiled
 def write_symmetric(matrix: Symmetric, out: Array) -> None:
-    """Write a symmetric matrix into an array (3, 3)."""
+    """Write a symmetric matrix, given as six entries, into an array (3, 3)."""
     out[0, 0], out[1, 1], out[2, 2] = matrix[0], matrix[3], matrix[5]
     out[0, 1] = out[1, 0] = matrix[1]
     out[0, 2] = out[2, 0] = matrix[2]
@@ -411,7 +432,11 @@ def write_symmetric(matrix: Symmetric, out: Array) -> None:
 
 @inlined
 def _gram(sense: Array, u: Triple) -> Symmetric:
-    """Return ``sense'sense - u u'``; squared lengths that rounding makes negative are set to zero."""
+    """Return ``sense'sense - u u'``; squared lengths that rounding makes negative are set to zero.
+
+    With u the gradient along a unit vector, this quadratic form of s is the squared length of ``sense s`` across the
+    vector.
+    """
     a, b, c = sense[0, 0], sense[0, 1], sense[0, 2]
     d, e, f = sense[1, 0], sense[1, 1], sense[1, 2]
     p, q, r = sense[2, 0], sense[2, 1], sense[2, 2]

@@ -1,6 +1,8 @@
 """Ranges over a box: all ranges of a problem at once; and ranges minus the distance to the centre of an atlas.
 
 Most rows are sums of ranges, so these loops are written out: values that all ranges share are computed once for a box.
+Around a fix, the position is x = c + T s with s in the box. In an atlas, the position is ``m + R p / v`` with the
+centre m and half-width R of the cube, and a station is at ``m + R a`` (`optloc.proof.atlas`).
 """
 
 from __future__ import annotations
@@ -54,14 +56,14 @@ RangeBend = tuple[Symmetric, Triple, float, float]
 def bound_ranges(kinds: Array, data: Array, centre: Array, sense: Array, gram: Array, half: Array, nodes: Array) -> int:
     """Bound all ranges over a box; return the number of other nodes.
 
-    Let u be the direction of the line v, a = r + u.d and b = |d - u u.d|. The remainder is ``sqrt(a^2 + b^2) - a``. It
-    decreases with a (of either sign) and increases with b. So it is at most its value at the least a and the greatest
-    b.
+    Let v be the line from the station to the centre of the box, r its length, u its direction, and d = T s. With
+    a = r + u.d and b = |d - u u.d|, the remainder is ``sqrt(a^2 + b^2) - a``. It decreases with a (of either sign) and
+    increases with b. So it is at most its value at the least a and the greatest b.
 
     Parameters
     ----------
     kinds, data : array (J,), (J, width)
-        The nodes.
+        The nodes: their codes and their numbers.
     centre, half : array (3,)
         Centre of the box, metres, and half-widths in search coordinates.
     sense, gram : array (3, 3)
@@ -105,9 +107,9 @@ def bound_ranges(kinds: Array, data: Array, centre: Array, sense: Array, gram: A
 def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: Array) -> None:
     """Write Hessians of all ranges, and bounds of their change, into the table of second derivatives.
 
-    Let P be the projection across the direction u of the line, and r' >= A the range elsewhere in the box. The
-    gradient T'u changes by ``(T'P d - q T'u) / r'``, and the Hessian ``T'P T / r`` changes by a difference of
-    quotients.
+    Let u be the direction of the line, r its length, P the projection across u, d = T s, and q the remainder. With r'
+    the range elsewhere in the box, the gradient T'u changes by ``(T'P d - q T'u) / r'``. The Hessian ``T'P T / r``
+    changes by a difference of quotients.
 
     Parameters
     ----------
@@ -158,10 +160,11 @@ def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: A
 def bound_difference(
     frame: AtlasFrame, data: Array, centre: RangeForm, h: Triple, away: Array, sense: Array
 ) -> tuple[float, float, float, Triple, RangeForm]:
-    """Return value, remainder, slope and form over a box of a range minus the distance to the centre, metres.
+    """Return the bounds over a box of a range minus the distance to the centre of the cube.
 
-    It is a quotient N/S with linear N, like ratios (`optloc.proof.nodes.ratio.bound_ratio`), and its size is at most
-    ``R |a|``.
+    The results are the value at the centre of the box, the least and greatest remainder, the slope (all metres), and
+    the `range_form` of the scaled line. The node is a quotient N/S with linear N, like ratios
+    (`optloc.proof.nodes.ratio.bound_ratio`), and its size is at most ``R |a|``.
 
     Parameters
     ----------
@@ -194,7 +197,11 @@ def bound_difference(
 
 @inlined
 def curve_centre(slant: Array, centre: RangeForm, h: Triple) -> RangeBend:
-    """Return the second derivatives of the distance to the cube's centre over a box, for `curve_difference`."""
+    """Return the second derivatives of the distance |p| to the cube's centre over a box, for `curve_difference`.
+
+    `slant` (3, 3) is the derivative of p, and `centre` its `range_form`. If the box may contain the centre, the bounds
+    of changes are infinite.
+    """
     r, u, least, q, _ = centre
     if not least > 0.0:
         return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (inf, inf, inf), inf, inf
@@ -252,7 +259,7 @@ def _size(data: Array, reach: float) -> float:
 
 @compiled
 def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
-    """Return the ball of a range: the ball around its station."""
+    """Return the ball of all points with a range of at most `most`: station (three numbers) and radius, metres."""
     return data[0], data[1], data[2], most
 
 

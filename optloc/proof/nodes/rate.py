@@ -37,7 +37,10 @@ STATION, VELOCITY, RATE_WIDTH = 0, 3, 6
 
 @compiled
 def bound_rate(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
-    """Bound a range rate over a box (see `optloc.proof.nodes.node`): as a quotient, or by the cone of directions."""
+    """Bound a range rate over a box, m/s (see `optloc.proof.nodes.node`), in two ways: as a quotient, and by a cone.
+
+    The cone contains the directions from the station to the points of the box. The narrower bound is the result.
+    """
     h, n, w = triple_at(half, 0), triple_at(line, 0), triple_at(data, VELOCITY)
     r, u, least, most, far = range_form(line, sense, h)
     phi = inner_product(w, n) / r if r > 0.0 else 0.0
@@ -55,10 +58,10 @@ def bound_rate(data: Array, line: Array, sense: Array, half: Array, slope: Array
 
 @compiled
 def _cone(phi: float, speed: float, least: float, aside: float) -> tuple[float, float]:
-    """Return the least and greatest rate over all directions from the station to the points of a box.
+    """Return the least and greatest rate, m/s, over all directions from the station to the points of a box.
 
-    The directions are in a cone around the direction to the centre. Along it, lines are at least `least` long; across
-    it, at most `aside`.
+    `phi` is the rate at the centre and `speed` the speed of the station, m/s. The directions are in a cone around the
+    direction to the centre. Along it, lines are at least `least` long; across it, at most `aside`.
     """
     if not (least > 0.0 and speed > 0.0):
         return -speed, speed
@@ -92,7 +95,7 @@ def curve_rate(data: Array, line: Array, sense: Array, half: Array, curvature: A
 
 @compiled
 def _size(data: Array, reach: float) -> float:
-    """Return the size of the terms of a rate, at least the speed of the station."""
+    """Return the size of the terms of a rate, m/s: a bound of the speed of the station, which limits the accuracy."""
     return float(abs(data[VELOCITY]) + abs(data[VELOCITY + 1]) + abs(data[VELOCITY + 2]))
 
 

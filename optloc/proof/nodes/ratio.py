@@ -40,10 +40,10 @@ def bound_ratio(
 ) -> tuple[float, float, float]:
     """Bound a ratio of ranges over a box (see `optloc.proof.nodes.node`).
 
-    There are two quotients. With ``N = r_a^2 - r_b^2`` (affine in the position) and S = r_a + r_b, the first is delta
-    = N/S = r_a - r_b. The second is phi = 1 + delta/r_b. The remainder of a quotient phi = N/S with slope g is
-    ``(q_N - (g.s)(u.s) - (phi + g.s) q_S) / S'``. Here q are remainders, u is the slope of S, and S' = S + u.s + q_S.
-    Only the enclosures of q_N and q_S are inexact.
+    There are two quotients. With ``N = r_a^2 - r_b^2`` (affine in the position) and S = r_a + r_b, the first is delta =
+    N/S = r_a - r_b. The second is phi = 1 + delta/r_b. At displacement s from the centre, the remainder of a quotient
+    phi = N/S with slope g is ``(q_N - (g.s)(u.s) - (phi + g.s) q_S) / S'``. Here q_N and q_S are the remainders of N
+    and S, u is the slope of S, and S' = S + u.s + q_S. Only the enclosures of q_N and q_S are inexact.
 
     If the box may contain station b, the ratio has no upper bound.
     """
@@ -108,7 +108,10 @@ def quotient_remainder(
 
 @compiled
 def _squares(line: Array, sense: Array, line_b: Array, sense_b: Array, h: Triple) -> tuple[Triple, tuple[float, float]]:
-    """Return slope and remainder of ``|line|^2 - |line_b|^2`` over a box, as the product of difference and sum."""
+    """Return slope and remainder of ``|line|^2 - |line_b|^2`` over a box, as the product of difference and sum.
+
+    The results are the gradient at the centre, and the least and greatest remainder, square metres.
+    """
     apart = (line[0] - line_b[0], line[1] - line_b[1], line[2] - line_b[2])
     n, low, high = turned_form(apart, sense), 0.0, 0.0
     n = sum_of_forms(1.0, n, 1.0, turned_form(apart, sense_b))
@@ -132,7 +135,10 @@ def curve_ratio(
     curvature: Array,
     turn: Array,
 ) -> float:
-    """Bound the second derivatives of a ratio over a box (`optloc.proof.nodes.node`), in two steps like the ratio."""
+    """Bound the second derivatives of a ratio over a box (`optloc.proof.nodes.node`).
+
+    As in `bound_ratio`, there are two quotients: the difference of the ranges first, then the ratio.
+    """
     h = triple_at(half, 0)
     bound_ratio(data, line, sense, line_b, sense_b, half, turn)
     ra, ua, least_a, qa, _ = range_form(line, sense, h)
@@ -243,7 +249,11 @@ def quotient_hessian(
 
 @compiled
 def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
-    """Return the ball of Apollonius: the points with ``r_a <= q r_b``, q < 1, form a ball."""
+    """Return a ball that contains all points with ``least <= r_a/r_b <= most``: centre (three numbers) and radius, m.
+
+    The points with ``r_a <= q r_b``, q < 1, form the ball of Apollonius, around station a. If most >= 1 and least > 1,
+    the ball is around station b, with q = 1/least. Otherwise there is no ball: the radius is infinite.
+    """
     q = most if most < 1.0 else (1.0 / least if least > 1.0 else 1.0)
     if not q * q < 1.0 - 1e-9:  # nearly half of space: such a ball is useless and badly rounded
         return 0.0, 0.0, 0.0, inf

@@ -1,8 +1,8 @@
 """A target at a known height over the Earth: its positions at all epochs, and bounds of their derivatives.
 
-The state has four numbers: the position along two axes of a plane, and the velocity along these axes. The surface
-determines the rest: the position is on the surface, and the velocity is along it. So the position at an epoch is a
-function of the two position numbers q and of w, the velocity times the time. Values are computed like
+The state has four numbers: the position along two axes of a plane, m, and the velocity along these axes, m/s. The
+surface determines the rest: the position is on the surface, and the velocity is along it. So the position at an epoch
+is a function of the two position numbers q and of w, the velocity times the time. Values are computed like
 `optloc.models.course.carry`. Derivatives at a state are finite differences, whose error is bounded by the third
 derivatives of this function.
 """
@@ -64,7 +64,11 @@ _STILL, _E2 = 1e-14, WGS84_F * (2.0 - WGS84_F)
 
 @compiled
 def lift(ground: Ground, first: float, second: float) -> tuple[float, Triple, Triple]:
-    """Return the remaining height error, metres, the point of the surface with two given numbers, and its normal."""
+    """Return the remaining height error, m, the point of the surface above two given coordinates, and its normal.
+
+    `first` and `second` are the coordinates of the point along the two axes of states, m. Point and normal are in the
+    frame.
+    """
     data, e, f, up = (
         ground.data,
         triple_at(ground.axes[0], 0),
@@ -90,7 +94,7 @@ def lift(ground: Ground, first: float, second: float) -> tuple[float, Triple, Tr
 
 @compiled
 def _centre(data: Array) -> Triple:
-    """Return the Earth's centre in the frame, metres."""
+    """Return the Earth's centre in the frame, metres; `data` are the numbers of the height node."""
     x, y, z = data[3], data[4], data[5]
     first, second, third = triple_at(data, 6), triple_at(data, 9), triple_at(data, 12)
     c = sum_of_forms(1.0, sum_of_forms(x, first, y, second), z, third)
@@ -99,7 +103,10 @@ def _centre(data: Array) -> Triple:
 
 @compiled
 def horizontal_vector(ground: Ground, normal: Triple, first: float, second: float) -> Triple:
-    """Return the vector along the surface that has two given components along the axes."""
+    """Return the vector along the surface that has two given components along the axes of states.
+
+    `normal` is the normal of the surface at the position.
+    """
     up = triple_at(ground.axes[2], 0)
     plan = sum_of_forms(first, triple_at(ground.axes[0], 0), second, triple_at(ground.axes[1], 0))
     return sum_of_forms(1.0, plan, -inner_product(plan, normal) / inner_product(up, normal), up)
@@ -107,7 +114,10 @@ def horizontal_vector(ground: Ground, normal: Triple, first: float, second: floa
 
 @compiled
 def place_over_ground(ground: Ground, start: Triple, way: Triple, rise: float) -> Triple:
-    """Return the position, in the frame, that a target reaches over ground, like `optloc.models.course.carry`."""
+    """Return the position, in the frame, that a target reaches over ground, like `optloc.models.course.carry`.
+
+    `start` is its position, `way` its velocity times the time, m, and `rise` the reported change of its height, m.
+    """
     data = ground.data
     height, up, _, _, sp = normal_at(data, np.array(start))
     climb = inner_product(way, up)
@@ -146,7 +156,10 @@ _MOVES = _moves()
 
 @compiled
 def set_starts(ground: Ground, state: Array, begin: int, end: int, starts: Array) -> None:
-    """Write positions and normals (SECOND_ORDER, 6) of the points `begin` to `end` of the differences."""
+    """Write positions and normals of the points `begin` to `end` - 1 of the differences to `starts` (SECOND_ORDER, 6).
+
+    Points that differ in the velocity only have the same position and normal.
+    """
     for k in range(begin, end):
         twin = k
         for other in range(k):  # points that differ in the velocity only have one start
@@ -164,7 +177,11 @@ def set_starts(ground: Ground, state: Array, begin: int, end: int, starts: Array
 def set_reached(
     ground: Ground, state: Array, time: float, rise: float, starts: Array, begin: int, end: int, reached: Array
 ) -> None:
-    """Write the positions (SECOND_ORDER, 3) that the points `begin` to `end` of the differences reach at a time."""
+    """Write the positions that the points `begin` to `end` - 1 of the differences reach at a time.
+
+    They are written into `reached` (SECOND_ORDER, 3), m. `time` is the time after the state, s, and `rise` the change
+    of height.
+    """
     for k in range(begin, end):
         first, second = time * state[2] + _STEP * _MOVES[k, 2], time * state[3] + _STEP * _MOVES[k, 3]
         way = horizontal_vector(ground, triple_at(starts[k], 3), first, second)
@@ -173,13 +190,13 @@ def set_reached(
 
 @compiled
 def slope_of(reached: Array, i: int, a: int) -> float:
-    """Return the derivative of coordinate i of a position with respect to number a of (q, w)."""
+    """Return the derivative of coordinate i of a position with respect to number a of (q, w): a central difference."""
     return float((reached[1 + 2 * a, i] - reached[2 + 2 * a, i]) / (2.0 * _STEP))
 
 
 @compiled
 def set_second(reached: Array, i: int, out: Array) -> None:
-    """Write the second derivatives (4, 4) of coordinate i of a position."""
+    """Write the second derivatives (4, 4) of coordinate i of a position with respect to (q, w), by differences, 1/m."""
     share, here = 1.0 / (_STEP * _STEP), reached[0, i]
     for a in range(4):
         out[a, a] = share * (reached[1 + 2 * a, i] - here + (reached[2 + 2 * a, i] - here))
@@ -256,9 +273,9 @@ def curvature_bounds(ground: Ground, state: Array, half: Array) -> tuple[bool, f
 def errors_of(third: float) -> tuple[float, float]:
     """Return bounds of the errors of slopes and second derivatives, as norms over (q, w), from the third derivatives.
 
-    A first difference has an error of ``b3 h^2 / 6``. The error of a second difference is ``b3 h / 3`` along one
-    number, and ``(2 2^1.5 + 4) b3 h / 12`` along two. Four orthogonal numbers double the first error, and quadruple
-    the others.
+    With h the step, m, and b3 the bound of the third derivatives (`third`, 1/m^2), the error of a first difference is
+    ``b3 h^2 / 6``. The error of a second difference is ``b3 h / 3`` along one number, and ``(2 2^1.5 + 4) b3 h / 12``
+    along two. Four orthogonal numbers double the first error, and quadruple the others.
     """
     first = 2.0 * (third * _STEP * _STEP / 6.0 + _ROUNDED / _STEP)
     return first, 4.0 * (0.6 * third * _STEP + 4.0 * _ROUNDED / (_STEP * _STEP))
@@ -266,7 +283,12 @@ def errors_of(third: float) -> tuple[float, float]:
 
 @compiled
 def _begun(turns: Derivatives, lean: float, way: float) -> tuple[Jet, Jet, Jet]:
-    """Return bounds of the position on the surface (without a bound of its value), the normal there, and the way."""
+    """Return bounds of the position on the surface (without a bound of its value), the normal there, and the way.
+
+    `turns` bounds the derivatives of normals, `lean` is the greatest angle between a normal and the upward axis,
+    radians, and `way` the greatest distance along the two axes, m. A `Jet` contains a bound of a value and of three
+    derivatives.
+    """
     n1, n2, _ = turns
     c, s = cos(lean), sin(lean)
     p1 = 1.0 / c
@@ -284,7 +306,11 @@ def _begun(turns: Derivatives, lean: float, way: float) -> tuple[Jet, Jet, Jet]:
 def _ended(
     turns: Derivatives, level: float, high: float, place: Jet, normal: Jet, along: Jet
 ) -> tuple[float, float, float]:
-    """Return bounds of the first three derivatives of the position at the end of a way."""
+    """Return bounds of the first three derivatives of the position at the end of a way.
+
+    `level` is the height of the state and `high` the greatest change of height, m. `place`, `normal` and `along` are
+    the results of `_begun`.
+    """
     n1, n2, _ = turns
     flat = WGS84_A * sqrt(1.0 - _E2)
     outer = (_RADIUS[0] * flat, _RADIUS[1] * flat, _RADIUS[2] * flat)
@@ -321,7 +347,10 @@ def _product(f: Jet, g: Jet) -> Jet:
 
 @compiled
 def _composed(most: float, outer: Derivatives, own: Jet) -> Jet:
-    """Return bounds of a composed function, from its greatest value and the outer function's derivatives."""
+    """Return bounds of a composed function, from its greatest value and the outer function's derivatives.
+
+    `most` is the greatest value, `outer` bounds the derivatives of the outer function, and `own` the inner function.
+    """
     a, b, c = own[1], own[2], own[3]
     bent = outer[2] * a**3 + 3.0 * outer[1] * a * b
     return most, outer[0] * a, outer[1] * a * a + outer[0] * b, bent + outer[0] * c
@@ -329,7 +358,7 @@ def _composed(most: float, outer: Derivatives, own: Jet) -> Jet:
 
 @compiled
 def _inverse(f: Jet, least: float) -> Jet:
-    """Return bounds of the inverse of a function that is at least a positive number."""
+    """Return bounds of 1/f, where f is at least `least`, a positive number."""
     return _composed(1.0 / least, (1.0 / least**2, 2.0 / least**3, 6.0 / least**4), f)
 
 
@@ -341,13 +370,19 @@ _UPRIGHT = 0.9
 
 
 def axes_at(data: Array, place: Array) -> Array:
-    """Return the axes of states around a position (3,): the frame's if the third is upward, else east, north, up."""
+    """Return the axes (3, 3) of states around a position (3,), as rows: the frame's if its third is upward, else ENU.
+
+    ENU is east, north, up. `data` are the numbers of the height node.
+    """
     _, up, east, north, _ = normal_at(data, np.ascontiguousarray(place))
     return np.eye(3) if up[2] > _UPRIGHT else np.array([east, north, up])
 
 
 def state_on(ground: Ground, state: Array) -> Array:
-    """Return the four numbers (..., 4) of states (..., 6) on the surface."""
+    """Return the four numbers (..., 4) of states (..., 6) on the surface.
+
+    They are position (m) and velocity (m/s) along the two axes of states.
+    """
     plan = ground.axes[:2]
     return np.concatenate([state[..., :3] @ plan.T, state[..., 3:] @ plan.T], axis=-1)
 
@@ -362,6 +397,6 @@ def corners_on(ground: Ground, corners: Array) -> Array:
 
 
 def state_off(ground: Ground, state: Array) -> Array:
-    """Return position and velocity (6,) of a state (4,) on the surface."""
+    """Return position and velocity (6,), m and m/s, of a state (4,) on the surface."""
     _, place, normal = lift(ground, state[0], state[1])
     return np.array([*place, *horizontal_vector(ground, normal, state[2], state[3])])

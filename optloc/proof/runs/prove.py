@@ -1,4 +1,8 @@
-"""The proof of a run: no position costs less than a fix, and no other minimum is within a gap."""
+"""The proof of a run: no position costs less than a fix, and no other minimum is within a gap.
+
+A run has many rows, which are sparse (`optloc.proof.runs.rows`). The search is over all space (functions `..._far`), or
+in search coordinates around the fix (functions `..._near`). The last functions prove fixes of moving targets.
+"""
 
 from __future__ import annotations
 
@@ -94,7 +98,8 @@ def _convex_sides(
 ) -> bool:
     """Write half-widths (3,), at most the hull, of a box around a position on which the cost is convex.
 
-    Return False without a convex box.
+    The position has the coordinates `at` (3,) in a piece of the atlas, or in search coordinates. `margin` is the margin
+    of the Hessian of f/2. Return False without a convex box.
     """
     box, share, floor = tables.box, _WIDEST, floor_of(space, run.cost)
     for _ in range(_TRIALS):
@@ -112,7 +117,10 @@ def _convex_sides(
 
 @inlined
 def _margin(tables: RunTables, noise: float, eps: float) -> float:
-    """Return the margin of convexity of a box for which its cost falls at most eps below the cost of its centre."""
+    """Return the margin of convexity for which the cost in a box falls at most eps below the cost of its centre.
+
+    The slope is in ``box.sums``, and `noise` bounds the rounding of a residual.
+    """
     total = 0.0
     for k in range(3):
         slope = abs(tables.box.sums[G0 + k]) + tables.box.sums[LENGTH0 + k] * noise
@@ -124,7 +132,11 @@ def _margin(tables: RunTables, noise: float, eps: float) -> float:
 def _set_far(
     run: RunCost, space: Space, tables: RunTables, i: int, x: Array, value: float, eps: float, limit: float
 ) -> bool:
-    """Write a minimum and the boxes around it into an atlas; see `optloc.proof.convex_boxes.set_minimum`."""
+    """Write minimum i, at x (D,), and the boxes around it into an atlas.
+
+    Return False if x is no minimum or costs less than `value`. For `eps` and `limit` see
+    `optloc.proof.convex_boxes.set_minimum`.
+    """
     atlas, box, d, hull = space.atlas, tables.box, space.atlas.dimension, np.zeros(3)
     minima, piece = atlas.minima, 2 * d + 1 + i
     minima.home[i] = piece_of(atlas, x, minima.start[i])
@@ -162,9 +174,10 @@ def _set_near(
     eps: float,
     hidden: bool,
 ) -> bool:
-    """Write a minimum in search coordinates, and the sides of a convex box around it.
+    """Write minimum i, at x (D,), in search coordinates, and the sides of a convex box around it.
 
-    Return False if x is no minimum or costs too little.
+    `corners` (2, 3) limit the box, in which the cost falls at most eps below the cost of x. If `hidden`, the size of
+    the box is limited to `HIDDEN_REACH`. Return False if x is no minimum or costs less than `value`.
     """
     chart, box, hull, shift, at = space.chart, tables.box, np.zeros(3), np.zeros(3), space.minima[i]
     for k in range(3):
@@ -207,7 +220,7 @@ def _reaches_infinity(run: RunCost) -> bool:
 
 @compiled
 def cost_of_place(run: RunCost, x: Array, tables: RunTables) -> float:
-    """Return the cost at a position x (D,), metres."""
+    """Return the cost at a position x (D,), metres; the nodes are written into ``tables.box``."""
     cost, box, axes = run.cost, tables.box, np.zeros((3, 3))
     box.half[:], box.centre[:] = 0.0, 0.0
     for k in range(x.shape[0]):
@@ -258,7 +271,7 @@ def prove_run(
     """Prove the claim of `optloc.proof.local_search.prove_locally` for a run; for arguments and result see there.
 
     If the cost stays finite at infinity, the search is over all space. Otherwise it is within a region, around a
-    surface, or within an enclosure of the level of the cost of few rows.
+    surface, or within an enclosure of all positions at which the few rows cost less than the level.
     """
     tables, D = tables_of(run), x.shape[0]
     chart, good = chart_on(run.look, x, tables.small, beside.planes, beside.surface)
@@ -271,6 +284,7 @@ def prove_run(
     if not eps <= most:
         return COARSE, 0, -inf
     level = least + kappa if kappa > 0.0 else least - eps
+    # The search of a run does not read the last two fields, the numbers of minima that do not count.
     aim = Goal(level, least - eps, least - 0.5 * eps, beside.hidden == 0 and isnan(lower[0]), 0, 0)
     task = ProofTask(x, beside, aim, eps, budget, found)
     if far:
@@ -282,7 +296,7 @@ def prove_run(
 
 @compiled
 def _blur(run: RunCost, chart: LocalAxes, x: Array, far: bool, tables: RunTables) -> float:
-    """Return a bound of the rounding of a residual, as a length, at a fix or in the atlas of all positions."""
+    """Return a bound of the rounding of a residual, as a length, at the fix x or (`far`) in the atlas."""
     middle, radius = station_cube(run.cost.kinds, run.cost.data, x)
     atlas, none = atlas_of(middle, radius, x.shape[0], 0), np.empty((0, 3))
     space = Space(False, atlas, chart, none, none)
@@ -295,7 +309,7 @@ def _blur(run: RunCost, chart: LocalAxes, x: Array, far: bool, tables: RunTables
 def _prove_far(
     run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalAxes, tables: RunTables
 ) -> tuple[int, int, float]:
-    """Prove the claim over all space."""
+    """Prove the claim over all space; return verdict, number of boxes, and lower bound of the cost."""
     none, known, place, aim = np.empty((0, 3)), zero(), np.empty(task.x.shape[0]), task.aim
     space, stack, others = Space(True, atlas, chart, none, none), np.zeros((CAPACITY, DEPTH)), task.beside.points
     for p in range(1 + others.shape[0]):
@@ -316,7 +330,7 @@ def _prove_far(
 
 @compiled
 def _verdict(outcome: int, aim: Goal) -> int:
-    """Return the verdict of a proof for the outcome of its search."""
+    """Return the verdict of a proof (UNIQUE, VALUE, BETTER, OTHER, BUDGET, UNBOUNDED) for the outcome of its search."""
     if outcome == CLEAR:
         return UNIQUE if aim.level > aim.value else VALUE
     if outcome == SPENT:
@@ -330,7 +344,11 @@ def _verdict(outcome: int, aim: Goal) -> int:
 def _prove_near(
     run: RunCost, task: ProofTask, atlas: Atlas, around: LocalAxes, tables: RunTables, lower: Array, upper: Array
 ) -> tuple[int, int, float]:
-    """Prove the claim in search coordinates around a fix: in a region, in an enclosure, or around a surface."""
+    """Prove the claim in search coordinates around a fix: in a region, in an enclosure, or around a surface.
+
+    `lower` and `upper` (D,) are the corners of the region, metres; NaN for an enclosure. Return verdict, number of
+    boxes, and lower bound of the cost.
+    """
     corners, bent, aim = np.empty((2, 3)), around.surface.shape[0] > 0, task.aim
     stack, total, bound = np.zeros((CAPACITY, DEPTH)), 0, aim.value
     rho = sqrt(max(aim.level, aim.value + task.eps))
@@ -362,7 +380,11 @@ def _prove_near(
 def _beside(
     run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalAxes, tables: RunTables, corners: Array, own: bool
 ) -> Space:
-    """Return search coordinates with their known minima, the fix (`own`) first; empty if the fix is no minimum."""
+    """Return the search coordinates of one piece of the search, with known minima that the search leaves out.
+
+    If `own`, the piece contains the fix, which is the first minimum. Each minimum has a convex box within `corners` (2,
+    3). If the fix is no minimum, the list is empty.
+    """
     others, known, place = task.beside.points, zero(), np.empty(task.x.shape[0])
     room = np.zeros((2, 1 + others.shape[0], 3))
     space = Space(False, atlas, chart, room[0], room[1])
@@ -385,17 +407,18 @@ def prove_runs(costs: Runs, asked: ProofRequest) -> ProofResult:
     Plain Python would take a second for ten boxes. Without compiled code no box is searched.
     """
     n, d = asked.x.shape
-    verdict, boxes, bound, whole = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.ones(n, np.bool_)
+    verdict, boxes, bound, everywhere = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.ones(n, np.bool_)
     found, asked = np.full((n, d), np.nan), ProofRequest(*(plainly(array) for array in asked))
 
     def prove(i: int) -> None:
+        """Write the result of proof i: for the requested region, then, if that region is open, for the fallback."""
         others = asked.others[i, : asked.known[i]]
-        beside = KnownMinima(others, int(asked.hidden[i]), asked.planes[i], asked.surface[i])
+        known = KnownMinima(others, int(asked.hidden[i]), asked.planes[i], asked.surface[i])
         for corners in (asked.region[i], asked.fallback[i]):
             verdict[i], boxes[i], bound[i] = prove_run(
                 costs.runs[i],
                 asked.x[i],
-                beside,
+                known,
                 asked.gaps[i, 0],
                 asked.eps[i],
                 int(asked.budget[i]),
@@ -403,15 +426,15 @@ def prove_runs(costs: Runs, asked: ProofRequest) -> ProofResult:
                 corners[1],
                 found[i],
             )
-            whole[i] = np.isnan(corners[0, 0])
-            if verdict[i] != OPEN or not whole[i]:
+            everywhere[i] = np.isnan(corners[0, 0])
+            if verdict[i] != OPEN or not everywhere[i]:
                 break
 
     if may_use_code(prove_run, n):
         map_on_threads(prove, range(n))
     else:
         verdict[:], bound[:] = BUDGET, -inf
-    return without_rivals(verdict, boxes, bound, whole, asked, found)
+    return without_rivals(verdict, boxes, bound, everywhere, asked, found)
 
 
 def runs_lack_code(costs: Runs | CourseCosts, count: int) -> bool:
@@ -420,7 +443,7 @@ def runs_lack_code(costs: Runs | CourseCosts, count: int) -> bool:
 
 
 def costs_of_runs(costs: Runs, x: Array) -> tuple[Array, Array]:
-    """Return costs (n, P) at positions x (n, P, d) and the rounding of their residuals, see `costs_at`."""
+    """Return costs (n, P) at positions x (n, P, d), m, and the rounding of their residuals, see `costs_at`."""
     out = np.zeros((2, *x.shape[:2]))
     for i, run in enumerate(costs.runs):
         tables = tables_of(run)
@@ -435,38 +458,42 @@ def costs_of_runs(costs: Runs, x: Array) -> tuple[Array, Array]:
 
 
 def prove_courses(costs: CourseCosts, asked: ProofRequest) -> ProofResult:
-    """Return the results of the proofs of n fixes of n problems of a moving target; x contains velocities as well.
+    """Return the results of the proofs of n fixes of n problems of a moving target.
 
-    Without compiled code no box is searched, as in `prove_runs`.
+    The fixes x contain position and velocity, m and m/s. Without compiled code no box is searched, as in `prove_runs`.
     """
     n, size = asked.x.shape
     verdict, boxes, bound = np.full(n, BUDGET), np.zeros(n, np.int64), np.full(n, -inf)
     found = np.full((n, size), np.nan)
 
     def prove(i: int) -> None:
-        (whole, few), ground = _on_surface(costs.courses[i], asked.x[i])
+        """Write the result of proof i: within the requested region of states."""
+        (whole, few), ground = _with_axes_around(costs.courses[i], asked.x[i])
         state, others, corners = asked.x[i], asked.others[i, : asked.known[i]], asked.region[i]
         if over_ground(ground):
             state, others, corners = state_on(ground, state), state_on(ground, others), corners_on(ground, corners)
-        state, another = plainly(state), np.full(STATE, np.nan)
+        state, found_state = plainly(state), np.full(STATE, np.nan)
         axes = axes_of(hessian_of_state(whole, state), state, plainly(corners))
         if axes is None:
             verdict[i] = STATIONARY
             return
         verdict[i], boxes[i], bound[i] = prove_course(
-            whole, few, axes, plainly(others), asked.gaps[i, 0], asked.eps[i], int(asked.budget[i]), another
+            whole, few, axes, plainly(others), asked.gaps[i, 0], asked.eps[i], int(asked.budget[i]), found_state
         )
-        found[i] = state_off(ground, another) if over_ground(ground) else another
+        found[i] = state_off(ground, found_state) if over_ground(ground) else found_state
 
     if may_use_code(prove_course, n):
         map_on_threads(prove, range(n))
     return without_rivals(verdict, boxes, bound, np.zeros(n, np.bool_), asked, found)
 
 
-def _on_surface(
+def _with_axes_around(
     courses: tuple[ConstantVelocityCost, ConstantVelocityCost], state: Array
 ) -> tuple[tuple[ConstantVelocityCost, ConstantVelocityCost], Ground]:
-    """Return courses whose axes of states are set around one state, and the surface on which they move."""
+    """Return courses whose axes of states are set around one state, and the surface on which they move.
+
+    The two courses are the cost of all rows and the cost of few rows. In the plane they stay as they are.
+    """
     if not over_ground(courses[0].ground):
         return courses, courses[0].ground
     axes = axes_at(courses[0].ground.data, state[:3])
@@ -475,7 +502,7 @@ def _on_surface(
 
 
 def costs_of_courses(costs: CourseCosts, states: Array) -> tuple[Array, Array]:
-    """Return costs (n, P) of states (n, P, 2 d) and the rounding of their residuals, see `costs_at`."""
+    """Return costs (n, P) of states (n, P, 2 d), m and m/s, and the rounding of their residuals, see `costs_at`."""
     out = np.zeros((2, *states.shape[:2]))
     for i, (whole, _) in enumerate(costs.courses):
         for p, state in enumerate(plainly(states[i])):

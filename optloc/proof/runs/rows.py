@@ -1,10 +1,12 @@
 """Bounds over a box for hundreds of rows, in a time that is proportional to the number of rows.
 
-Each row of a long run depends on few nodes. All rows share a few unknowns that enter linearly, such as offsets and
-drifts. The residual without them is ``e = S phi - w`` (S sparse, whitened). With Q an orthonormal basis of their
-directions, the cost is ``f = |P e|^2``, ``P = 1 - Q Q'``. The dense rows P S are never computed. Each unit vector v
-with ``Q'v = 0`` gives the bound ``|P e| >= v.e``. Bounds of v.e over a box need one pass over the entries of S. Second
-derivatives are summed over all nodes before they are bounded, because they cancel in a long run.
+Each row of a long run depends on few nodes (scalar functions of the position, such as ranges). All rows share a few
+unknowns that enter linearly, such as offsets and drifts. The residual without them is ``e = S phi - w`` with S (q, J)
+sparse and whitened. With Q an orthonormal basis of their directions, the cost is ``f = |P e|^2``, ``P = 1 - Q Q'``. The
+dense rows P S are never computed. Each unit vector v with ``Q'v = 0`` gives the bound ``|P e| >= v.e``. Bounds of v.e
+over a box need one pass over the entries of S. Second derivatives are summed over all nodes before they are bounded,
+because they cancel in a long run. A box has half-widths `half` (3,) in search coordinates, and tables `nodes` and
+`curves` (`optloc.proof.nodes.node`).
 """
 
 from __future__ import annotations
@@ -102,14 +104,14 @@ class RunWorkspace(NamedTuple):
 
 @compiled
 def workspace_of(rows: RunRows) -> RunWorkspace:
-    """Return working memory for rows."""
+    """Return uninitialised working memory for rows."""
     q, J = rows.w.shape[0], rows.weight.shape[0]
     return RunWorkspace(np.empty(q), np.empty(J), np.empty((3, q)), np.empty((3, J)), np.empty(J), np.empty(q))
 
 
 @compiled
 def multiply(rows: RunRows, values: Array, out: Array) -> None:
-    """Write ``S values``."""
+    """Write ``S values`` for numbers (J,) of the nodes into `out` (q,)."""
     for i in range(out.shape[0]):
         total = 0.0
         for n in range(rows.start[i], rows.start[i + 1]):
@@ -119,7 +121,7 @@ def multiply(rows: RunRows, values: Array, out: Array) -> None:
 
 @compiled
 def multiply_transposed(rows: RunRows, values: Array, out: Array) -> None:
-    """Write ``S'values``."""
+    """Write ``S'values`` for numbers (q,) of the rows into `out` (J,)."""
     out[:] = 0.0
     for i in range(values.shape[0]):
         value = values[i]
@@ -130,7 +132,7 @@ def multiply_transposed(rows: RunRows, values: Array, out: Array) -> None:
 @compiled
 def project_out_unknowns(rows: RunRows, values: Array) -> None:
     """Subtract from values (q,) their part that the other unknowns can explain."""
-    for _ in range(2):  # twice is exact (Parlett)
+    for _ in range(2):  # twice is exact (Parlett 1980)
         for k in range(rows.basis.shape[0]):
             along, own = 0.0, rows.basis[k]
             for i in range(values.shape[0]):
@@ -141,7 +143,10 @@ def project_out_unknowns(rows: RunRows, values: Array) -> None:
 
 @compiled
 def greatest_length(rows: RunRows, values: Array, out: Array) -> float:
-    """Return a bound of the length of ``S y`` over all y with ``|y_j| <= values_j``."""
+    """Return a bound of the length of ``S y`` over all y with ``|y_j| <= values_j``.
+
+    `out` (q,) only has the right length.
+    """
     total = 0.0
     for i in range(out.shape[0]):
         most = 0.0
@@ -172,19 +177,22 @@ def rounding_of_residual(rows: RunRows, floor: float, nodes: Array) -> float:
 
 @compiled
 def relative_rounding_of(rows: RunRows) -> float:
-    """Return the relative rounding of sums over nodes and rows: one for each term, and 32 within a node."""
+    """Return the relative rounding of sums over nodes and rows: one unit for each term, and 32 within a node."""
     return float((_WITHIN + rows.w.shape[0] + rows.weight.shape[0]) * _ULP)
 
 
 @compiled
 def share_within(rows: RunRows) -> float:
-    """Return the share of this rounding within a node, which is the rounding of coordinates."""
+    """Return the share, 0 to 1, of `relative_rounding_of` from within a node: the rounding of coordinates."""
     return float(_WITHIN / (_WITHIN + rows.w.shape[0] + rows.weight.shape[0]))
 
 
 @compiled
 def residual_at(rows: RunRows, nodes: Array, sheet: RunWorkspace) -> float:
-    """Write the residual at the centre of a box whose nodes are bounded, and its forces; return the cost there."""
+    """Write the residual at the centre of a box whose nodes are bounded, and its forces; return the cost there.
+
+    The residual P e (q,) and the forces (J,) are written into `sheet`.
+    """
     e, total = sheet.residual, 0.0
     for i in range(e.shape[0]):
         value = -rows.w[i]
@@ -204,7 +212,11 @@ _BALANCED = 1e-11
 
 @compiled
 def is_balanced(rows: RunRows, ones: Array, out: Array) -> bool:
-    """Return whether equal changes of the marked nodes (J,) change the rows only as the other unknowns can explain."""
+    """Return whether equal changes of the marked nodes change the rows only as the other unknowns can explain.
+
+    `ones` (J,) is 1 for marked nodes and 0 for others; `out` (q,) is working memory. With ranges marked, True means
+    that the cost stays finite at infinity.
+    """
     size = greatest_length(rows, ones, out)
     multiply(rows, ones, out)
     project_out_unknowns(rows, out)
@@ -328,7 +340,10 @@ def sum_up_rows(
 
 @compiled
 def _turn_entries(half: Array, curves: Array, pulls: Array, sums: Array) -> None:
-    """Write the part of the Hessian's change that is linear in s; the nodes' third derivatives are not included."""
+    """Write the part of the Hessian's change that is linear in s into sums[C00:].
+
+    `pulls` (3, J) are the columns of ``S'P S Phi``. The nodes' third derivatives are not included.
+    """
     third = np.zeros((3, 6))  # entry (l, m) along k: sum_j pull_jk N_jlm
     for j in range(curves.shape[0]):
         for k in range(3):
@@ -352,7 +367,10 @@ def _turn_entries(half: Array, curves: Array, pulls: Array, sums: Array) -> None
 def _rest(
     rows: RunRows, half: Array, nodes: Array, curves: Array, blur: float, sheet: RunWorkspace, sums: Array
 ) -> float:
-    """Return a bound of the norm of the rest of the Hessian's change; arguments as in `sum_up_rows`."""
+    """Return a bound of the norm of the rest of the Hessian's change; arguments as in `sum_up_rows`.
+
+    `blur` bounds the rounding of a force per weight of its node.
+    """
     h0, h1, h2, reach = half[0], half[1], half[2], sheet.reach
     size = sqrt(h0 * h0 + h1 * h1 + h2 * h2)
     own = cross = ball = 0.0
@@ -390,7 +408,10 @@ def norm_of(curves: Array, j: int) -> float:
 
 @compiled
 def is_convex_by(half: Array, sums: Array, ball: float, margin: float) -> bool:
-    """Return whether the Hessian of f/2 exceeds `margin` over a whole box, from its sums and bounds of their change."""
+    """Return whether the Hessian of f/2 exceeds `margin` over a whole box, from its sums and bounds of their change.
+
+    `sums` and `ball` are the results of `sum_up_rows`.
+    """
     if not ball < inf:
         return False
     d0 = sums[C00] + sums[C01] + sums[C02] + ball + margin

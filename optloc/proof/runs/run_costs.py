@@ -1,6 +1,7 @@
 """From long problems to costs of runs: sparse rows over the nodes, and dense rows of a few epochs.
 
-The cost of the few rows is nowhere more than the cost of all rows.
+The cost of the few rows is nowhere more than the cost of all rows, and takes a fraction of the time. Letters: m rows of
+measurements, q whitened rows, J nodes (scalar functions of the position, such as ranges), N problems.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class RunCost(NamedTuple):
     rows : RunRows
         All rows, sparse.
     look : Cost
-        The cost of a few of the rows, which is nowhere larger.
+        The cost of a few of the rows, which is nowhere larger. A search evaluates it first.
     """
 
     cost: Cost
@@ -88,9 +89,10 @@ class Runs:
 
     @property
     def dense(self) -> float:
-        """Return the number of dense nodes that a box of this run counts as in the budget of boxes.
+        """Return the weight of a box in the budget of boxes, as a number of dense nodes.
 
-        Long runs take fewer boxes than short ones, so the number grows only with a root of the time for a box.
+        A larger number gives a smaller budget. Long runs take fewer boxes than short runs, so the number grows only
+        with a root of the time for a box.
         """
         return float(_DENSE * max(1.0, len(self.runs[0].cost.kinds) / _LONG) ** 0.25)
 
@@ -103,49 +105,52 @@ class Runs:
 def run_costs(problem: Problem) -> Runs:
     """Return the costs of a flat batch of N long problems over the position."""
     problem, count = with_station_noise(problem), problem.batch_shape[0]
-    with _quickest(count):
+    with _fastest_kernels(count):
         costs = [_run_cost(problem.take(np.array([i]))) for i in range(count)]
     return Runs(tuple(run for run, _ in costs), np.array([level for _, level in costs]))
 
 
-def _quickest(count: int) -> AbstractContextManager[None]:
+def _fastest_kernels(count: int) -> AbstractContextManager[None]:
     """Return a context with plain Python kernels, unless compiled code is available or worth its compilation."""
     return nullcontext() if may_use_code(cost_of, count) else plain()
 
 
 def few_costs(problem: Problem) -> PositionCosts:
-    """Return the cost of a few rows of one long problem, a batch of one."""
-    with _quickest(1):
+    """Return the cost of a few rows of one long problem as the costs of a batch of one."""
+    with _fastest_kernels(1):
         run, level = _run_cost(with_station_noise(problem))
     look = run.look
     return PositionCosts(look.kinds, look.data[None], look.K[None], look.w[None], np.array([level]))
 
 
-def _read(problem: Problem) -> tuple[OtherRows, Array, Array, CostColumns]:
-    """Return the other unknowns, measurements minus known additions, whether they are present, and the nodes."""
+def _nodes_and_measurements(problem: Problem) -> tuple[OtherRows, Array, Array, CostColumns]:
+    """Return the other unknowns, measurements minus known additions (N, m), whether they are present, and the nodes."""
     others = OtherRows.of(problem)
-    known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
-    usable = (problem.weight > 0.0) & np.isfinite(known)
-    known = np.where(usable, known, 0.0)
-    made = columns_of(problem, known)
-    return others.with_stations(problem, made), known, usable, made
+    known = problem.observed - (others.coefficients @ others.mean[..., None])[..., 0]
+    present = (problem.weight > 0.0) & np.isfinite(known)
+    known = np.where(present, known, 0.0)
+    nodes = columns_of(problem, known)
+    return others.with_stations(problem, nodes), known, present, nodes
 
 
 def _run_cost(problem: Problem) -> tuple[RunCost, float]:
-    """Return one problem, a batch of one, as a run, and its level (see `Runs`)."""
-    others, known, usable, made = _read(problem)
-    priors = position_prior(problem, made)
-    kinds = np.array(made.kinds)
+    """Return one problem, a batch of one, as a run, and its level (see `Runs`).
+
+    Dense rows of a few epochs, without other unknowns, become the field `look`.
+    """
+    others, known, usable, nodes = _nodes_and_measurements(problem)
+    priors = position_prior(problem, nodes)
+    kinds = np.array(nodes.kinds)
     value = np.where(counts_from_measured(problem), 0.0, known)[0]
-    prior = _rows_at(priors, len(kinds))
-    whole = _WhitenedRows.of(problem, usable[0], made, others, value, prior)
-    data = whole.marked(kinds, made.numbers[:1])
-    few = _WhitenedRows.of(problem, usable[0] & _few(problem, len(kinds)), made, others, value, prior)
-    used = np.bincount(few.nodes.indices, minlength=len(kinds)) > 0
-    dense = project_out(few.unknowns, np.column_stack([few.nodes[:, used].toarray(), few.measured]))
-    present = (dense != 0.0).any(1)
-    look = cost_of(kinds[used], plainly(data[used]), plainly(dense[present, :-1]), plainly(dense[present, -1]))
-    rows = whole.rows()
+    prior = _rows_of_single_nodes(priors, len(kinds))
+    all_rows = _WhitenedRows.of(problem, usable[0], nodes, others, value, prior)
+    data = all_rows.marked(kinds, nodes.numbers[:1])
+    few_rows = _WhitenedRows.of(problem, usable[0] & _are_few(problem, len(kinds)), nodes, others, value, prior)
+    used = np.bincount(few_rows.nodes.indices, minlength=len(kinds)) > 0
+    dense = project_out(few_rows.unknowns, np.column_stack([few_rows.nodes[:, used].toarray(), few_rows.measured]))
+    nonzero = (dense != 0.0).any(1)
+    look = cost_of(kinds[used], plainly(data[used]), plainly(dense[nonzero, :-1]), plainly(dense[nonzero, -1]))
+    rows = all_rows.rows()
     none = np.empty((0, len(kinds)))
     cost = Cost(kinds, plainly(data), none, rows.w, np.empty((0, 0)), rows.weight, empty_groups(0))
     return RunCost(cost, rows, look), float(turned_level(problem, others, known)[0])
@@ -171,7 +176,7 @@ class CourseCosts:
 
     @property
     def dense(self) -> float:
-        """Return the number of dense nodes that a box of these costs counts as in the budget of boxes."""
+        """Return the weight of a box in the budget of boxes, as a number of dense nodes (see `Runs.dense`)."""
         return float(_DENSE)
 
     def take(self, items: Array | slice) -> CourseCosts:
@@ -189,32 +194,33 @@ def course_costs(problem: Problem) -> CourseCosts:
 
 def _course_cost(problem: Problem) -> tuple[tuple[ConstantVelocityCost, ConstantVelocityCost], float]:
     """Return one problem, a batch of one, as costs of all rows and of few rows, and its level (see `Runs`)."""
-    others, known, usable, made = _read(problem)
+    others, known, usable, nodes = _nodes_and_measurements(problem)
     since = problem.times - problem.origin
-    when = np.zeros(len(made.kinds))
-    when[made.column] = since[problem.epoch[made.row]]  # rows that share a node are of one epoch
+    when = np.zeros(len(nodes.kinds))
+    when[nodes.column] = since[problem.epoch[nodes.row]]  # rows that share a node are of one epoch
     value = np.where(counts_from_measured(problem), 0.0, known)[0]
-    rise = np.zeros(len(made.kinds))
-    rise[made.column] = _rise(problem)[problem.epoch[made.row]]
-    prior, times = _state_prior(problem, made, max(float(np.ptp(since)), 1.0))
+    rise = np.zeros(len(nodes.kinds))
+    rise[nodes.column] = _heights_above_state(problem)[problem.epoch[nodes.row]]
+    prior, times = _state_prior(problem, nodes, max(float(np.ptp(since)), 1.0))
     # a prior applies to the state itself, at any reported height
     when = np.stack([np.concatenate([when, times]), np.concatenate([rise, np.zeros(len(times))])], axis=1)
-    parts = [usable[0], usable[0] & _few(problem, len(when))]
-    systems = [_WhitenedRows.of(problem, part, made, others, value, prior) for part in parts]
-    courses = [_course(problem, system, made, when) for system in systems]
+    parts = [usable[0], usable[0] & _are_few(problem, len(when))]
+    systems = [_WhitenedRows.of(problem, part, nodes, others, value, prior) for part in parts]
+    courses = [_cost_over_states(problem, system, nodes, when) for system in systems]
     return (courses[0], courses[1]), float(turned_level(problem, others, known)[0])
 
 
-def _rise(problem: Problem) -> Array:
-    """Return the heights (k,) of a moving target above the height of its state, metres."""
+def _heights_above_state(problem: Problem) -> Array:
+    """Return the heights (k,) of a moving target at its k epochs above the height of its state, metres."""
     rise = problem.motions[0].rise
     return np.zeros(problem.epochs) if rise is None else np.reshape(rise[..., 0], (-1, problem.epochs))[0]
 
 
-def _state_prior(problem: Problem, made: CostColumns, span: float) -> tuple[Any, list[float]]:
+def _state_prior(problem: Problem, nodes: CostColumns, span: float) -> tuple[Any, list[float]]:
     """Add the nodes of priors on position and velocity; return their rows over all nodes, and their times, seconds.
 
-    A velocity is the difference of two positions, divided by the time between them.
+    The rows are sparse (count, J). A velocity is the difference of two positions, divided by the time `span` between
+    them, seconds.
     """
     from scipy import sparse
 
@@ -228,30 +234,36 @@ def _state_prior(problem: Problem, made: CostColumns, span: float) -> tuple[Any,
             continue
         root, centre = roots(precision.reshape(problem.dimension, -1)), mean.reshape(1, -1)
         for time, share in ((0.0, 1.0),) if name == "position" else ((span, 1.0 / span), (0.0, -1.0 / span)):
-            node += add_linear(made, root[None], centre if name == "position" else time * centre)
+            node += add_linear(nodes, root[None], centre if name == "position" else time * centre)
             row += range(count, count + problem.dimension)
             factor += [share] * problem.dimension
             times += [time] * problem.dimension
         count += problem.dimension
     entries = (np.array(factor), (np.array(row, dtype=int), np.array(node, dtype=int)))
-    return sparse.csr_array(entries, shape=(count, len(made.kinds))), times
+    return sparse.csr_array(entries, shape=(count, len(nodes.kinds))), times
 
 
-def _course(problem: Problem, system: _WhitenedRows, made: CostColumns, when: Array) -> ConstantVelocityCost:
-    """Return whitened rows as a cost over the nodes that they use; `when` (J, 2) has the nodes' times and heights."""
+def _cost_over_states(problem: Problem, system: _WhitenedRows, nodes: CostColumns, when: Array) -> ConstantVelocityCost:
+    """Return whitened rows as a cost over the nodes that they use, in order of time.
+
+    `when` (J, 2) has the time of each node after the time of the state, s, and its height above the state, m.
+    """
     used = np.flatnonzero(np.bincount(system.nodes.indices, minlength=len(when)))
     order = used[np.lexsort((when[used, 1], when[used, 0]))]
     epochs, first = np.unique(when[order], axis=0, return_index=True)
-    own = replace(system, nodes=system.nodes[:, order])
-    kinds = np.array(made.kinds)[order]
-    data = own.marked(kinds, made.numbers[:1, order])
+    sorted_system = replace(system, nodes=system.nodes[:, order])
+    kinds = np.array(nodes.kinds)[order]
+    data = sorted_system.marked(kinds, nodes.numbers[:1, order])
     since, rise = (plainly(column) for column in epochs.T)
     ground = _ground(problem, since, rise)
-    return ConstantVelocityCost(kinds, data, np.append(first, len(order)), since, own.rows(), ground)
+    return ConstantVelocityCost(kinds, data, np.append(first, len(order)), since, sorted_system.rows(), ground)
 
 
 def _ground(problem: Problem, since: Array, rise: Array) -> Ground:
-    """Return the surface on which a target moves; its axes are the axes of the frame until a position is known."""
+    """Return the surface on which a target moves, or `STRAIGHT`; its axes are the frame's until a position is known.
+
+    `since` and `rise` (k,) are the times of the epochs after the state, s, and their heights above it, m.
+    """
     level = held_height(problem)
     if level is None:
         return STRAIGHT
@@ -259,8 +271,11 @@ def _ground(problem: Problem, since: Array, rise: Array) -> Ground:
     return Ground(plainly(height_numbers(problem)[0]), np.eye(3), value, rise, float(np.abs(since).max(initial=0.0)))
 
 
-def _few(problem: Problem, nodes: int) -> Array:
-    """Return whether each row (m,) is one of the few: rows of evenly spaced epochs, or evenly spaced rows."""
+def _are_few(problem: Problem, nodes: int) -> Array:
+    """Return a bool array (m,): whether the row is one of the few, of evenly spaced epochs, or evenly spaced rows.
+
+    `nodes` is the number of nodes of all rows.
+    """
     epochs = np.unique(problem.epoch)
     key = np.searchsorted(epochs, problem.epoch) if len(epochs) >= _LOOK // 3 else np.arange(problem.count)
     apart = max(1, round(nodes / _LOOK))
@@ -269,7 +284,11 @@ def _few(problem: Problem, nodes: int) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _WhitenedRows:
-    """Whitened rows over nodes (sparse) and over other unknowns, with rows of priors, and the measurements (q,)."""
+    """Whitened rows with rows of priors.
+
+    `nodes` (q, J), sparse, are the coefficients of the nodes, `unknowns` (q, p) the coefficients of other unknowns, and
+    `measured` (q,) the whitened measurements.
+    """
 
     nodes: Any
     unknowns: Array
@@ -277,25 +296,32 @@ class _WhitenedRows:
 
     @classmethod
     def of(
-        cls, problem: Problem, present: Array, made: CostColumns, others: OtherRows, value: Array, prior: Any
+        cls, problem: Problem, present: Array, nodes: CostColumns, others: OtherRows, value: Array, prior: Any
     ) -> _WhitenedRows:
-        """Return the whitened rows of one problem; `present` (m,) marks the rows to use."""
+        """Return the whitened rows of one problem.
+
+        `present` (m,) marks the rows to use, `value` (m,) are measurements minus known additions, and `prior` the
+        sparse rows of priors on the state.
+        """
         from scipy import sparse  # imported with the first long run: problems of one epoch do not need it
 
-        size, white = len(made.kinds), _whitening(problem, present)
-        design = sparse.csr_array((made.coefficient, (made.row, made.column)), shape=(problem.count, size))
+        size, white = len(nodes.kinds), _whitening(problem, present)
+        design = sparse.csr_array((nodes.coefficient, (nodes.row, nodes.column)), shape=(problem.count, size))
         precision = others.precision[0]
-        used = others.touch.any(0) | precision.any(0)
+        used = others.coefficients.any(0) | precision.any(0)
         root = roots(precision[used][:, used])
         none = sparse.csr_array((len(root), size))
         return cls(
             sparse.csr_array(sparse.vstack([white @ design, prior, none])),
-            np.concatenate([white @ others.touch[:, used], np.zeros((prior.shape[0], len(root))), root]),
+            np.concatenate([white @ others.coefficients[:, used], np.zeros((prior.shape[0], len(root))), root]),
             np.concatenate([white @ value, np.zeros(prior.shape[0] + len(root))]),
         )
 
     def marked(self, kinds: Array, data: Array) -> Array:
-        """Return the numbers (J, width) of the nodes, with a mark on nodes that share no row with others."""
+        """Return the numbers (J, width) of the nodes, with a mark on nodes that share no row with others.
+
+        `kinds` (J,) and `data` (1, J, width) are codes and numbers of the nodes; for the mark see `mark_nodes`.
+        """
         shared = (np.diff(self.nodes.indptr) > 1) | self.unknowns.any(1)
         touched = self.nodes != 0.0
         size = np.sqrt(np.asarray(self.nodes.multiply(self.nodes).sum(0)))
@@ -313,8 +339,8 @@ class _WhitenedRows:
         return RunRows(start, column, *map(plainly, arrays))
 
 
-def _rows_at(nodes: list[int], size: int) -> Any:
-    """Return sparse rows (n, size), each of which contains one of the nodes."""
+def _rows_of_single_nodes(nodes: list[int], size: int) -> Any:
+    """Return sparse rows (n, size), each of which contains one of the n nodes with the factor 1."""
     from scipy import sparse
 
     return sparse.csr_array((np.ones(len(nodes)), (np.arange(len(nodes)), nodes)), shape=(len(nodes), size))

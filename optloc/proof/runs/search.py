@@ -73,7 +73,8 @@ def tables_of(run: RunCost) -> RunTables:
 def sum_at(run: RunCost, space: Space, tables: RunTables, floor: float) -> tuple[float, float]:
     """Return the cost at the centre of a box that is set, and the norm of the rest of its Hessian's change.
 
-    The sums of the box are filled. Both results are infinite if the nodes cannot be bounded.
+    The sums of the box are filled. `floor` is the result of `floor_of`. Both results are infinite if the nodes cannot
+    be bounded.
     """
     box, sheet = tables.box, tables.sheet
     if not set_nodes(space, run.cost, box):
@@ -131,8 +132,12 @@ def search_run(
 
     Returns
     -------
-    outcome, boxes, bound
-        As in `optloc.proof.global_search.search_everywhere`.
+    outcome : int
+        CLEAR, CHEAPER, ANOTHER, SPENT or INFINITE, as in `optloc.proof.level_search.search_levels`.
+    boxes : int
+        Number of boxes that were taken from the stack.
+    bound : float
+        A lower bound of f for the outcomes CLEAR and SPENT, otherwise 0.
     """
     look, small, d, boxes, looks, lows = run.look, tables.small, found.shape[0], 0, 0, 0
     floors = floor_of(space, look), floor_of(space, run.cost)
@@ -187,7 +192,11 @@ def _is_done(
     touching: bool,
     floor: float,
 ) -> bool:
-    """Return whether a box, with the cost at its centre and a bound, is finished."""
+    """Return whether a box is finished: its cost is at least the level, or it contains no minimum.
+
+    `here` is the cost at its centre, `low` a lower bound of the residual, `touching` whether it reaches infinity, and
+    `floor` the result of `floor_of`.
+    """
     if exceeds_level(low, aim.level):
         return True
     if not (aim.whole or exceeds_level(low, aim.value)) or not here < _NEAR * (aim.level + 1.0):
@@ -200,7 +209,10 @@ def _is_done(
 
 @compiled
 def _is_flat_out(run: RunCost, space: Space, tables: RunTables, level: float) -> bool:
-    """Return whether a box at infinity is very small and its cost at infinity is below a level."""
+    """Return whether a box at infinity is very small and its cost at infinity is below a level.
+
+    Halving this box would never exclude it, so the search ends.
+    """
     half, box = tables.small.half, tables.box
     if not max(half[0], half[1], half[2]) < _TINY:
         return False
@@ -211,7 +223,11 @@ def _is_flat_out(run: RunCost, space: Space, tables: RunTables, level: float) ->
 
 @compiled
 def _bound(run: RunCost, space: Space, tables: RunTables, floor: float, level: float) -> tuple[float, float]:
-    """Return the cost at the centre of a box, and a lower bound of the residual over it, negative without a bound."""
+    """Return the cost at the centre of a box, and a lower bound of the residual over it, negative without a bound.
+
+    All rows are used. Second derivatives are computed only if the bound without them is below `level`. `floor` is the
+    result of `floor_of`.
+    """
     box, sheet, rows = tables.box, tables.sheet, run.rows
     if not set_nodes(space, run.cost, box):
         return inf, -1.0
@@ -236,7 +252,7 @@ _ASIDE = 1.5
 
 @compiled
 def _descends(run: RunCost, space: Space, tables: RunTables, level: float, found: Array) -> bool:
-    """Return whether the centre of a box descends to an unknown minimum below the level, and write this minimum."""
+    """Return whether the centre of a box descends to an unknown minimum below the level, and write this minimum, m."""
     box, d, home = tables.box, found.shape[0], 0
     u, before, face = box.at.copy(), np.zeros(3), False
     if space.far:
@@ -272,7 +288,10 @@ def _descends(run: RunCost, space: Space, tables: RunTables, level: float, found
 
 @compiled
 def cost_at_coordinates(run: RunCost, space: Space, tables: RunTables, home: int, u: Array) -> float:
-    """Return the cost at coordinates u (3,) of a piece; its derivatives are written into the sums of the box."""
+    """Return the cost at coordinates u (3,) of the piece `home`.
+
+    Its derivatives are written into the sums of the box.
+    """
     tables.box.half[:] = 0.0
     put(u, tables.box.at)
     if space.far:
@@ -296,7 +315,10 @@ def rounding_at_place(run: RunCost, space: Space, tables: RunTables, floor: floa
 
 @compiled
 def _step(box: Box, damping: float) -> float:
-    """Write a damped Newton step into box.solve[0]; return its squared length, or NaN if there is no step."""
+    """Write a damped Newton step into box.solve[0]; return its squared length in squared standard deviations.
+
+    The result is NaN if the Hessian is not positive definite.
+    """
     sums = box.sums
     h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]
     if not positive_along(h0, h1, h2, h3, h4, h5, h3 != 0.0, h5 != 0.0):

@@ -1,4 +1,10 @@
-"""Bounds of the residual of a moving target, and of its second derivatives, over boxes of states."""
+"""Bounds of the residual of a moving target, and of its second derivatives, over boxes of states.
+
+A state is position and velocity (n = 4 numbers). The cost is ``f = |P e|^2`` with residual e (q,) and the projection P
+that removes other unknowns (`optloc.proof.runs.rows`). Derivatives are with respect to search coordinates in the units
+`table.unit`: the half-widths of a box, so that the box is ``|s_m| <= 1``, or 1 at a point. The working memory `table`
+is described in `optloc.proof.runs.states.StateTable`.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +33,7 @@ from optloc.proof.runs.states import STATE, ConstantVelocityCost, StateAxes, Sta
 
 @compiled
 def set_lines(course: ConstantVelocityCost, table: StateTable) -> None:
-    """Write the Jacobian of the rows at the centre of a box whose nodes are bounded."""
+    """Write the Jacobian ``P S Phi`` (n, q) at the centre of a box whose nodes are bounded into `table.lines`."""
     values, d = table.sheet.reach, table.lever.shape[1]
     for m in range(table.at.shape[0]):
         for k in range(course.since.shape[0]):
@@ -47,7 +53,11 @@ _SWEEPS = 3
 
 @compiled
 def _reach(course: ConstantVelocityCost, table: StateTable, direction: Array, curved: bool) -> float:
-    """Return a lower bound of ``|P e|`` over a box from a direction (q,), without rounding; see `least_length`."""
+    """Return a lower bound of ``|P e|`` over a box from a direction (q,), without rounding; see `least_length`.
+
+    If `curved`, second derivatives are available (`set_bends`). Each node counts with them and a third-order remainder,
+    or with the interval of its remainder, whichever is better.
+    """
     n, d, force = table.at.shape[0], table.lever.shape[1], table.sheet.force
     length, total, rest = 0.0, 0.0, 0.0
     for i in range(direction.shape[0]):
@@ -87,8 +97,8 @@ def _reach(course: ConstantVelocityCost, table: StateTable, direction: Array, cu
 def least_length(course: ConstantVelocityCost, table: StateTable, cost: float, curved: bool) -> float:
     """Return a lower bound of ``|P e|`` over a box, without rounding; a negative result means that no bound is known.
 
-    The residual at the centre and the Jacobian must be set. The direction of the bound is the shortest residual of the
-    linear part.
+    `cost` is the cost at the centre, and `curved` as in `_reach`. The residual at the centre and the Jacobian must be
+    set. The direction of the bound is the shortest residual of the linear part.
     """
     sheet, lines, n = table.sheet, table.lines, table.at.shape[0]
     if not cost > 0.0:
@@ -120,8 +130,8 @@ def least_length(course: ConstantVelocityCost, table: StateTable, cost: float, c
 def sum_up(course: ConstantVelocityCost, table: StateTable, noise: float) -> tuple[float, float]:
     """Write gradient, Hessian and its first-order change; return bounds of the rest and of the gradient's rounding.
 
-    The method is `optloc.proof.runs.rows.sum_up_rows`, in units of the half-widths of the box. Nodes, Hessians of
-    nodes, residual and Jacobian must be set; `noise` is the rounding of a residual.
+    The method is `optloc.proof.runs.rows.sum_up_rows`, in the units `table.unit`. Nodes, Hessians of nodes, residual
+    and Jacobian must be set; `noise` bounds the rounding of a residual.
     """
     rows, sheet, lines, pulls, n = course.rows, table.sheet, table.lines, table.pulls, table.at.shape[0]
     multiply_transposed(rows, sheet.residual, sheet.force)
@@ -152,7 +162,7 @@ def sum_up(course: ConstantVelocityCost, table: StateTable, noise: float) -> tup
 
 @compiled
 def _blur_of_lines(course: ConstantVelocityCost, table: StateTable) -> float:
-    """Return a bound of the rounding of each column of the Jacobian."""
+    """Return a bound of the rounding of each column of the Jacobian, as a length."""
     most, missed = 0.0, _missed(course, table)
     for m in range(table.at.shape[0]):
         total = 0.0
@@ -166,7 +176,7 @@ def _blur_of_lines(course: ConstantVelocityCost, table: StateTable) -> float:
 
 @compiled
 def _missed(course: ConstantVelocityCost, table: StateTable) -> float:
-    """Return a bound of the error of finite differences in each column of the Jacobian."""
+    """Return a bound of the error of finite differences in each column of the Jacobian; 0 for motion in the plane."""
     total = 0.0
     if table.lever.shape[1] == 3:
         first, _ = errors_of(table.limits[2])
@@ -181,7 +191,7 @@ def _missed(course: ConstantVelocityCost, table: StateTable) -> float:
 
 @compiled
 def _turn(course: ConstantVelocityCost, table: StateTable) -> None:
-    """Add the nodes' part to the Hessian, and write the part of its change that is linear in s."""
+    """Add the nodes' part to `table.hessian`, and write the linear part of its change to `table.change`."""
     n = table.at.shape[0]
     third = np.zeros((n, n, n))
     for j in range(course.kinds.shape[0]):
@@ -202,7 +212,10 @@ def _turn(course: ConstantVelocityCost, table: StateTable) -> None:
 
 @compiled
 def _rest(course: ConstantVelocityCost, table: StateTable, blur: float) -> float:
-    """Return a bound of the norm of the rest of the Hessian's change; see `optloc.proof.runs.rows`."""
+    """Return a bound of the norm of the rest of the Hessian's change; see `optloc.proof.runs.rows.sum_up_rows`.
+
+    `blur` bounds the rounding of a force per weight of its node.
+    """
     rows, sheet, reach, n = course.rows, table.sheet, table.sheet.reach, table.at.shape[0]
     own = cross = ball = 0.0
     size = sqrt(float(n))
@@ -228,7 +241,11 @@ def _rest(course: ConstantVelocityCost, table: StateTable, blur: float) -> float
 
 @compiled
 def is_convex(table: StateTable, ball: float, margin: float) -> bool:
-    """Return whether the Hessian of f/2, in lengths of 1, exceeds `margin` over a whole box whose sums are filled."""
+    """Return whether the Hessian of f/2 exceeds `margin` times the identity over a whole box, in search coordinates.
+
+    `sum_up` must have run; `ball` is its first result. Its Hessian is in units of the half-widths, so the margin is
+    multiplied by their squares. Bounds of the change are subtracted from the diagonal (Gershgorin).
+    """
     if not ball < inf:
         return False
     n, matrix = table.at.shape[0], table.solve
@@ -245,7 +262,8 @@ def is_convex(table: StateTable, ball: float, margin: float) -> bool:
 def has_no_minimum(table: StateTable, ball: float, noise: float) -> bool:
     """Return whether a box whose sums are filled contains no minimum of the cost.
 
-    This holds if the gradient does not vanish, or if the cost has negative curvature along a coordinate.
+    `ball` and `noise` are the results of `sum_up`. The box has no minimum if the gradient does not vanish, or if the
+    cost has negative curvature along a coordinate.
     """
     n, matrix = table.at.shape[0], table.solve
     if not ball < inf:
@@ -283,7 +301,7 @@ def has_no_minimum(table: StateTable, ball: float, noise: float) -> bool:
 
 @compiled
 def hessian_of_state(course: ConstantVelocityCost, state: Array) -> Array:
-    """Return the Hessian (4, 4) of f/2 at a state (4,)."""
+    """Return the Hessian (4, 4) of f/2 at a state (4,), with respect to position (m) and velocity (m/s)."""
     table = table_of(course)
     table.unit[:] = 1.0
     axes = StateAxes(state, np.eye(STATE), np.eye(STATE), np.zeros((2, STATE)))
@@ -296,7 +314,10 @@ def hessian_of_state(course: ConstantVelocityCost, state: Array) -> Array:
 
 
 def axes_of(hessian: Array, state: Array, corners: Array) -> StateAxes | None:
-    """Return the principal axes of the cost at a state (n,), in standard deviations; None if it is no minimum."""
+    """Return the principal axes of the cost at a state (n,), in standard deviations; None if it is no minimum.
+
+    `hessian` (n, n) is the Hessian of f/2 at the state, and `corners` (2, n) is the region.
+    """
     size = np.sqrt(np.maximum(np.diag(hessian), 0.0))
     if not (np.isfinite(hessian).all() and size.all()):
         return None

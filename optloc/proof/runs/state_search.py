@@ -1,4 +1,9 @@
-"""The search of boxes of positions and velocities for a target in uniform motion, and its proof in a region."""
+"""The search of boxes of positions and velocities for a target in uniform motion, and its proof in a region.
+
+A state is position and velocity (n = 4 numbers), and search coordinates are principal axes of the cost at the fix, in
+standard deviations. Each box is first bounded with the rows of a few epochs, whose cost is never more than the cost of
+all rows; all rows are used only if this bound is not sufficient.
+"""
 
 from __future__ import annotations
 
@@ -97,8 +102,10 @@ def search_courses(search: Search, stack: Array, size: int, aim: Goal, budget: i
 
     Returns
     -------
-    outcome, boxes
+    outcome : int
         CLEAR, CHEAPER (a state costs less than `aim.better`), ANOTHER (an unknown minimum below the level), or SPENT.
+    boxes : int
+        Number of boxes that were taken from the stack.
     """
     axes, table, small, n = search.axes, search.table, search.small, found.shape[0]
     boxes, looks, lows = 0, 0, 0
@@ -141,7 +148,11 @@ def search_courses(search: Search, stack: Array, size: int, aim: Goal, budget: i
 def _look(
     course: ConstantVelocityCost, axes: StateAxes, table: StateTable, floor: float, level: float
 ) -> tuple[float, float]:
-    """Return the cost at the centre of a box that is set, and a lower bound of the residual over it."""
+    """Return the cost at the centre of a box that is set, and a lower bound of the residual over it.
+
+    A negative bound means that no bound is known. `floor` is the result of `floor_of`. Second derivatives are computed
+    only if the bound without them is below `level`.
+    """
     set_box(course, axes, table)
     here = residual_at(course.rows, table.nodes, table.sheet)
     noise = rounding_of_residual(course.rows, floor, table.nodes)
@@ -157,7 +168,7 @@ def _look(
 
 @compiled
 def _curve(search: Search, table: StateTable) -> tuple[float, float]:
-    """Fill the sums of a box that was bounded with all rows, see `sum_up`."""
+    """Fill the sums of a box that was bounded with all rows; return the results of `sum_up`."""
     noise = rounding_of_residual(search.whole.rows, search.floors[0], table.nodes)
     set_bends(search.whole, search.axes, table)
     return sum_up(search.whole, table, noise)
@@ -165,7 +176,10 @@ def _curve(search: Search, table: StateTable) -> tuple[float, float]:
 
 @compiled
 def _where(axes: StateAxes, at: Array, half: Array) -> int:
-    """Return -1 if no state of a box is in the region, 1 if all are inside it, and 0 otherwise."""
+    """Return -1 if no state of a box is in the region, 1 if all are inside it, and 0 otherwise.
+
+    The box has the centre `at` and the half-widths `half` (n,); the region is in `axes`.
+    """
     inside = 1
     for i in range(at.shape[0]):
         middle, reach = axes.origin[i], 0.0
@@ -181,7 +195,7 @@ def _where(axes: StateAxes, at: Array, half: Array) -> int:
 
 @compiled
 def _is_inside(axes: StateAxes, at: Array, state: Array) -> bool:
-    """Write the state of search coordinates; return whether it is in the region."""
+    """Write the state of search coordinates `at` into `state`; return whether it is in the region."""
     inside = True
     for i in range(at.shape[0]):
         state[i] = axes.origin[i]
@@ -193,7 +207,7 @@ def _is_inside(axes: StateAxes, at: Array, state: Array) -> bool:
 
 @compiled
 def _is_known(search: Search, at: Array, half: Array) -> bool:
-    """Return whether a box is inside the convex box of a known minimum."""
+    """Return whether a box (centre `at`, half-widths `half`) is inside the convex box of a known minimum."""
     for p in range(search.minima.shape[0]):
         inside = True
         for m in range(at.shape[0]):
@@ -205,7 +219,7 @@ def _is_known(search: Search, at: Array, half: Array) -> bool:
 
 @compiled
 def _steepest(table: StateTable) -> int:
-    """Return the side of a linearised box along which the residual changes most."""
+    """Return the side of a linearised box along which the residual changes most: the side to halve."""
     best, steepest, side, n = -1.0, 0.0, 0, table.at.shape[0]
     for m in range(n):
         table.move[m] = 0.0
@@ -222,7 +236,7 @@ def _steepest(table: StateTable) -> int:
 
 @compiled
 def _push_halves(stack: Array, size: int, table: StateTable, side: int) -> int:
-    """Push the halves of a box; return the size of the stack."""
+    """Push the halves of a box across `side`, widened by rounding; return the number of boxes on the stack."""
     n = table.at.shape[0]
     for sign in (-0.5, 0.5):
         for m in range(n):
@@ -242,7 +256,10 @@ _STEPS, _CLOSE = 40, 1e-3
 
 @compiled
 def _descends(search: Search, level: float, found: Array) -> bool:
-    """Return whether the centre of a box descends to an unknown minimum below the level, and write this minimum."""
+    """Return whether the centre of a box descends to an unknown minimum below the level, and write this minimum.
+
+    The minimum (n,) is a state in m and m/s.
+    """
     table = search.table
     before, damping = table.at.copy(), 1e-3
     now = _linearise(search, table)
@@ -273,7 +290,7 @@ def _descends(search: Search, level: float, found: Array) -> bool:
 
 @compiled
 def _linearise(search: Search, table: StateTable) -> float:
-    """Return the cost at the coordinates of the box; write residual, Jacobian and slope in lengths of 1."""
+    """Return the cost at the centre of the box; write residual and Jacobian per unit of search coordinates."""
     for m in range(table.at.shape[0]):
         table.half[m], table.unit[m] = 0.0, 1.0
     set_box(search.whole, search.axes, table)
@@ -284,7 +301,10 @@ def _linearise(search: Search, table: StateTable) -> float:
 
 @compiled
 def _step(table: StateTable, damping: float) -> float:
-    """Write a damped Gauss-Newton step; return its squared length in standard deviations, or -1 without a step."""
+    """Write a damped Gauss-Newton step into `table.move`; return its squared length in standard deviations, or -1.
+
+    The result is -1 if the rows do not determine a step. The step is subtracted from the coordinates.
+    """
     n, matrix, lines = table.at.shape[0], table.solve, table.lines
     for m in range(n):
         table.slope[m] = 0.0
@@ -316,9 +336,10 @@ _WIDEST, _SMALLER, _TRIALS = 100.0, 0.8, 62
 
 @compiled
 def set_minimum(search: Search, p: int, state: Array, least: float, eps: float) -> bool:
-    """Write a minimum and the sides of a convex box around it; return False if x is no minimum or costs too little.
+    """Write minimum p and the sides of a convex box around it; return False if it is no minimum or costs too little.
 
-    In the box the cost is at most eps below the cost of the minimum.
+    `least` is the least cost that the minimum may have. In the box the cost is at most eps below the cost of the
+    minimum.
     """
     axes, table, n = search.axes, search.table, state.shape[0]
     for m in range(n):
@@ -396,6 +417,7 @@ def prove_course(
     if not eps <= most:
         return COARSE, 0, -inf
     level = least + kappa if kappa > 0.0 else least - eps
+    # The search of states does not read the last three fields.
     aim = Goal(level, least - eps, least - 0.5 * eps, False, 0, 0)
     known, place = zero(), x.copy()
     for p in range(1 + (others.shape[0] if kappa > 0.0 else 0)):
@@ -417,7 +439,7 @@ def prove_course(
 
 @compiled
 def _set_first(axes: StateAxes, at: Array, half: Array) -> None:
-    """Write the box that contains a region."""
+    """Write the box in search coordinates that contains the region into `at` and `half` (n,), which must be zero."""
     for m in range(at.shape[0]):
         for i in range(at.shape[0]):
             low, high = axes.corners[0, i], axes.corners[1, i]

@@ -1,9 +1,11 @@
 """A target in uniform motion: bounds of a cost over boxes of positions and velocities.
 
-The rows are the rows of a run. For a box of states, the target's positions at the time t of an epoch are in a box of
-space. The nodes of this epoch are bounded over this box. In the plane these positions are ``p + t v``; over ground,
-see `optloc.proof.runs.ground`. Slopes and Hessians with respect to the state follow by the chain rule, and are summed
-over all nodes before they are bounded. Search coordinates are the principal axes of the cost at the fix.
+A *state* is position and velocity (4 numbers, m and m/s). The rows are the rows of a run. For a box of states, the
+target's positions at the time t of an epoch are in a box of space. The nodes of this epoch (ranges, for instance) are
+bounded over this box. In the plane these positions are ``p + t v``; over ground, see `optloc.proof.runs.ground`. Slopes
+and Hessians with respect to the state follow by the chain rule, and are summed over all nodes before they are bounded.
+Search coordinates are the principal axes of the cost at the fix. Letters: J nodes, K epochs, q rows, n = 4 numbers of a
+state, d = 2 or 3 coordinates of a position. A *lever* is the derivative of a position with respect to the state.
 """
 
 from __future__ import annotations
@@ -164,7 +166,7 @@ WIDER, SHIFT = 1e-12, 1e-15
 
 @compiled
 def table_of(course: ConstantVelocityCost) -> StateTable:
-    """Return working memory for boxes of states."""
+    """Return working memory for boxes of states of a cost, filled with zeros."""
     J, K, q, n = course.kinds.shape[0], course.since.shape[0], course.rows.w.shape[0], STATE
     over = over_ground(course.ground)
     vectors, matrices = np.zeros((6, n)), np.zeros((3, n, n))
@@ -197,14 +199,14 @@ def table_of(course: ConstantVelocityCost) -> StateTable:
 
 @compiled
 def put(table: StateTable, at: Array, half: Array) -> None:
-    """Set a box, with its half-widths as the units of derivatives."""
+    """Set the centre `at` and the half-widths `half` (n,) of a box; the half-widths are the units of derivatives."""
     for m in range(at.shape[0]):
         table.at[m], table.half[m], table.unit[m] = at[m], half[m], half[m]
 
 
 @compiled
 def set_box(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
-    """Bound all nodes over a box that is set, and write the derivatives of positions in its units."""
+    """Bound all nodes over a box that is set by `put`, and write the derivatives of positions in its units."""
     if over_ground(course.ground):
         _carry(course, axes, table)
     else:
@@ -216,7 +218,7 @@ def set_box(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) ->
 
 @compiled
 def _bound(course: ConstantVelocityCost, table: StateTable) -> None:
-    """Bound all nodes over the positions at their epochs."""
+    """Bound all nodes over the boxes of positions at their epochs (`table.places`)."""
     plan, line = np.zeros((3, 3)), np.zeros(6)
     for i in range(table.lever.shape[1]):
         plan[i, i] = 1.0
@@ -227,7 +229,7 @@ def _bound(course: ConstantVelocityCost, table: StateTable) -> None:
 
 @compiled
 def _shift(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
-    """Write positions and their derivatives for a target that moves in the plane."""
+    """Write the boxes of positions at all epochs, and their derivatives, for a target that moves in the plane."""
     at, half = table.at, table.half
     for k in range(course.since.shape[0]):
         time, place, reach = course.since[k], table.places[k, 0], table.places[k, 1]
@@ -249,7 +251,10 @@ def _shift(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> 
 
 @compiled
 def _carry(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
-    """Write positions and their derivatives for a target that moves over ground, and bounds of the derivatives."""
+    """Write positions and their derivatives for a target that moves over ground, and bounds of the derivatives.
+
+    The boxes of positions include the nonlinear part of the motion and the errors of finite differences.
+    """
     ground, state, half = course.ground, np.zeros(STATE), np.zeros(STATE)
     for i in range(STATE):
         state[i] = axes.origin[i]
@@ -287,7 +292,10 @@ def _carry(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> 
 
 @compiled
 def _rest_of_places(table: StateTable, k: int, blur: float) -> float:
-    """Return the greatest distance of positions over ground from their linear form, metres."""
+    """Return the greatest distance of positions over ground at epoch k from their linear form, metres.
+
+    `blur` bounds the error of the slopes of positions.
+    """
     return float(0.5 * table.limits[1] * table.sizes[k, 0] + blur * sqrt(table.sizes[k, 0]))
 
 
@@ -297,7 +305,10 @@ _ANY = 1e300
 
 @compiled
 def _fold(course: ConstantVelocityCost, table: StateTable) -> None:
-    """Add the nonlinear part of positions over ground to the bounds of nodes."""
+    """Add the nonlinear part of positions over ground to the bounds of nodes.
+
+    Without bounds of the derivatives of positions, the remainders become practically infinite.
+    """
     blur, _ = errors_of(table.limits[2])
     for k in range(course.since.shape[0]):
         rest = _rest_of_places(table, k, blur)
@@ -312,7 +323,7 @@ def _fold(course: ConstantVelocityCost, table: StateTable) -> None:
 
 @compiled
 def set_bends(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
-    """Bound second derivatives of all nodes over a box whose nodes are bounded."""
+    """Bound second derivatives of all nodes over a box whose nodes are bounded: `table.bends` and `table.rests`."""
     plan, line, second, d = np.zeros((3, 3)), np.zeros(6), np.zeros((3, 3)), table.lever.shape[1]
     for i in range(d):
         plan[i, i] = 1.0
@@ -336,7 +347,10 @@ def set_bends(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) 
 
 @compiled
 def _pull_back(curve: Array, lever: Array, out: Array) -> None:
-    """Add ``L'N L`` to the lower triangle of a matrix (n, n), with N the Hessian of a node and L the lever."""
+    """Add ``L'N L`` to the lower triangle of a matrix (n, n): the Hessian of a node with respect to the state.
+
+    N, in `curve`, is its Hessian with respect to the position, and L (d, n) the lever.
+    """
     d, n = lever.shape
     for m in range(n):
         for i in range(d):
@@ -349,7 +363,7 @@ def _pull_back(curve: Array, lever: Array, out: Array) -> None:
 
 @compiled
 def _carry_beside(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
-    """Write the positions over ground from which second derivatives are computed as differences."""
+    """Write the positions over ground around the centre, from which second derivatives are computed as differences."""
     state = np.zeros(STATE)
     for i in range(STATE):
         state[i] = axes.origin[i]
@@ -363,11 +377,12 @@ def _carry_beside(course: ConstantVelocityCost, axes: StateAxes, table: StateTab
 
 @compiled
 def _bends_over(table: StateTable, k: int, j: int, chi: float, size: float) -> tuple[float, float, float]:
-    """Return bounds for a node over ground: change and norm of its Hessian, and the error of its slope times the reach.
+    """Return bounds for node j of epoch k: change and norm of its Hessian, and the error of its slope times the reach.
 
-    States are in metres. With g slope and N Hessian of the node with respect to the position F, the Hessian is
-    ``F''(g) + F'(N, F')``. The error of differences does not shrink with the box, and counts three times: a
-    third-order remainder is a sixth of a change that shrinks with the box, but half of a change that does not.
+    `chi` and `size` are change and norm of the Hessian with respect to the position. States are in metres. With g slope
+    and N Hessian of the node with respect to the position F, the Hessian is ``F''(g) + F'(N, F')``. The error of
+    differences does not shrink with the box, and counts three times: a third-order remainder is a sixth of a change
+    that shrinks with the box, but half of a change that does not.
     """
     b1, b2, b3 = table.limits[0], table.limits[1], table.limits[2]
     first, second = errors_of(b3)
@@ -383,7 +398,7 @@ def _bends_over(table: StateTable, k: int, j: int, chi: float, size: float) -> t
 
 @compiled
 def _bend_over(course: ConstantVelocityCost, axes: StateAxes, table: StateTable, k: int) -> None:
-    """Add the second derivatives of a position over ground to the Hessians of its nodes."""
+    """Add the second derivatives of the position over ground at epoch k to the Hessians of its nodes."""
     time, n = course.since[k], STATE
     scaled, own = np.zeros((n, n)), np.zeros((n, n))
     for i in range(3):
@@ -413,7 +428,10 @@ def _bend_over(course: ConstantVelocityCost, axes: StateAxes, table: StateTable,
 
 @compiled
 def cost_of_state(course: ConstantVelocityCost, state: Array) -> tuple[float, float]:
-    """Return the cost of a position and velocity (2 d,), and the rounding of its residual; the height may be any."""
+    """Return the cost of a position and velocity (2 d,), m and m/s, and the rounding of its residual.
+
+    The state may be at any height.
+    """
     table, d = table_of(course), state.shape[0] // 2
     for k in range(course.since.shape[0]):
         for i in range(d):
@@ -431,7 +449,10 @@ def cost_of_state(course: ConstantVelocityCost, state: Array) -> tuple[float, fl
 
 @compiled
 def floor_of(course: ConstantVelocityCost, state: Array) -> float:
-    """Return the sizes of measurements and coordinates in residuals, without nodes, over all positions of a state."""
+    """Return the sizes of measurements and coordinates in residuals, without nodes, over all positions of a state.
+
+    The result limits the accuracy of residuals, see `optloc.proof.search_space.accuracy_floor`.
+    """
     d, last, most = state.shape[0] // 2, 0.0, np.zeros(3)
     for time in course.since:
         last = max(last, abs(time))

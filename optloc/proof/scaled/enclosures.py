@@ -1,4 +1,10 @@
-"""Enclosures of a cost with unknown factors that grows without limit: boxes around all positions of low cost."""
+"""Enclosures of a cost with unknown factors that grows without limit: boxes around all positions of low cost.
+
+The cost is ``|sum_g k_g K_g phi + K_0 phi - w|^2`` with factors k_g and nodes phi_j (`optloc.proof.scaled.reduction`).
+Group g contains the nodes of factor g; the group -1 has no factor. rho is the root of a level of the cost. Corners
+`low` and `high` (3,) are in the search coordinates of `chart`, around the fix x (D,). If a function `_meet_...` returns
+False, its method does not apply.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +62,10 @@ _LEAST_GAP = 0.03
 def first_enclosed(
     scaled: Scaled, chart: LocalAxes, x: Array, levels: Array, least: float, low: Array, high: Array
 ) -> int:
-    """Return the index of the first level whose positions are enclosed, or the number of levels; write the corners."""
+    """Return the index of the first level whose positions are enclosed, or the number of levels; write the corners.
+
+    `levels` (G,) are in descending order, and no level counts as lower than `least`, the cost of the fix.
+    """
     for k in range(levels.shape[0]):
         level = max(levels[k], least)
         if (
@@ -71,7 +80,7 @@ def first_enclosed(
 
 @compiled
 def _without_factors(scaled: Scaled) -> Cost:
-    """Return the cost of the rows whose nodes have no factors."""
+    """Return the cost of the rows whose nodes have no factors; it is nowhere more than the cost of all rows."""
     K, rows, columns = scaled.cost.K, zero(), zero()
     row, column = np.zeros(K.shape[0], dtype=np.int64), np.zeros(K.shape[1], dtype=np.int64)
     for j in range(K.shape[1]):
@@ -112,7 +121,10 @@ def _without_factors(scaled: Scaled) -> Cost:
 
 @compiled
 def _enclose(cost: Cost, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
-    """Write the corners of a box around all positions whose cost is below a level; return False without a box."""
+    """Write the corners of a box around all positions whose cost is below a level; return False without a box.
+
+    `cost` is the cost of rows without factors (`_without_factors`).
+    """
     q, J = cost.K.shape
     if q == 0 or J == 0:
         return False
@@ -125,7 +137,7 @@ def _enclose(cost: Cost, chart: LocalAxes, x: Array, level: float, low: Array, h
 def _factor_at(scaled: Scaled, g: int, rho: float) -> float:
     """Return an end of a factor's range from its prior: the least for negative rho, else the greatest; 1 for no factor.
 
-    Without a prior the greatest is infinite, and the least -1.
+    The prior is the last row of the factor. Without a prior the greatest is infinite, and the least -1.
     """
     if g < 0:
         return 1.0
@@ -147,7 +159,7 @@ def _is_of_ranges(scaled: Scaled) -> bool:
 
 @compiled
 def _open(x: Array, low: Array, high: Array) -> None:
-    """Write infinite corners, which contain all positions."""
+    """Write infinite corners, which contain all positions x (D,); coordinates that do not exist get the corners 0."""
     low[:], high[:] = -inf, inf
     for k in range(x.shape[0], 3):
         low[k] = high[k] = 0.0
@@ -155,7 +167,11 @@ def _open(x: Array, low: Array, high: Array) -> None:
 
 @compiled
 def _fitted(scaled: Scaled, R: Array, j: int) -> float:
-    """Return the least-squares value of a node times its factor, with R the inverse of K'K."""
+    """Return the least-squares estimate of node j times its factor, in the unit of the node: entry j of ``R K'w``.
+
+    R (J, J) is the inverse of K'K. The radius of a ball of the enclosure is this estimate plus its uncertainty, divided
+    by the least factor.
+    """
     cost, total = scaled.cost, 0.0
     for m in range(R.shape[0]):
         for i in range(cost.w.shape[0]):
@@ -186,11 +202,11 @@ def _meet_balls(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: A
 
 @compiled
 def _meet_differences(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
-    """Write the corners of a box around stations with two waves of one emission time; return False without any.
+    """Write the corners of a box around stations that receive two waves of one emission.
 
-    The difference of both arrivals is the range times the difference of the factors. The null space of K'K is the
-    vector of ones, and differences of nodes do not depend on it. So a multiple of its square is added, which makes K'K
-    regular.
+    Return False without these stations. The difference of both arrivals is the range times the difference of the
+    factors. The null space of K'K is the vector of ones, and differences of nodes do not depend on it. So a multiple of
+    its square is added, which makes K'K regular.
     """
     cost, found = scaled.cost, False
     R, J, rho, size = cost.A.copy(), cost.kinds.shape[0], np.sqrt(level), 0.0
@@ -222,10 +238,11 @@ def _meet_differences(scaled: Scaled, chart: LocalAxes, x: Array, level: float, 
 def _meet_field(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
     """Write the corners of a box outside which levels with a free exponent cost too much; or return False.
 
-    Let all stations s_j be within D/2 of their middle. For a position at distance D in direction u, ``log r_j`` is
-    ``log D - u.s_j / D`` within ``(s_j / D)^2``. With ``q = k u / D`` and ``M = K s``, the residual is ``w + M q``
-    within |q| B / D, where B is the sum of ``|K_j| s_j^2``. Let r be the length of the residual of the best field, and
-    m the least singular value of M. For ``D > B (|w| + r) / (m (r - rho))`` each q leaves a residual longer than rho.
+    Let the stations s_j, counted from their middle, be closer to it than D/2, and let k be the exponent. For a position
+    at distance D in direction u, ``log r_j`` is ``log D - u.s_j / D`` within ``(s_j / D)^2``. With ``q = k u / D`` and
+    ``M = K s``, the residual is ``w + M q`` within |q| B / D, where B is the sum of ``|K_j| s_j^2``. Let r be the
+    length of the residual of the best q, and m the least singular value of M. For ``D > B (|w| + r) / (m (r - rho))``
+    each q leaves a residual longer than rho.
     """
     cost, J, rho = scaled.cost, scaled.cost.kinds.shape[0], np.sqrt(level)
     d, middle, widest, bend, whole = x.shape[0], np.zeros(3), 0.0, 0.0, 0.0

@@ -1,8 +1,9 @@
 """Second derivatives of a cost with unknown factors: boxes with one minimum, and boxes without a stationary point.
 
-The coordinates are offsets s and ``t = R (k - best - B s)``, with R and U as in `optloc.proof.scaled.reduction`. B is
-the derivative of the best factors. So the Hessian at the centre has no entry between s and t, and its part along t is
-the identity.
+The coordinates are offsets s from the centre (3,) and ``t = R (k - best - B s)`` (G,), with the factors k, and with R
+and U as in `optloc.proof.scaled.reduction`. B is the derivative of the best factors. So the Hessian at the centre has
+no entry between s and t, and its part along t is the identity. E (q, 3) is the derivative of the residual along s. The
+force on a node is the product of its column of the rows with the residual.
 
 The statements are about points whose factors fit their position best, and are either not zero or may be negative. All
 minima are such points, and so is the point of least cost at each position.
@@ -68,25 +69,25 @@ def sum_scaled(scaled: Scaled, squares: bool, box: Box, sheet: ScaledWorkspace) 
 
 @inlined
 def factor_of(scaled: Scaled, sheet: ScaledWorkspace, j: int) -> float:
-    """Return the factor of a node at the centre of a box."""
+    """Return the factor of node j at the centre of a box: the best factor of its group, or 1 without a factor."""
     return float(sheet.best[scaled.group[j]]) if scaled.group[j] >= 0 else 1.0
 
 
 @inlined
 def _range_of(sheet: ScaledWorkspace, g: int) -> float:
-    """Return the largest distance of a factor from its value at the centre; zero for no factor."""
+    """Return the largest distance of factor g from its value at the centre; zero for no factor (g < 0)."""
     return float(max(sheet.most[g] - sheet.best[g], sheet.best[g] - sheet.least[g])) if g >= 0 else 0.0
 
 
 @inlined
 def _greatest(sheet: ScaledWorkspace, g: int) -> float:
-    """Return the greatest size of a factor; 1 for no factor."""
+    """Return the greatest size of factor g in its range; 1 for no factor (g < 0)."""
     return float(max(size_of_factor(sheet, g), abs(sheet.best[g]))) if g >= 0 else 1.0
 
 
 @inlined
 def _change_of(box: Box, j: int) -> float:
-    """Return the largest change of a node over a box."""
+    """Return the greatest difference of node j in a box from its value at the centre, in the unit of the node."""
     change = max(abs(box.nodes[j, LOW]), abs(box.nodes[j, HIGH]))
     for m in range(3):
         change += abs(box.nodes[j, SLOPE0 + m]) * box.half[m]
@@ -95,7 +96,11 @@ def _change_of(box: Box, j: int) -> float:
 
 @inlined
 def _derive(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorkspace) -> None:
-    """Write derivatives of residual and factors, pulls, changes of derivatives, and half-widths of the coordinates."""
+    """Write derivatives of residual and factors, pulls, changes of derivatives, and half-widths of the coordinates.
+
+    They are the fields `E`, `lean`, `force`, `tie`, `turn` and `reach` of `sheet`; `noise` bounds the rounding of a
+    residual.
+    """
     nodes, E, lean, back, third = box.nodes, sheet.E, sheet.lean, sheet.back, sheet.third
     (q, J), G = scaled.cost.K.shape, back.shape[0]
     for j in range(J):
@@ -134,7 +139,7 @@ def _derive(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorkspace) -> N
 
 @inlined
 def _reach_of(scaled: Scaled, noise: float, g: int, box: Box, sheet: ScaledWorkspace) -> float:
-    """Return the largest coordinate t of a factor, at points whose factors are best."""
+    """Return the largest coordinate t_g of the factors in a box, at points whose factors are best."""
     nodes, half, G, reach = box.nodes, box.half, sheet.back.shape[0], sheet.spin[g] + noise
     for m in range(3):
         reach += abs(sheet.third[G + g, m]) * half[m]
@@ -154,7 +159,7 @@ def _reach_of(scaled: Scaled, noise: float, g: int, box: Box, sheet: ScaledWorks
 
 @inlined
 def _set_turn(scaled: Scaled, j: int, box: Box, sheet: ScaledWorkspace) -> None:
-    """Write the pulls on a node, and the changes over a box of its multiples in the derivatives of the residual."""
+    """Write the pulls on node j, and the changes over a box of its multiples in the derivatives of the residual."""
     nodes, g, G = box.nodes, scaled.group[j], sheet.back.shape[0]
     change = _change_of(box, j)
     for m in range(3):
@@ -171,7 +176,10 @@ def _set_turn(scaled: Scaled, j: int, box: Box, sheet: ScaledWorkspace) -> None:
 
 @inlined
 def _add_information(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorkspace) -> None:
-    """Add ``E'E`` and the gradient to the sums, and their rounding to the bounds of change."""
+    """Add ``E'E`` and the gradient to the sums, and their rounding to the bounds of change.
+
+    `noise` bounds the rounding of a residual.
+    """
     sums, E, weight, share, longest = box.sums, sheet.E, scaled.cost.weight, relative_rounding(scaled.cost.K), 0.0
     for i in range(E.shape[0]):
         longest += sheet.w[i] * sheet.w[i]
@@ -196,7 +204,7 @@ def _add_information(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorksp
 
 @inlined
 def _second(scaled: Scaled, j: int, k: int, m: int, box: Box, sheet: ScaledWorkspace) -> float:
-    """Return the second derivative along two offsets of a node times its factor."""
+    """Return the second derivative along the offsets k and m of node j times its factor."""
     own, g = factor_of(scaled, sheet, j) * box.curves[j, symmetric_entry(k, m)], scaled.group[j]
     if g < 0:
         return float(own)
@@ -206,7 +214,7 @@ def _second(scaled: Scaled, j: int, k: int, m: int, box: Box, sheet: ScaledWorks
 
 @inlined
 def _rest_of(scaled: Scaled, noise: float, j: int, box: Box, sheet: ScaledWorkspace) -> float:
-    """Return the change of the force of a node over a box without its linear part."""
+    """Return the change of the force of node j over a box without its linear part; `noise` as in `_derive`."""
     A, nodes, G = scaled.cost.A, box.nodes, sheet.back.shape[0]
     rest = scaled.cost.weight[j] * noise
     for m in range(A.shape[0]):
@@ -226,7 +234,7 @@ def _rest_of(scaled: Scaled, noise: float, j: int, box: Box, sheet: ScaledWorksp
 
 @inlined
 def _add_node(scaled: Scaled, noise: float, j: int, box: Box, sheet: ScaledWorkspace) -> float:
-    """Add the second derivatives of a node times its force to the sums; return a bound of the norm of their change."""
+    """Add the second derivatives of node j times its force to the sums; return a bound of the norm of their change."""
     curves, sums, third, g, G = box.curves, box.sums, sheet.third, scaled.group[j], sheet.back.shape[0]
     force, rest, linear = sheet.force[j], _rest_of(scaled, noise, j, box, sheet), 0.0
     for n in range(3 + G):
@@ -253,7 +261,10 @@ def _add_node(scaled: Scaled, noise: float, j: int, box: Box, sheet: ScaledWorks
 
 @inlined
 def _add_third(box: Box, sheet: ScaledWorkspace) -> None:
-    """Add the linear changes of forces to the bounds of the Hessian's change, summed over the nodes."""
+    """Add the linear changes of forces to the bounds of the Hessian's change along s, ``sums[C00:]``.
+
+    They were summed over the nodes into ``sheet.third``, because they partly cancel.
+    """
     G = sheet.back.shape[0]
     for at in range(6):
         for n in range(3 + G):
@@ -264,7 +275,10 @@ def _add_third(box: Box, sheet: ScaledWorkspace) -> None:
 
 @inlined
 def _add_mixed(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> None:
-    """Add the linear changes of forces to the bounds of the change of entries between offsets and factors."""
+    """Add the linear changes of forces to the bounds of the change of entries between offsets and factors.
+
+    These bounds are ``sheet.cross`` (G, 3 + G).
+    """
     G = sheet.back.shape[0]
     for h in range(G):
         for k in range(3):
@@ -354,7 +368,11 @@ def clip_stationary(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> bool:
 
 @compiled
 def slope_of(box: Box, eps: float) -> float:
-    """Return the margin of convexity for which the slope at the centre of a box lowers the cost by at most eps."""
+    """Return the margin of convexity for which the slope at the centre of a box lowers the cost by at most eps.
+
+    If the Hessian of f/2 exceeds this margin over the box, no point of the box costs less than the centre by more than
+    eps.
+    """
     total = 0.0
     for k in range(3):
         slope = abs(box.sums[G0 + k]) + box.sums[NOISE0 + k]

@@ -1,17 +1,18 @@
 """A box of a cost with unknown factors: the factors are projected out of the rows, and their ranges are bounded.
 
-The cost is ``f(x, k) = |sum_g k_g (K_g phi(x) + l_g) + K_0 phi(x) - w|^2`` with k >= 0. Each node belongs to one
-factor or to none. A prior on a factor is a row in which K is zero. At the centre c of a box the columns of the factors
-are ``a_g = K_g phi(c) + l_g``. With ``A = U R``, U orthonormal, and ``P = 1 - U U'`` follows ``P A = 0``. So no x of
-the box and no k cost less than
+The cost is ``f(x, k) = |sum_g k_g (K_g phi(x) + l_g) + K_0 phi(x) - w|^2`` with factors k >= 0, such as an unknown
+speed of waves. Letters: G factors, J nodes phi (scalar functions of the position, such as ranges), q whitened rows.
+Each node belongs to one factor or to none. A prior on a factor is a row in which K is zero. At the centre c of a box
+the columns of the factors are ``a_g = K_g phi(c) + l_g``. With ``A = U R``, U orthonormal, and ``P = 1 - U U'`` follows
+``P A = 0``. So no x of the box and no k cost less than
 
     |P (sum_g k_g K_g (phi(x) - phi(c)) + K_0 phi(x) - w)|^2.
 
-So all bounds of rows hold for the projected rows, in which each node is multiplied by the middle of its factor's
-range. A factor may differ from the middle. This difference times the slopes of its nodes is one more node without
-slopes for each coordinate. The column of this node is the projected derivative of the rows along the coordinate. The
-rows along U bound k. At each position the residual of the best factors is orthogonal to their columns, so the ranges
-shrink with the box.
+So all bounds of rows hold for the projected rows, in which each node is multiplied by the middle of its factor's range.
+A factor may differ from the middle. This difference times the slopes of its nodes is one more node without slopes for
+each coordinate. The column of this node is the projected derivative of the rows along the coordinate. The rows along U
+bound k. At each position the residual of the best factors is orthogonal to their columns, so the ranges shrink with the
+box.
 
 The components of a target's velocity at one epoch are factors, too, and may be negative. Their nodes are components of
 unit vectors from stations. The bounds that need ``k >= 0`` then hold for the sizes of the factors.
@@ -170,28 +171,14 @@ def workspace_of(scaled: Scaled) -> ScaledWorkspace:
     )
 
 
-# The centre of a box.
-
-
 @compiled
 def reduce_rows(scaled: Scaled, floor: float, box: Box, sheet: ScaledWorkspace) -> None:
     """Project the factors out of the rows at the centre of a box whose nodes are bounded.
 
-    Parameters
-    ----------
-    scaled : Scaled
-        The cost.
-    floor : float
-        Sizes of measurements and coordinates that limit the accuracy of residuals.
-    box : Box
-        Its nodes are filled.
-    sheet : ScaledWorkspace
-        Written, except the ranges of the factors. If the columns are dependent, `best` is NaN.
-
-    Notes
-    -----
-    A logarithm without a lower bound counts from its upper end. At the centre it may be far below all other values.
-    The cost at the centre is then infinite.
+    `floor` is the size of measurements and coordinates that limits the accuracy of residuals. All of `sheet` is written
+    except the ranges of the factors. If the columns are dependent, `best` is NaN. A logarithm without a lower bound
+    counts from its upper end. At the centre it may be far below all other values. The cost at the centre is then
+    infinite.
     """
     K, weight, nodes, lift = scaled.cost.K, scaled.cost.weight, box.nodes, scaled.lift
     (q, J), G, size, unit, w = K.shape, lift.shape[1], floor, sheet.unit, sheet.w
@@ -254,7 +241,7 @@ def _orthogonalise(sheet: ScaledWorkspace) -> None:
 
 @inlined
 def _project(scaled: Scaled, sheet: ScaledWorkspace) -> None:
-    """Write the projected rows and measurements, the factors at the centre, and the cost there."""
+    """Write the projected rows and measurements, the factors at the centre, and the cost there (``span[HERE]``)."""
     K, unit, back, w, here = scaled.cost.K, sheet.unit, sheet.back, sheet.w, 0.0
     (q, J), G = K.shape, unit.shape[1]
     for g in range(G):
@@ -303,9 +290,6 @@ def _forwards(sheet: ScaledWorkspace) -> float:
     return cost
 
 
-# Ranges of the factors.
-
-
 @compiled
 def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> bool:
     """Write the ranges of factors for points of a box with residuals shorter than rho; False if a range is empty.
@@ -347,7 +331,10 @@ def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) 
 
 @inlined
 def _bound_by_priors(scaled: Scaled, rho: float, sheet: ScaledWorkspace) -> None:
-    """Narrow the ranges of the factors by the rows of priors: the last rows, one for each factor."""
+    """Narrow the ranges of the factors by the rows of priors: the last rows, one for each factor.
+
+    The residual of each of these rows is at most rho.
+    """
     lift, w = scaled.lift, scaled.cost.w
     q, G = lift.shape
     for g in range(G):
@@ -360,7 +347,10 @@ def _bound_by_priors(scaled: Scaled, rho: float, sheet: ScaledWorkspace) -> None
 
 @inlined
 def _swing(scaled: Scaled, blur: float, box: Box, sheet: ScaledWorkspace) -> None:
-    """Write the greatest change of the factors by the change of each column of the rows over a box, with rounding."""
+    """Write the greatest decrease (`fall`) and increase (`rise`) of the factors by the change of the rows over a box.
+
+    `blur` bounds the rounding of a residual.
+    """
     nodes, half, V, slopes = box.nodes, box.half, sheet.V, sheet.third  # unused memory
     G, J = V.shape
     for g in range(G):
@@ -392,7 +382,7 @@ def size_of_factor(sheet: ScaledWorkspace, g: int) -> float:
 
 @inlined
 def _reach_of(sheet: ScaledWorkspace, g: int, blur: float) -> float:
-    """Return the largest change of a factor by residuals."""
+    """Return the greatest distance of factor g from its best value that residuals up to `spin` along U allow."""
     total = 0.0
     for h in range(g, sheet.best.shape[0]):
         total += abs(sheet.back[g, h]) * (sheet.spin[h] + blur)
@@ -401,7 +391,7 @@ def _reach_of(sheet: ScaledWorkspace, g: int, blur: float) -> float:
 
 @inlined
 def _narrow(free: bool, sheet: ScaledWorkspace, blur: float) -> bool:
-    """Narrow the ranges of the factors, which are bounded; return False if a range is empty."""
+    """Narrow the ranges of the factors, which are bounded; return False if a range is empty. `blur` as in `_swing`."""
     G, least, most, fall, rise = sheet.best.shape[0], sheet.least, sheet.most, sheet.fall, sheet.rise
     for g in range(G):
         reach = _reach_of(sheet, g, blur)
@@ -429,8 +419,8 @@ def _narrow(free: bool, sheet: ScaledWorkspace, blur: float) -> bool:
 def _solve_swing(free: bool, sheet: ScaledWorkspace, blur: float) -> bool:
     """Bound the greatest factors by ``(1 - N) k <= best + reach``; return False if there is no solution k >= 0.
 
-    If factors may be negative, k are their sizes. If all pivots are positive, the inverse of 1 - N has no negative
-    entry (an M-matrix). The elimination has no pivoting.
+    N is `sheet.fall`. If factors may be negative, k are their sizes. If all pivots are positive, the inverse of 1 - N
+    has no negative entry (an M-matrix). The elimination has no pivoting.
     """
     G, most = sheet.best.shape[0], sheet.most
     matrix, right = sheet.cross, sheet.reach  # unused memory
@@ -460,7 +450,10 @@ def _solve_swing(free: bool, sheet: ScaledWorkspace, blur: float) -> bool:
 
 @inlined
 def _set_slopes(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> None:
-    """Write the derivatives of the columns of the factors along each coordinate, before their projection."""
+    """Write the derivatives of the columns of the factors along each coordinate into the last columns of ``sheet.K``.
+
+    They are not projected yet.
+    """
     K, nodes, J = scaled.cost.K, box.nodes, box.nodes.shape[0]
     sheet.K[:, J:] = 0.0
     for j in range(J):
@@ -473,7 +466,7 @@ def _set_slopes(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> None:
 
 @inlined
 def _turn(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> None:
-    """Write the greatest length of residuals along U, for factors that are best at their position."""
+    """Write the greatest length of residuals along U into `spin`, for factors that are best at their position."""
     nodes, half, back = box.nodes, box.half, sheet.back
     J, G = nodes.shape[0], back.shape[0]
     sheet.spin[:] = 0.0
@@ -488,9 +481,6 @@ def _turn(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> None:
             sheet.spin[h] += abs(back[g, h]) * change
     for h in range(G):
         sheet.spin[h] = rho * min(sheet.spin[h] * (1.0 + _ROUNDED), 1.0)
-
-
-# Bounds of the residual.
 
 
 @compiled
@@ -522,7 +512,7 @@ def bound_rows(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> float:
 
 @inlined
 def _length_of(sheet: ScaledWorkspace, j: int) -> float:
-    """Return the length of a projected column."""
+    """Return the length of column j of the rows ``sheet.K``."""
     square = 0.0
     for i in range(sheet.K.shape[0]):
         square += sheet.K[i, j] * sheet.K[i, j]
@@ -531,7 +521,10 @@ def _length_of(sheet: ScaledWorkspace, j: int) -> float:
 
 @inlined
 def _has_signs(scaled: Scaled, sheet: ScaledWorkspace) -> bool:
-    """Return whether nodes without a lower bound only add to the residual along its direction, beyond rounding."""
+    """Return whether nodes without a lower bound only add to the residual along its direction, beyond rounding.
+
+    Otherwise the bound of the residual is not valid.
+    """
     good = True
     for j in range(scaled.cost.K.shape[1]):
         if sheet.nodes[j, LOW] == -inf:
@@ -583,7 +576,7 @@ def is_positive(sheet: ScaledWorkspace) -> bool:
 
 @inlined
 def size_of(sheet: ScaledWorkspace) -> float:
-    """Return the sizes that limit the accuracy of residuals, at any factors of a box."""
+    """Return the sizes that limit the accuracy of residuals, at any factors of a box (see `reduce_rows`)."""
     most = 1.0
     for g in range(sheet.best.shape[0]):
         most = max(most, size_of_factor(sheet, g) if sheet.most[g] < inf else abs(sheet.best[g]))

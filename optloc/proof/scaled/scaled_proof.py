@@ -1,4 +1,8 @@
-"""The proof of a fix of a cost with unknown factors: no position costs less, and no other minimum is within a gap."""
+"""The proof of a fix of a cost with unknown factors: no position costs less, and no other minimum is within a gap.
+
+A factor multiplies the ranges of a group of rows (an unknown speed of waves, for instance), or is a component of an
+unknown velocity. Letters: N problems, B is N or 1 if all share, q whitened rows, J nodes, G factors, d coordinates.
+"""
 
 from __future__ import annotations
 
@@ -74,17 +78,20 @@ class ScaledCosts(NamedTuple):
 
     @property
     def dense(self) -> float:
-        """Return the number of nodes; the time of a box is proportional to its square."""
+        """Return the weight of a box in the budget of boxes: the number of nodes.
+
+        The time of a box grows with its square. With an unknown velocity (`free`) it is at most `_MOST_COUNTED`.
+        """
         return float(min(len(self.kinds), _MOST_COUNTED if self.free else len(self.kinds)))
 
     def take(self, items: Array | slice) -> ScaledCosts:
-        """Return the costs of some of the problems."""
+        """Return the costs of the problems with the indices `items`."""
 
-        def own(array: Array) -> Array:
+        def chosen(array: Array) -> Array:
             return array if len(array) == 1 else array[items]
 
         return self._replace(
-            data=own(self.data), K=own(self.K), w=self.w[items], level=self.level[items], lift=own(self.lift)
+            data=chosen(self.data), K=chosen(self.K), w=self.w[items], level=self.level[items], lift=chosen(self.lift)
         )
 
     def one(self, i: int) -> Scaled:
@@ -94,28 +101,34 @@ class ScaledCosts(NamedTuple):
 
 
 def scaled_costs(problem: Problem) -> ScaledCosts:
-    """Return the costs of a flat batch of problems whose rows have unknown factors, see `optloc.proof.scope`."""
+    """Return the costs of a flat batch of problems whose rows have unknown factors, see `optloc.proof.scope`.
+
+    The priors on the factors are the last G rows.
+    """
     costs, group = costs_of_groups(problem, factors_of_rows(problem))
-    root, known = _priors(problem, len(costs.w))
-    G, (rows, J) = len(root), costs.K.shape[1:]
+    inverse_sigma, means = _factor_priors(problem, len(costs.w))
+    G, (rows, J) = len(inverse_sigma), costs.K.shape[1:]
     K = np.concatenate([costs.K, np.zeros((len(costs.K), G, J))], axis=1)
     lift = np.zeros((rows + G, G))
-    lift[rows + np.arange(G), np.arange(G)] = root
-    w = np.concatenate([costs.w, root * known], axis=1)
+    lift[rows + np.arange(G), np.arange(G)] = inverse_sigma
+    w = np.concatenate([costs.w, inverse_sigma * means], axis=1)
     return ScaledCosts(plainly(costs.kinds), costs.data, K, w, costs.level, lift[None], plainly(group))
 
 
-def _priors(problem: Problem, count: int) -> tuple[Array, Array]:
-    """Return the inverse standard deviations (G,) of the factors, zero without a prior, and their means (N, G)."""
-    root, known = [], []
-    given = {name: (mean, precision) for name, mean, precision in prior_parts(problem)}
+def _factor_priors(problem: Problem, count: int) -> tuple[Array, Array]:
+    """Return the inverse standard deviations (G,) of the factors, zero without a prior, and their means (N, G).
+
+    `count` is the number N of problems. A mean is 1 plus the mean of the scale error.
+    """
+    inverse_sigma, means = [], []
+    priors = {name: (mean, precision) for name, mean, precision in prior_parts(problem)}
     for bias in problem.biases:
         if form_of(bias).enters == "scales":
             n = len(bias.members)
-            mean, precision = given.get(bias.name, (np.zeros(n), np.zeros((n, n))))
-            root.append(np.sqrt(np.diagonal(precision, axis1=-2, axis2=-1).reshape(-1, n)[0]))
-            known.append(np.broadcast_to(1.0 + mean, (count, n)))
-    return np.concatenate(root), np.concatenate(known, axis=1)
+            mean, precision = priors.get(bias.name, (np.zeros(n), np.zeros((n, n))))
+            inverse_sigma.append(np.sqrt(np.diagonal(precision, axis1=-2, axis2=-1).reshape(-1, n)[0]))
+            means.append(np.broadcast_to(1.0 + mean, (count, n)))
+    return np.concatenate(inverse_sigma), np.concatenate(means, axis=1)
 
 
 # Share of the longest column below which entries are rounding, in rows without a velocity: whitening loses some
@@ -126,35 +139,36 @@ _NOTHING = 1e-12
 def largest_rate(problem: Problem) -> float:
     """Return the largest size of a measured rate or of a station's velocity, metres per second; 1 without any."""
     moving = problem.stations.velocity
-    own = [] if moving is None else [np.abs(moving).max(initial=0.0)]
+    sizes = [] if moving is None else [np.abs(moving).max(initial=0.0)]
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         if MODELS[rows.kind].velocity:
             rates = problem.observed[..., start : start + rows.count]
-            own.append(np.abs(rates, where=np.isfinite(rates), out=np.zeros(rates.shape)).max(initial=0.0))
-    return float(max(own, default=0.0)) or 1.0
+            sizes.append(np.abs(rates, where=np.isfinite(rates), out=np.zeros(rates.shape)).max(initial=0.0))
+    return float(max(sizes, default=0.0)) or 1.0
 
 
 def velocity_costs(problem: Problem) -> ScaledCosts:
     """Return the costs of a flat batch of problems of a target of unknown velocity at one epoch.
 
-    Rates are linear in the velocity, whose components are factors of the components of unit vectors. An orthogonal
-    transform of the rows removes these components from the last rows, which bound the position at every velocity. The
-    factors are in units of the largest rate, so that bounds of rounding do not depend on the unit of length.
+    Rates are linear in the velocity: its components are the factors, and they multiply components of unit vectors from
+    the stations. An orthogonal transform of the rows removes the factors from the last rows, which bound the position
+    at every velocity. The factors are in units of the largest rate, so that bounds of rounding do not depend on the
+    unit of length.
     """
     costs, group = costs_of_velocity(problem)
     w, d, speed = costs.w, problem.dimension, largest_rate(problem)
     K = np.where(group >= 0, speed, 1.0) * costs.K
     basis, size, _ = np.linalg.svd(K[:, :, group >= 0])
-    back = np.swapaxes(basis, -1, -2)
-    K, w = back @ K, (back @ w[..., None])[..., 0]
+    transform = np.swapaxes(basis, -1, -2)
+    K, w = transform @ K, (transform @ w[..., None])[..., 0]
     rank = int((size > _NOTHING * size.max(initial=0.0)).sum(-1).max(initial=0))
     K[:, rank:, group >= 0] = 0.0
     length = np.linalg.norm(K, axis=1, keepdims=True)
     K[:, rank:] = np.where(np.abs(K[:, rank:]) > _NOTHING * length, K[:, rank:], 0.0)
     order = np.argsort(~K[:, rank:].any((0, 1)), kind="stable")
-    known = [(roots(precision), mean) for name, mean, precision in prior_parts(problem) if name == "velocity"]
+    priors = [(roots(precision), mean) for name, mean, precision in prior_parts(problem) if name == "velocity"]
     lift = np.zeros((1, K.shape[1], d))
-    for root, mean in known:
+    for root, mean in priors:
         whole = speed * (root if root.ndim == 3 else root[None])
         lift = np.concatenate([np.zeros((len(whole), K.shape[1], d)), whole], axis=1)
         K = np.concatenate([K, np.zeros((len(K), d, K.shape[2]))], axis=1)
@@ -239,7 +253,11 @@ def _with_minima(
     eps: float,
     stack: Array,
 ) -> tuple[Space, int]:
-    """Return the atlas with known minima, and the number of boxes on the stack: 0 if the fix is no minimum."""
+    """Return the atlas with known minima, and the number of boxes on the stack: 0 if the fix is no minimum.
+
+    The fix x and `others` (P, D) are the minima. `levels` are the costs to exceed, `least` is the cost of the fix, and
+    `eps` the tolerance of equal costs.
+    """
     known, at, rho = zero(), np.empty(x.shape[0]), np.sqrt(max(levels[0], least))
     for p in range(atlas.minima.home.shape[0]):
         put(x if p == 0 else others[p - 1], at)
@@ -267,7 +285,10 @@ def _in_box(
     high: Array,
     stack: Array,
 ) -> tuple[Space, int]:
-    """Return search coordinates with known minima, and the number of boxes on the stack: 0 if the fix is no minimum."""
+    """Return search coordinates with known minima, and the number of boxes on the stack: 0 if the fix is no minimum.
+
+    The boxes fill the region between `low` and `high` (3,), search coordinates; other arguments as in `_with_minima`.
+    """
     rho, hull = np.sqrt(max(levels[0], least)), np.zeros(3)
     room, known = np.zeros((2, 1 + others.shape[0], 3)), zero()
     space = Space(False, atlas, chart, room[0], room[1])
@@ -296,6 +317,7 @@ def prove_all_scaled(costs: ScaledCosts, asked: ProofRequest) -> ProofResult:
     out.everywhere[:] = True
 
     def prove(i: int, most: int) -> None:
+        """Write the result of proof i, with at most `most` boxes."""
         if np.array_equal(asked.region[i], asked.fallback[i]):  # a second trial after a proof for all positions
             out.verdict[i], out.bound[i], out.gap[i] = BUDGET, -inf, asked.gaps[i, -1]
             return
@@ -304,16 +326,16 @@ def prove_all_scaled(costs: ScaledCosts, asked: ProofRequest) -> ProofResult:
             costs.one(i), asked.x[i], others, asked.gaps[i], float(asked.eps[i]), budget, out.rivals[i], out.found[i]
         )
 
-    left = list(range(n))
+    pending = list(range(n))
     if not worth_loading(prove_scaled, n):
         few = max(1, FIRST_BOXES // n)
         with plain(), np.errstate(all="ignore"):
-            for i in left:
+            for i in pending:
                 prove(i, few)
         # more boxes may prove a larger gap and find minima
-        left = [i for i in left if out.boxes[i] >= few and asked.budget[i] > few]
-    if left and enabled() and may_use_code(prove_scaled, n):
-        map_on_threads(lambda i: prove(i, int(asked.budget[i])), left)
+        pending = [i for i in pending if out.boxes[i] >= few and asked.budget[i] > few]
+    if pending and enabled() and may_use_code(prove_scaled, n):
+        map_on_threads(lambda i: prove(i, int(asked.budget[i])), pending)
     return out
 
 
@@ -342,14 +364,18 @@ def _evaluate(scaled: Scaled, x: Array, out: Array) -> None:
 
 
 def costs_at_scaled(costs: ScaledCosts, x: Array) -> tuple[Array, Array]:
-    """Return costs (n, P) at positions x (n, P, d) and the rounding of their residuals, see `costs_at`."""
+    """Return costs (n, P) at positions x (n, P, d), m, and the rounding of their residuals, see `costs_at`.
+
+    Each cost is the least cost over the factors.
+    """
     out = np.zeros((2, *x.shape[:2]))
 
     def evaluate() -> None:
+        """Write the costs of all problems and their rounding."""
         for i, places in enumerate(x):
-            own = np.zeros((2, x.shape[1]))
-            _evaluate(costs.one(i), plainly(places), own)
-            out[:, i] = own
+            result = np.zeros((2, x.shape[1]))
+            _evaluate(costs.one(i), plainly(places), result)
+            out[:, i] = result
 
     if worth_loading(_evaluate, len(x)):
         evaluate()

@@ -1,4 +1,8 @@
-"""The search of all positions for minima of a cost with unknown factors, in the pieces of an atlas."""
+"""The search of all positions for minima of a cost with unknown factors, in the pieces of an atlas.
+
+For the cost, its factors and the reduced rows see `optloc.proof.scaled.reduction`; for the search itself
+`optloc.proof.level_search`.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +67,11 @@ from optloc.proof.space import Space, floor_of, in_atlas, set_box, set_curves, s
 
 
 class ScaledTables(NamedTuple):
-    """Working memory: a box of the atlas with its rows, a box around a position, and rows without factors."""
+    """Working memory of a search.
+
+    `box` is a box of the atlas, and `sheet` its reduced rows. `near` is a box around a position, and `look` has rows
+    without factors (see `look_at`).
+    """
 
     box: Box
     sheet: ScaledWorkspace
@@ -85,7 +93,10 @@ def tables_of(scaled: Scaled) -> ScaledTables:
 
 @compiled
 def look_at(scaled: Scaled, sheet: ScaledWorkspace, box: Box, look: Cost) -> None:
-    """Write rows without factors that have the same cost, slope and information at a point whose rows are reduced."""
+    """Write rows without factors that have the same cost, slope and information at a point whose rows are reduced.
+
+    The rows are written into `look`, so that functions for costs without factors apply to them.
+    """
     J = box.nodes.shape[0]
     for i in range(sheet.K.shape[0]):
         total = sheet.w[i]
@@ -118,7 +129,10 @@ _SAME_COST = 1e-13
 
 @compiled
 def descend_scaled(scaled: Scaled, chart: LocalAxes, tables: ScaledTables) -> float:
-    """Move the box around a position to a minimum; return its cost, or infinity if no minimum is reached."""
+    """Move the box around a position to a minimum; return its cost, or infinity if no minimum is reached.
+
+    The cost is the least cost over the factors. The box is ``tables.near``, in the search coordinates `chart`.
+    """
     near = tables.near
     now, damping, start = cost_near(scaled, chart, tables), _DAMPING, near.at.copy()
     for _ in range(_STEPS):
@@ -154,7 +168,11 @@ _SMALLEST = 1e-6  # standard deviations: a smaller box is rounding
 def _convex(
     scaled: Scaled, tables: ScaledTables, space: Space, piece: int, at: Array, half: Array, rho: float, margin: float
 ) -> bool:
-    """Return whether the cost has one minimum on a box around a minimum."""
+    """Return whether the cost has one minimum on the box with centre `at` and half-widths `half` (3,) around a minimum.
+
+    `piece` is its piece of the atlas, rho the longest residual of interest, and `margin` the margin of the Hessian. The
+    result is also True if no factors of the box give a residual shorter than rho.
+    """
     box = tables.box
     for k in range(3):
         box.at[k], box.half[k] = at[k], half[k]
@@ -167,7 +185,7 @@ def _convex(
 
 @inlined
 def _fill(scaled: Scaled, tables: ScaledTables, space: Space, piece: int, floor: float) -> None:
-    """Set the centre of a box, bound its nodes and reduce its rows."""
+    """Set the centre of ``tables.box``, bound its nodes and reduce its rows."""
     set_place(space, tables.box, piece)
     set_nodes(space, scaled.cost, tables.box)
     reduce_rows(scaled, floor, tables.box, tables.sheet)
@@ -261,7 +279,10 @@ def _grow(
     margin: float,
     sides: Array,
 ) -> bool:
-    """Write the sides of a convex box around a minimum; return False without a convex box."""
+    """Write the sides (3,) of a convex box around a minimum, at most `hull`; return False without a convex box.
+
+    The other arguments are as in `_convex`.
+    """
     size = _FIRST
     while not _convex(scaled, tables, space, piece, at, np.minimum(hull, size), rho, margin):
         size *= 0.5
@@ -300,7 +321,11 @@ class ScaledSearchWorkspace(NamedTuple):
 
 @compiled
 def rest_of(scaled: Scaled) -> Cost:
-    """Return the rows without factors, over the first nodes; `optloc.proof.scaled.scaled_proof` orders both."""
+    """Return the cost of the rows without factors, over the first nodes.
+
+    `optloc.proof.scaled.scaled_proof` orders rows and nodes accordingly. If factors may not be negative, no row is
+    returned.
+    """
     K, first, count, nodes = scaled.cost.K, zero(), zero(), zero()
     for i in range(K.shape[0] if scaled.free else 0):
         last, own = zero(), True
@@ -318,7 +343,7 @@ def rest_of(scaled: Scaled) -> Cost:
 
 @inlined
 def _bound_rest(work: ScaledSearchWorkspace, space: Space, box: Box) -> float:
-    """Return a lower bound of the residual from the rows without factors; negative if no bound is known."""
+    """Return a lower bound of the residual over a box from the rows without factors; negative if no bound is known."""
     rest = work.rest
     if rest.w.shape[0] == 0:
         return -1.0
@@ -330,7 +355,10 @@ def _bound_rest(work: ScaledSearchWorkspace, space: Space, box: Box) -> float:
 
 @compiled
 def _bound_row(work: ScaledSearchWorkspace, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
-    """Return the result of `optloc.proof.level_search.bound_row` for a cost with unknown factors."""
+    """Return a bound of the residual in a box of the stack, infinite if excluded, and the cost at its centre.
+
+    This is `optloc.proof.level_search.bound_row` for a cost with unknown factors.
+    """
     scaled, box, sheet, piece = work.scaled, work.box, work.tables.sheet, int(stack[row, PIECE])
     pop(stack, row, box.at, box.half)
     contract_at_infinity(box, space.atlas.dimension - 1, infinity_coordinate(space.atlas, piece) if space.far else -inf)
@@ -350,6 +378,8 @@ def _bound_row(work: ScaledSearchWorkspace, space: Space, stack: Array, row: int
 
 @compiled
 def _side_of_rest(work: ScaledSearchWorkspace, space: Space, touching: bool, rho: float, sound: bool) -> int:
+    # Contracts a box and returns the side across which to halve the rest; -1 if no part remains. This is
+    # `optloc.proof.level_search.side_of_rest` for a cost with unknown factors.
     scaled, box, sheet, d = work.scaled, work.box, work.tables.sheet, space.atlas.dimension
     if not is_bounded(sheet):
         return _side_of_rows(work, rho, d)
@@ -374,7 +404,11 @@ def _side_of_rest(work: ScaledSearchWorkspace, space: Space, touching: bool, rho
 
 @inlined
 def _side_of_rows(work: ScaledSearchWorkspace, rho: float, d: int) -> int:
-    """Contract a box whose factors have no bound by the rows without factors; return the result of `side_of_rest`."""
+    """Contract a box by the rows without factors and return the side across which to halve the rest.
+
+    -1 if no part remains.
+    It is for boxes whose factors have no bound. Residuals longer than rho are cut off, and d is the dimension.
+    """
     rest, box = work.rest, work.box
     reset_cut(box.half, box.cut)
     if rest.w.shape[0] == 0:
@@ -387,7 +421,10 @@ def _side_of_rows(work: ScaledSearchWorkspace, rho: float, d: int) -> int:
 
 @compiled
 def _descend_near(work: ScaledSearchWorkspace, chart: LocalAxes) -> float:
-    """Return the result of `optloc.proof.level_search.descend_near` for a cost with unknown factors."""
+    """Move the box around a position to a minimum; return its cost, or infinity if no minimum is reached.
+
+    This is `optloc.proof.level_search.descend_near` for a cost with unknown factors.
+    """
     return descend_scaled(work.scaled, chart, work.tables)
 
 
@@ -402,13 +439,19 @@ def _set_rival(
     eps: float,
     rho: float,
 ) -> bool:
-    """Return the result of `optloc.proof.level_search.set_rival` for a cost with unknown factors."""
+    """Write minimum i, at x, and the boxes around it into an atlas; return False if it is no minimum.
+
+    This is `optloc.proof.level_search.set_rival` for a cost with unknown factors.
+    """
     return set_scaled_minimum(work.scaled, work.tables, atlas, chart, i, x, value, eps, rho)
 
 
 @compiled
 def _cost_set(work: ScaledSearchWorkspace, atlas: Atlas) -> float:
-    """Return the result of `optloc.proof.level_search.cost_set` for a cost with unknown factors."""
+    """Return the cost at the current centre of the atlas; the tables of the box are overwritten.
+
+    This is `optloc.proof.level_search.cost_set` for a cost with unknown factors.
+    """
     bound_pieces(atlas, work.scaled.cost.kinds, work.scaled.cost.data, work.box.half, work.box.nodes)
     if work.scaled.free and not work.scaled.lift.any():  # the columns of factors vanish at infinity
         return float(cost_at(work.rest.K, work.rest.w, work.box.nodes))
