@@ -4,6 +4,8 @@ A group g with an error shifts its rows by an unknown e_g. With residuals y, wei
 fit, Q = P - P J (J'P J)^-1 J'P. Exclusion of the group lowers the cost by u'Q_gg^-1 u with u = (Q y)_g. The estimated
 error is Q_gg^-1 u with the covariance Q_gg^-1. Priors are rows too.
 
+Arrays have q rows, including the rows of priors, n shared unknowns, and l local unknowns of each epoch.
+
 W. Baarda, "A testing procedure for use in geodetic networks" (1968); P. J. G. Teunissen, "Testing theory" (2006), eqs.
 3.21 and 4.23.
 """
@@ -62,7 +64,7 @@ class Influence:
     deviation: Array
 
     def rows(self, group: Group) -> Array:
-        """Return the row numbers of a group, (q,)."""
+        """Return the row numbers of a group; for a prior, the numbers of the rows that it adds."""
         return np.array(group.rows) if group.prior < 0 else self.prior[group.prior]
 
     def block(self, rows: Array) -> Array:
@@ -76,7 +78,10 @@ class Influence:
         return np.asarray(precision - lost)
 
     def root(self, rows: Array) -> Array:
-        """Return A with A A' the pseudo-inverse of Q (..., r, r) of sets of rows; undetermined columns are zero."""
+        """Return a matrix A (..., r, r) with A A' the pseudo-inverse of Q for sets of rows (..., r).
+
+        A column of A is zero if the other rows have no information about this combination of rows.
+        """
         weight = np.asarray(self.precision.diagonal())[rows]
         scale = 1.0 / np.sqrt(np.where(weight > 0.0, weight, 1.0))
         values, vectors = np.linalg.eigh(self.block(rows) * scale[..., :, None] * scale[..., None, :])
@@ -160,7 +165,10 @@ def influences(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()
 
 
 def _prior_rows(problem: Problem) -> tuple[list[Array], list[Array], list[Array]]:
-    """Return selection matrices (p, n), means (N or 1, p) and precisions (p, p) of the priors on shared unknowns."""
+    """Return selection matrices (p, n), means (N or 1, p) and precisions (p, p) of the priors on shared unknowns.
+
+    Each prior refers to p of the n shared unknowns.
+    """
     layout = problem.layout
     picks, means, inner = [], [], []
     for prior in problem.priors:
@@ -175,15 +183,16 @@ def _prior_rows(problem: Problem) -> tuple[list[Array], list[Array], list[Array]
 def _precisions(linear: Linear, count: int, inner: Sequence[Array], size: int) -> list[Any]:
     """Return the inverse covariances (q, q) of the rows and priors of each problem; absent rows are zero.
 
-    The result is dense for few rows and sparse for many rows.
+    `count` is the number of rows without priors, `inner` the precisions of the priors, and `size` the number of
+    problems. The result is dense for few rows and sparse for many rows.
     """
     parts = []
     for whitener in linear.noise:
-        own = np.swapaxes(whitener.matrix, -1, -2) @ whitener.matrix
+        weights = np.swapaxes(whitener.matrix, -1, -2) @ whitener.matrix
         g, r = whitener.row.shape
-        own = np.broadcast_to(own, (size, g, r, r)).reshape(size, -1)
+        weights = np.broadcast_to(weights, (size, g, r, r)).reshape(size, -1)
         i, j = np.broadcast_arrays(whitener.row[:, :, None], whitener.row[:, None, :])
-        parts.append((own, i.ravel(), j.ravel()))
+        parts.append((weights, i.ravel(), j.ravel()))
     for block in inner:
         i, j = (index.ravel() + count for index in np.indices(block.shape))
         parts.append((np.broadcast_to(block.ravel(), (size, block.size)), i, j))
@@ -195,13 +204,14 @@ def _precisions(linear: Linear, count: int, inner: Sequence[Array], size: int) -
         return list(dense)
     from scipy.sparse import coo_array
 
-    return [coo_array((own, (i, j)), shape=(count, count)).tocsr() for own in values]
+    return [coo_array((weights, (i, j)), shape=(count, count)).tocsr() for weights in values]
 
 
 def _roots(equations: Normal, A: Array, B: Array, epoch: Array) -> tuple[Array, Array, Array]:
-    """Return roots (N, n, n) of (J'P J)^-1, and factors (N, q, n) and (N, q, l) of J (J'P J)^-1 J'.
+    """Return roots (N, n, n) of the covariance of the shared unknowns, and factors (N, q, n) and (N, q, l).
 
-    The local unknowns are eliminated.
+    The products of the factors with their transposes sum to J (J'P J)^-1 J', the second only within each epoch. `A` (N,
+    q, n) and `B` (N, q, l) are the derivatives by shared and local unknowns, and `epoch` (q,) is -1 for priors.
     """
     information, _, _ = marginal(equations)
     root, _ = linalg.root(information)
@@ -218,7 +228,7 @@ def log_tail(statistic: Array, dof: Array) -> Array:
     """Return the logarithm of the tail probability of a chi-square, also for very small probabilities.
 
     Below the range of floating-point numbers, the leading term of the asymptotic series is used (Abramowitz, Stegun
-    1964, eq. 6.5.32).
+    1964, eq. 6.5.32). With `dof` of zero, the result is 0, a probability of one.
     """
     from scipy.special import gammaincc, gammaln
 
@@ -229,7 +239,10 @@ def log_tail(statistic: Array, dof: Array) -> Array:
 
 
 def significance(at: Influence, groups: Sequence[Group]) -> Array:
-    """Return the logarithms (G,) of the probabilities of the decrease of the cost without each group."""
+    """Return the logarithms (G,) of the p-values of the decrease of the cost without each of G groups.
+
+    The p-value of a group is small if its exclusion lowers the cost much.
+    """
     return log_tail(*drops(at, [at.rows(group) for group in groups]))
 
 
@@ -248,7 +261,7 @@ def drops(at: Influence, rows: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def errors(at: Influence, groups: Sequence[Group]) -> list[Error]:
-    """Return the estimated error of each of some groups that all have errors."""
+    """Return the estimated error of each of some groups, if all of them have errors at once."""
     rows = [at.rows(group) for group in groups]
     index = np.concatenate(rows)
     block, root = at.block(index), at.root(index)
@@ -256,12 +269,12 @@ def errors(at: Influence, groups: Sequence[Group]) -> list[Error]:
     known = np.abs(np.diagonal(covariance @ block) - 1.0) < _UNDETERMINED
     value, sigma = covariance @ at.pull[index], np.where(known, np.sqrt(np.diagonal(covariance)), np.inf)
     out = []
-    for own in np.split(np.arange(len(index)), np.cumsum([len(one) for one in rows])[:-1]):
+    for numbers in np.split(np.arange(len(index)), np.cumsum([len(one) for one in rows])[:-1]):
         # the statistic of a group uses only its determined components and their covariance
-        inside = own[known[own]]
+        inside = numbers[known[numbers]]
         information, _ = linalg.root(covariance[np.ix_(inside, inside)]) if len(inside) else (np.zeros((0, 0)), None)
         squared = ((information.T @ value[inside]) ** 2).sum()
-        out.append(Error(value[own], sigma[own], float(squared), len(inside)))
+        out.append(Error(value[numbers], sigma[numbers], float(squared), len(inside)))
     return out
 
 
@@ -343,7 +356,10 @@ def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) ->
 
 
 def _rows_of_suspect(work: Problem, origin: Sequence[Array], suspect: Suspect) -> Array:
-    """Return a mask (m,) of the rows of a suspect; the problem may have arrival times instead of differences."""
+    """Return a mask (m,) of the rows of a suspect; the problem may have arrival times instead of differences.
+
+    `origin` has the numbers of the original rows from which each row comes.
+    """
     if suspect.group == "station":
         a, b = (np.concatenate([getattr(rows, end) for rows in work.rows]) for end in "ab")
         number = work.stations.names.index(suspect.name.removeprefix("station "))
@@ -353,7 +369,7 @@ def _rows_of_suspect(work: Problem, origin: Sequence[Array], suspect: Suspect) -
 
 
 def embed(layout: Layout, other: Layout, x: Array) -> Array:
-    """Return a vector (size,) in the order of a layout with more unknowns.
+    """Return the vector `x` (size,) of `layout` in the order of `other`, a layout with more unknowns.
 
     The additional unknowns are zero: the rows are linear in them.
     """
@@ -368,10 +384,10 @@ def embed(layout: Layout, other: Layout, x: Array) -> Array:
 
 
 def _channels(problem: Problem) -> list[tuple[str, Array]]:
-    """Return the name and the present rows of every station and kind; rows without a station are omitted."""
+    """Return the name and the row numbers of each station and kind with present rows that have a station."""
     present, out = problem.weight.reshape(-1)[: problem.count] > 0.0, []
     for rows, start in zip(problem.rows, problem.starts, strict=True):
-        own = present[start : start + rows.count] & (rows.a >= 0)
-        names = ((i, f"{rows.kind} of {problem.stations.names[i]}") for i in np.unique(rows.a[own]))
-        out += [(name, start + np.flatnonzero(own & (rows.a == i))) for i, name in names]
+        inside = present[start : start + rows.count] & (rows.a >= 0)
+        names = ((i, f"{rows.kind} of {problem.stations.names[i]}") for i in np.unique(rows.a[inside]))
+        out += [(name, start + np.flatnonzero(inside & (rows.a == i))) for i, name in names]
     return out
