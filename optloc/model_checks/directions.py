@@ -1,9 +1,9 @@
 """Confidence sets of direction and range of a target, from the likelihood over direction and inverse range.
 
-The target is at ``x = c + (s / v) u``. Here c is the centre of the stations, s their spread, u a unit vector, and v >=
-0 the inverse range in units of 1/s. Infinity is v = 0, a regular point, so a plane wave needs no special case. A cone
-holds the directions whose cost, at the best v, is close enough to the minimum. The inverse range is not Gaussian at its
-bound, so all ends follow from the cost itself.
+The target is at ``x = c + (s / v) u``. Here c is the centre of the stations, s their spread, u a unit vector, and v the
+inverse range in units of 1/s, at least 0. Infinity is v = 0, a regular point, so a plane wave needs no special case. A
+cone holds the directions whose cost, at the best v, is close enough to the minimum. The inverse range is not Gaussian
+at its bound, so all ends follow from the cost itself.
 
 Arrays hold q or k directions of d coordinates, and a vector of `size` parameters for each. A rise is an increase of the
 cost above the lowest cost of all minima, `least`; the edge of a set is at a given rise. Its square root is in standard
