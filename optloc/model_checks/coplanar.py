@@ -156,7 +156,8 @@ def is_symmetric(problem: Problem) -> bool:
 def is_coplanar(problem: Problem) -> Array:
     """Return a mask (N,) of problems with all stations in one plane, or on one line for problems in the plane.
 
-    Distances from the plane far below the noise count as zero.
+    Distances from the plane far below the noise count as zero. The mask is False if the two sides of the plane differ
+    for other reasons, such as bearings or a prior on the position.
     """
     count = problem.batch_shape[0]
     if not is_symmetric(problem):
@@ -232,12 +233,12 @@ def information_in_square(across: Across, x: Array) -> tuple[Array, Array]:
     is False if the local unknowns of the only epoch are not determined.
     """
     axis = across.part.stop - 1
-    at = np.array(x)
-    at[:, axis] = np.maximum(at[:, axis], across.least)
+    start = np.array(x)
+    start[:, axis] = np.maximum(start[:, axis], across.least)
     with np.errstate(all="ignore"):
-        information, _, ok = marginal(equations_at(across.problem, at))
+        information, _, ok = marginal(equations_at(across.problem, start))
     scale = np.ones((len(x), information.shape[-1]))
-    scale[:, axis] = 0.5 / at[:, axis]
+    scale[:, axis] = 0.5 / start[:, axis]
     return information * scale[:, :, None] * scale[:, None, :], ok
 
 
@@ -307,6 +308,7 @@ def _crossing(across: Across, x: Array, rise: float, ends: tuple[Array, ...], fi
     ----------
     M. Dowell and P. Jarratt, "A modified regula falsi method for computing the root of an equation", BIT 11 (1971).
     """
+    # a and b are the ends of the search in q; low and high are the excesses of the root of the rise there
     a, least, b, above = ends
     root_rise = np.sqrt(rise)
     low, high, side = np.full(len(x), -root_rise), np.sqrt(above - least) - root_rise, np.zeros(len(x))

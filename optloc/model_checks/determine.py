@@ -133,9 +133,9 @@ def _about_line(flat: Problem) -> Problem | None:
     centre, axes, _, size = plane_of_stations(flat)
     if size[0] == 0.0:
         return None
-    place = (flat.stations.position - centre[0]) @ axes[0][:, [2, 1]]
-    still = None if flat.stations.velocity is None else np.zeros((1, flat.stations.count, 2))
-    stations = replace(flat.stations, position=place, velocity=still, axes=None)
+    in_plane = (flat.stations.position - centre[0]) @ axes[0][:, [2, 1]]
+    no_velocity = None if flat.stations.velocity is None else np.zeros((1, flat.stations.count, 2))
+    stations = replace(flat.stations, position=in_plane, velocity=no_velocity, axes=None)
     reduced = replace(flat, stations=stations, frame=CARTESIAN)
     return reduced if is_coplanar(reduced)[0] else None
 
@@ -246,8 +246,8 @@ def _curve(flat: Problem) -> tuple[str, Array | None, tuple[Quantity, ...]]:
     numbers = np.flatnonzero(flat.weight.reshape(-1) > 0.0)
     if flat.dimension != 2 or len(numbers) != 1 or flat.biases or flat.priors:
         return "", None, ()
-    place = int(np.searchsorted(flat.starts, numbers[0], side="right")) - 1
-    rows, i = flat.rows[place], int(numbers[0]) - flat.starts[place]
+    block = int(np.searchsorted(flat.starts, numbers[0], side="right")) - 1
+    rows, i = flat.rows[block], int(numbers[0]) - flat.starts[block]
     if rows.kind not in _NAMES:
         return "", None, ()
     z = float(flat.observed.reshape(-1)[numbers[0]])

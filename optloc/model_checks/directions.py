@@ -109,7 +109,7 @@ class DirectionCost:
         x[:, slot.start : slot.start + slot.size] = self.positions(u, v)
         return x
 
-    def look(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
+    def evaluate(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return costs (q,), information (q, d, d) and right sides (q, d) at directions `u` and inverse ranges `v`.
 
         Information and right side refer to d changes: d - 1 rotations of u, rad, and the change of v. A cost that
@@ -132,14 +132,14 @@ class DirectionCost:
         """
         d = u.shape[1]
         free = np.array([rotate] * (d - 1) + [change_range])
-        cost, information, vector = self.look(u, v)
+        cost, information, vector = self.evaluate(u, v)
         damping, growth = np.full(len(u), _DAMPING), np.full(len(u), FIRST_GROWTH)
         for _ in range(steps):
             move, gain, ok = _step(information, vector, damping, self._may_change(free, v, vector))
             if not (gain > _CONVERGED * (1.0 + cost)).any():
                 break
             there, v_there = self._moved(u, v, move)
-            new, more, other = self.look(there, v_there)
+            new, more, other = self.evaluate(there, v_there)
             better, _, _, damping, growth = judge(cost, new, gain, ok, 0.0 * cost, damping, growth, 0.0, True)
             u, v = np.where(better[:, None], there, u), np.where(better, v_there, v)
             information = np.where(better[:, None, None], more, information)
@@ -218,7 +218,7 @@ def minima_of(surface: DirectionCost, rise: float) -> DirectionMinima:
     d = len(surface.centre)
     spot = spread_directions(_TRIED[d], d)
     u, v = np.repeat(spot, len(_INVERSE), axis=0), np.tile(np.minimum(_INVERSE, surface.most), len(spot))
-    cost = surface.look(u, v)[0].reshape(len(spot), -1)
+    cost = surface.evaluate(u, v)[0].reshape(len(spot), -1)
     order = np.argsort(cost.min(1), kind="stable")[:_REFINED]
     found = surface.descend(spot[order], np.minimum(_INVERSE, surface.most)[cost[order].argmin(1)], True, True, _STEPS)
     found = _lowest(surface, *found)
@@ -270,9 +270,10 @@ def edge(
     u0, v0 = start
     wanted, v = np.sqrt(rise), np.full(len(rays), v0)
     low, high, above = np.zeros(len(rays)), _gaussian_edge(surface, u0, v0, rays, wanted), np.zeros(len(rays))
-    below = _sigmas_above(surface.look(u0[None], np.atleast_1d(v0))[0], least)[0] - wanted
+    below = _sigmas_above(surface.evaluate(u0[None], np.atleast_1d(v0))[0], least)[0] - wanted
 
     def at(angle: Array, guess: Array) -> tuple[Array, Array]:
+        # excess of the root of the rise at angles on the rays, and the best inverse ranges there
         turned = np.cos(angle)[:, None] * u0 + np.sin(angle)[:, None] * rays
         found, cost = surface.best_range(turned, guess)
         return _sigmas_above(cost, least) - wanted, found
@@ -300,7 +301,7 @@ def _gaussian_edge(surface: DirectionCost, u: Array, v: Array, rays: Array, want
 
     `u` (d,) and `v` are a minimum, and `wanted` (k,) is the square root of the rise at the edge.
     """
-    _, information, _ = surface.look(u[None], np.atleast_1d(v))
+    _, information, _ = surface.evaluate(u[None], np.atleast_1d(v))
     across = rays @ basis(u)
     form = ((across @ _direction_information(information[0], float(v))) * across).sum(-1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -348,12 +349,13 @@ def ends_of_range(surface: DirectionCost, minima: DirectionMinima, least: float,
     low, limit = side * np.tile(minima.v, 2), np.where(side > 0.0, surface.most, -INFINITY)
 
     def at(inverse: Array, _: Array) -> tuple[Array, Array]:
+        # excess of the root of the rise at inverse ranges; the directions start at the last good ones
         nonlocal state
         there, _, cost = surface.descend(state, side * inverse, True, False, _FEW)
         state = np.where((cost <= least + rise)[:, None], there, state)
         return _sigmas_above(cost, least) - wanted, inverse
 
-    _, information, _ = surface.look(state, side * low)
+    _, information, _ = surface.evaluate(state, side * low)
     step = np.clip(wanted / np.sqrt(np.maximum(information[:, -1, -1], 1e-300)), INFINITY, surface.most)
     before, high = np.full(2 * count, -wanted), np.minimum(low + step, limit)
     while True:
@@ -450,7 +452,7 @@ def _cone(surface: DirectionCost, minima: DirectionMinima, i: int, rises: Array,
 
 def _principal(surface: DirectionCost, u: Array, v: float) -> Array:
     """Return the principal axes (d, d - 1) of the information on a direction: unit vectors perpendicular to it."""
-    _, information, _ = surface.look(u[None], np.atleast_1d(v))
+    _, information, _ = surface.evaluate(u[None], np.atleast_1d(v))
     return np.asarray(basis(u) @ np.linalg.eigh(_direction_information(information[0], v))[1])
 
 
@@ -548,19 +550,21 @@ def extent_of(surface: DirectionCost, u: Array, v: float, least: float, rise: fl
     The region holds the positions with a cost of less than `rise` above the lowest cost `least`. `u` (2,) and `v` are a
     minimum inside the region. An edge at infinity is at 1e6 spreads of the stations.
     """
-    _, information, _ = surface.look(u[None], np.atleast_1d(v))
+    _, information, _ = surface.evaluate(u[None], np.atleast_1d(v))
     values, axes = np.linalg.eigh(information[0])
     steps = axes * np.sqrt(rise / np.maximum(values, _DAMPING * max(float(values.max()), 1e-300)))
     turn = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
     rays, side = np.stack([np.cos(turn), np.sin(turn)], axis=-1) @ steps.T, basis(u)[:, 0]
 
     def places(share: Array) -> tuple[Array, Array]:
+        # directions and inverse ranges at shares of the Gaussian rays
         angle = np.clip(share * rays[:, 0], -np.pi, np.pi)
         inverse = np.clip(v + share * rays[:, 1], INFINITY, _LARGEST)
         return np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * side, inverse
 
     def at(share: Array, _: Array) -> tuple[Array, Array]:
-        return _sigmas_above(surface.look(*places(share))[0], least) - np.sqrt(rise), share
+        # excess of the root of the rise at these points
+        return _sigmas_above(surface.evaluate(*places(share))[0], least) - np.sqrt(rise), share
 
     # a ray that reaches infinity ends there
     falls = rays[:, 1] < 0.0

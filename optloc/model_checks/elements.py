@@ -245,8 +245,9 @@ def typical_sigma(problem: Problem, by: By) -> dict[str, float]:
 def common_effects(problem: Problem, by: By, size: dict[str, float]) -> tuple[Array, Array, Array]:
     """Return the effects (m, c) of the errors that the rows of a group share in an epoch, their names and sizes (c,).
 
-    `size` holds the standard deviation of a shared error by group name. Each effect is this deviation or its negative
-    value, in the units of the rows, in the rows of one group and epoch.
+    There is one column for each group and epoch. `size` holds the standard deviation of a shared error by group name.
+    An effect is this deviation or its negative value in the rows of the group and epoch, in the units of the rows, else
+    0.
     """
     ends, epoch = ends_of(problem, by), problem.epoch
     columns, names = [], []

@@ -108,7 +108,7 @@ class Error:
 
     @property
     def log_tail(self) -> float:
-        """Return the logarithm of the probability of an estimate at least this far from zero if there is no error."""
+        """Return the logarithm of the p-value of the estimate: very negative for a clear error, 0 if `dof` is 0."""
         return float(log_tail(np.array(self.statistic), np.array(self.dof)))
 
 
@@ -139,17 +139,17 @@ def influences(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()
     problem = replace(problem, priors=tuple(p for j, p in enumerate(problem.priors) if j not in dropped))
     # whitening is applied to neither: Q needs P and J separately
     linear, equations = linearise(problem, x), equations_at(problem, x)
-    picks, means, inner = _prior_rows(problem)
-    cuts = np.cumsum([problem.count, *(len(pick) for pick in picks)])
-    more = int(cuts[-1]) - problem.count
+    selections, means, prior_precisions = _prior_rows(problem)
+    cuts = np.cumsum([problem.count, *(len(pick) for pick in selections)])
+    prior_count = int(cuts[-1]) - problem.count
     present = np.broadcast_to(problem.weight > 0.0, linear.residual.shape)
     n = layout.n_shared
-    left = [mean - x[:, :n] @ pick.T for mean, pick in zip(means, picks, strict=True)]
-    residual = np.concatenate([np.where(present, linear.residual, 0.0), *left], axis=1)
-    picked = (np.broadcast_to(pick, (size, *pick.shape)) for pick in picks)
+    prior_residuals = [mean - x[:, :n] @ pick.T for mean, pick in zip(means, selections, strict=True)]
+    residual = np.concatenate([np.where(present, linear.residual, 0.0), *prior_residuals], axis=1)
+    picked = (np.broadcast_to(pick, (size, *pick.shape)) for pick in selections)
     A = np.concatenate([linear.shared, *picked], axis=1)
-    B = np.concatenate([linear.local, np.zeros((size, more, layout.n_local))], axis=1)
-    epoch = np.concatenate([problem.epoch, np.full(more, -1)])
+    B = np.concatenate([linear.local, np.zeros((size, prior_count, layout.n_local))], axis=1)
+    epoch = np.concatenate([problem.epoch, np.full(prior_count, -1)])
     root, shared, local = _roots(equations, A, B, epoch)
     # x need not be a minimum: Q y is the residual after one more step
     move, _ = step(equations, np.zeros(size))
@@ -159,7 +159,12 @@ def influences(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()
     return [
         Influence(own @ rest, own, own @ by_shared, own @ by_local, epoch, prior, deviation)
         for own, rest, by_shared, by_local, deviation in zip(
-            _precisions(linear, problem.count, inner, size), residual - fitted, shared, local, root, strict=True
+            _precisions(linear, problem.count, prior_precisions, size),
+            residual - fitted,
+            shared,
+            local,
+            root,
+            strict=True,
         )
     ]
 
@@ -170,21 +175,21 @@ def _prior_rows(problem: Problem) -> tuple[list[Array], list[Array], list[Array]
     Each prior refers to p of the n shared unknowns.
     """
     layout = problem.layout
-    picks, means, inner = [], [], []
+    selections, means, precisions = [], [], []
     for prior in problem.priors:
         slot, shared = layout.find(prior.name)
         if shared:
-            picks.append(np.eye(layout.n_shared)[slot.start : slot.start + slot.size])
+            selections.append(np.eye(layout.n_shared)[slot.start : slot.start + slot.size])
             means.append(prior.mean.reshape(-1, slot.size))
-            inner.append(linalg.inverse(prior.covariance.reshape(slot.size, slot.size))[0])
-    return picks, means, inner
+            precisions.append(linalg.inverse(prior.covariance.reshape(slot.size, slot.size))[0])
+    return selections, means, precisions
 
 
-def _precisions(linear: Linear, count: int, inner: Sequence[Array], size: int) -> list[Any]:
+def _precisions(linear: Linear, count: int, prior_precisions: Sequence[Array], size: int) -> list[Any]:
     """Return the inverse covariances (q, q) of the rows and priors of each problem; absent rows are zero.
 
-    `count` is the number of rows without priors, `inner` the precisions of the priors, and `size` the number of
-    problems. The result is dense for few rows and sparse for many rows.
+    `count` is the number of rows without priors, `prior_precisions` the precisions of the priors, and `size` the number
+    of problems. The result is dense for few rows and sparse for many rows.
     """
     parts = []
     for whitener in linear.noise:
@@ -193,7 +198,7 @@ def _precisions(linear: Linear, count: int, inner: Sequence[Array], size: int) -
         weights = np.broadcast_to(weights, (size, g, r, r)).reshape(size, -1)
         i, j = np.broadcast_arrays(whitener.row[:, :, None], whitener.row[:, None, :])
         parts.append((weights, i.ravel(), j.ravel()))
-    for block in inner:
+    for block in prior_precisions:
         i, j = (index.ravel() + count for index in np.indices(block.shape))
         parts.append((np.broadcast_to(block.ravel(), (size, block.size)), i, j))
         count += len(block)
@@ -220,8 +225,8 @@ def _roots(equations: Normal, A: Array, B: Array, epoch: Array) -> tuple[Array, 
     inner, _ = linalg.root(equations.local)
     gain = inner @ np.swapaxes(inner, -1, -2) @ np.swapaxes(equations.cross, -1, -2)
     # J minus the part that the local unknowns of the epoch explain: Schur complement, row by row
-    left = A - (B[..., None, :] @ gain[:, epoch])[..., 0, :]
-    return root, left @ root, (B[..., None, :] @ inner[:, epoch])[..., 0, :]
+    eliminated = A - (B[..., None, :] @ gain[:, epoch])[..., 0, :]
+    return root, eliminated @ root, (B[..., None, :] @ inner[:, epoch])[..., 0, :]
 
 
 def log_tail(statistic: Array, dof: Array) -> Array:

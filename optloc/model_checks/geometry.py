@@ -199,7 +199,7 @@ def _is_flat(problem: Problem, shape: _Shape, axis: int) -> bool:
 
 
 def _describe_offset(shape: _Shape) -> str:
-    """Return a text with the RMS distance of the stations from their plane, and their extent."""
+    """Return a text with the RMS distance of the stations from their plane or line, and their extent, m."""
     off, size = float(np.sqrt((shape.height**2).mean())), float(shape.extent[-1])
     return f"{off if off > _ROUNDING * size else 0.0:.2g} m off it, over {size:.3g} m"
 
@@ -214,9 +214,9 @@ def _mirror_fits(problem: Problem, shape: _Shape, x: Array) -> bool:
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
     height = float((x[0, part] - shape.centre) @ shape.axes[:, 0])
-    other = np.array(x)
-    other[0, part] -= 2.0 * height * shape.axes[:, 0]
-    both, cost = descend(problem.take(np.zeros(2, dtype=int)), np.concatenate([x, other]))
+    image = np.array(x)
+    image[0, part] -= 2.0 * height * shape.axes[:, 0]
+    both, cost = descend(problem.take(np.zeros(2, dtype=int)), np.concatenate([x, image]))
     after = (both[:, part] - shape.centre) @ shape.axes[:, 0]
     inside = not problem.constraints or bool((violation(problem, both[1:]) <= 0.0).all())
     # the descent must stay on the other side, and not return to the plane

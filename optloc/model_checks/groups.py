@@ -76,14 +76,18 @@ class _Columns:
     @classmethod
     def of(cls, problem: Problem) -> _Columns:
         """Return the columns of all rows of a problem."""
-        taken = [MODELS[rows.kind].stations for rows in problem.rows]
-        none = [np.full(rows.count, -1) for rows in problem.rows]
+        station_count = [MODELS[rows.kind].stations for rows in problem.rows]
+        absent = [np.full(rows.count, -1) for rows in problem.rows]
         kind = [rows.kind for rows in problem.rows for _ in range(rows.count)]
-        a = np.concatenate([r.a if n > 0 else no for r, n, no in zip(problem.rows, taken, none, strict=True)])
-        b = np.concatenate([r.b if n > 1 else no for r, n, no in zip(problem.rows, taken, none, strict=True)])
+        a = np.concatenate(
+            [r.a if n > 0 else missing for r, n, missing in zip(problem.rows, station_count, absent, strict=True)]
+        )
+        b = np.concatenate(
+            [r.b if n > 1 else missing for r, n, missing in zip(problem.rows, station_count, absent, strict=True)]
+        )
         epoch, target = problem.epoch, np.concatenate([rows.target for rows in problem.rows])
-        sort = np.unique(kind, return_inverse=True)[1]
-        _, label = np.unique(np.column_stack([sort, a, b, epoch, target]), axis=0, return_inverse=True)
+        kind_number = np.unique(kind, return_inverse=True)[1]
+        _, label = np.unique(np.column_stack([kind_number, a, b, epoch, target]), axis=0, return_inverse=True)
         # place: the number of a row among rows with equal columns, so that their names differ
         label, place = label.reshape(-1), np.empty(len(a), dtype=np.int64)
         order, sizes = np.argsort(label, kind="stable"), np.bincount(label)

@@ -472,23 +472,23 @@ def _fit_mixture(error: Array, sigma: Array, late: Array) -> tuple[float, float,
     delay = float(np.mean(error[late])) if late.any() else 0.0
     if not share or delay <= 0.0:
         return 0.0, 0.0, 0.0, np.zeros(len(error))
-    prompt = -0.5 * (error / sigma) ** 2 - np.log(sigma) - 0.5 * np.log(2.0 * np.pi)
+    log_on_time = -0.5 * (error / sigma) ** 2 - np.log(sigma) - 0.5 * np.log(2.0 * np.pi)
     for _ in range(_TURNS):
         # Given the error, the delay is normal about error - sigma^2 / delay, truncated at zero.
         middle = error - sigma**2 / delay
         tail = log_ndtr(middle / sigma)
-        density = np.log(share / delay) + 0.5 * (sigma / delay) ** 2 - error / delay + tail
-        both = np.logaddexp(np.log1p(-share) + prompt, density)
-        chance = np.exp(density - both)
+        log_late = np.log(share / delay) + 0.5 * (sigma / delay) ** 2 - error / delay + tail
+        log_either = np.logaddexp(np.log1p(-share) + log_on_time, log_late)
+        p_late = np.exp(log_late - log_either)
         # mean of the truncated normal distribution; erfcx computes the ratio of density and distribution without
         # cancellation
         mean = middle + sigma * np.sqrt(2.0 / np.pi) / erfcx(-middle / (np.sqrt(2.0) * sigma))
-        new = float(np.clip(chance.mean(), 1e-12, 1.0 - 1e-6))
-        longer = float((chance * mean).sum() / max(chance.sum(), 1e-300))
+        new = float(np.clip(p_late.mean(), 1e-12, 1.0 - 1e-6))
+        longer = float((p_late * mean).sum() / max(p_late.sum(), 1e-300))
         done = abs(new - share) <= _ENDED * share and abs(longer - delay) <= _ENDED * delay
         if longer < _MIN_DELAY:
             return 0.0, 0.0, 0.0, np.zeros(len(error))
         share, delay = new, longer
         if done:
             break
-    return share, delay, float(2.0 * (both - prompt).sum()), chance
+    return share, delay, float(2.0 * (log_either - log_on_time).sum()), p_late

@@ -191,7 +191,7 @@ def _scales(problem: Problem) -> tuple[Array, Array]:
 
 
 def _multiplying(problem: Problem) -> list[Bias]:
-    """Return the biases that multiply rows."""
+    """Return the biases that multiply rows; their members are the unknown scales."""
     return [bias for bias in problem.biases if form_of(bias).enters == "scales"]
 
 

@@ -186,7 +186,10 @@ def _is_time_scale(one: Explained) -> bool:
 
 
 def _is_of_arrivals(kind: str) -> bool:
-    """Return whether rows of a kind are clock times of their stations: differences, or times since an emission."""
+    """Return whether rows of a kind measure arrival times, so that a clock error changes them.
+
+    These rows are lengths that involve two stations, such as differences, or times since an unknown emission.
+    """
     model = MODELS[kind]
     return model.quantity == "length" and (model.emission or model.stations == 2)
 
@@ -304,18 +307,18 @@ def _sharpened(problem: Problem, x: Array, found: Sequence[Candidate], values: A
 
 
 def _search_width(problem: Problem) -> int:
-    """Return the number of epochs between two times of the first search."""
+    """Return the number of epochs between two neighbouring times that `_steps_and_bursts` tries."""
     return -(-problem.epochs // _STEP_TIMES)
 
 
 def _epochs_of(problem: Problem, one: Candidate) -> tuple[int, int]:
-    """Return the first epoch of a step or burst, and the epoch after its last epoch."""
+    """Return the number of the first epoch of a step or burst, and the number of the epoch after its last epoch."""
     last = int(np.searchsorted(problem.times, one.until)) if np.isfinite(one.until) else problem.epochs
     return int(np.searchsorted(problem.times, one.since)), last
 
 
 def _restricted(bias: Bias, inside: Array) -> Bias:
-    """Return a bias that affects only some of its rows."""
+    """Return a bias that affects only those of its rows that the mask `inside` marks."""
     return replace(bias, row=bias.row[inside], member=bias.member[inside], coefficient=bias.coefficient[inside])
 
 

@@ -50,12 +50,13 @@ def profile(problem: Problem, x: Array, at: Array, passes: int = 1) -> tuple[Arr
     # rounding, and the sum of squares without it is never negative.
     cost = equations.cost - decrement(equations, move, n) if passes == 1 else equations.cost
     information, vector, _ = marginal(equations)
-    across = information[..., part, :] @ along
+    # Schur complement: eliminate the other unknowns from the equations of the position.
+    coupling = information[..., part, :] @ along
     turned = np.swapaxes(along, -1, -2)
-    right = np.concatenate([np.swapaxes(across, -1, -2), turned @ vector[..., None]], axis=-1)
+    right = np.concatenate([np.swapaxes(coupling, -1, -2), turned @ vector[..., None]], axis=-1)
     solved, _ = linalg.solve(turned @ information @ along, right)
-    lost = across @ solved
-    return cost, information[..., part, part] - lost[..., :-1], vector[..., part] - lost[..., -1]
+    explained = coupling @ solved
+    return cost, information[..., part, part] - explained[..., :-1], vector[..., part] - explained[..., -1]
 
 
 def _other_directions(problem: Problem, x: Array, part: slice) -> Array:
@@ -263,7 +264,7 @@ def cost_at_infinity(problem: Problem, x: Array) -> Array:
         fixed = sphere.direction(x[:, part] - centre)
         spread_out = spread_directions(_DIRECTIONS[slot.size], slot.size)[:, None]
         tried = sphere.direction(np.broadcast_to(spread_out, (len(spread_out), *fixed.shape)))
-        cost = sphere.look(tried)[0]
+        cost = sphere.evaluate(tried)[0]
         best = np.argsort(cost, axis=0)[:_REFINED]
         starts = np.concatenate([fixed[None], np.take_along_axis(tried, best[..., None], axis=0)])
         least = sphere.descend(starts).min(0)
@@ -294,7 +295,7 @@ class _Sphere:
             vector = (self.along @ (np.swapaxes(self.along, -1, -2) @ vector[..., None]))[..., 0]
         return normalised(vector)
 
-    def look(self, direction: Array) -> tuple[Array, Array, Array]:
+    def evaluate(self, direction: Array) -> tuple[Array, Array, Array]:
         """Return costs (q, N) in directions (q, N, d), with the normal equations of the position.
 
         These are information (q, N, d, d) and right sides (q, N, d). The cost is infinite if the position violates a
@@ -311,7 +312,7 @@ class _Sphere:
 
     def descend(self, direction: Array) -> Array:
         """Return the lowest costs (q, N) near directions (q, N, d), by damped Gauss-Newton on the sphere."""
-        cost, information, vector = self.look(direction)
+        cost, information, vector = self.evaluate(direction)
         damping, growth = np.full(cost.shape, _DAMPING), np.full(cost.shape, FIRST_GROWTH)
         scale = self.radius[:, None, None]
         for _ in range(_STEPS):
@@ -326,7 +327,7 @@ class _Sphere:
             if not (gain > _STILL * (1.0 + cost)).any():
                 break
             trial = self.direction(direction + (across @ move)[..., 0] / self.radius[:, None])
-            new, more, other = self.look(trial)
+            new, more, other = self.evaluate(trial)
             better, _, _, damping, growth = judge(cost, new, gain, ok, 0.0 * cost, damping, growth, 0.0, True)
             direction = np.where(better[..., None], trial, direction)
             information = np.where(better[..., None, None], more, information)

@@ -163,14 +163,14 @@ def departure_inwards(problem: Problem, x: Array, covariance: Array, law: Trunca
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
     d = slot.size
-    moved, grown = np.zeros((len(x), d, d)), np.ones((len(x), d))
+    moved, increases = np.zeros((len(x), d, d)), np.ones((len(x), d))
     for i in range(len(x)):
         for k, (step, increase) in enumerate(_inward_steps(take(law, i))):
-            moved[i, k], grown[i, k] = step, increase
+            moved[i, k], increases[i, k] = step, increase
     spread = covariance[:, part, part]
     pull = covariance[:, :, part] @ np.linalg.pinv(spread, hermitian=True)
     with np.errstate(all="ignore"):
-        return ShapeTest(problem, x, pull, part, exact(problem)).departs(moved, np.sqrt(grown))
+        return ShapeTest(problem, x, pull, part, exact(problem)).departs(moved, np.sqrt(increases))
 
 
 def _inward_steps(law: Truncated) -> list[tuple[Array, float]]:

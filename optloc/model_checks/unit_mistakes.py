@@ -107,7 +107,7 @@ def _p_of_best_fit(problem: Problem, start: Array | None = None) -> float:
 
 
 def _without_constraints(problem: Problem, p: float) -> Advice:
-    """Return the advice for values that fit with probability p without constraints, but not with them."""
+    """Return the advice for values that fit without constraints with the p-value `p`, but not with them."""
     names = violation_names(problem)
     seen = f"the values fit without the constraints ({names}; p = {p:.2g}), but no position was found that meets both"
     return Advice("constraint", seen, "check their values; heights must be above the ellipsoid, not above the sea")
@@ -120,7 +120,7 @@ def _p_of_cost(problem: Problem, cost: float) -> float:
 
 
 def _fitting_readings(problem: Problem) -> Iterator[Advice]:
-    """Yield the readings with a good fit that is unlikely by chance, the most probable reading first."""
+    """Yield advice for the readings with a good fit that is unlikely by chance, the most probable reading first."""
     tried = list(_readings(problem))
     found = []
     for one in tried:
@@ -155,7 +155,10 @@ def _readings(problem: Problem) -> Iterator[Reading]:
 
 
 def _length_units(kinds: tuple[str, ...]) -> Iterator[Reading]:
-    """Yield readings of lengths for the ratio of every two units, the SI unit first."""
+    """Yield readings of lengths in another unit than stated, one for each ratio of two units.
+
+    The SI unit comes first. Units of time count as lengths: they are multiplied by the speed of light.
+    """
     table = {name: size * (SPEED_OF_LIGHT if name in _TIMES else 1.0) for name, size in UNITS["length"].items()}
     what = " and ".join(kinds)
     seen_before: list[float] = []
@@ -187,7 +190,7 @@ _MAX_PAIRS = 3
 
 
 def _either(pairs: list[str]) -> str:
-    """Return the first few pairs of units as one text."""
+    """Return the first few pairs of units as one text, for instance "km for m or m for mm"."""
     return " or ".join(pairs[:_MAX_PAIRS])
 
 

@@ -126,9 +126,10 @@ class _MaximumLikelihood:
 def fit(packed: Elements, left: Array, single: Array) -> VarianceFit:
     """Return the variance factors that maximise the penalised restricted likelihood.
 
-    The penalty multiplies the likelihood by every factor (see `_PENALTY`), so a factor of few errors has no maximum at
-    zero. `packed` holds N linearised problems with g groups. `left` (g,) marks groups without errors: their factor is
-    zero. `single` (g,) marks groups that keep a separate factor, even if the data do not determine it.
+    The penalty multiplies the likelihood by a power of each factor, at most its square (see `_PENALTY`). So a factor of
+    few errors has no maximum at zero. `packed` holds N linearised problems with g groups. `left` (g,) marks groups
+    without errors: their factor is zero. `single` (g,) marks groups that keep a separate factor, even if the data do
+    not determine it.
 
     The check of which factors the data determine uses one factor for all groups. Otherwise a group with a small
     estimate would wrongly count as not determined.
@@ -144,44 +145,49 @@ def fit(packed: Elements, left: Array, single: Array) -> VarianceFit:
     parameters in multilevel models", Psychometrika 78 (2013), section 3.
     """
     packed, size = without_groups(packed, left), len(packed.names)
-    used = np.flatnonzero(total(packed.of_effect, size))
-    count, number = len(used), np.full(size + 1, -1)
-    number[used] = np.arange(count)
-    group, nothing_fixed = number[packed.of_effect], np.zeros(count, dtype=bool)
+    with_errors = np.flatnonzero(total(packed.of_effect, size))
+    count, number_of_group = len(with_errors), np.full(size + 1, -1)
+    number_of_group[with_errors] = np.arange(count)
+    group, nothing_fixed = number_of_group[packed.of_effect], np.zeros(count, dtype=bool)
     if not (tested(packed, np.ones(())).dof > 0).any():
         advice = "add rows, stations or known heights"
         raise InvalidProblem("no fix has more rows than unknowns, so the noise cannot be estimated", "noise", advice)
     # One factor for all groups. If the data do not determine it, they determine no factor.
     common = _maximise(packed, np.minimum(group, 0), np.zeros(1), nothing_fixed[:1], np.zeros(1))
-    begin = np.full(count, np.log(common.variance[0]))
-    shared = ~(_relative_errors(common.tests, group, np.exp(begin), nothing_fixed) < LOOSE) & ~single[used]
+    first_log_factor = np.full(count, np.log(common.variance[0]))
+    shared = (
+        ~(_relative_errors(common.tests, group, np.exp(first_log_factor), nothing_fixed) < LOOSE) & ~single[with_errors]
+    )
     # Groups whose factors are not determined are merged. The merged class has the number of its first group.
     merge = np.where(shared, np.flatnonzero(shared)[0] if shared.any() else 0, np.arange(count))
-    kinds, class_of = np.unique(merge, return_inverse=True)
+    first_groups, class_of = np.unique(merge, return_inverse=True)
     classes = np.append(class_of, -1)[group]
     # If several groups are merged, the data may determine their common factor.
-    undetermined = np.isin(kinds, np.flatnonzero(shared))
+    undetermined = np.isin(first_groups, np.flatnonzero(shared))
     if shared.sum() > 1:
         undetermined &= ~(
-            _relative_errors(common.tests, classes, np.exp(begin[: len(kinds)]), nothing_fixed[: len(kinds)]) < LOOSE
+            _relative_errors(
+                common.tests, classes, np.exp(first_log_factor[: len(first_groups)]), nothing_fixed[: len(first_groups)]
+            )
+            < LOOSE
         )
-    level = np.where(undetermined, 0.0, begin[: len(kinds)])
-    information, _ = _score(common.tests, classes, np.exp(begin[: len(kinds)]), undetermined)
+    log_factor = np.where(undetermined, 0.0, first_log_factor[: len(first_groups)])
+    information, _ = _score(common.tests, classes, np.exp(first_log_factor[: len(first_groups)]), undetermined)
     penalty = np.minimum(_PENALTY, _MAX_PENALTY_SHARE * np.diagonal(information))
-    found = _maximise(packed, classes, level, undetermined, penalty)
+    found = _maximise(packed, classes, log_factor, undetermined, penalty)
     low, high = (
         np.where(undetermined, np.nan, end)[class_of] for end in _confidence_interval(found, classes, undetermined)
     )
 
     def per_group(values: Array) -> Array:
-        return np.asarray(np.append(values, np.nan)[number[:-1]])
+        return np.asarray(np.append(values, np.nan)[number_of_group[:-1]])
 
     return VarianceFit(
         np.where(left, 0.0, per_group(found.variance[class_of])),
         per_group(np.where(shared, np.nan, found.error[class_of])),
         per_group(low),
         per_group(high),
-        np.isin(np.arange(size), used[shared]),
+        np.isin(np.arange(size), with_errors[shared]),
         bool(undetermined.any()),
         found.gross,
         found.tests,
@@ -201,11 +207,11 @@ _SIGNIFICANT = 2.33
 
 
 def visible(packed: Elements, found: VarianceFit, left: Array) -> Array:
-    """Return the excluded groups (g,) whose errors are significant, by a score test of the factor zero.
+    """Return a mask (g,) of the excluded groups whose errors are significant, by a score test of the factor zero.
 
     `found` is a fit of the N problems `packed` without the groups that `left` (g,) marks. The test uses the information
     I and the scores U of all factors. If group g has no errors, U_g divided by the square root of I_gg - I_gh I_hh^-1
-    I_hg is standard normal (Verbeke and Molenberghs 2003, section 4).
+    I_hg is standard normal (Verbeke and Molenberghs 2003, section 4). Here h are the groups that are not excluded.
     """
     size = len(packed.names)
     variance = np.append(np.nan_to_num(found.variance), 0.0)
@@ -243,33 +249,35 @@ def _determinable(tests: Tested, packed: Elements, found: VarianceFit, left: Arr
     return np.asarray(information * (2.0 * _RELATIVE) ** 2 > 1.0)
 
 
-def _maximise(packed: Elements, classes: Array, level: Array, fixed: Array, penalty: Array) -> _MaximumLikelihood:
+def _maximise(packed: Elements, classes: Array, log_factor: Array, fixed: Array, penalty: Array) -> _MaximumLikelihood:
     """Return the variance factors of c classes of errors, their standard errors and the gross errors.
 
-    `classes` (N, q) is the class of each error and `level` (c,) the log-factors at the start. `fixed` (c,) marks
+    `classes` (N, q) is the class of each error and `log_factor` (c,) the log-factors at the start. `fixed` (c,) marks
     factors that keep their value. `penalty` (c,) is added to the scores.
     """
-    count, level = len(level), level.copy()
+    count, log_factor = len(log_factor), log_factor.copy()
     # Start with medians: medians tolerate up to half of the errors as gross, but scores of the likelihood do not.
     for _ in range(_COARSE):
-        step = np.where(fixed, 0.0, _median_step(tested(packed, np.exp(level)[classes]), classes, np.exp(level)))
-        level += step
+        step = np.where(
+            fixed, 0.0, _median_step(tested(packed, np.exp(log_factor)[classes]), classes, np.exp(log_factor))
+        )
+        log_factor += step
         if np.abs(step).max() < _NEAR:
             break
     for _ in range(_ROUNDS):
-        before = level.copy()
+        before = log_factor.copy()
         # Gross errors are selected once per round, not in every step. Otherwise the steps would jump when the selection
         # changes.
-        gross, tests = cleaned(packed, np.exp(level)[classes])
+        gross, tests = cleaned(packed, np.exp(log_factor)[classes])
         for _ in range(_STEPS):
-            step, sure = _scoring_step(tests, classes, np.exp(level), fixed, penalty)
-            last, level = level, np.maximum(level + step, np.log(_MIN_VARIANCE))
-            tests = without(tested(packed, np.exp(level)[classes]), gross)
-            if (np.abs(level - last) <= _CLOSE * sure).all():
+            step, error = _scoring_step(tests, classes, np.exp(log_factor), fixed, penalty)
+            last, log_factor = log_factor, np.maximum(log_factor + step, np.log(_MIN_VARIANCE))
+            tests = without(tested(packed, np.exp(log_factor)[classes]), gross)
+            if (np.abs(log_factor - last) <= _CLOSE * error).all():
                 break
-        if (np.abs(level - before) <= _SETTLED * sure).all():
+        if (np.abs(log_factor - before) <= _SETTLED * error).all():
             break
-    variance = np.exp(level)
+    variance = np.exp(log_factor)
     return _MaximumLikelihood(variance, _relative_errors(tests, classes, variance, fixed[:count]), gross, tests)
 
 
@@ -309,11 +317,11 @@ def _score(tests: Tested, classes: Array, variance: Array, fixed: Array) -> tupl
     """
     (n, q), count = classes.shape, len(variance)
     # Errors without a group get an additional last class, which is dropped.
-    number, scale = np.where(classes >= 0, classes, count), np.where(fixed, 0.0, variance)
-    each = 0.5 * (tests.vector[:, :q] ** 2 - tests.size[:, :q])
-    place = (np.arange(n)[:, None] * (count + 1) + number).ravel()
-    per_fix = np.bincount(place, each.ravel(), n * (count + 1)).reshape(n, -1)[:, :count] * scale
-    pair = (number[:, :, None] * (count + 1) + number[:, None, :]).ravel()
+    class_number, scale = np.where(classes >= 0, classes, count), np.where(fixed, 0.0, variance)
+    error_score = 0.5 * (tests.vector[:, :q] ** 2 - tests.size[:, :q])
+    position = (np.arange(n)[:, None] * (count + 1) + class_number).ravel()
+    per_fix = np.bincount(position, error_score.ravel(), n * (count + 1)).reshape(n, -1)[:, :count] * scale
+    pair = (class_number[:, :, None] * (count + 1) + class_number[:, None, :]).ravel()
     squared = 0.5 * tests.matrix[:, :q, :q].ravel() ** 2
     information = np.bincount(pair, squared, (count + 1) ** 2).reshape(count + 1, -1)[:count, :count]
     return information * np.outer(scale, scale), per_fix

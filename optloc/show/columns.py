@@ -248,9 +248,10 @@ _LEVEL = {"e": "east", "n": "north", "u": "up"}
 
 
 def _hide_undetermined_levels(local: Columns, limit: Array, before: Sequence[str]) -> tuple[Columns, list[str]]:
-    """Return geodetic columns with NaN for undetermined axes (east, north, up), and all undetermined names (n).
+    """Return geodetic columns with NaN for undetermined axes (east, north, up), and the undetermined names of each row.
 
-    An axis is undetermined if its standard deviation exceeds `limit` (n,), m. `before` (n) holds earlier names.
+    An axis is undetermined if its standard deviation exceeds `limit` (n,), m. `before` holds the names (n texts) that
+    other columns already gave.
     """
     axes = [axis for axis in _LEVEL if f"cov_{axis}{axis}" in local]
     with np.errstate(invalid="ignore"):
@@ -330,7 +331,7 @@ def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
         Observability of the biases. It gives `from_data`, the share of the information that comes from the data.
         Without `seen`, the share is NaN.
     """
-    found = []
+    rows = []
     for slot in fix.layout.shared:
         if not slot.members:
             continue
@@ -338,10 +339,10 @@ def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
         shares = np.full(slot.size, np.nan) if seen is None else seen.from_data[slot.start : slot.start + slot.size]
         for member, value, sigma, share in zip(slot.entries, values, sigmas, shares, strict=True):
             record = {"name": slot.name, "member": member, "value": float(value), "sigma": float(sigma)}
-            found.append(record | {"unit": slot.unit, "from_data": float(share)})
+            rows.append(record | {"unit": slot.unit, "from_data": float(share)})
         for i in np.flatnonzero(fix.undetermined(slot.name)).tolist():
-            found[len(found) - slot.size + i]["undetermined"] = True
-    return found
+            rows[len(rows) - slot.size + i]["undetermined"] = True
+    return rows
 
 
 def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool = False) -> dict[str, Any]:

@@ -170,10 +170,10 @@ def _state(columns: Columns, i: int, whose: str) -> list[tuple[str, str]]:
         held = " (held)" if len(local) == 3 and local[2] < (_HELD * _EARTH) ** 2 else ""
         height = f"{columns['height'][i] + 0.0:.2f} m{held}".replace("-0.00", "0.00")
         lines.append((f"height{whose}", NOT_DETERMINED if "up" in undetermined else height))
-        known = [(word, v) for word, v in zip(("east", "north", "up"), local, strict=False) if word not in undetermined]
-        if known:
-            sizes = _sizes(np.sqrt(np.maximum([v for _, v in known], 0.0)))
-            lines.append((f"sigma {', '.join(word for word, _ in known)}", ", ".join(sizes) + " m"))
+        shown = [(word, v) for word, v in zip(("east", "north", "up"), local, strict=False) if word not in undetermined]
+        if shown:
+            sizes = _sizes(np.sqrt(np.maximum([v for _, v in shown], 0.0)))
+            lines.append((f"sigma {', '.join(word for word, _ in shown)}", ", ".join(sizes) + " m"))
     for letter, word, unit in (("v", "velocity", "m/s"), ("a", "acceleration", "m/s²")):
         for axis in (axis for axis in axes if f"{letter}{axis}" in columns):
             value, sigma = (columns[f"{prefix}{letter}{axis}"][i] for prefix in ("", "sigma_"))
@@ -422,7 +422,10 @@ def dict_of(fix: Fix) -> dict[str, Any]:
 
 
 def frame_of(fix: Fix) -> Any:
-    """Return fixes as a pandas data frame; raise InvalidProblem if pandas is not installed."""
+    """Return fixes as a pandas data frame, with the labels of the fixes as index if there is one row for each label.
+
+    If pandas is not installed, the function raises InvalidProblem.
+    """
     try:
         import pandas as pd
     except ImportError:

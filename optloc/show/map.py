@@ -421,9 +421,9 @@ def ground_tracks(problem: Problem) -> list[tuple[str, Array]]:
 
     Longitudes continue beyond 180 degrees, so that a track has no jump at the antimeridian.
     """
-    used = [index for rows in problem.rows if MODELS[rows.kind].velocity for index in (rows.a, rows.b)]
+    indices = [index for rows in problem.rows if MODELS[rows.kind].velocity for index in (rows.a, rows.b)]
     found = []
-    for station in np.unique(np.concatenate([*used, [-1]]))[1:].tolist():
+    for station in np.unique(np.concatenate([*indices, [-1]]))[1:].tolist():
         track = problem.stations.position.reshape(-1, *problem.stations.position.shape[-3:])[0, :, station]
         lat, lon, height = problem.frame.to_geodetic(thinned(track))
         if height.min() > _SKY:

@@ -101,15 +101,15 @@ def _kml_mark(document: Element, mark: Mark, area: Area | None) -> None:
     if not mark.known:
         _placemark(document, mark.name, mark.words, "doubtful", mark)
         return
-    style, flat = "ok" if mark.sure else "doubtful", len(mark.position)
+    style, dimension = "ok" if mark.sure else "doubtful", len(mark.position)
     label = mark.name if mark.sure else f"{mark.name}: {mark.status}"
-    _point(_placemark(document, label, mark.words, style, mark), mark.place, flat)
+    _point(_placemark(document, label, mark.words, style, mark), mark.place, dimension)
     if area is not None:
         word = area.role.replace("95", ", 95 %, cut off" if area.cut else ", 95 %")
         _polygons(_placemark(document, f"{mark.name}: {word}", mark.words, style), area)
     for number, other in enumerate(mark.others, 1):
         place = _placemark(document, _alternative_name(mark, number), _alternative_text(mark, other), "alternative")
-        _point(place, other.place, flat)
+        _point(place, other.place, dimension)
 
 
 def _kml_known(document: Element, mark: Mark, geometry: dict[str, Any], about: dict[str, Any]) -> None:
@@ -205,15 +205,16 @@ def gpx(results: Results) -> str:
     A segment ends where the track is lost.
     """
     names = {"xmlns": "http://www.topografix.com/GPX/1/1", "xmlns:optloc": _OWN, "version": "1.1", "creator": "optloc"}
-    root, marks, flat = Element("gpx", names), results.marks(), len(results.axes)
+    root, marks, dimension = Element("gpx", names), results.marks(), len(results.axes)
     _add(_add(root, "metadata"), "name", results.title)
     for name, place in results.stations():
-        _gpx_point(root, "wpt", place, flat, name=name, type="station")
+        _gpx_point(root, "wpt", place, dimension, name=name, type="station")
     for mark in marks:
         if mark.known and not (results.course and mark.sure):
             label = mark.name if mark.sure else f"{mark.name}: {mark.status}"
             _add_extensions(
-                _gpx_point(root, "wpt", mark.place, flat, _time(mark), name=label, desc=mark.words, type="fix"), mark
+                _gpx_point(root, "wpt", mark.place, dimension, _time(mark), name=label, desc=mark.words, type="fix"),
+                mark,
             )
         for number, other in enumerate(mark.others, 1):
             texts = {
@@ -221,14 +222,14 @@ def gpx(results: Results) -> str:
                 "desc": _alternative_text(mark, other),
                 "type": "alternative",
             }
-            _gpx_point(root, "wpt", other.place, flat, _time(mark), **texts)
+            _gpx_point(root, "wpt", other.place, dimension, _time(mark), **texts)
     for target, parts in _courses(marks) if results.course else ():
         track = _add(root, "trk")
         _add(track, "name", target)
         for part in parts:
             segment = _add(track, "trkseg")
             for mark in part:
-                _add_extensions(_gpx_point(segment, "trkpt", mark.place, flat, _time(mark)), mark)
+                _add_extensions(_gpx_point(segment, "trkpt", mark.place, dimension, _time(mark)), mark)
     return _document(root)
 
 

@@ -443,7 +443,7 @@ def thinned(track: Array) -> Array:
 
 
 def _paths(problem: Problem, fixes: Sequence[Fix]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Return the paths (k, d), m, of the moving targets of a run: first of the fix, then of its alternatives."""
+    """Return the paths (k, d), m, of the moving targets of a run: first of its only fix, then of the alternatives."""
     if len(fixes) != 1 or fixes[0].shape or problem.epochs == 1:
         return (), ()
     others = fixes[0].alternatives
