@@ -161,7 +161,7 @@ class Curve:
     colour: str = ""
     width: float = 0.0
     tell: str = ""
-    shape: ClassVar = "curve"
+    shape: ClassVar = "curve"  # The template selects the SVG element by the shape.
 
 
 @dataclass(frozen=True, slots=True)
