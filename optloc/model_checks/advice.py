@@ -1,6 +1,7 @@
 """Explanations of a fix that is not `ok`: geometry, misread values (unit, sign, convention), and systematic errors.
 
-Score tests name a systematic error. Each explanation comes with a remedy, if possible as lines of a problem file.
+Score tests name a systematic error. Each explanation comes with a remedy, if possible as lines of a problem file. A
+parameter vector has `size` numbers: first the unknowns that all epochs share, then the local unknowns of each epoch.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def advise(problem: Problem, fix: Fix | None = None) -> Any:
 def advise_at(problem: Problem, x: Array) -> tuple[Advice, ...]:
     """Return the advice for one problem or run at a fix (size,), or at fixes (k, size of an epoch) of separate epochs.
 
-    Least squares starts at `x`; `x` is NaN if there is no fix.
+    Least squares starts at `x`. `x` is NaN if there is no fix; then only a problem with one position is fitted here.
     """
     flat, x = problem.flat(), _joined(problem, np.asarray(x))
     # planned rows without a measurement also count for the geometry
@@ -122,7 +123,7 @@ def explained(problem: Problem, fix: Fix) -> Problem | None:
 
 
 def explained_at(problem: Problem, x: Array) -> Problem | None:
-    """Return the result of `explained` for a parameter vector with the shapes of `advise_at`."""
+    """Return the result of `explained` at `x`: a fix (size,), or fixes (k, size of an epoch) of separate epochs."""
     if problem.batch_shape:
         raise InvalidProblem("a batch of problems was given", "explained", "call it for each problem")
     part, x = _shortened(*_without_unknown(problem.flat(), _joined(problem, np.asarray(x))))
@@ -133,9 +134,9 @@ def explained_at(problem: Problem, x: Array) -> Problem | None:
 
 
 def misfit_of(problem: Problem, x: Array) -> str:
-    """Return a sentence about the error that explains most of the misfit of a run at its fix (size,).
+    """Return a sentence about the error that explains most of the misfit of a run at its fix `x` (size,).
 
-    `problem` is a flat batch of one run.
+    `problem` is a flat batch of one run. If no error of one station explains the misfit, the sentence states this.
     """
     part, x = _shortened(*_without_unknown(problem, x[None]))
     explanations = explain_misfit(part, x)
@@ -146,20 +147,27 @@ def misfit_of(problem: Problem, x: Array) -> str:
     return f"{article} {one.candidate.name}, {value} {unit}, would explain it (p = {one.p_after:.2g})"
 
 
-def _bias_of_run(problem: Problem, one: Candidate) -> Bias:
-    """Return the bias of a candidate over all rows of a run; the test used only some of the rows."""
-    members = (one.bias.members[0],) if one.per == "station" else None
-    rows, names, kind = problem.rows, problem.stations.names, one.kind or None
-    bias = family(rows, names, one.name, per=one.per, form=one.bias.form, kind=kind, members=members)
-    if not np.isfinite(one.since):
+def _bias_of_run(problem: Problem, candidate: Candidate) -> Bias:
+    """Return the bias of a candidate over all rows of a run; the test used only some of the rows.
+
+    A step or burst affects only the rows between its start and its end.
+    """
+    members = (candidate.bias.members[0],) if candidate.per == "station" else None
+    rows, names, kind = problem.rows, problem.stations.names, candidate.kind or None
+    bias = family(rows, names, candidate.name, per=candidate.per, form=candidate.bias.form, kind=kind, members=members)
+    if not np.isfinite(candidate.since):
         return bias
     when = problem.times[problem.epoch[bias.row]]
-    inside = (when >= one.since) & ~(when >= one.until)
+    inside = (when >= candidate.since) & ~(when >= candidate.until)
     return replace(bias, row=bias.row[inside], member=bias.member[inside], coefficient=bias.coefficient[inside])
 
 
 def _joined(problem: Problem, x: Array) -> Array:
-    """Return the parameter vector (1, size) of a problem; separate fixes of its epochs are joined."""
+    """Return the parameter vector (1, size) of a problem at `x`.
+
+    `x` is (size,) or (1, size). If the epochs of the problem share nothing, `x` may also hold k separate fixes
+    (k, size of an epoch). The function joins these fixes.
+    """
     layout = problem.layout
     if x.size == layout.size and x.ndim < 3 and not (separable(problem) and len(x) == problem.epochs > 1):
         return x.reshape(1, -1)
@@ -167,15 +175,16 @@ def _joined(problem: Problem, x: Array) -> Array:
         raise InvalidProblem(
             f"a fix of shape {x.shape} does not belong to this problem", "fix", "give the fix of this problem"
         )
-    own = by_epoch(problem).layout
-    parts = [own.take(x, slot.name).reshape(problem.epochs, -1) for slot in layout.local]
+    epoch_layout = by_epoch(problem).layout
+    parts = [epoch_layout.take(x, slot.name).reshape(problem.epochs, -1) for slot in layout.local]
     return np.concatenate(parts, axis=1).reshape(1, -1)
 
 
 def _shortened(problem: Problem, x: Array) -> tuple[Problem, Array]:
-    """Return some epochs of a long run, evenly over the whole run, to limit the time of the tests.
+    """Return a problem with at most about `_MAX_ROWS` rows, and its vector, to limit the time of the tests.
 
-    Errors can grow with the run: its first epochs alone would not show a slow drift or an error that starts late.
+    The epochs that remain are spread evenly over the run. Errors can grow with the run: the first epochs alone would
+    not show a slow drift or an error that starts late. `x` (1, size) belongs to the whole run.
     """
     if problem.count <= _MAX_ROWS or problem.epochs == 1 or has_correlated_epochs(problem):
         return problem, x
@@ -183,12 +192,16 @@ def _shortened(problem: Problem, x: Array) -> tuple[Problem, Array]:
     chosen = np.unique(np.linspace(0, problem.epochs - 1, kept).round().astype(int))
     chosen = chosen[np.isin(chosen, problem.epoch)]
     n, length = problem.layout.n_shared, problem.layout.n_local
-    own = x[:, n:].reshape(len(x), problem.epochs, length)[:, chosen]
-    return some_epochs(problem, chosen), np.concatenate([x[:, :n], own.reshape(len(x), -1)], axis=1)
+    local = x[:, n:].reshape(len(x), problem.epochs, length)[:, chosen]
+    return some_epochs(problem, chosen), np.concatenate([x[:, :n], local.reshape(len(x), -1)], axis=1)
 
 
 def _without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:
-    """Return the problem without values that are not finite, and without the epochs of a run that have no fix."""
+    """Return the problem without values that are not finite and without epochs that have no fix, and a finite vector.
+
+    These rows stay in the arrays with weight zero. In the vector (1, size), an epoch without a fix gets the mean of the
+    local unknowns of the other epochs.
+    """
     weight = np.where(np.isfinite(problem.z), problem.weight, 0.0)
     n, length = problem.layout.n_shared, problem.layout.n_local
     if problem.epochs > 1 and length and np.isfinite(x[:, :n]).all():
@@ -206,55 +219,62 @@ def _without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:
 # Sentences about the result of a score test.
 
 
-def _noun(one: Candidate) -> str:
-    """Return the noun of a candidate with its article."""
-    return {"step": "a step", "burst": "a burst of errors"}.get(one.form) or form_of(one.bias).noun
+def _noun(candidate: Candidate) -> str:
+    """Return the noun of a candidate with its article, for instance "a drift"."""
+    return {"step": "a step", "burst": "a burst of errors"}.get(candidate.form) or form_of(candidate.bias).noun
 
 
-def _error_advice(problem: Problem, one: Explained) -> Advice:
+def _error_advice(problem: Problem, explanation: Explained) -> Advice:
     """Return the advice about a systematic error: its form, channel, size, duration and p-values."""
-    bias, who = one.candidate.bias, one.candidate
-    value, unit = _size(problem, one)
+    bias, candidate = explanation.candidate.bias, explanation.candidate
+    value, unit = _size(problem, explanation)
     station = bias.members[0]
-    whose = f"station {station}" if who.per == "station" else f"all {station} rows"
-    rows = f" in its {who.kind} rows" if who.per == "station" and who.kind and len(problem.rows) > 1 else ""
-    kind, what = who.form, _noun(who)
-    when = f" from t = {who.since:.6g} s " if np.isfinite(who.since) else ""
-    when += {"step": "on", "burst": f"to {who.until:.6g} s"}.get(kind, "")
-    better = "the misfit" if one.p_before < _MISFIT else "the residuals better"
-    seen = f"{what} of {whose}{rows} of {value} {unit}{when} would explain {better}: p = {one.p_after:.2g}"
-    seen += f" with it, {one.p_before:.2g} without"
+    subject = f"station {station}" if candidate.per == "station" else f"all {station} rows"
+    rows = (
+        f" in its {candidate.kind} rows"
+        if candidate.per == "station" and candidate.kind and len(problem.rows) > 1
+        else ""
+    )
+    kind, what = candidate.form, _noun(candidate)
+    when = f" from t = {candidate.since:.6g} s " if np.isfinite(candidate.since) else ""
+    when += {"step": "on", "burst": f"to {candidate.until:.6g} s"}.get(kind, "")
+    better = "the misfit" if explanation.p_before < _MISFIT else "the residuals better"
+    seen = f"{what} of {subject}{rows} of {value} {unit}{when} would explain {better}: p = {explanation.p_after:.2g}"
+    seen += f" with it, {explanation.p_before:.2g} without"
     if kind == "step":
         return Advice("step", seen, "split the run there, or give the later rows another station name")
     if kind == "burst":
         return Advice("burst", seen, "remove these rows, or use the method 'robust'")
-    return Advice(kind, seen, "check this channel; until then, model the error", _lines(problem, one))
+    return Advice(kind, seen, "check this channel; until then, model the error", _lines(problem, explanation))
 
 
-def _size(problem: Problem, one: Explained) -> tuple[str, str]:
-    """Return the estimate with its standard deviation, and its unit; angles in degrees."""
-    slot = _unit(problem, one)
-    unit, scale = (slot.replace("rad", "deg"), np.degrees(1.0)) if "rad" in slot else (slot, 1.0)
-    if form_of(one.candidate.bias).enters == "scales":
+def _size(problem: Problem, explanation: Explained) -> tuple[str, str]:
+    """Return the estimate of an error with its standard deviation as text, and its unit.
+
+    Angles are in degrees and scales in percent; all other errors are in SI units.
+    """
+    si_unit = _unit(problem, explanation)
+    unit, scale = (si_unit.replace("rad", "deg"), np.degrees(1.0)) if "rad" in si_unit else (si_unit, 1.0)
+    if form_of(explanation.candidate.bias).enters == "scales":
         unit, scale = "%", 100.0
-    pairs = [f"{scale * v:+.4g} ± {scale * s:.2g}" for v, s in zip(one.value, one.sigma, strict=True)]
+    pairs = [f"{scale * v:+.4g} ± {scale * s:.2g}" for v, s in zip(explanation.value, explanation.sigma, strict=True)]
     return ", ".join(pairs), unit
 
 
-def _unit(problem: Problem, one: Explained) -> str:
+def _unit(problem: Problem, explanation: Explained) -> str:
     """Return the SI unit of a systematic error."""
-    larger = replace(problem, biases=(*problem.biases, one.candidate.bias))
-    return larger.layout.find(one.candidate.bias.name)[0].unit
+    larger = replace(problem, biases=(*problem.biases, explanation.candidate.bias))
+    return larger.layout.find(explanation.candidate.bias.name)[0].unit
 
 
-def _lines(problem: Problem, one: Explained) -> str:
+def _lines(problem: Problem, explanation: Explained) -> str:
     """Return the lines of a problem file that model an error as a bias."""
-    who, bias = one.candidate, one.candidate.bias
-    taken = {each.name for each in problem.biases}
-    name = next(text for text in (bias.form, *(f"{bias.form} {i}" for i in range(2, 99))) if text not in taken)
-    lines = [f'name = "{name}"', f'form = "{bias.form}"', f'per = "{who.per}"']
-    lines += [f'kind = "{who.kind}"'] if who.kind else []
-    lines += [f"members = [{_quoted(bias.members[0])}]"] if who.per == "station" else []
+    candidate, bias = explanation.candidate, explanation.candidate.bias
+    used_names = {each.name for each in problem.biases}
+    name = next(text for text in (bias.form, *(f"{bias.form} {i}" for i in range(2, 99))) if text not in used_names)
+    lines = [f'name = "{name}"', f'form = "{bias.form}"', f'per = "{candidate.per}"']
+    lines += [f'kind = "{candidate.kind}"'] if candidate.kind else []
+    lines += [f"members = [{_quoted(bias.members[0])}]"] if candidate.per == "station" else []
     return "\n".join(["[[biases]]", *lines]) + "\n"
 
 

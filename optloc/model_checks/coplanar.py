@@ -1,7 +1,11 @@
 """Interval of the distance of a target from the plane of all stations, where both sides of the plane fit equally well.
 
 The cost depends on the position in the plane and on q = w^2, the square of the distance w from the plane. The
-distribution of w follows from the profile of the cost over q, because no Gaussian describes w near the plane.
+distribution of w follows from the profile of the cost over q, because no Gaussian describes w near the plane. A point
+of the profile is the lowest cost at a fixed w.
+
+Arrays have one entry for each of N problems. A position has d coordinates; a vector (size,) holds all unknowns of a
+problem. In plane coordinates, the last coordinate of the position is w.
 """
 
 from __future__ import annotations
@@ -52,10 +56,10 @@ _TRIALS, _CLOSE = 20, 1e-2
 class Across:
     """N problems in coordinates whose last axis is the distance from the plane of the stations.
 
-    - problem: the problems without constraints.
-    - centre (N, d): mean of the stations, m.
-    - axes (N, d, d): unit vectors in columns; the last one is the normal of the plane.
-    - size (N,): spread of the stations, m.
+    - problem: the problems without constraints, with stations at distance zero from the plane.
+    - centre (N, d): mean of the stations, m, in the original coordinates.
+    - axes (N, d, d): unit vectors in columns; the last column is the normal of the plane.
+    - size (N,): spread of the stations, m; 1 for stations at one point.
     """
 
     problem: Problem
@@ -65,7 +69,7 @@ class Across:
 
     @classmethod
     def of(cls, problem: Problem) -> Across:
-        """Return problems with coplanar stations in the coordinates of their plane."""
+        """Return a flat batch of N problems with coplanar stations in the coordinates of their plane."""
         count = problem.batch_shape[0]
         centre, axes, _, size = plane_of_stations(problem)
         centre, axes = np.broadcast_to(centre, (count, centre.shape[-1])), axes[..., ::-1]
@@ -77,18 +81,18 @@ class Across:
         return cls(turned, centre, axes, np.broadcast_to(np.where(size > 0.0, size, 1.0), (count,)))
 
     def take(self, items: Array) -> Across:
-        """Return the problems with these numbers."""
+        """Return the problems with the numbers `items`."""
         return Across(self.problem.take(items), self.centre[items], self.axes[items], self.size[items])
 
     @property
     def part(self) -> slice:
-        """Return the slice of the position in the vector of unknowns."""
+        """Return the slice of the position in a vector of unknowns."""
         slot, _ = self.problem.layout.find("position")
         return slice(slot.start, slot.start + slot.size)
 
     @property
     def least(self) -> Array:
-        """Return the distances (N,) that count as zero, m."""
+        """Return the distances from the plane (N,) that count as zero, m; derivatives by q exist only above zero."""
         return _ZERO_DISTANCE * self.size
 
     def to_plane(self, x: Array) -> Array:
@@ -100,7 +104,10 @@ class Across:
         return out
 
     def to_space(self, x: Array, side: Array) -> Array:
-        """Return vectors (N, size) in the original coordinates, on one side (1 or -1) of the plane."""
+        """Return vectors (N, size) in the original coordinates, on one side of the plane.
+
+        `x` (N, size) is in plane coordinates. `side` (N,) is 1 for the side of the normal and -1 for the other side.
+        """
         out = np.array(x)
         place = x[:, self.part].copy()
         place[:, -1] *= side
@@ -110,7 +117,7 @@ class Across:
     def refine(self, x: Array, *, held: bool) -> tuple[Array, Array, Array]:
         """Return the refined vectors (N, size), their costs and their `Status` numbers (N,), by steps in plane and q.
 
-        `x` (N, size) are the starts. With `held`, the distance from the plane stays fixed.
+        `x` (N, size) are the starts in plane coordinates. With `held`, the distance from the plane keeps its value.
         """
         start = np.array(x)
         axis = self.part.stop - 1
@@ -127,7 +134,10 @@ class Across:
         return done.x, done.cost, done.status
 
     def profile(self, x: Array, w: Array) -> tuple[Array, Array]:
-        """Return the optimal vectors (N, size) and their costs (N,) at fixed distances w (N,) from the plane, m."""
+        """Return the optimal vectors (N, size) and their costs (N,) at fixed distances `w` (N,) from the plane, m.
+
+        `x` (N, size) are starts in plane coordinates; `w` replaces the distances from the plane in `x`.
+        """
         start = np.array(x)
         start[:, self.part.stop - 1] = w
         end, cost, _ = self.refine(start, held=True)
@@ -146,7 +156,8 @@ def is_symmetric(problem: Problem) -> bool:
 def is_coplanar(problem: Problem) -> Array:
     """Return a mask (N,) of problems with all stations in one plane, or on one line for problems in the plane.
 
-    Distances from the plane far below the noise count as zero.
+    Distances from the plane far below the noise count as zero. The mask is False if the two sides of the plane differ
+    for other reasons, such as bearings or a prior on the position.
     """
     count = problem.batch_shape[0]
     if not is_symmetric(problem):
@@ -156,7 +167,7 @@ def is_coplanar(problem: Problem) -> Array:
 
 
 def _noise(problem: Problem) -> Array:
-    """Return the smallest standard deviation of the ranges (N or 1,), m; zero if a row depends on no range."""
+    """Return the smallest standard deviation of the present rows (N or 1,), m; zero if a row depends on no range."""
     if any(MODELS[rows.kind].ranges is None for rows in problem.rows):
         return np.zeros(1)
     sigma = np.sqrt(variances(problem.noise, problem.count))
@@ -164,7 +175,7 @@ def _noise(problem: Problem) -> Array:
 
 
 def normal_of(problem: Problem) -> Array | None:
-    """Return the normal (d,) of the plane of the stations, or None if the two sides of the plane differ."""
+    """Return the unit normal (d,) of the plane of the stations, or None if the two sides of the plane differ."""
     if problem.constraints or not is_coplanar(problem).all():
         return None
     return np.asarray(plane_of_stations(problem)[1][0, :, 0])
@@ -209,24 +220,25 @@ def distance_from_plane(problem: Problem, fix: Fix, level: float = 0.95) -> tupl
     if not np.isfinite(x).all():
         raise InvalidProblem("the fix has no position", "fix", "see its status for the reason")
     across = Across.of(flat)
-    at = across.to_plane(x)
-    _, cost = across.profile(at, at[:, across.part.stop - 1])
-    low, high = interval_across(across, at, cost, level)
+    in_plane = across.to_plane(x)
+    _, cost = across.profile(in_plane, in_plane[:, across.part.stop - 1])
+    low, high = interval_across(across, in_plane, cost, level)
     return float(low[0]), float(high[0])
 
 
 def information_in_square(across: Across, x: Array) -> tuple[Array, Array]:
-    """Return the information (N, n, n) on the shared unknowns, and a mask (N,) of its existence.
+    """Return the information (N, n, n) on the n shared unknowns, and a mask (N,) of its existence.
 
-    The unknown w, the distance from the plane, is replaced by q = w^2.
+    The unknown w, the distance from the plane, is replaced by q = w^2. `x` (N, size) is in plane coordinates. The mask
+    is False if the local unknowns of the only epoch are not determined.
     """
     axis = across.part.stop - 1
-    at = np.array(x)
-    at[:, axis] = np.maximum(at[:, axis], across.least)
+    start = np.array(x)
+    start[:, axis] = np.maximum(start[:, axis], across.least)
     with np.errstate(all="ignore"):
-        information, _, ok = marginal(equations_at(across.problem, at))
+        information, _, ok = marginal(equations_at(across.problem, start))
     scale = np.ones((len(x), information.shape[-1]))
-    scale[:, axis] = 0.5 / at[:, axis]
+    scale[:, axis] = 0.5 / start[:, axis]
     return information * scale[:, :, None] * scale[:, None, :], ok
 
 
@@ -239,16 +251,20 @@ def interval_across(across: Across, x: Array, cost: Array, level: float = REGION
     rise, w = quantile(level, 1), x[:, across.part.stop - 1]
     sigma = _spread_of_square(across, x)
     _, on_plane = across.profile(x, across.least)
-    apart, low = np.flatnonzero(on_plane - cost > rise), np.zeros(len(x))
-    if len(apart):
-        least = across.least[apart] ** 2
-        ends = (w[apart] ** 2, cost[apart], least, on_plane[apart])
-        low[apart] = _crossing(across.take(apart), x[apart], rise, ends, w[apart] ** 2 - np.sqrt(rise) * sigma[apart])
-    far, there = _bracket(across, x, cost + rise, sigma)
-    found, high = np.flatnonzero(np.isfinite(far)), np.full(len(x), np.inf)
-    if len(found):
-        ends = (w[found] ** 2, cost[found], far[found] ** 2, there[found])
-        high[found] = _crossing(across.take(found), x[found], rise, ends, w[found] ** 2 + np.sqrt(rise) * sigma[found])
+    off_plane, low = np.flatnonzero(on_plane - cost > rise), np.zeros(len(x))
+    if len(off_plane):
+        least = across.least[off_plane] ** 2
+        ends = (w[off_plane] ** 2, cost[off_plane], least, on_plane[off_plane])
+        low[off_plane] = _crossing(
+            across.take(off_plane), x[off_plane], rise, ends, w[off_plane] ** 2 - np.sqrt(rise) * sigma[off_plane]
+        )
+    far, far_cost = _bracket(across, x, cost + rise, sigma)
+    bounded, high = np.flatnonzero(np.isfinite(far)), np.full(len(x), np.inf)
+    if len(bounded):
+        ends = (w[bounded] ** 2, cost[bounded], far[bounded] ** 2, far_cost[bounded])
+        high[bounded] = _crossing(
+            across.take(bounded), x[bounded], rise, ends, w[bounded] ** 2 + np.sqrt(rise) * sigma[bounded]
+        )
     return low, high
 
 
@@ -262,7 +278,11 @@ def _spread_of_square(across: Across, x: Array) -> Array:
 
 
 def _bracket(across: Across, x: Array, top: Array, sigma: Array) -> tuple[Array, Array]:
-    """Return distances (N,) whose profile cost exceeds a level (N,), and these costs; infinite without a crossing."""
+    """Return distances (N,) from the plane, m, whose profile cost exceeds the limit `top` (N,), and these costs (N,).
+
+    A distance is infinite if the cost stays below the limit at all tried distances. `x` (N, size) are the fixes in
+    plane coordinates, and `sigma` (N,) the standard deviations of q, m^2.
+    """
     # one step is enough if the cost is quadratic in q
     far = np.sqrt(x[:, across.part.stop - 1] ** 2 + _FIRST_STEP * sigma)
     reached, cost = across.profile(x, far)
@@ -271,37 +291,39 @@ def _bracket(across: Across, x: Array, top: Array, sigma: Array) -> tuple[Array,
         if not within.any():
             break
         far = np.where(within, 4.0 * far, far)
-        there, found = across.profile(reached, far)
-        cost = np.where(within, found, cost)
-        reached = np.where((cost <= top)[:, None], there, reached)
+        refined, new_cost = across.profile(reached, far)
+        cost = np.where(within, new_cost, cost)
+        reached = np.where((cost <= top)[:, None], refined, reached)
     return np.where(cost <= top, np.inf, far), cost
 
 
 def _crossing(across: Across, x: Array, rise: float, ends: tuple[Array, ...], first: Array) -> Array:
-    """Return the distances (N,) at which the profile of the cost reaches `rise` above the fix, by false position in q.
+    """Return the distances (N,), m, at which the profile of the cost reaches `rise` above the fix.
 
-    The iteration uses the square root of the rise, which is nearly linear in q. `ends` are q and cost of the fix, and q
-    and cost of a point above the level. `first` (N,) is the expected q of the crossing.
+    False position in q uses the square root of the rise, which is nearly linear in q. `x` (N, size) are the fixes in
+    plane coordinates. `ends` are four arrays (N,): q and cost of the fix, then q and cost of a point with a larger
+    rise. `first` (N,) is the expected q of the crossing, m^2.
 
     References
     ----------
     M. Dowell and P. Jarratt, "A modified regula falsi method for computing the root of an equation", BIT 11 (1971).
     """
+    # a and b are the ends of the search in q; low and high are the excesses of the root of the rise there
     a, least, b, above = ends
-    wanted = np.sqrt(rise)
-    low, high, side = np.full(len(x), -wanted), np.sqrt(above - least) - wanted, np.zeros(len(x))
+    root_rise = np.sqrt(rise)
+    low, high, side = np.full(len(x), -root_rise), np.sqrt(above - least) - root_rise, np.zeros(len(x))
     q, reached = np.where((first > np.minimum(a, b)) & (first < np.maximum(a, b)), first, 0.5 * (a + b)), x
     for _ in range(_TRIALS):
-        there, cost = across.profile(reached, np.sqrt(q))
-        now = np.where(np.isfinite(cost), np.sqrt(np.maximum(cost - least, 0.0)) - wanted, np.inf)
-        if (np.abs(now) <= _CLOSE).all():
+        refined, cost = across.profile(reached, np.sqrt(q))
+        excess = np.where(np.isfinite(cost), np.sqrt(np.maximum(cost - least, 0.0)) - root_rise, np.inf)
+        if (np.abs(excess) <= _CLOSE).all():
             break
-        over = now > 0.0
-        reached = np.where(over[:, None], reached, there)
+        over = excess > 0.0
+        reached = np.where(over[:, None], reached, refined)
         # an end that stays for two iterations counts half, as in the modified regula falsi
         low, high = np.where(over & (side > 0.0), 0.5 * low, low), np.where(~over & (side < 0.0), 0.5 * high, high)
-        a, low = np.where(over, a, q), np.where(over, low, now)
-        b, high = np.where(over, q, b), np.where(over, now, high)
+        a, low = np.where(over, a, q), np.where(over, low, excess)
+        b, high = np.where(over, q, b), np.where(over, excess, high)
         side = np.where(over, 1.0, -1.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             q = (a * high - b * low) / (high - low)

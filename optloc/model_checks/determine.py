@@ -79,11 +79,11 @@ def determined(problem: Problem, fix: Fix) -> Determined:
         centre = problem.stations.places.reshape(-1, problem.dimension).mean(0)
         return Determined(centre, _level(problem, centre), problem.frame.geodetic, words=words)
     with np.errstate(all="ignore"):
-        return replace(_of_one(flat, int(fix.dof)), words=words)
+        return replace(_determined_of_problem(flat, int(fix.dof)), words=words)
 
 
 def _level(problem: Problem, centre: Array) -> Array:
-    """Return the unit vectors east, north and up (d, d) at a position in rows, or the axes of a Cartesian frame."""
+    """Return the unit vectors east, north and up (d, d) as rows at `centre`, or the axes of a Cartesian frame."""
     return problem.frame.enu_axes(centre) if problem.frame.geodetic else np.eye(problem.dimension)
 
 
@@ -93,58 +93,70 @@ def _is_complete(problem: Problem) -> bool:
     return bool(present.any() and np.isfinite(np.where(present, problem.z, 0.0)).all())
 
 
-def _of_one(flat: Problem, dof: int) -> Determined:
-    """Return the determined quantities of a flat batch of one problem; directions only with enough rows."""
-    view, north = DirectionCost.of(flat), flat.frame.geodetic
-    level = _level(flat, view.centre)
+def _determined_of_problem(flat: Problem, dof: int) -> Determined:
+    """Return the determined quantities of a flat batch of one problem with `dof` degrees of freedom.
+
+    The function tries these cases in order: all stations on a line in space; a single measurement in the plane; all
+    others. In the last case, it searches for directions if at most one unknown, the range, is undetermined. If the
+    range of each direction has an upper limit, coordinates in the plane of the stations are added.
+    """
+    surface, north = DirectionCost.of(flat), flat.frame.geodetic
+    level = _level(flat, surface.centre)
     axes, line = plane_of_stations(flat)[1][0], _about_line(flat)
     if line is not None:
-        return Determined(view.centre, level, north, (), _along_line(line), axis=axes[:, -1])
+        return Determined(surface.centre, level, north, (), _along_line(line), axis=axes[:, -1])
     outside, (name, curve, numbers) = False, _curve(flat)
     if curve is not None:
-        return Determined(view.centre, level, north, (), numbers, curve, name)
-    found = directions_of(view, level, dof < 0) if dof >= _MIN_DOF else ()
+        return Determined(surface.centre, level, north, (), numbers, curve, name)
+    found = directions_of(surface, level, dof < 0) if dof >= _MIN_DOF else ()
     if dof >= 0 and not found:
         # between the stations any direction is possible: consider only targets outside their sphere
-        found = directions_of(replace(view, most=1.0), level)
+        found = directions_of(replace(surface, most=1.0), level)
         outside = bool(found)
     # if the range is unbounded, the distance from a plane is unbounded too
     closed = not outside and all(one.mixed for one in found)
-    across = _in_plane(flat, view) if closed and is_coplanar(flat)[0] else ()
+    across = _in_plane(flat, surface) if closed and is_coplanar(flat)[0] else ()
     axis = axes[:, 0] if across else None
-    return Determined(view.centre, level, north, found, across, axis=axis, outside=outside)
+    return Determined(surface.centre, level, north, found, across, axis=axis, outside=outside)
 
 
 # Stations on a line in space: the data do not determine the angle of the target about the line.
 
 
 def _about_line(flat: Problem) -> Problem | None:
-    """Return the problem in a plane through the line of all stations, or None if the stations are on no line."""
+    """Return the problem in a plane through the line of all stations, or None if the stations are on no line in space.
+
+    In the plane, the stations are on the x axis and do not move.
+    """
     if flat.dimension != 3 or not is_coplanar(flat)[0]:
         return None
     centre, axes, _, size = plane_of_stations(flat)
     if size[0] == 0.0:
         return None
-    place = (flat.stations.position - centre[0]) @ axes[0][:, [2, 1]]
-    still = None if flat.stations.velocity is None else np.zeros((1, flat.stations.count, 2))
-    stations = replace(flat.stations, position=place, velocity=still, axes=None)
+    in_plane = (flat.stations.position - centre[0]) @ axes[0][:, [2, 1]]
+    no_velocity = None if flat.stations.velocity is None else np.zeros((1, flat.stations.count, 2))
+    stations = replace(flat.stations, position=in_plane, velocity=no_velocity, axes=None)
     reduced = replace(flat, stations=stations, frame=CARTESIAN)
     return reduced if is_coplanar(reduced)[0] else None
 
 
 def _along_line(problem: Problem) -> tuple[Quantity, ...]:
-    """Return the angle to the line of stations, the coordinate along it and the distance from it.
+    """Return three quantities with 95 % intervals, for stations on the x axis of a problem in the plane.
 
-    The problem has the line as its x axis.
+    They are the angle to the line (rad), the coordinate along the line (m) and the distance from it (m). The intervals
+    cover the regions of all minima whose cost is close enough to the lowest cost. If no minimum has a finite cost, the
+    result is empty. If the best minimum is at infinity, each coordinate is infinite, or zero if it is below a limit.
     """
-    view, rise = DirectionCost.of(problem), quantile(LEVEL, 1)
-    minima = minima_of(view, rise)
+    surface, rise = DirectionCost.of(problem), quantile(LEVEL, 1)
+    minima = minima_of(surface, rise)
     if not np.isfinite(minima.cost[0]):
         return ()
-    best = view.positions(minima.u[:1], minima.v[:1])[0]
-    best = np.where(minima.v[0] <= INFINITY, np.where(np.abs(best) < _ENDLESS * view.spread, 0.0, np.inf * best), best)
+    best = surface.positions(minima.u[:1], minima.v[:1])[0]
+    best = np.where(
+        minima.v[0] <= INFINITY, np.where(np.abs(best) < _ENDLESS * surface.spread, 0.0, np.inf * best), best
+    )
     found = [
-        extent_of(view, minima.u[i], float(minima.v[i]), float(minima.cost[0]), rise) for i in range(len(minima.v))
+        extent_of(surface, minima.u[i], float(minima.v[i]), float(minima.cost[0]), rise) for i in range(len(minima.v))
     ]
     points = np.concatenate(found)
     crosses = any((edge[:, 1] > 0.0).any() and (edge[:, 1] < 0.0).any() for edge in found)
@@ -152,7 +164,7 @@ def _along_line(problem: Problem) -> tuple[Quantity, ...]:
     turn = abs(float(np.arctan2(minima.u[0, 1], minima.u[0, 0])))
     low, high = float(angle.min()), float(angle.max())
     ahead = crosses and bool((points[:, 0] > 0.0).any()), crosses and bool((points[:, 0] < 0.0).any())
-    limit = _ENDLESS * view.spread
+    limit = _ENDLESS * surface.spread
     along, away = _endless(points[:, 0], limit), _endless(np.abs(points[:, 1]), limit)
     return (
         Quantity(
@@ -168,7 +180,7 @@ def _along_line(problem: Problem) -> tuple[Quantity, ...]:
 
 
 def _endless(values: Array, limit: float) -> tuple[float, float]:
-    """Return the smallest and the largest value; infinite beyond a limit."""
+    """Return the smallest and the largest value, m; an end becomes infinite if its size is at least `limit`, m."""
     ends = np.array([values.min(), values.max()])
     low, high = np.where(np.abs(ends) < limit, ends, np.copysign(np.inf, ends)).tolist()
     return low, high
@@ -177,15 +189,19 @@ def _endless(values: Array, limit: float) -> tuple[float, float]:
 # Stations in a plane: the data do not determine the side of the plane.
 
 
-def _in_plane(flat: Problem, view: DirectionCost) -> tuple[Quantity, ...]:
-    """Return the coordinates in the plane of all stations and the distance from it; empty if one is unbounded."""
+def _in_plane(flat: Problem, surface: DirectionCost) -> tuple[Quantity, ...]:
+    """Return the coordinates in the plane of all stations and the distance from the plane, with 95 % intervals in m.
+
+    The result is empty if a coordinate is unbounded, if the best minimum is at infinity, or with fewer rows than
+    coordinates.
+    """
     if (flat.weight > 0.0).sum() < flat.dimension:
         return ()
-    minima = minima_of(view, 0.0)
+    minima = minima_of(surface, 0.0)
     if not np.isfinite(minima.cost[0]) or minima.v[0] <= INFINITY:
         return ()
     across = Across.of(flat)
-    x, cost, _ = across.refine(across.to_plane(view.vectors(minima.u[:1], minima.v[:1])), held=False)
+    x, cost, _ = across.refine(across.to_plane(surface.vectors(minima.u[:1], minima.v[:1])), held=False)
     low, high = interval_across(across, x, cost, LEVEL)
     spread, ok = linalg.inverse(information_in_square(across, x)[0])
     if not ok[0] or not np.isfinite(high[0]):
@@ -198,7 +214,11 @@ def _in_plane(flat: Problem, view: DirectionCost) -> tuple[Quantity, ...]:
 
 
 def _coordinates(across: Across, place: Array, covariance: Array) -> tuple[Quantity, ...]:
-    """Return coordinates in a plane: along axes of the frame if they are in the plane, else along principal axes."""
+    """Return the coordinates of a position in the plane of the stations, with 95 % intervals in m.
+
+    `place` (d - 1,) and `covariance` (d - 1, d - 1) are along the axes of the plane. The results are along the axes of
+    the frame if enough of these are in the plane, else along the principal axes of the stations.
+    """
     centre, axes = across.centre[0], across.axes[0]
     level = np.flatnonzero(np.abs(axes[:, -1]) <= _IN_PLANE)
     if len(level) == len(place):
@@ -207,8 +227,8 @@ def _coordinates(across: Across, place: Array, covariance: Array) -> tuple[Quant
         names = [f"along ({', '.join(f'{a:.2f}' for a in axis)})" for axis in axes.T[:-1]]
         turn, start = np.eye(len(place)), np.zeros(len(place))
     values = start + turn @ place
-    wide = _WIDE * np.sqrt(np.maximum(np.diagonal(turn @ covariance @ turn.T), 0.0))
-    ends = zip(names, values.tolist(), (values - wide).tolist(), (values + wide).tolist(), strict=True)
+    half_width = _WIDE * np.sqrt(np.maximum(np.diagonal(turn @ covariance @ turn.T), 0.0))
+    ends = zip(names, values.tolist(), (values - half_width).tolist(), (values + half_width).tolist(), strict=True)
     return tuple(Quantity(name, value, low, high, "m") for name, value, low, high in ends)
 
 
@@ -221,13 +241,13 @@ _LENGTHS = {"tdoa": "difference", "range": "range", "range_sum": "sum"}
 def _curve(flat: Problem) -> tuple[str, Array | None, tuple[Quantity, ...]]:
     """Return the name of the curve of a single row in the plane, its points (k, 2) in m, and the measured length.
 
-    The points are None if the problem is not of this form.
+    If the problem is not of this form, the results are an empty name, None and an empty tuple.
     """
     numbers = np.flatnonzero(flat.weight.reshape(-1) > 0.0)
     if flat.dimension != 2 or len(numbers) != 1 or flat.biases or flat.priors:
         return "", None, ()
-    place = int(np.searchsorted(flat.starts, numbers[0], side="right")) - 1
-    rows, i = flat.rows[place], int(numbers[0]) - flat.starts[place]
+    block = int(np.searchsorted(flat.starts, numbers[0], side="right")) - 1
+    rows, i = flat.rows[block], int(numbers[0]) - flat.starts[block]
     if rows.kind not in _NAMES:
         return "", None, ()
     z = float(flat.observed.reshape(-1)[numbers[0]])
@@ -241,7 +261,10 @@ def _curve(flat: Problem) -> tuple[str, Array | None, tuple[Quantity, ...]]:
 
 
 def _hyperbola(a: Array, b: Array, z: float) -> Array:
-    """Return points (k, 2) of the hyperbola |x - a| - |x - b| = z, m; of a ray if |z| exceeds the baseline."""
+    """Return points (k, 2) of the hyperbola |x - a| - |x - b| = z, m; of a ray if |z| is at least the baseline.
+
+    `a` and `b` (2,) are the positions of the stations, m.
+    """
     base = float(np.hypot(*(a - b)))
     along = (b - a) / base
     if abs(z) >= base:
@@ -250,7 +273,7 @@ def _hyperbola(a: Array, b: Array, z: float) -> Array:
     turn = np.linspace(-1.0, 1.0, _POINTS) * np.arcsinh(_REACH * base / side)
     # for z > 0 the branch is nearer to b
     ahead = vertex * np.cosh(turn)
-    return np.asarray(0.5 * (a + b) + ahead[:, None] * along + (side * np.sinh(turn))[:, None] * _across(along))
+    return np.asarray(0.5 * (a + b) + ahead[:, None] * along + (side * np.sinh(turn))[:, None] * _perpendicular(along))
 
 
 def _ellipse(a: Array, b: Array, total: float) -> Array:
@@ -261,13 +284,15 @@ def _ellipse(a: Array, b: Array, total: float) -> Array:
         return np.stack([a, b])
     turn = np.linspace(0.0, 2.0 * np.pi, _POINTS)
     long, short = 0.5 * total, 0.5 * np.sqrt(total**2 - base**2)
-    ring = 0.5 * (a + b) + (long * np.cos(turn))[:, None] * along + (short * np.sin(turn))[:, None] * _across(along)
+    ring = (
+        0.5 * (a + b) + (long * np.cos(turn))[:, None] * along + (short * np.sin(turn))[:, None] * _perpendicular(along)
+    )
     ring[-1] = ring[0]
     return np.asarray(ring)
 
 
-def _across(along: Array) -> Array:
-    """Return a vector in the plane, rotated counter-clockwise by a right angle."""
+def _perpendicular(along: Array) -> Array:
+    """Return the vector `along` (2,) after a rotation by a right angle, counter-clockwise."""
     return np.array([-along[1], along[0]])
 
 
@@ -275,21 +300,25 @@ def _across(along: Array) -> Array:
 
 
 def of_fix(fix: Fix) -> Determined | None:
-    """Return the coordinates of a single fix with their intervals if it is `ok`, else None."""
+    """Return the coordinates of a single fix with their 95 % intervals, m, if its status is `ok`, else None."""
     if Status(int(fix.code)) is not Status.OK or fix.chart is None:
         return None
     numbers = tuple(
-        Quantity(name, value, *_ends(fix, name), "m") for name, value in zip(AXES, fix.position.tolist(), strict=False)
+        Quantity(name, value, *_interval(fix, name), "m")
+        for name, value in zip(AXES, fix.position.tolist(), strict=False)
     )
     centre, north = np.asarray(fix.chart.centre), fix.frame.geodetic
     level = fix.frame.enu_axes(centre) if north else np.eye(len(centre))
     return Determined(centre, level, north, (), numbers)
 
 
-def _ends(fix: Fix, axis: Extent) -> tuple[float, float]:
-    """Return the 95 % interval of a coordinate, m; the shortest interval if bounds truncate the distribution."""
+def _interval(fix: Fix, axis: Extent) -> tuple[float, float]:
+    """Return the 95 % interval of a coordinate ("x", "y" or "z") of a fix, m.
+
+    If bounds truncate the distribution, it is the shortest interval, else plus and minus 1.96 sigma.
+    """
     if fix.chart is not None and fix.chart.cut_off:
         low, high = fix.interval(axis)
         return float(low), float(high)
-    value, wide = (float(each[AXES.index(axis)]) for each in (fix.position, _WIDE * fix.sigma()))
-    return value - wide, value + wide
+    value, half_width = (float(each[AXES.index(axis)]) for each in (fix.position, _WIDE * fix.sigma()))
+    return value - half_width, value + half_width

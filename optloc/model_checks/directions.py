@@ -1,9 +1,13 @@
 """Confidence sets of direction and range of a target, from the likelihood over direction and inverse range.
 
-The target is at ``x = c + (s / v) u``. Here c is the centre of the stations, s their spread, u a unit vector, and v >=
-0 the inverse range in spreads. Infinity is v = 0, a regular point, so a plane wave needs no special case. A cone holds
-the directions whose cost, at the best v, is close enough to the minimum. The inverse range is not Gaussian at its
-bound, so all ends follow from the cost itself.
+The target is at ``x = c + (s / v) u``. Here c is the centre of the stations, s their spread, u a unit vector, and v the
+inverse range in units of 1/s, at least 0. Infinity is v = 0, a regular point, so a plane wave needs no special case. A
+cone holds the directions whose cost, at the best v, is close enough to the minimum. The inverse range is not Gaussian
+at its bound, so all ends follow from the cost itself.
+
+Arrays hold q or k directions of d coordinates, and a vector of `size` parameters for each. A rise is an increase of the
+cost above the lowest cost of all minima, `least`; the edge of a set is at a given rise. Its square root is in standard
+deviations.
 """
 
 from __future__ import annotations
@@ -76,8 +80,8 @@ class DirectionCost:
     - x (1, size): start of the search for the other unknowns.
     - centre (d,): centre of the stations with present rows, m.
     - spread: largest distance of these stations from the centre, m; 1 for one station.
-    - weighed (1, size): parameters at which station errors are weighted; without it, each position itself.
-    - most: largest inverse range of the search.
+    - weighed (1, size): parameters at which station errors are weighted; None weights each position at this position.
+    - most: largest inverse range of the search, in 1/spread.
     """
 
     problem: Problem
@@ -89,48 +93,53 @@ class DirectionCost:
 
     @classmethod
     def of(cls, problem: Problem) -> DirectionCost:
-        """Return the view of a flat batch of one problem."""
+        """Return the cost of a flat batch of one problem, with the centre and spread of its stations."""
         centre, _, _, size = plane_of_stations(problem)
         spread = float(size[0]) if size[0] > 0.0 else 1.0
         return cls(problem, vectors(problem, np.zeros((1, 1, problem.dimension)))[:, 0], centre[0], spread)
 
     def positions(self, u: Array, v: Array) -> Array:
-        """Return positions (q, d), m."""
+        """Return the positions (q, d), m, at the directions `u` (q, d) and the inverse ranges `v` (q,)."""
         return np.asarray(self.centre + (self.spread / v)[:, None] * u)
 
     def vectors(self, u: Array, v: Array) -> Array:
-        """Return parameter vectors (q, size) with these positions."""
+        """Return parameter vectors (q, size) with positions at directions `u` (q, d) and inverse ranges `v` (q,)."""
         slot, _ = self.problem.layout.find("position")
         x = np.repeat(self.x, len(u), axis=0)
         x[:, slot.start : slot.start + slot.size] = self.positions(u, v)
         return x
 
-    def look(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Return costs (q,) and the normal equations (q, d, d) and (q, d) for a rotation of u and a change of v."""
+    def evaluate(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Return costs (q,), information (q, d, d) and right sides (q, d) at directions `u` and inverse ranges `v`.
+
+        Information and right side refer to d changes: d - 1 rotations of u, rad, and the change of v. A cost that
+        cannot be computed is infinite.
+        """
         x = self.vectors(u, v)[:, None]
-        own = profile_by_rows if has_scales(self.problem) else profile
-        cost, information, vector = own(self.problem, x, x if self.weighed is None else self.weighed, 2)
+        method = profile_by_rows if has_scales(self.problem) else profile
+        cost, information, vector = method(self.problem, x, x if self.weighed is None else self.weighed, 2)
         away = self.spread * u
         gradient = jacobian(np.concatenate([0.0 * u[:, :-1], v[:, None]], axis=1), away, np.zeros(u.shape[1]))
         turned = np.swapaxes(gradient, -1, -2)
         cost = np.where(np.isfinite(cost[:, 0]), cost[:, 0], np.inf)
         return cost, turned @ information[:, 0] @ gradient, (turned @ vector[:, 0, :, None])[..., 0]
 
-    def descend(self, u: Array, v: Array, turns: bool, moves: bool, steps: int) -> tuple[Array, Array, Array]:
+    def descend(self, u: Array, v: Array, rotate: bool, change_range: bool, steps: int) -> tuple[Array, Array, Array]:
         """Return the directions (q, d), inverse ranges and costs (q,) after at most `steps` damped Gauss-Newton steps.
 
-        `u` and `v` are the starts. `turns` allows changes of the direction, `moves` changes of the inverse range.
+        `u` and `v` are the starts. `rotate` allows changes of the direction, and `change_range` changes of the inverse
+        range.
         """
         d = u.shape[1]
-        free = np.array([turns] * (d - 1) + [moves])
-        cost, information, vector = self.look(u, v)
+        free = np.array([rotate] * (d - 1) + [change_range])
+        cost, information, vector = self.evaluate(u, v)
         damping, growth = np.full(len(u), _DAMPING), np.full(len(u), FIRST_GROWTH)
         for _ in range(steps):
-            move, gain, ok = _step(information, vector, damping, self._free(free, v, vector))
+            move, gain, ok = _step(information, vector, damping, self._may_change(free, v, vector))
             if not (gain > _CONVERGED * (1.0 + cost)).any():
                 break
             there, v_there = self._moved(u, v, move)
-            new, more, other = self.look(there, v_there)
+            new, more, other = self.evaluate(there, v_there)
             better, _, _, damping, growth = judge(cost, new, gain, ok, 0.0 * cost, damping, growth, 0.0, True)
             u, v = np.where(better[:, None], there, u), np.where(better, v_there, v)
             information = np.where(better[:, None, None], more, information)
@@ -138,7 +147,10 @@ class DirectionCost:
         return u, v, cost
 
     def _moved(self, u: Array, v: Array, move: Array) -> tuple[Array, Array]:
-        """Return directions and inverse ranges after a step (q, d)."""
+        """Return directions (q, d) and inverse ranges (q,) after steps (q, d): d - 1 rotations, rad, and a change of v.
+
+        A rotation is at most `_TURN`, and an inverse range stays within its bounds.
+        """
         turn = move[:, :-1]
         length = np.sqrt((turn**2).sum(-1, keepdims=True))
         turn = turn * np.minimum(1.0, _TURN / np.maximum(length, 1e-300))
@@ -146,14 +158,21 @@ class DirectionCost:
         there /= np.sqrt((there**2).sum(-1, keepdims=True))
         return there, np.clip(v + move[:, -1], INFINITY, self.most)
 
-    def _free(self, free: Array, v: Array, vector: Array) -> Array:
-        """Return the mask (q, d) of free coordinates: an inverse range at its bound moves only away from it."""
-        out = np.broadcast_to(free, vector.shape).copy()
+    def _may_change(self, searched: Array, v: Array, vector: Array) -> Array:
+        """Return the mask (q, d) of the coordinates of a step that may change.
+
+        `searched` (d,) marks the coordinates that the search changes, and `vector` (q, d) is the right side. An inverse
+        range at its bound may only move away from the bound.
+        """
+        out = np.broadcast_to(searched, vector.shape).copy()
         out[:, -1] &= ~(((v <= INFINITY) & (vector[:, -1] <= 0.0)) | ((v >= self.most) & (vector[:, -1] >= 0.0)))
         return out
 
     def best_range(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Return the best inverse ranges (q,) of directions (q, d) and their costs, from three starts."""
+        """Return the best inverse ranges (q,) of directions `u` (q, d) and their costs (q,).
+
+        Each direction has three starts: its guess in `v` (q,), infinity, and a point near the stations.
+        """
         starts = np.concatenate([v, np.full(len(v), INFINITY), np.full(len(v), _NEAR_STATIONS)])
         _, found, cost = self.descend(np.tile(u, (3, 1)), starts, False, True, _FEW)
         found, cost = found.reshape(3, -1), cost.reshape(3, -1)
@@ -162,7 +181,11 @@ class DirectionCost:
 
 
 def _step(information: Array, vector: Array, damping: Array, free: Array) -> tuple[Array, Array, Array]:
-    """Return damped steps (q, d) of the free coordinates, their predicted decreases, and a mask of solvable systems."""
+    """Return damped steps (q, d), the predicted decreases of the cost (q,), and a mask (q,) of solvable systems.
+
+    `information` (q, d, d) and `vector` (q, d) are the normal equations, and `damping` (q,) is relative to their
+    diagonal. Coordinates that `free` (q, d) does not mark do not change.
+    """
     inner = np.where(free[:, :, None] & free[:, None, :], information, 0.0)
     right = np.where(free, vector, 0.0)
     size = np.diagonal(inner, axis1=-2, axis2=-1).copy()
@@ -190,32 +213,35 @@ class DirectionMinima:
         return DirectionMinima(self.u[items], self.v[items], self.cost[items])
 
 
-def minima_of(view: DirectionCost, rise: float) -> DirectionMinima:
-    """Return the minima with a cost of at most `rise` above the lowest cost."""
-    d = len(view.centre)
+def minima_of(surface: DirectionCost, rise: float) -> DirectionMinima:
+    """Return the different minima with a cost of at most `rise` above the lowest cost, from a grid search."""
+    d = len(surface.centre)
     spot = spread_directions(_TRIED[d], d)
-    u, v = np.repeat(spot, len(_INVERSE), axis=0), np.tile(np.minimum(_INVERSE, view.most), len(spot))
-    cost = view.look(u, v)[0].reshape(len(spot), -1)
+    u, v = np.repeat(spot, len(_INVERSE), axis=0), np.tile(np.minimum(_INVERSE, surface.most), len(spot))
+    cost = surface.evaluate(u, v)[0].reshape(len(spot), -1)
     order = np.argsort(cost.min(1), kind="stable")[:_REFINED]
-    found = view.descend(spot[order], np.minimum(_INVERSE, view.most)[cost[order].argmin(1)], True, True, _STEPS)
-    found = _lowest(view, *found)
+    found = surface.descend(spot[order], np.minimum(_INVERSE, surface.most)[cost[order].argmin(1)], True, True, _STEPS)
+    found = _lowest(surface, *found)
     # add mirror images in the plane of the stations, and points on the plane, where a separate minimum is a point
-    image = normalised(mirror(view.problem, view.centre + found[0][None])[0] - view.centre)
+    image = normalised(mirror(surface.problem, surface.centre + found[0][None])[0] - surface.centre)
     on = normalised(found[0] + image)
-    more = view.descend(np.concatenate([image, on]), np.tile(found[1], 2), True, True, _STEPS)
+    more = surface.descend(np.concatenate([image, on]), np.tile(found[1], 2), True, True, _STEPS)
     u, v, cost = (np.concatenate(pair) for pair in zip(found, more, strict=True))
     return _distinct(u, v, cost, rise)
 
 
-def _lowest(view: DirectionCost, u: Array, v: Array, cost: Array) -> tuple[Array, Array, Array]:
-    """Return minima at their inverse range or at infinity, whichever has the lower cost."""
-    there, other, flat = view.descend(u, np.full(len(v), INFINITY), True, True, _STEPS)
+def _lowest(surface: DirectionCost, u: Array, v: Array, cost: Array) -> tuple[Array, Array, Array]:
+    """Return directions (q, d), inverse ranges (q,) and costs (q,): the better one of each minimum and infinity.
+
+    The arguments are minima. A second descent starts at infinity in the direction of each minimum.
+    """
+    there, other, flat = surface.descend(u, np.full(len(v), INFINITY), True, True, _STEPS)
     better = flat < cost
     return np.where(better[:, None], there, u), np.where(better, other, v), np.where(better, flat, cost)
 
 
 def _distinct(u: Array, v: Array, cost: Array, rise: float) -> DirectionMinima:
-    """Return the different minima within a rise above the lowest cost."""
+    """Return the different minima within `rise` of the lowest cost, in ascending order of the cost."""
     order = [int(i) for i in np.argsort(cost, kind="stable") if cost[i] <= cost.min() + rise]
     kept: list[int] = []
     for i in order:
@@ -233,25 +259,26 @@ Profile = Callable[[Array, Array], tuple[Array, Array]]
 
 
 def edge(
-    view: DirectionCost, start: tuple[Array, Array], ways: Array, least: float, rise: Array
+    surface: DirectionCost, start: tuple[Array, Array], rays: Array, least: float, rise: Array
 ) -> tuple[Array, Array]:
     """Return the angles (k,) of the edge of a cone along rays, in radians, and the directions (k, d) there.
 
-    `start` is the direction and inverse range of a minimum. `ways` (k, d) are unit vectors perpendicular to the
-    direction. `least` is the lowest cost of all minima, and `rise` (k,) the rise of the cost at the edge. The results
-    are NaN beyond the widest angle.
+    `start` is the direction (d,) and the inverse range of a minimum. `rays` (k, d) are unit vectors perpendicular to
+    the direction, one for each ray. `least` is the lowest cost of all minima, and `rise` (k,) the rise of the cost at
+    the edge. The results are NaN for a ray whose cost stays lower up to the widest angle.
     """
     u0, v0 = start
-    wanted, v = np.sqrt(rise), np.full(len(ways), v0)
-    low, high, above = np.zeros(len(ways)), _first(view, u0, v0, ways, wanted), np.zeros(len(ways))
-    below = _root(view.look(u0[None], np.atleast_1d(v0))[0], least)[0] - wanted
+    wanted, v = np.sqrt(rise), np.full(len(rays), v0)
+    low, high, above = np.zeros(len(rays)), _gaussian_edge(surface, u0, v0, rays, wanted), np.zeros(len(rays))
+    below = _sigmas_above(surface.evaluate(u0[None], np.atleast_1d(v0))[0], least)[0] - wanted
 
     def at(angle: Array, guess: Array) -> tuple[Array, Array]:
-        turned = np.cos(angle)[:, None] * u0 + np.sin(angle)[:, None] * ways
-        found, cost = view.best_range(turned, guess)
-        return _root(cost, least) - wanted, found
+        # excess of the root of the rise at angles on the rays, and the best inverse ranges there
+        turned = np.cos(angle)[:, None] * u0 + np.sin(angle)[:, None] * rays
+        found, cost = surface.best_range(turned, guess)
+        return _sigmas_above(cost, least) - wanted, found
 
-    inside = np.ones(len(ways), dtype=bool)
+    inside = np.ones(len(rays), dtype=bool)
     while inside.any():
         above, found = at(high, v)
         inside = (above < 0.0) & (high < _WIDEST)
@@ -260,19 +287,22 @@ def edge(
         high = np.where(inside, np.minimum(_GROWTH * high, _WIDEST), high)
     open_ = above < 0.0
     low = _false_position(at, (low, below), (high, above), v)
-    turned = np.cos(low)[:, None] * u0 + np.sin(low)[:, None] * ways
+    turned = np.cos(low)[:, None] * u0 + np.sin(low)[:, None] * rays
     return np.where(open_, np.nan, low), np.where(open_[:, None], np.nan, turned)
 
 
-def _root(cost: Array, least: float) -> Array:
+def _sigmas_above(cost: Array, least: float) -> Array:
     """Return the square root of the rise of costs above the lowest cost, in standard deviations."""
     return np.sqrt(np.maximum(cost - least, 0.0))
 
 
-def _first(view: DirectionCost, u: Array, v: Array, ways: Array, wanted: Array) -> Array:
-    """Return the angles (k,) of the edge of a Gaussian cone, in radians."""
-    _, information, _ = view.look(u[None], np.atleast_1d(v))
-    across = ways @ basis(u)
+def _gaussian_edge(surface: DirectionCost, u: Array, v: Array, rays: Array, wanted: Array) -> Array:
+    """Return the angles (k,) of the edge of a Gaussian cone along the rays `rays` (k, d), in radians, as first guesses.
+
+    `u` (d,) and `v` are a minimum, and `wanted` (k,) is the square root of the rise at the edge.
+    """
+    _, information, _ = surface.evaluate(u[None], np.atleast_1d(v))
+    across = rays @ basis(u)
     form = ((across @ _direction_information(information[0], float(v))) * across).sum(-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         guess = wanted / np.sqrt(form)
@@ -281,6 +311,9 @@ def _first(view: DirectionCost, u: Array, v: Array, ways: Array, wanted: Array) 
 
 def _false_position(at: Profile, low: tuple[Array, Array], high: tuple[Array, Array], v: Array) -> Array:
     """Return the zeros (k,) of functions between two ends, by the modified false position.
+
+    `at` evaluates the functions, which are negative at `low` and positive at `high`. Both ends are pairs of arguments
+    (k,) and values (k,). `v` (k,) are guesses of the unknown that `at` minimises.
 
     References
     ----------
@@ -304,24 +337,26 @@ def _false_position(at: Profile, low: tuple[Array, Array], high: tuple[Array, Ar
     return np.asarray(middle)
 
 
-def ends_of_range(view: DirectionCost, minima: DirectionMinima, least: float, rise: float) -> tuple[float, float]:
+def ends_of_range(surface: DirectionCost, minima: DirectionMinima, least: float, rise: float) -> tuple[float, float]:
     """Return the smallest and largest inverse range near minima with a low enough cost, in 1/spread.
 
-    The cost is a profile over the inverse range: the directions adapt to each inverse range.
+    The cost is a profile over the inverse range: the directions adapt to each inverse range. An inverse range belongs
+    to the interval if its cost is at most `rise` above `least`.
     """
     wanted, count = np.sqrt(rise), len(minima.v)
     # all ends together: lower ends with the sign changed, so that each search goes upwards
     side, state = np.repeat([-1.0, 1.0], count), np.tile(minima.u, (2, 1))
-    low, limit = side * np.tile(minima.v, 2), np.where(side > 0.0, view.most, -INFINITY)
+    low, limit = side * np.tile(minima.v, 2), np.where(side > 0.0, surface.most, -INFINITY)
 
     def at(inverse: Array, _: Array) -> tuple[Array, Array]:
+        # excess of the root of the rise at inverse ranges; the directions start at the last good ones
         nonlocal state
-        there, _, cost = view.descend(state, side * inverse, True, False, _FEW)
+        there, _, cost = surface.descend(state, side * inverse, True, False, _FEW)
         state = np.where((cost <= least + rise)[:, None], there, state)
-        return _root(cost, least) - wanted, inverse
+        return _sigmas_above(cost, least) - wanted, inverse
 
-    _, information, _ = view.look(state, side * low)
-    step = np.clip(wanted / np.sqrt(np.maximum(information[:, -1, -1], 1e-300)), INFINITY, view.most)
+    _, information, _ = surface.evaluate(state, side * low)
+    step = np.clip(wanted / np.sqrt(np.maximum(information[:, -1, -1], 1e-300)), INFINITY, surface.most)
     before, high = np.full(2 * count, -wanted), np.minimum(low + step, limit)
     while True:
         above, _ = at(high, high)
@@ -337,38 +372,39 @@ def ends_of_range(view: DirectionCost, minima: DirectionMinima, least: float, ri
 # Cones.
 
 
-def directions_of(view: DirectionCost, level: Array, few: bool = False) -> tuple[Direction, ...]:
-    """Return the directions that the data allow, with their cones; empty if a few cones cannot hold all directions.
+def directions_of(surface: DirectionCost, level: Array, few: bool = False) -> tuple[Direction, ...]:
+    """Return the directions that the data allow, with their cones and ranges.
 
+    The result is empty if there is no minimum, a cone has no closed edge, or more than `_CONES` cones are necessary.
     `level` (d, d) has two horizontal axes and, in space, the vertical axis as rows. `few` means fewer rows than
     unknowns: separate minima are then points of a valley, and no cone is traced.
     """
-    d = len(view.centre)
+    d = len(surface.centre)
     rise, single = quantile(LEVEL, d - 1), quantile(LEVEL, 1)
-    minima = minima_of(view, rise)
-    if depends_on_place(view.problem):
-        view = replace(view, weighed=view.vectors(minima.u[:1], minima.v[:1]))
-        minima = minima_of(view, rise)
+    minima = minima_of(surface, rise)
+    if depends_on_place(surface.problem):
+        surface = replace(surface, weighed=surface.vectors(minima.u[:1], minima.v[:1]))
+        minima = minima_of(surface, rise)
     if not np.isfinite(minima.cost[0]) or (few and _is_valley(minima.u)):
         return ()
     least, found = float(minima.cost[0]), list[tuple[Direction, list[int]]]()
     for i, u in enumerate(minima.u):
-        around, own = next(((cone, items) for cone, items in found if cone.covers(u)), (None, [i]))
+        around, members = next(((cone, items) for cone, items in found if cone.covers(u)), (None, [i]))
         if around is not None:
-            own.append(i)
-            if not _is_image(view, around.vector, u):
+            members.append(i)
+            if not _is_image(surface, around.vector, u):
                 continue
-        cone = _cone(view, minima, i, np.array([rise, single]), level)
+        cone = _cone(surface, minima, i, np.array([rise, single]), level)
         if around is not None and (cone is None or around.covers(u + _WITHIN * (cone.outline - u)).all()):
             continue
         if cone is None or len(found) == _CONES:
             return ()
-        found.append((cone, own))
-    return tuple(_with_range(view, cone, minima[np.array(items)], least, single) for cone, items in found)
+        found.append((cone, members))
+    return tuple(_with_range(surface, cone, minima[np.array(items)], least, single) for cone, items in found)
 
 
 def _is_valley(u: Array) -> bool:
-    """Return whether directions (k, d) contain more well separated directions than the largest number of cones."""
+    """Return whether more than `_CONES` of the directions (k, d) are well separated from each other."""
     kept = u[:1]
     for one in u[1:]:
         if (kept @ one).max() < np.cos(_VALLEY_ANGLE):
@@ -376,66 +412,76 @@ def _is_valley(u: Array) -> bool:
     return len(kept) > _CONES
 
 
-def _is_image(view: DirectionCost, one: Array, other: Array) -> bool:
-    """Return whether a direction is the mirror image of another direction in the plane of the stations.
+def _is_image(surface: DirectionCost, one: Array, other: Array) -> bool:
+    """Return whether two different directions (d,) are mirror images in the plane of the stations.
 
     Two touching cones of mirror images have a waist, so rays from one of them miss much of the other.
     """
-    image = mirror(view.problem, (view.centre + one)[None])[0] - view.centre
+    image = mirror(surface.problem, (surface.centre + one)[None])[0] - surface.centre
     return bool(np.abs(image - other).max() < _ALIKE and np.abs(image - one).max() > _ALIKE)
 
 
-def _cone(view: DirectionCost, minima: DirectionMinima, i: int, rises: Array, level: Array) -> Direction | None:
-    """Return the cone about a minimum without its range, or None if the set has no closed edge."""
+def _cone(surface: DirectionCost, minima: DirectionMinima, i: int, rises: Array, level: Array) -> Direction | None:
+    """Return the cone about minimum number `i` without its range, or None if the set has no closed edge.
+
+    `rises` (2,) are the rises of the cost at the edge of the cone, and at the ends of azimuth and elevation. `level` is
+    as in `directions_of`.
+    """
     u, v, least = minima.u[i], minima.v[i], float(minima.cost[0])
-    usable, across = rises > minima.cost[i] - least, _principal(view, minima.u[i], minima.v[i])
+    usable, across = rises > minima.cost[i] - least, _principal(surface, minima.u[i], minima.v[i])
     sides = np.concatenate([across.T, -across.T])
-    reach, _ = edge(view, (u, v), sides, least, np.full(len(sides), rises[0]))
+    reach, _ = edge(surface, (u, v), sides, least, np.full(len(sides), rises[0]))
     if np.isnan(reach).mean() > _OPEN:
         return None
     half = np.where(np.isnan(reach), _WIDEST, reach).reshape(2, -1).mean(0)
     # rays have equal angles in the metric of the ellipse, so that its tips are not cut off
-    ways = sides if len(u) == 2 else normalised(_circle() * half @ across.T)
-    k = len(ways)
+    rays = sides if len(u) == 2 else normalised(_unit_circle() * half @ across.T)
+    k = len(rays)
     angle, edges = np.zeros((2, k)), np.tile(u, (2, k, 1))
-    found = edge(view, (u, v), np.tile(ways, (usable.sum(), 1)), least, np.repeat(rises[usable], k))
+    found = edge(surface, (u, v), np.tile(rays, (usable.sum(), 1)), least, np.repeat(rises[usable], k))
     angle[usable], edges[usable] = found[0].reshape(-1, k), found[1].reshape(-1, k, len(u))
     if np.isnan(angle[0]).mean() > _OPEN:
         return None
     opposite = np.isnan(angle)
     angle = np.where(opposite, _WIDEST, angle)
-    edges = np.where(opposite[..., None], np.cos(_WIDEST) * u + np.sin(_WIDEST) * ways, edges)
-    half, axes = _ellipse(u, ways, angle[0])
+    edges = np.where(opposite[..., None], np.cos(_WIDEST) * u + np.sin(_WIDEST) * rays, edges)
+    half, axes = _ellipse(u, rays, angle[0])
     azimuth, elevation = _angles(u, edges[1], level)
     return Direction(u, azimuth, elevation, half, axes, edges[0], (np.inf, 0.0, np.inf), float(minima.cost[i]) - least)
 
 
-def _principal(view: DirectionCost, u: Array, v: float) -> Array:
+def _principal(surface: DirectionCost, u: Array, v: float) -> Array:
     """Return the principal axes (d, d - 1) of the information on a direction: unit vectors perpendicular to it."""
-    _, information, _ = view.look(u[None], np.atleast_1d(v))
+    _, information, _ = surface.evaluate(u[None], np.atleast_1d(v))
     return np.asarray(basis(u) @ np.linalg.eigh(_direction_information(information[0], v))[1])
 
 
-def _circle() -> Array:
+def _unit_circle() -> Array:
     """Return unit vectors (k, 2) on the whole circle, counter-clockwise."""
     turn = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
     return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
 
 
 def _direction_information(information: Array, v: float) -> Array:
-    """Return the information (d - 1, d - 1) on rotations of a direction, with the inverse range eliminated."""
+    """Return the information (d - 1, d - 1) on rotations of a direction, rad^-2.
+
+    If the inverse range `v` is free, it is eliminated from `information` (d, d); at infinity it is fixed.
+    """
     turns = information[:-1, :-1]
     if v <= INFINITY or information[-1, -1] <= 0.0:
         return turns
     return np.asarray(turns - np.outer(information[:-1, -1], information[-1, :-1]) / information[-1, -1])
 
 
-def _ellipse(u: Array, ways: Array, angle: Array) -> tuple[Array, Array]:
-    """Return semi-axes (d - 1,), rad, and unit vectors (d, d - 1) of the ellipse with the moments of an outline."""
+def _ellipse(u: Array, rays: Array, angle: Array) -> tuple[Array, Array]:
+    """Return semi-axes (d - 1,), rad, and unit vectors (d, d - 1) of the ellipse with the moments of an outline.
+
+    The outline is at the angles `angle` (k,), rad, from the direction `u` (d,) along the unit vectors `rays` (k, d).
+    """
     across = basis(u)
     if len(u) == 2:
         return np.array([0.5 * angle.sum()]), across
-    rim = angle[:, None] * (ways @ across)
+    rim = angle[:, None] * (rays @ across)
     rim = rim[np.argsort(np.arctan2(rim[:, 1], rim[:, 0]))]
     following = np.roll(rim, -1, axis=0)
     # triangles from the direction to the outline: twice their areas, and their second moments
@@ -447,10 +493,13 @@ def _ellipse(u: Array, ways: Array, angle: Array) -> tuple[Array, Array]:
 
 
 def _angles(u: Array, edges: Array, level: Array) -> tuple[tuple[float, float, float], tuple[float, ...]]:
-    """Return azimuth and elevation of a direction with their ends in radians, from the edge (k, d) of a cone."""
-    own, rim = level @ u, edges @ level.T
-    middle = float(np.arctan2(own[1], own[0]))
-    turn = np.arctan2(rim[:, 1] * own[0] - rim[:, 0] * own[1], rim[:, :2] @ own[:2])
+    """Return azimuth and elevation of a direction, each as (value, lower end, upper end) in radians.
+
+    `edges` (k, d) is the edge of its cone, and `level` is as in `directions_of`. In the plane, the elevation is empty.
+    """
+    local, rim = level @ u, edges @ level.T
+    middle = float(np.arctan2(local[1], local[0]))
+    turn = np.arctan2(rim[:, 1] * local[0] - rim[:, 0] * local[1], rim[:, :2] @ local[:2])
     ends = (middle + float(turn.min()), middle + float(turn.max()))
     if len(u) == 2:
         return (middle, *ends), ()
@@ -459,20 +508,26 @@ def _angles(u: Array, edges: Array, level: Array) -> tuple[tuple[float, float, f
     low, high = -0.5 * np.pi if down else float(height.min()), 0.5 * np.pi if up else float(height.max())
     # if a cone contains the vertical, every azimuth is possible
     ends = (middle - np.pi, middle + np.pi) if up or down else ends
-    return (middle, *ends), (float(np.arcsin(np.clip(own[2], -1.0, 1.0))), low, high)
+    return (middle, *ends), (float(np.arcsin(np.clip(local[2], -1.0, 1.0))), low, high)
 
 
-def _with_range(view: DirectionCost, cone: Direction, minima: DirectionMinima, least: float, rise: float) -> Direction:
-    """Return a cone with its range in m, from the inverse ranges of all minima in the cone."""
+def _with_range(
+    surface: DirectionCost, cone: Direction, minima: DirectionMinima, least: float, rise: float
+) -> Direction:
+    """Return a cone with its range (best, smallest, largest) in m, from the inverse ranges of the minima in the cone.
+
+    `least` is the lowest cost of all minima, and `rise` the rise at the ends of the range. If no minimum in the cone is
+    within this rise, the minimum with the lowest cost is used.
+    """
     near = minima[minima.cost <= least + rise]
     if not len(near.cost):
         near = minima[minima.cost == minima.cost.min()]
     with np.errstate(divide="ignore"):
-        low, high = ends_of_range(view, near, least, max(rise, float(near.cost.min()) - least))
+        low, high = ends_of_range(surface, near, least, max(rise, float(near.cost.min()) - least))
         best = near.v[near.cost.argmin()]
 
     def distance(v: float) -> float:
-        return np.inf if v <= INFINITY else 0.0 if v >= _LARGEST else view.spread / v
+        return np.inf if v <= INFINITY else 0.0 if v >= _LARGEST else surface.spread / v
 
     return replace(cone, range=(distance(float(best)), distance(high), distance(low)))
 
@@ -489,29 +544,31 @@ def has_directions(problem: Problem) -> bool:
 _AROUND = 64
 
 
-def extent_of(view: DirectionCost, u: Array, v: float, least: float, rise: float) -> Array:
+def extent_of(surface: DirectionCost, u: Array, v: float, least: float, rise: float) -> Array:
     """Return positions (k, 2) on the edge of a region in the plane, m.
 
     The region holds the positions with a cost of less than `rise` above the lowest cost `least`. `u` (2,) and `v` are a
     minimum inside the region. An edge at infinity is at 1e6 spreads of the stations.
     """
-    _, information, _ = view.look(u[None], np.atleast_1d(v))
+    _, information, _ = surface.evaluate(u[None], np.atleast_1d(v))
     values, axes = np.linalg.eigh(information[0])
     steps = axes * np.sqrt(rise / np.maximum(values, _DAMPING * max(float(values.max()), 1e-300)))
     turn = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
-    ways, side = np.stack([np.cos(turn), np.sin(turn)], axis=-1) @ steps.T, basis(u)[:, 0]
+    rays, side = np.stack([np.cos(turn), np.sin(turn)], axis=-1) @ steps.T, basis(u)[:, 0]
 
     def places(share: Array) -> tuple[Array, Array]:
-        angle = np.clip(share * ways[:, 0], -np.pi, np.pi)
-        inverse = np.clip(v + share * ways[:, 1], INFINITY, _LARGEST)
+        # directions and inverse ranges at shares of the Gaussian rays
+        angle = np.clip(share * rays[:, 0], -np.pi, np.pi)
+        inverse = np.clip(v + share * rays[:, 1], INFINITY, _LARGEST)
         return np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * side, inverse
 
     def at(share: Array, _: Array) -> tuple[Array, Array]:
-        return _root(view.look(*places(share))[0], least) - np.sqrt(rise), share
+        # excess of the root of the rise at these points
+        return _sigmas_above(surface.evaluate(*places(share))[0], least) - np.sqrt(rise), share
 
     # a ray that reaches infinity ends there
-    falls = ways[:, 1] < 0.0
-    most = np.where(falls, (v - INFINITY) / np.maximum(-ways[:, 1], 1e-300), _FARTHEST)
+    falls = rays[:, 1] < 0.0
+    most = np.where(falls, (v - INFINITY) / np.maximum(-rays[:, 1], 1e-300), _FARTHEST)
     low, high = np.zeros(_AROUND), np.minimum(1.0, most)
     below = np.full(_AROUND, float(at(low, low)[0][0]))
     while True:
@@ -522,7 +579,7 @@ def extent_of(view: DirectionCost, u: Array, v: float, least: float, rise: float
         low, below = np.where(inside, high, low), np.where(inside, above, below)
         high = np.where(inside, np.minimum(_GROWTH * high, most), high)
     ends = np.where(above < 0.0, high, _false_position(at, (low, below), (high, above), high))
-    return view.positions(*places(ends))
+    return surface.positions(*places(ends))
 
 
 # Longest ray, in units of the ray of a Gaussian region.

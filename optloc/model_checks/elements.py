@@ -1,6 +1,10 @@
 """Linearised residuals, errors and offsets of many small problems at their fixes, packed into arrays.
 
-`variance_components` and `noise_level` estimate noise levels from these arrays.
+`variance_components` and `noise_level` estimate noise levels from these arrays. Rows share a noise level in groups: one
+group per station, per pair of stations or per kind of row. The noise is a sum of independent errors, each in one group.
+An offset is a constant that a group adds to its rows.
+
+Arrays have N problems, m rows, p unknowns, q errors and c offsets.
 """
 
 from __future__ import annotations
@@ -63,12 +67,15 @@ class Elements:
 
     @property
     def common(self) -> Array:
-        """Return a mask (G + 1,) of the groups of shared errors; the last entry, for no group, is False."""
+        """Return a mask (G + 1,) of the groups of shared errors; the last entry, for no group, is False.
+
+        It is indexed by `of_effect`, where -1 selects the last entry.
+        """
         shared = [common_name(name) for name in self.names]
         return np.append(np.isin(np.array(self.names, dtype=object), shared), False)
 
     def take(self, index: Any) -> Elements:
-        """Return the elements of the problems with these indices."""
+        """Return the elements of the problems that `index` selects."""
         arrays = ("residual", "jacobian", "effect", "offset", "fixed", "sigma", "of_effect", "of_offset", "path")
         return replace(self, **{name: getattr(self, name)[index] for name in arrays})
 
@@ -108,7 +115,10 @@ def elements(problem: Problem, x: Array, by: By, common: By | None = None) -> El
 
 
 def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str, float]]) -> Elements:
-    """Return the elements of a part of a batch at the fixes x (n, size); `common` as in `elements`, with sigmas."""
+    """Return the elements of a part of a batch at the fixes `x` (n, size).
+
+    `common` is the grouping of the shared errors, or None, and the sigma of each group (see `elements`).
+    """
     count, rows = len(x), problem.count
     present = np.broadcast_to(problem.weight > 0.0, (count, rows))
     residual, jacobian = _linearise(problem, x)
@@ -139,10 +149,10 @@ def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str,
     path = np.take_along_axis(path, kept, 1)[..., None]
     # The growth of an offset is stated per metre of path; for several rows it is the mean path.
     mean = np.where(offset != 0.0, path, 0.0).sum(1) / np.maximum((offset != 0.0).sum(1), 1)
-    made = Elements(
+    packed = Elements(
         names, residual * present_packed, jacobian, effect, offset, fixed, sigma, of_effect, of_offset, mean
     )
-    return _with_priors(problem, x, made)
+    return _with_priors(problem, x, packed)
 
 
 def _linearise(problem: Problem, x: Array) -> tuple[Array, Array]:
@@ -166,7 +176,10 @@ def _linearise(problem: Problem, x: Array) -> tuple[Array, Array]:
 
 
 def _paths(problem: Problem, x: Array, residual: Array) -> Array:
-    """Return the modelled path (N, m) from target to station, m; NaN for a row that does not measure a single path."""
+    """Return the modelled path (N, m) from target to station, m; NaN for a row that does not measure a single path.
+
+    `residual` (N, m) are the residuals at the fixes `x` (N, size).
+    """
     parts, start = [], 0
     for rows in problem.rows:
         model = MODELS[rows.kind]
@@ -186,24 +199,27 @@ def _paths(problem: Problem, x: Array, residual: Array) -> Array:
 
 
 def _effects(problem: Problem, by: By, present: Array) -> tuple[Array, Array, Array]:
-    """Return the effects (N, m, Q) of all errors, the group names (Q,) and the standard deviations (N, Q)."""
+    """Return the effects (N, m, q) of all errors, the group names (q,) and the standard deviations (N, q).
+
+    `present` (N, m) marks rows with a weight above zero. Effects and deviations are in the units of the rows.
+    """
     count, rows = present.shape
     effects, names, sigmas = [], [], []
     for block in problem.noise.blocks:
-        own, name, sigma = split(problem, block, by, present)
-        own = np.broadcast_to(own, (count, len(block.row), *own.shape[-2:]))
-        g, _r, q = own.shape[1:]
+        block_effect, name, sigma = split(problem, block, by, present)
+        block_effect = np.broadcast_to(block_effect, (count, len(block.row), *block_effect.shape[-2:]))
+        g, _r, q = block_effect.shape[1:]
         # Each group of a block gets separate columns over all rows.
-        wide = np.zeros((count, rows, g, q))
-        wide[:, block.row, np.arange(g)[:, None]] = own
-        effects.append(wide.reshape(count, rows, g * q))
+        placed = np.zeros((count, rows, g, q))
+        placed[:, block.row, np.arange(g)[:, None]] = block_effect
+        effects.append(placed.reshape(count, rows, g * q))
         names.append(name.reshape(-1))
         sigmas.append(np.broadcast_to(sigma, (count, g, q)).reshape(count, g * q))
     return np.concatenate(effects, axis=-1), np.concatenate(names), np.concatenate(sigmas, axis=-1)
 
 
 def _offsets(problem: Problem, by: By) -> tuple[Array, Array]:
-    """Return the effects (m, c) of the offsets of the groups, and the names (c,) of the groups."""
+    """Return the effects (m, c) of the offsets of the groups, 1, -1 or 0, and the names (c,) of the groups."""
     ends = ends_of(problem, by)
     names = np.array(sorted({*ends.name.ravel().tolist()} - {""}), dtype=object)
     return ((ends.name[..., None] == names) * ends.sign[..., None]).sum(1), names
@@ -220,20 +236,25 @@ def typical_sigma(problem: Problem, by: By) -> dict[str, float]:
     weight, ends = np.broadcast_to(problem.weight > 0.0, variance.shape), ends_of(problem, by).name
     found = {}
     for name in sorted({*ends.ravel().tolist()} - {""}):
-        own = weight & (ends == name).any(1)
-        if own.any():
-            found[name] = float(np.sqrt(variance[own].mean()))
+        inside = weight & (ends == name).any(1)
+        if inside.any():
+            found[name] = float(np.sqrt(variance[inside].mean()))
     return found
 
 
 def common_effects(problem: Problem, by: By, size: dict[str, float]) -> tuple[Array, Array, Array]:
-    """Return the effects (m, c) of the errors that rows of a group share in an epoch, their names and sizes (c,)."""
+    """Return the effects (m, c) of the errors that the rows of a group share in an epoch, their names and sizes (c,).
+
+    There is one column for each group and epoch. `size` holds the standard deviation of a shared error by group name.
+    An effect is this deviation or its negative value in the rows of the group and epoch, in the units of the rows, else
+    0.
+    """
     ends, epoch = ends_of(problem, by), problem.epoch
     columns, names = [], []
-    for name, own in size.items():
+    for name, sigma in size.items():
         sign = np.where(ends.name == name, ends.sign, 0.0).sum(1)
         for k in np.unique(epoch[sign != 0.0]):
-            columns.append(np.where(epoch == k, sign, 0.0) * own)
+            columns.append(np.where(epoch == k, sign, 0.0) * sigma)
             names.append(name)
     sizes = np.array([size[name] for name in names])
     return np.stack(columns, axis=-1), np.array([common_name(name) for name in names], dtype=object), sizes
@@ -246,26 +267,33 @@ def _ungrouped_noise(problem: Problem, x: Array) -> Array:
     whole = gathered(with_station_noise(problem, x).noise, rows)[..., 0, :, :]
     weight = np.where(problem.weight > 0.0, problem.weight, 1.0)
     # A row of weight w has 1/w times its variance: the difference belongs to no group.
-    own = (1.0 / weight - 1.0) * np.diagonal(whole, axis1=-2, axis2=-1)
-    added = whole - stated + own[..., None] * np.eye(problem.count)
+    extra = (1.0 / weight - 1.0) * np.diagonal(whole, axis1=-2, axis2=-1)
+    added = whole - stated + extra[..., None] * np.eye(problem.count)
     return np.broadcast_to(added, (len(x), *added.shape[-2:]))
 
 
 def _present_first(present: Array) -> Array:
-    """Return the row numbers (N, most) of each problem with the present rows first."""
+    """Return the column numbers (N, most) of each problem with the present columns first.
+
+    `present` (N, m) is a mask. `most` is the largest number of present columns of a problem; absent columns fill the
+    rest.
+    """
     most = max(1, int(present.sum(1).max(initial=0)))
     return np.argsort(~present, axis=1, kind="stable")[:, :most]
 
 
 def _pack(columns: Array, number: Array) -> tuple[Array, Array, Array]:
-    """Return the nonzero columns (N, m, q), their groups (N, q) with -1 for zero columns, and their numbers (N, q)."""
+    """Return the nonzero columns (N, m, q), their groups (N, q) with -1 for zero columns, and their numbers (N, q).
+
+    `columns` (N, m, Q) are all columns and `number` (Q,) their groups; q is the largest count of nonzero columns.
+    """
     used = (columns != 0.0).any(1)
     kept = _present_first(used)
     group = np.where(np.take_along_axis(used, kept, 1), number[kept], -1)
     return np.take_along_axis(columns, kept[:, None], 2), group, kept
 
 
-def _with_priors(problem: Problem, x: Array, made: Elements) -> Elements:
+def _with_priors(problem: Problem, x: Array, packed: Elements) -> Elements:
     """Return the elements with additional rows for the priors of the problem; these rows belong to no group."""
     # With equality constraints, priors are omitted: their columns on the tangent space are not unit vectors, and the
     # constraint is stronger than the prior.
@@ -274,28 +302,31 @@ def _with_priors(problem: Problem, x: Array, made: Elements) -> Elements:
         slot, shared = problem.layout.find(name)
         start = slot.start if shared else problem.layout.n_shared + slot.start
         columns = start + np.arange(slot.size)
-        more = np.zeros((len(x), slot.size, made.jacobian.shape[-1]))
+        more = np.zeros((len(x), slot.size, packed.jacobian.shape[-1]))
         more[:, np.arange(slot.size), columns] = 1.0
         covariance, _ = linalg.inverse(np.broadcast_to(precision, (len(x), slot.size, slot.size)))
         error = np.broadcast_to(mean, (len(x), slot.size)) - x[:, columns]
-        n, m = made.residual.shape
+        n, m = packed.residual.shape
         fixed = np.zeros((n, m + slot.size, m + slot.size))
-        fixed[:, :m, :m], fixed[:, m:, m:] = made.fixed, covariance
+        fixed[:, :m, :m], fixed[:, m:, m:] = packed.fixed, covariance
         # A prior has no grouped errors and no offsets: its rows are zero in both arrays.
         below = ((0, 0), (0, slot.size), (0, 0))
-        made = replace(
-            made,
-            residual=np.concatenate([made.residual, error], axis=1),
-            jacobian=np.concatenate([made.jacobian, more], axis=1),
-            effect=np.pad(made.effect, below),
-            offset=np.pad(made.offset, below),
+        packed = replace(
+            packed,
+            residual=np.concatenate([packed.residual, error], axis=1),
+            jacobian=np.concatenate([packed.jacobian, more], axis=1),
+            effect=np.pad(packed.effect, below),
+            offset=np.pad(packed.offset, below),
             fixed=fixed,
         )
-    return made
+    return packed
 
 
 def _join(names: tuple[str, ...], parts: list[Elements]) -> Elements:
-    """Return the parts joined into one, with common group numbers and with arrays padded to one size."""
+    """Return the parts joined into one, with common group numbers and with arrays padded to one size.
+
+    `names` are the names of all groups of the result.
+    """
     renamed = []
     for part in parts:
         # The number -1, for no group, selects the last entry, which is -1.
@@ -305,8 +336,8 @@ def _join(names: tuple[str, ...], parts: list[Elements]) -> Elements:
     def stack(name: str, fill: float = 0.0) -> Array:
         arrays = [getattr(part, name) for part in renamed]
         shape = np.max([a.shape for a in arrays], axis=0)
-        room = [[(0, 0), *((0, int(n) - k) for n, k in zip(shape[1:], a.shape[1:], strict=True))] for a in arrays]
-        return np.concatenate([np.pad(a, gap, constant_values=fill) for a, gap in zip(arrays, room, strict=True)])
+        padding = [[(0, 0), *((0, int(n) - k) for n, k in zip(shape[1:], a.shape[1:], strict=True))] for a in arrays]
+        return np.concatenate([np.pad(a, gap, constant_values=fill) for a, gap in zip(arrays, padding, strict=True)])
 
     joined = {name: stack(name) for name in ("residual", "jacobian", "effect", "offset", "fixed", "sigma", "path")}
     return Elements(names, **joined, of_effect=stack("of_effect", -1), of_offset=stack("of_offset", -1))
@@ -350,7 +381,10 @@ def ends_of(problem: Problem, by: By) -> Ends:
 
 
 def _ends(problem: Problem, kind: str, a: Array, b: Array, by: By) -> tuple[Array, Array]:
-    """Return the group names and signs (m, 2) of rows of one kind with the stations a and b (m,)."""
+    """Return the group names and signs (m, 2) of rows of one kind with the station numbers `a` and `b` (m,).
+
+    The signs are as in `Ends`, before the sense of compass bearings is applied.
+    """
     name, sign = np.full((len(a), 2), "", dtype=object), np.zeros((len(a), 2))
     model = MODELS[kind]
     if by == "kind" or model.stations == 0:
@@ -365,14 +399,14 @@ def _ends(problem: Problem, kind: str, a: Array, b: Array, by: By) -> tuple[Arra
         sign[:, 0] = np.where(turned & (sum(model.ranges or (1, -1)) == 0), -1.0, 1.0)
     else:
         labels = station_names(problem, kind)
-        for end, (station, own) in enumerate(zip((a, b), model.ranges or (1, -1), strict=True)):
-            if end < model.stations and own:
-                name[:, end], sign[:, end] = labels[station], own
+        for end, (station, factor) in enumerate(zip((a, b), model.ranges or (1, -1), strict=True)):
+            if end < model.stations and factor:
+                name[:, end], sign[:, end] = labels[station], factor
     return name, sign
 
 
 def _both_ways(a: Array, b: Array) -> bool:
-    """Return whether a pair of stations occurs in both orders."""
+    """Return whether a pair of stations occurs in both orders, as A-B and as B-A."""
     pairs = set(zip(a.tolist(), b.tolist(), strict=True))
     return any((two, one) in pairs for one, two in pairs)
 
@@ -434,19 +468,20 @@ def _arrivals(
 ) -> tuple[Array, Array, Array] | None:
     """Return the noise of groups of rows (g, r) as errors of arrivals, plus errors of the rows if necessary.
 
-    Return None if the covariance does not have this form.
+    `row` are the row numbers, `covariance` (..., g, r, r) the noise, and `here` (..., g, r) marks present rows. The
+    results are as in `split`. Return None if the covariance does not have this form.
     """
     ends = ends_of(problem, "station")
     kind = str(kinds_of(problem)[row[0, 0]])
     labels = station_names(problem, kind)
     # D: the sign with which the arrival at each station (columns) enters each row.
     design = ((ends.name[row][..., None] == labels) * ends.sign[row][..., None]).sum(-2) * here[..., None]
-    own = np.eye(row.shape[1]) * here[..., None]
+    single = np.eye(row.shape[1]) * here[..., None]
     groups = labels if by == "station" else np.full(len(labels), kind, dtype=object)
     # Try arrivals alone first, then arrivals and errors of the rows. If neither fits, the correlation has another form.
     for parts, names in (
         ([design], groups),
-        ([design, own], np.concatenate([groups, np.full(row.shape[1], f"{kind} rows", dtype=object)])),
+        ([design, single], np.concatenate([groups, np.full(row.shape[1], f"{kind} rows", dtype=object)])),
     ):
         variance = _variances(parts, covariance)
         sigma = np.sqrt(np.maximum(variance, 0.0))
@@ -459,10 +494,11 @@ def _arrivals(
 
 
 def _variances(parts: list[Array], covariance: Array) -> Array:
-    """Return the variances (..., q) of errors whose covariance is nearest to a given covariance.
+    """Return the variances (..., q) of errors whose covariance is nearest to a given covariance R (..., r, r).
 
-    The fit is sum v_i d_i d_i' = R in least squares with the columns d of the parts, and its normal matrix is (d_i'
-    d_j)^2. All errors of single rows have the same variance.
+    The fit is sum v_i d_i d_i' = R in least squares. The columns d_i are the columns of all `parts` (..., r, n). The
+    normal matrix has the entries (d_i' d_j)^2. The columns of the first part have separate variances; all columns of
+    the second part, the errors of single rows, have one variance.
     """
     design = np.concatenate(parts, axis=-1)
     gram = (np.swapaxes(design, -1, -2) @ design) ** 2

@@ -4,6 +4,8 @@ A group g with an error shifts its rows by an unknown e_g. With residuals y, wei
 fit, Q = P - P J (J'P J)^-1 J'P. Exclusion of the group lowers the cost by u'Q_gg^-1 u with u = (Q y)_g. The estimated
 error is Q_gg^-1 u with the covariance Q_gg^-1. Priors are rows too.
 
+Arrays have q rows, including the rows of priors, n shared unknowns, and l local unknowns of each epoch.
+
 W. Baarda, "A testing procedure for use in geodetic networks" (1968); P. J. G. Teunissen, "Testing theory" (2006), eqs.
 3.21 and 4.23.
 """
@@ -62,7 +64,7 @@ class Influence:
     deviation: Array
 
     def rows(self, group: Group) -> Array:
-        """Return the row numbers of a group, (q,)."""
+        """Return the row numbers of a group; for a prior, the numbers of the rows that it adds."""
         return np.array(group.rows) if group.prior < 0 else self.prior[group.prior]
 
     def block(self, rows: Array) -> Array:
@@ -76,7 +78,10 @@ class Influence:
         return np.asarray(precision - lost)
 
     def root(self, rows: Array) -> Array:
-        """Return A with A A' the pseudo-inverse of Q (..., r, r) of sets of rows; undetermined columns are zero."""
+        """Return a matrix A (..., r, r) with A A' the pseudo-inverse of Q for sets of rows (..., r).
+
+        A column of A is zero if the other rows have no information about this combination of rows.
+        """
         weight = np.asarray(self.precision.diagonal())[rows]
         scale = 1.0 / np.sqrt(np.where(weight > 0.0, weight, 1.0))
         values, vectors = np.linalg.eigh(self.block(rows) * scale[..., :, None] * scale[..., None, :])
@@ -103,7 +108,7 @@ class Error:
 
     @property
     def log_tail(self) -> float:
-        """Return the logarithm of the probability of an estimate at least this far from zero if there is no error."""
+        """Return the logarithm of the p-value of the estimate: very negative for a clear error, 0 if `dof` is 0."""
         return float(log_tail(np.array(self.statistic), np.array(self.dof)))
 
 
@@ -134,17 +139,17 @@ def influences(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()
     problem = replace(problem, priors=tuple(p for j, p in enumerate(problem.priors) if j not in dropped))
     # whitening is applied to neither: Q needs P and J separately
     linear, equations = linearise(problem, x), equations_at(problem, x)
-    picks, means, inner = _prior_rows(problem)
-    cuts = np.cumsum([problem.count, *(len(pick) for pick in picks)])
-    more = int(cuts[-1]) - problem.count
+    selections, means, prior_precisions = _prior_rows(problem)
+    cuts = np.cumsum([problem.count, *(len(pick) for pick in selections)])
+    prior_count = int(cuts[-1]) - problem.count
     present = np.broadcast_to(problem.weight > 0.0, linear.residual.shape)
     n = layout.n_shared
-    left = [mean - x[:, :n] @ pick.T for mean, pick in zip(means, picks, strict=True)]
-    residual = np.concatenate([np.where(present, linear.residual, 0.0), *left], axis=1)
-    picked = (np.broadcast_to(pick, (size, *pick.shape)) for pick in picks)
+    prior_residuals = [mean - x[:, :n] @ pick.T for mean, pick in zip(means, selections, strict=True)]
+    residual = np.concatenate([np.where(present, linear.residual, 0.0), *prior_residuals], axis=1)
+    picked = (np.broadcast_to(pick, (size, *pick.shape)) for pick in selections)
     A = np.concatenate([linear.shared, *picked], axis=1)
-    B = np.concatenate([linear.local, np.zeros((size, more, layout.n_local))], axis=1)
-    epoch = np.concatenate([problem.epoch, np.full(more, -1)])
+    B = np.concatenate([linear.local, np.zeros((size, prior_count, layout.n_local))], axis=1)
+    epoch = np.concatenate([problem.epoch, np.full(prior_count, -1)])
     root, shared, local = _roots(equations, A, B, epoch)
     # x need not be a minimum: Q y is the residual after one more step
     move, _ = step(equations, np.zeros(size))
@@ -154,37 +159,46 @@ def influences(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()
     return [
         Influence(own @ rest, own, own @ by_shared, own @ by_local, epoch, prior, deviation)
         for own, rest, by_shared, by_local, deviation in zip(
-            _precisions(linear, problem.count, inner, size), residual - fitted, shared, local, root, strict=True
+            _precisions(linear, problem.count, prior_precisions, size),
+            residual - fitted,
+            shared,
+            local,
+            root,
+            strict=True,
         )
     ]
 
 
 def _prior_rows(problem: Problem) -> tuple[list[Array], list[Array], list[Array]]:
-    """Return selection matrices (p, n), means (N or 1, p) and precisions (p, p) of the priors on shared unknowns."""
+    """Return selection matrices (p, n), means (N or 1, p) and precisions (p, p) of the priors on shared unknowns.
+
+    Each prior refers to p of the n shared unknowns.
+    """
     layout = problem.layout
-    picks, means, inner = [], [], []
+    selections, means, precisions = [], [], []
     for prior in problem.priors:
         slot, shared = layout.find(prior.name)
         if shared:
-            picks.append(np.eye(layout.n_shared)[slot.start : slot.start + slot.size])
+            selections.append(np.eye(layout.n_shared)[slot.start : slot.start + slot.size])
             means.append(prior.mean.reshape(-1, slot.size))
-            inner.append(linalg.inverse(prior.covariance.reshape(slot.size, slot.size))[0])
-    return picks, means, inner
+            precisions.append(linalg.inverse(prior.covariance.reshape(slot.size, slot.size))[0])
+    return selections, means, precisions
 
 
-def _precisions(linear: Linear, count: int, inner: Sequence[Array], size: int) -> list[Any]:
+def _precisions(linear: Linear, count: int, prior_precisions: Sequence[Array], size: int) -> list[Any]:
     """Return the inverse covariances (q, q) of the rows and priors of each problem; absent rows are zero.
 
-    The result is dense for few rows and sparse for many rows.
+    `count` is the number of rows without priors, `prior_precisions` the precisions of the priors, and `size` the number
+    of problems. The result is dense for few rows and sparse for many rows.
     """
     parts = []
     for whitener in linear.noise:
-        own = np.swapaxes(whitener.matrix, -1, -2) @ whitener.matrix
+        weights = np.swapaxes(whitener.matrix, -1, -2) @ whitener.matrix
         g, r = whitener.row.shape
-        own = np.broadcast_to(own, (size, g, r, r)).reshape(size, -1)
+        weights = np.broadcast_to(weights, (size, g, r, r)).reshape(size, -1)
         i, j = np.broadcast_arrays(whitener.row[:, :, None], whitener.row[:, None, :])
-        parts.append((own, i.ravel(), j.ravel()))
-    for block in inner:
+        parts.append((weights, i.ravel(), j.ravel()))
+    for block in prior_precisions:
         i, j = (index.ravel() + count for index in np.indices(block.shape))
         parts.append((np.broadcast_to(block.ravel(), (size, block.size)), i, j))
         count += len(block)
@@ -195,13 +209,14 @@ def _precisions(linear: Linear, count: int, inner: Sequence[Array], size: int) -
         return list(dense)
     from scipy.sparse import coo_array
 
-    return [coo_array((own, (i, j)), shape=(count, count)).tocsr() for own in values]
+    return [coo_array((weights, (i, j)), shape=(count, count)).tocsr() for weights in values]
 
 
 def _roots(equations: Normal, A: Array, B: Array, epoch: Array) -> tuple[Array, Array, Array]:
-    """Return roots (N, n, n) of (J'P J)^-1, and factors (N, q, n) and (N, q, l) of J (J'P J)^-1 J'.
+    """Return roots (N, n, n) of the covariance of the shared unknowns, and factors (N, q, n) and (N, q, l).
 
-    The local unknowns are eliminated.
+    The products of the factors with their transposes sum to J (J'P J)^-1 J', the second only within each epoch. `A` (N,
+    q, n) and `B` (N, q, l) are the derivatives by shared and local unknowns, and `epoch` (q,) is -1 for priors.
     """
     information, _, _ = marginal(equations)
     root, _ = linalg.root(information)
@@ -210,15 +225,15 @@ def _roots(equations: Normal, A: Array, B: Array, epoch: Array) -> tuple[Array, 
     inner, _ = linalg.root(equations.local)
     gain = inner @ np.swapaxes(inner, -1, -2) @ np.swapaxes(equations.cross, -1, -2)
     # J minus the part that the local unknowns of the epoch explain: Schur complement, row by row
-    left = A - (B[..., None, :] @ gain[:, epoch])[..., 0, :]
-    return root, left @ root, (B[..., None, :] @ inner[:, epoch])[..., 0, :]
+    eliminated = A - (B[..., None, :] @ gain[:, epoch])[..., 0, :]
+    return root, eliminated @ root, (B[..., None, :] @ inner[:, epoch])[..., 0, :]
 
 
 def log_tail(statistic: Array, dof: Array) -> Array:
     """Return the logarithm of the tail probability of a chi-square, also for very small probabilities.
 
     Below the range of floating-point numbers, the leading term of the asymptotic series is used (Abramowitz, Stegun
-    1964, eq. 6.5.32).
+    1964, eq. 6.5.32). With `dof` of zero, the result is 0, a probability of one.
     """
     from scipy.special import gammaincc, gammaln
 
@@ -229,7 +244,10 @@ def log_tail(statistic: Array, dof: Array) -> Array:
 
 
 def significance(at: Influence, groups: Sequence[Group]) -> Array:
-    """Return the logarithms (G,) of the probabilities of the decrease of the cost without each group."""
+    """Return the logarithms (G,) of the p-values of the decrease of the cost without each of G groups.
+
+    The p-value of a group is small if its exclusion lowers the cost much.
+    """
     return log_tail(*drops(at, [at.rows(group) for group in groups]))
 
 
@@ -248,7 +266,7 @@ def drops(at: Influence, rows: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def errors(at: Influence, groups: Sequence[Group]) -> list[Error]:
-    """Return the estimated error of each of some groups that all have errors."""
+    """Return the estimated error of each of some groups, if all of them have errors at once."""
     rows = [at.rows(group) for group in groups]
     index = np.concatenate(rows)
     block, root = at.block(index), at.root(index)
@@ -256,12 +274,12 @@ def errors(at: Influence, groups: Sequence[Group]) -> list[Error]:
     known = np.abs(np.diagonal(covariance @ block) - 1.0) < _UNDETERMINED
     value, sigma = covariance @ at.pull[index], np.where(known, np.sqrt(np.diagonal(covariance)), np.inf)
     out = []
-    for own in np.split(np.arange(len(index)), np.cumsum([len(one) for one in rows])[:-1]):
+    for numbers in np.split(np.arange(len(index)), np.cumsum([len(one) for one in rows])[:-1]):
         # the statistic of a group uses only its determined components and their covariance
-        inside = own[known[own]]
+        inside = numbers[known[numbers]]
         information, _ = linalg.root(covariance[np.ix_(inside, inside)]) if len(inside) else (np.zeros((0, 0)), None)
         squared = ((information.T @ value[inside]) ** 2).sum()
-        out.append(Error(value[own], sigma[own], float(squared), len(inside)))
+        out.append(Error(value[numbers], sigma[numbers], float(squared), len(inside)))
     return out
 
 
@@ -343,7 +361,10 @@ def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) ->
 
 
 def _rows_of_suspect(work: Problem, origin: Sequence[Array], suspect: Suspect) -> Array:
-    """Return a mask (m,) of the rows of a suspect; the problem may have arrival times instead of differences."""
+    """Return a mask (m,) of the rows of a suspect; the problem may have arrival times instead of differences.
+
+    `origin` has the numbers of the original rows from which each row comes.
+    """
     if suspect.group == "station":
         a, b = (np.concatenate([getattr(rows, end) for rows in work.rows]) for end in "ab")
         number = work.stations.names.index(suspect.name.removeprefix("station "))
@@ -353,7 +374,7 @@ def _rows_of_suspect(work: Problem, origin: Sequence[Array], suspect: Suspect) -
 
 
 def embed(layout: Layout, other: Layout, x: Array) -> Array:
-    """Return a vector (size,) in the order of a layout with more unknowns.
+    """Return the vector `x` (size,) of `layout` in the order of `other`, a layout with more unknowns.
 
     The additional unknowns are zero: the rows are linear in them.
     """
@@ -368,10 +389,10 @@ def embed(layout: Layout, other: Layout, x: Array) -> Array:
 
 
 def _channels(problem: Problem) -> list[tuple[str, Array]]:
-    """Return the name and the present rows of every station and kind; rows without a station are omitted."""
+    """Return the name and the row numbers of each station and kind with present rows that have a station."""
     present, out = problem.weight.reshape(-1)[: problem.count] > 0.0, []
     for rows, start in zip(problem.rows, problem.starts, strict=True):
-        own = present[start : start + rows.count] & (rows.a >= 0)
-        names = ((i, f"{rows.kind} of {problem.stations.names[i]}") for i in np.unique(rows.a[own]))
-        out += [(name, start + np.flatnonzero(own & (rows.a == i))) for i, name in names]
+        inside = present[start : start + rows.count] & (rows.a >= 0)
+        names = ((i, f"{rows.kind} of {problem.stations.names[i]}") for i in np.unique(rows.a[inside]))
+        out += [(name, start + np.flatnonzero(inside & (rows.a == i))) for i, name in names]
     return out

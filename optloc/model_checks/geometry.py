@@ -26,7 +26,7 @@ class Advice:
     ----------
     cause : str
         A keyword for programs: "plane", "line", "redundancy", "mirror", "unit", "sign", "compass", "opposite",
-        "impossible", "constraint", "offset", "scale", "rotation", "drift" or "step".
+        "impossible", "constraint", "offset", "scale", "rotation", "drift", "step" or "burst".
     seen : str
         The observation, a sentence without its full stop.
     advice : str
@@ -66,9 +66,13 @@ def advise_on_geometry(problem: Problem, x: Array) -> Iterator[Advice]:
 
 
 def _redundancy_advice(problem: Problem) -> Iterator[Advice]:
-    """Yield advice about the smallest redundancy of the epochs: an error may not be detectable, or not attributable."""
-    alone = separable(problem)
-    dof = np.ravel(degrees_of_freedom(by_epoch(problem) if alone else problem))
+    """Yield advice if the smallest redundancy of the epochs is at most 1.
+
+    Without redundancy, no error is detectable. With a redundancy of 1, an error is detectable, but the wrong row is not
+    identifiable.
+    """
+    separate = separable(problem)
+    dof = np.ravel(degrees_of_freedom(by_epoch(problem) if separate else problem))
     least, k = int(dof.min()), len(dof)
     if least > 1:
         return
@@ -90,7 +94,13 @@ def _redundancy_advice(problem: Problem) -> Iterator[Advice]:
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """Stations relative to their centre: RMS extents in ascending order, m, and their directions in columns."""
+    """Stations with present rows, relative to their centre.
+
+    - places (s, d): positions, m.
+    - centre (d,): their mean, m.
+    - extent (d,): RMS extents along the principal axes, in ascending order, m.
+    - axes (d, d): directions of the principal axes in columns; the first is the normal of the best-fitting plane.
+    """
 
     places: Array
     centre: Array
@@ -105,29 +115,29 @@ class _Shape:
 
 def _shape(problem: Problem) -> _Shape | None:
     """Return the shape of the stations with present rows; None if a row is more than a function of ranges."""
-    used, weight = set(), np.broadcast_to(problem.weight, (1, problem.count))[0]
+    numbers, weight = set(), np.broadcast_to(problem.weight, (1, problem.count))[0]
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         model = MODELS[rows.kind]
         # angles and heights distinguish above from below, and range rates of moving stations may do so
         if model.axes or model.velocity or model.ecef or not model.stations:
             return None
         present = weight[start : start + rows.count] > 0.0
-        used |= {int(i) for index in (rows.a, rows.b)[: model.stations] for i in index[present]}
-    if len(used) < 2 or any(prior.name.startswith("position") for prior in problem.priors):
+        numbers |= {int(i) for index in (rows.a, rows.b)[: model.stations] for i in index[present]}
+    if len(numbers) < 2 or any(prior.name.startswith("position") for prior in problem.priors):
         return None
-    places = problem.stations.position[..., sorted(used), :].reshape(-1, problem.dimension)
+    places = problem.stations.position[..., sorted(numbers), :].reshape(-1, problem.dimension)
     centre, _ = centre_and_spread(places)
     values, vectors = np.linalg.eigh((places - centre).T @ (places - centre) / len(places))
     return _Shape(places, centre, np.sqrt(np.maximum(values, 0.0)), vectors)
 
 
 def _noise(problem: Problem) -> float:
-    """Return the smallest standard deviation of rows that are lengths, m; zero if there are no lengths."""
+    """Return the smallest positive standard deviation of present rows that are lengths, m; zero without lengths."""
     sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count)[0]
     weight = np.broadcast_to(problem.weight, (1, problem.count))[0]
     lengths = np.concatenate([np.full(r.count, MODELS[r.kind].quantity == "length") for r in problem.rows])
-    own = sigma[lengths & (weight > 0.0) & (sigma > 0.0)]
-    return float(own.min()) if len(own) else 0.0
+    lengths_sigma = sigma[lengths & (weight > 0.0) & (sigma > 0.0)]
+    return float(lengths_sigma.min()) if len(lengths_sigma) else 0.0
 
 
 def _mirror_advice(problem: Problem, x: Array) -> Iterator[Advice]:
@@ -136,7 +146,7 @@ def _mirror_advice(problem: Problem, x: Array) -> Iterator[Advice]:
     if shape is None or shape.extent[-1] == 0.0:
         return
     d, flat = problem.dimension, np.array([_is_flat(problem, shape, i) for i in range(problem.dimension)])
-    if flat[0] and not (d == 3 and flat[1]) and _is_decided(problem, shape):
+    if flat[0] and not (d == 3 and flat[1]) and _equality_excludes_image(problem, shape):
         return
     if d == 3 and flat[1]:
         axis = _spell(shape.axes[:, -1])
@@ -160,8 +170,8 @@ def _mirror_advice(problem: Problem, x: Array) -> Iterator[Advice]:
 _ACROSS = 0.1
 
 
-def _is_decided(problem: Problem, shape: _Shape) -> bool:
-    """Return whether an equality excludes mirror images: it keeps the target off the plane of the stations."""
+def _equality_excludes_image(problem: Problem, shape: _Shape) -> bool:
+    """Return whether an equality, an exact height or plane, excludes mirror images in the plane of the stations."""
     normal = shape.axes[:, 0]
     for band in problem.constraints:
         if not isinstance(band, Band) or not is_exact(band):
@@ -177,7 +187,10 @@ def _is_decided(problem: Problem, shape: _Shape) -> bool:
 
 
 def _is_flat(problem: Problem, shape: _Shape, axis: int) -> bool:
-    """Return whether the data separate no position from its mirror image across an axis by three sigma."""
+    """Return whether the data separate no position from its mirror image across an axis by three sigma.
+
+    `axis` is the number of a principal axis of the stations.
+    """
     height = (shape.places - shape.centre) @ shape.axes[:, axis]
     # a mirror image changes a range by at most twice the height of the station
     noise = _noise(problem)
@@ -186,21 +199,24 @@ def _is_flat(problem: Problem, shape: _Shape, axis: int) -> bool:
 
 
 def _describe_offset(shape: _Shape) -> str:
-    """Return a text with the RMS distance of the stations from their plane, and their extent."""
+    """Return a text with the RMS distance of the stations from their plane or line, and their extent, m."""
     off, size = float(np.sqrt((shape.height**2).mean())), float(shape.extent[-1])
     return f"{off if off > _ROUNDING * size else 0.0:.2g} m off it, over {size:.3g} m"
 
 
 def _mirror_fits(problem: Problem, shape: _Shape, x: Array) -> bool:
-    """Return whether the mirror image of a fix is another minimum whose cost is higher by less than nine."""
+    """Return whether the mirror image of a fix `x` (1, size) leads to a second minimum that fits almost as well.
+
+    Its cost is higher by less than nine. It must be on the other side of the plane and satisfy the constraints.
+    """
     if not one_place(problem) or not np.isfinite(x).all():
         return False
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
     height = float((x[0, part] - shape.centre) @ shape.axes[:, 0])
-    other = np.array(x)
-    other[0, part] -= 2.0 * height * shape.axes[:, 0]
-    both, cost = descend(problem.take(np.zeros(2, dtype=int)), np.concatenate([x, other]))
+    image = np.array(x)
+    image[0, part] -= 2.0 * height * shape.axes[:, 0]
+    both, cost = descend(problem.take(np.zeros(2, dtype=int)), np.concatenate([x, image]))
     after = (both[:, part] - shape.centre) @ shape.axes[:, 0]
     inside = not problem.constraints or bool((violation(problem, both[1:]) <= 0.0).all())
     # the descent must stay on the other side, and not return to the plane

@@ -56,10 +56,13 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Kind, stations, epoch and target of each row, for the names of rows.
+    """Kind, stations, epoch and target of each of m rows, for the names of rows.
 
-    A station is -1 if the kind of the row has no station there. `alike` is the number of rows with equal columns, and
-    `place` the number of the row among them.
+    - kind: kind of each row.
+    - a, b (m,): numbers of the stations; -1 if the kind of the row has no station there.
+    - epoch, target (m,): numbers of epoch and target.
+    - place (m,): number of the row among the rows with equal columns, from 0.
+    - alike (m,): number of rows with equal columns.
     """
 
     kind: list[str]
@@ -73,14 +76,18 @@ class _Columns:
     @classmethod
     def of(cls, problem: Problem) -> _Columns:
         """Return the columns of all rows of a problem."""
-        taken = [MODELS[rows.kind].stations for rows in problem.rows]
-        none = [np.full(rows.count, -1) for rows in problem.rows]
+        station_count = [MODELS[rows.kind].stations for rows in problem.rows]
+        absent = [np.full(rows.count, -1) for rows in problem.rows]
         kind = [rows.kind for rows in problem.rows for _ in range(rows.count)]
-        a = np.concatenate([r.a if n > 0 else no for r, n, no in zip(problem.rows, taken, none, strict=True)])
-        b = np.concatenate([r.b if n > 1 else no for r, n, no in zip(problem.rows, taken, none, strict=True)])
+        a = np.concatenate(
+            [r.a if n > 0 else missing for r, n, missing in zip(problem.rows, station_count, absent, strict=True)]
+        )
+        b = np.concatenate(
+            [r.b if n > 1 else missing for r, n, missing in zip(problem.rows, station_count, absent, strict=True)]
+        )
         epoch, target = problem.epoch, np.concatenate([rows.target for rows in problem.rows])
-        sort = np.unique(kind, return_inverse=True)[1]
-        _, label = np.unique(np.column_stack([sort, a, b, epoch, target]), axis=0, return_inverse=True)
+        kind_number = np.unique(kind, return_inverse=True)[1]
+        _, label = np.unique(np.column_stack([kind_number, a, b, epoch, target]), axis=0, return_inverse=True)
         # place: the number of a row among rows with equal columns, so that their names differ
         label, place = label.reshape(-1), np.empty(len(a), dtype=np.int64)
         order, sizes = np.argsort(label, kind="stable"), np.bincount(label)
@@ -143,7 +150,10 @@ def check_kinds(by: str | Sequence[str]) -> tuple[GroupKind, ...]:
 
 
 def leave_out(problem: Problem, left: Array, others: Sequence[Group] = ()) -> Problem:
-    """Return a flat batch of problems without some rows (N, m), without the groups' priors, with their offsets."""
+    """Return a flat batch of N problems without the rows that `left` (N, m) marks.
+
+    For each group in `others`, the problems lose its prior, or get its offset as an additional unknown.
+    """
     weight = np.where(left, 0.0, np.broadcast_to(problem.weight, left.shape))
     dropped = {group.prior for group in others}
     priors = tuple(prior for j, prior in enumerate(problem.priors) if j not in dropped)
@@ -160,7 +170,7 @@ def mark_rows(groups: Sequence[Group], count: int) -> Array:
 
 
 def _sightings(columns: _Columns, present: Array) -> list[tuple[int, ...]]:
-    """Return sets of several rows that the same stations measured of one target at one epoch."""
+    """Return sets of several row numbers: rows that the same stations measured of one target at one epoch."""
     keys = np.column_stack([columns.a, columns.b, columns.epoch, columns.target])
     seen = (columns.a >= 0) & present
     _, label = np.unique(keys, axis=0, return_inverse=True)
@@ -171,7 +181,10 @@ def _sightings(columns: _Columns, present: Array) -> list[tuple[int, ...]]:
 
 
 def _row_name(problem: Problem, columns: _Columns, rows: tuple[int, ...]) -> str:
-    """Return the description of rows of the same stations: kinds, stations, target and epoch."""
+    """Return the description of the rows with the numbers `rows`: kinds, stations, target and epoch.
+
+    All rows are of the same stations.
+    """
     first, names = rows[0], problem.stations.names
     kinds = " and ".join(dict.fromkeys(columns.kind[i] for i in rows))
     stations = " and ".join(names[int(s)] for s in (columns.a[first], columns.b[first]) if s >= 0)

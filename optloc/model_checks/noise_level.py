@@ -2,6 +2,9 @@
 
 The chi-square test of a single fix cannot separate these causes. The functions here compare the likelihoods of the
 causes over all fixes together. Each cause may also exclude single rows, at a penalty per row.
+
+Arrays have N fixes and q errors of each fix, mostly one error per row and station. `Elements` are the linearised fixes,
+and `Tested` holds their test statistics.
 """
 
 from __future__ import annotations
@@ -100,7 +103,7 @@ class CommonLevel:
         return self.suspect and bool((self.factor > 1.0).any())
 
     def sizes(self, problem: Problem) -> Array:
-        """Return the factor of the standard deviation of each row (m,)."""
+        """Return the factor (m,) of the standard deviation of each row of a problem; 1 for a kind without a factor."""
         factor = dict(zip(self.kinds, self.factor.tolist(), strict=True))
         return np.array([factor.get(kind, 1.0) for kind in kinds_of(problem).tolist()])
 
@@ -127,9 +130,9 @@ def common_level_at(problem: Problem, x: Array) -> CommonLevel:
     errors are not a higher noise level. Let c_k be the cost of a fix without k measurements, r_k its redundancy, and f
     the factor of sigma. Twice the negative logarithm of the restricted likelihood is then ``c_k / f^2 + r_k ln f^2``
     plus the penalty of k measurements. The measurements with the largest tests are excluded one after another, to first
-    order at the fix. A factor of one station or kind changes c and r by the update of V for its errors. The result is
-    the explanation with the lowest sum over all fixes, including the penalty of its factor. `variance_components.fit`
-    computes the factors.
+    order at the fix. A factor of one station or kind changes the cost and the determinant of V (see `_single_groups`).
+    The result is the explanation with the lowest sum over all fixes, including the penalty of its factor.
+    `variance_components.fit` computes the factors.
 
     Parameters
     ----------
@@ -169,19 +172,25 @@ def common_level_at(problem: Problem, x: Array) -> CommonLevel:
     return _with_factors(replace(unchanged, gain=gain), by_kind)
 
 
-def _with_factors(unchanged: CommonLevel, made: Elements) -> CommonLevel:
-    """Return the explanation with the factors of all kinds; a factor that is not significant is 1."""
-    left = np.zeros(len(made.names), dtype=bool)
-    found = fit(made, left, left)
-    place = [made.names.index(kind) if kind in made.names else -1 for kind in unchanged.kinds]
+def _with_factors(unchanged: CommonLevel, packed: Elements) -> CommonLevel:
+    """Return the explanation with the factors of all kinds; a factor that is not significant is 1.
+
+    `unchanged` is the explanation without factors, and it is returned if no factor is significant. The groups of
+    `packed`, the N linearised fixes, are kinds.
+    """
+    none = np.zeros(len(packed.names), dtype=bool)
+    found = fit(packed, none, none)
+    place = [packed.names.index(kind) if kind in packed.names else -1 for kind in unchanged.kinds]
     factor, low, high = (np.append(np.sqrt(v), np.nan)[place] for v in (found.variance, found.low, found.high))
     with np.errstate(invalid="ignore"):
         significant = ((low > 1.0) | (high < 1.0)) & (np.abs(np.log(factor)) > np.log(_MIN_CHANGE))
     if not significant.any():
         return unchanged
     factor, low, high = (np.where(significant, v, 1.0) for v in (factor, low, high))
-    own = np.append(factor, 1.0)[[unchanged.kinds.index(n) if n in unchanged.kinds else -1 for n in (*made.names, "")]]
-    after = tested(made, own[made.of_effect] ** 2)
+    factor_of_group = np.append(factor, 1.0)[
+        [unchanged.kinds.index(n) if n in unchanged.kinds else -1 for n in (*packed.names, "")]
+    ]
+    after = tested(packed, factor_of_group[packed.of_effect] ** 2)
     return replace(unchanged, factor=factor, low=low, high=high, suspect=True, left=_count_rejected(after))
 
 
@@ -193,7 +202,7 @@ def _count_rejected(tests: Tested) -> int:
 
 
 def _exclusion_path(tests: Tested) -> tuple[Array, Array]:
-    """Return the cost and the redundancy (N, 1 + k) of each fix without its 0, 1, ... k most outstanding errors.
+    """Return the cost and the redundancy (N, 1 + k) of each fix without its 0, 1, ... k errors with the largest tests.
 
     Only errors whose squared test exceeds the penalty are excluded. A fix with fewer of these errors gets an infinite
     cost in the remaining columns.
@@ -216,39 +225,44 @@ def priced_cost(tests: Tested) -> Array:
 
 
 def _lowest_deviance(cost: Array, dof: Array, factor: float) -> Array:
-    """Return the minimum (N,) of twice the negative log-likelihood of each fix, with sigma times a factor."""
+    """Return the minimum (N,) of twice the negative log-likelihood of each fix, over the number of excluded errors.
+
+    `cost` and `dof` (N, 1 + k) come from `_exclusion_path`. Sigma is multiplied by `factor`; the penalties are
+    included.
+    """
     left = np.arange(cost.shape[1])
     return np.asarray((cost / factor**2 + dof * np.log(factor**2) + ROW_PRICE * left).min(1))
 
 
-def _single_groups(made: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[tuple[str, float, float]]:
+def _single_groups(packed: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[tuple[str, float, float]]:
     """Yield for each group its name, the most likely factor of sigma of its errors alone, and the likelihood with it.
 
-    The likelihood is twice the negative logarithm. A factor f adds (f^2 - 1) B B' to V, with the columns B of the
-    group. Let l be the eigenvalues of T of `Tested` for these columns, and y the components of t along its
-    eigenvectors. The cost decreases by the sum of (f^2 - 1) y^2 / (1 + (f^2 - 1) l), and the determinant of V is
-    multiplied by 1 + (f^2 - 1) l for each l (A. J. Woodbury 1950). A fix may also exclude a measurement instead.
+    The likelihood is twice the negative logarithm. `tests` are the tests with the noise as stated, and `cost`
+    (N, 1 + k) comes from `_exclusion_path`. A factor f adds (f^2 - 1) B B' to V, with the columns B of the group. Let l
+    be the eigenvalues of T of `Tested` for these columns, and y the components of t along its eigenvectors. The cost
+    decreases by the sum of (f^2 - 1) y^2 / (1 + (f^2 - 1) l), and the determinant of V is multiplied by 1 + (f^2 - 1) l
+    for each l (A. J. Woodbury 1950). Instead of the factor, a fix may also exclude measurements.
     """
-    left = ROW_PRICE * np.arange(1, cost.shape[1])
-    instead = (cost[:, 1:] + left).min(1, initial=np.inf)
-    for g in np.flatnonzero(total(made.of_effect, len(made.names))):
-        own = made.of_effect == g
+    penalty = ROW_PRICE * np.arange(1, cost.shape[1])
+    instead = (cost[:, 1:] + penalty).min(1, initial=np.inf)
+    for g in np.flatnonzero(total(packed.of_effect, len(packed.names))):
+        inside = packed.of_effect == g
         # The columns of the group come first; a fix with fewer columns is padded with zeros.
-        order = np.argsort(~own, axis=1, kind="stable")[:, : int(own.sum(1).max())]
-        here = np.take_along_axis(own, order, 1)
+        order = np.argsort(~inside, axis=1, kind="stable")[:, : int(inside.sum(1).max())]
+        here = np.take_along_axis(inside, order, 1)
         matrix = np.take_along_axis(np.take_along_axis(tests.matrix, order[:, :, None], 1), order[:, None], 2)
         values, vectors = np.linalg.eigh(np.where(here[:, :, None] & here[:, None, :], matrix, 0.0))
         seen = values > _ROUNDING * values[:, -1:]
         vector = np.where(here, np.take_along_axis(tests.vector, order, 1), 0.0)
         squared = np.where(seen, (np.swapaxes(vectors, 1, 2) @ vector[..., None])[..., 0] ** 2, 0.0)
         values = np.where(seen, values, 0.0)
-        more = _FACTORS[_FACTORS > 1.0, None, None] ** 2 - 1.0
-        grown = 1.0 + more * values
+        increase = _FACTORS[_FACTORS > 1.0, None, None] ** 2 - 1.0
+        grown = 1.0 + increase * values
         determinant = np.log(grown).sum(-1)
-        each = tests.cost - (more * squared / grown).sum(-1)
+        each = tests.cost - (increase * squared / grown).sum(-1)
         sums = (determinant + np.minimum(each, instead)).sum(-1)
         best = int(sums.argmin())
-        yield made.names[g], float(np.sqrt(1.0 + more[best, 0, 0])), float(sums[best])
+        yield packed.names[g], float(np.sqrt(1.0 + increase[best, 0, 0])), float(sums[best])
 
 
 # Late rows (NLOS): their share, their mean delay, and the fixes that depend on them.
@@ -355,11 +369,11 @@ def _late_kinds(problem: Problem) -> list[str]:
     return [rows.kind for rows in problem.rows if rows.kind in LATE]
 
 
-def _late_rows(made: Elements, able: list[str]) -> LateSignals:
-    """Return the late rows of linearised fixes with the noise as stated."""
-    tests = tested(made, np.ones(()))
-    fit_for = np.isin(np.array([*made.names, ""], dtype=object)[made.of_effect], able)
-    share, delay, gain, late, seen = _mixture(tests, fit_for)
+def _late_rows(packed: Elements, able: list[str]) -> LateSignals:
+    """Return the late rows of linearised fixes with the noise as stated; `able` are the kinds that can be late."""
+    tests = tested(packed, np.ones(()))
+    fit_for = np.isin(np.array([*packed.names, ""], dtype=object)[packed.of_effect], able)
+    share, delay, gain, late, seen = _select_late(tests, fit_for)
     none = np.zeros(len(late), dtype=int)
     # Compare the misfit that late rows explain with the misfit that excluded rows of both signs explain, penalties
     # included. The ratio is about one half if the errors have symmetric tails, and less if the noise is understated.
@@ -383,15 +397,15 @@ def _common_delay(problem: Problem, x: Array, kind: str) -> tuple[str, float, fl
     delay moves the fixes far. Offset and standard deviation are in SI units; the cost includes the penalty of the
     offset.
     """
-    own = np.concatenate([np.full(rows.count, rows.kind == kind) for rows in problem.rows])
+    of_kind = np.concatenate([np.full(rows.count, rows.kind == kind) for rows in problem.rows])
     offset, error = 0.0, np.inf
     tests = None
     for _ in range(_STEPS):
-        moved = problem.with_rows(z=problem.z - offset * own)
+        moved = problem.with_rows(z=problem.z - offset * of_kind)
         x, _ = descend(moved, x)
-        made = elements(moved, x, "kind")
-        tests = tested(made, np.ones(()))
-        here = made.of_offset == made.names.index(kind)
+        packed = elements(moved, x, "kind")
+        tests = tested(packed, np.ones(()))
+        here = packed.of_offset == packed.names.index(kind)
         size = float(tests.size[:, tests.errors :][here].sum())
         if size <= 0.0:  # the emission time absorbs a common delay
             return kind, 0.0, np.inf, np.inf
@@ -402,8 +416,12 @@ def _common_delay(problem: Problem, x: Array, kind: str) -> tuple[str, float, fl
     return kind, offset, error, np.inf if tests is None else float(priced_cost(tests).sum()) + ROW_PRICE
 
 
-def _mixture(tests: Tested, able: Array) -> tuple[float, float, float, Array, int]:
-    """Return share, mean delay in sigmas, gain, late rows (N, q) and the number of rows that other rows check."""
+def _select_late(tests: Tested, able: Array) -> tuple[float, float, float, Array, int]:
+    """Return share, mean delay in sigmas, gain, late rows (N, q) and the number of rows that other rows check.
+
+    The share and the delay are estimated from rows of unknown state; then each row gets the more probable state. Both
+    steps repeat until no state changes. `able` (N, q) marks errors of kinds whose rows can be late.
+    """
     found = snooped(tests, slice(0, tests.errors), _FIRST_CUT)
     late = found.gross & able & (found.shift > 0.0)
     share = delay = gain = 0.0
@@ -411,7 +429,7 @@ def _mixture(tests: Tested, able: Array) -> tuple[float, float, float, Array, in
     for _ in range(_CHOICES):
         shift, sigma = _leave_one_out(tests, late)
         seen = able & np.isfinite(shift)
-        share, delay, gain, chance = _expect(shift[seen], sigma[seen], late[seen])
+        share, delay, gain, chance = _fit_mixture(shift[seen], sigma[seen], late[seen])
         now = np.zeros(late.shape, dtype=bool)
         now[seen] = chance > 0.5
         # Rows that no other row checks after the exclusions keep their state.
@@ -423,7 +441,11 @@ def _mixture(tests: Tested, able: Array) -> tuple[float, float, float, Array, in
 
 
 def _leave_one_out(tests: Tested, late: Array) -> tuple[Array, Array]:
-    """Return the error (N, q) of each row and its standard deviation, from the other rows that are not late."""
+    """Return the estimated error (N, q) of each row and its standard deviation, from the other rows that are not late.
+
+    `late` (N, q) marks late rows. Both results are in sigmas of the row; NaN if the other rows do not determine the
+    error.
+    """
     items, q = np.arange(len(late)), tests.errors
     shift, sigma = error_sizes(without(tests, late), slice(0, q))
     order = np.argsort(~late, axis=1, kind="stable")[:, : int(late.sum(1).max(initial=0))]
@@ -438,10 +460,11 @@ def _leave_one_out(tests: Tested, late: Array) -> tuple[Array, Array]:
     return shift, sigma
 
 
-def _expect(error: Array, sigma: Array, late: Array) -> tuple[float, float, float, Array]:
-    """Return share, mean delay, gain, and the probability of each row to be late, by EM.
+def _fit_mixture(error: Array, sigma: Array, late: Array) -> tuple[float, float, float, Array]:
+    """Return share and mean delay of late rows, the gain, and the probability (r,) of each row to be late, by EM.
 
-    The errors are normal. A late row has an additional exponentially distributed delay.
+    `error` and `sigma` (r,) are from `_leave_one_out`, and `late` (r,) is the first selection. The errors are normal. A
+    late row has an additional exponentially distributed delay. If the mean delay is negligible, all results are zero.
     """
     from scipy.special import erfcx, log_ndtr
 
@@ -449,23 +472,23 @@ def _expect(error: Array, sigma: Array, late: Array) -> tuple[float, float, floa
     delay = float(np.mean(error[late])) if late.any() else 0.0
     if not share or delay <= 0.0:
         return 0.0, 0.0, 0.0, np.zeros(len(error))
-    prompt = -0.5 * (error / sigma) ** 2 - np.log(sigma) - 0.5 * np.log(2.0 * np.pi)
+    log_on_time = -0.5 * (error / sigma) ** 2 - np.log(sigma) - 0.5 * np.log(2.0 * np.pi)
     for _ in range(_TURNS):
         # Given the error, the delay is normal about error - sigma^2 / delay, truncated at zero.
         middle = error - sigma**2 / delay
         tail = log_ndtr(middle / sigma)
-        density = np.log(share / delay) + 0.5 * (sigma / delay) ** 2 - error / delay + tail
-        both = np.logaddexp(np.log1p(-share) + prompt, density)
-        chance = np.exp(density - both)
+        log_late = np.log(share / delay) + 0.5 * (sigma / delay) ** 2 - error / delay + tail
+        log_either = np.logaddexp(np.log1p(-share) + log_on_time, log_late)
+        p_late = np.exp(log_late - log_either)
         # mean of the truncated normal distribution; erfcx computes the ratio of density and distribution without
         # cancellation
         mean = middle + sigma * np.sqrt(2.0 / np.pi) / erfcx(-middle / (np.sqrt(2.0) * sigma))
-        new = float(np.clip(chance.mean(), 1e-12, 1.0 - 1e-6))
-        longer = float((chance * mean).sum() / max(chance.sum(), 1e-300))
+        new = float(np.clip(p_late.mean(), 1e-12, 1.0 - 1e-6))
+        longer = float((p_late * mean).sum() / max(p_late.sum(), 1e-300))
         done = abs(new - share) <= _ENDED * share and abs(longer - delay) <= _ENDED * delay
         if longer < _MIN_DELAY:
             return 0.0, 0.0, 0.0, np.zeros(len(error))
         share, delay = new, longer
         if done:
             break
-    return share, delay, float(2.0 * (both - prompt).sum()), chance
+    return share, delay, float(2.0 * (log_either - log_on_time).sum()), p_late

@@ -24,14 +24,14 @@ _FACTORS = np.exp(0.05 * np.arange(112))
 _TURNS, _NONE = 8, 1.05
 
 
-def tail_factors(made: Elements, found: VarianceFit) -> Array:
+def tail_factors(packed: Elements, found: VarianceFit) -> Array:
     """Return the factor of the standard deviation of each group (g,) with which a Gaussian bounds its tails.
 
     With k times the variance theta of an error, its test t / sqrt(T) has the variance 1 + (k - 1) theta T. The factor
     is the smallest k that explains the numbers of tests beyond 2, 2.6 and 3.3 sigma. It is an overbound, as in the
     integrity of satellite navigation. Each variance is multiplied by the square root of its factor, and the tests are
-    repeated until all factors are one. Errors that the residuals cannot separate share the excess. `made` holds N
-    linearised problems, and `found` their variances.
+    repeated until all factors are one. Errors that the residuals cannot separate share the excess. `packed` are N
+    linearised problems, and `found` the variances of their g groups. t and T are the statistics of `Tested`.
 
     References
     ----------
@@ -39,26 +39,32 @@ def tail_factors(made: Elements, found: VarianceFit) -> Array:
     """
     variance = np.append(np.nan_to_num(found.variance), 0.0)
     # Errors of five sigma are tails; errors of ten sigma are gross.
-    gross = snooped(tested(made, variance[made.of_effect]), slice(0, made.effect.shape[-1]), _GROSS).gross
+    gross = snooped(tested(packed, variance[packed.of_effect]), slice(0, packed.effect.shape[-1]), _GROSS).gross
     grown = np.ones(len(variance))
     for _ in range(_TURNS):
-        tests = without(tested(made, (grown * variance)[made.of_effect]), gross)
-        needed = np.array([_needed(tests, made.of_effect == g, v) for g, v in enumerate((grown * variance)[:-1])])
+        tests = without(tested(packed, (grown * variance)[packed.of_effect]), gross)
+        needed = np.array(
+            [_needed_factor(tests, packed.of_effect == g, v) for g, v in enumerate((grown * variance)[:-1])]
+        )
         if (needed <= _NONE).all():
             break
         grown[:-1] *= np.sqrt(needed)
     return np.sqrt(grown[:-1])
 
 
-def _needed(tests: Tested, own: Array, variance: float) -> float:
-    """Return the smallest factor of the variance of some errors (N, q) with which normal tails bound their tails."""
+def _needed_factor(tests: Tested, own: Array, variance: float) -> float:
+    """Return the smallest factor of a variance with which normal tails bound the tails of some errors.
+
+    `own` (N, q) marks the errors, and `variance` is their present variance. The largest factor that is tried is
+    returned if none is sufficient.
+    """
     size = tests.size[:, : tests.errors]
     own = own & (size * variance > _SHOWN)
     count = int(own.sum())
     if not count:
         return 1.0
     share, squared = size[own] * variance, tests.vector[:, : tests.errors][own] ** 2 / size[own]
-    expected = count * _beyond()
+    expected = count * _tail_probabilities()
     allowed = expected + _CHANCE * np.sqrt(expected) + 1.0
     for factor in _FACTORS:
         # Errors of one fix depend on each other, but most pairs of errors belong to different fixes.
@@ -68,8 +74,8 @@ def _needed(tests: Tested, own: Array, variance: float) -> float:
     return float(_FACTORS[-1])
 
 
-def _beyond() -> Array:
-    """Return the probabilities of normal errors beyond the limits (3,)."""
+def _tail_probabilities() -> Array:
+    """Return the probabilities (3,) that a normal error exceeds each of the three limits of the tests."""
     from scipy.special import ndtr
 
     return np.asarray(2.0 * ndtr(-_SIZES))

@@ -3,6 +3,9 @@
 At a fixed position the rows are linear in all other unknowns. The column of an unknown scale is as long as the ranges.
 For a distant position, normal equations lose the digits in which this column differs from the column of an emission
 time. This module projects the rows instead, and it subtracts nothing from a cost.
+
+An unknown scale e multiplies rows by the factor 1 + e. Arrays have N problems, r rows (with priors), n unknown scales,
+and d coordinates of the position.
 """
 
 from __future__ import annotations
@@ -42,18 +45,18 @@ _DISTANT = 1e4
 
 
 def has_scales(problem: Problem) -> bool:
-    """Return whether unknown scales multiply rows, in a problem without walks."""
+    """Return whether unknown scales multiply rows, in a problem without random walks."""
     return not walks(problem) and bool(_multiplying(problem))
 
 
 def runs_backwards(problem: Problem, x: Array) -> Array:
-    """Return a mask (...) of the vectors with an unknown factor of ranges, times or levels of zero or less.
+    """Return a mask (...) of vectors `x` (..., size) with an unknown factor of ranges, times or levels of zero or less.
 
     For candidates (N, K, size), the mask also marks candidates whose exponent is rounding (`_STEEP`), unless all others
     are marked too.
     """
     out, steep = np.zeros(x.shape[:-1], dtype=bool), np.zeros(x.shape[:-1], dtype=bool)
-    levels = _touch(problem, _is_level)
+    levels = _multiplies_kind(problem, _is_level)
     for column, least, level in zip(*_scales(problem), levels, strict=True):
         out |= x[..., column] <= least
         steep |= level & (x[..., column] > _STEEP)
@@ -76,15 +79,15 @@ def profile_by_rows(problem: Problem, x: Array, at: Array, passes: int) -> tuple
         others = design[..., rest]
         basis, turned = span_of(others), np.linalg.pinv(others)
         left, slope, along = (
-            _without(basis, residual[..., None]),
-            _without(basis, design[..., part]),
+            _project_out(basis, residual[..., None]),
+            _project_out(basis, design[..., part]),
             design[..., scale],
         )
-        column = _without(basis, along)
-        long = np.sqrt((column**2).sum(-2)) > _EXPLAINED * np.sqrt((along**2).sum(-2))
-        move, left, held = _bounded(column * long[..., None, :], left, least - x[..., scale])
-        free = span_of(column * (long & ~held)[..., None, :])
-        slope = _without(free, slope)
+        column = _project_out(basis, along)
+        usable = np.sqrt((column**2).sum(-2)) > _EXPLAINED * np.sqrt((along**2).sum(-2))
+        move, left, at_bound = _bounded(column * usable[..., None, :], left, least - x[..., scale])
+        free_basis = span_of(column * (usable & ~at_bound)[..., None, :])
+        slope = _project_out(free_basis, slope)
         x = np.array(x)
         x[..., scale] += move
         x[..., rest] += (turned @ (residual - (along @ move[..., None])[..., 0])[..., None])[..., 0]
@@ -111,21 +114,26 @@ def cost_beyond_speed(problem: Problem, x: Array) -> Array:
         there = np.array(x[items])
         there[:, part] = centre + side * spread[:, None] * normal
         if len(free) == 1:
-            own = _above_any_place(some, there, x[items], part, tangents, free[0])
+            lowest = _above_any_place(some, there, x[items], part, tangents, free[0])
         else:
-            own = _above_one_place(some, there, x[items], part, tangents * spread[:, None, None])
-        out[items] = np.fmin(out[items], own)
+            lowest = _above_one_place(some, there, x[items], part, tangents * spread[:, None, None])
+        out[items] = np.fmin(out[items], lowest)
     return out
 
 
 def _above_any_place(problem: Problem, there: Array, at: Array, part: Array, tangents: Array, j: int) -> Array:
-    """Return the lowest cost (N,) of distant waves with one free factor j; a position is a tilt of the wave front."""
+    """Return the lowest cost (N,) of distant waves with one free factor; a position is a tilt of the wave front.
+
+    `there` (N, size) are vectors with distant positions. `at` (N, size) are the fixes, at which station errors are
+    weighted. `part` (d,) are the columns of the position, `tangents` (N, d, d - 1) span the plane of the stations, and
+    `j` is the column of the factor.
+    """
     residual, design = _rows(problem, there, at)
     touched = (design[..., j] != 0.0)[..., None]
     tilt = np.where(touched, design[..., part] @ tangents, 0.0)
     rest = np.setdiff1d(np.arange(design.shape[-1]), np.append(part, j))
     basis = span_of(np.concatenate([design[..., rest], tilt], axis=-1))
-    column, left = _without(basis, design[..., [j]]), _without(basis, residual[..., None])
+    column, left = _project_out(basis, design[..., [j]]), _project_out(basis, residual[..., None])
     _, left, _ = _bounded(column, left, _STILL - there[:, [j]])
     return np.asarray((left[..., 0] ** 2).sum(-1))
 
@@ -134,7 +142,7 @@ def _above_one_place(problem: Problem, there: Array, at: Array, part: Array, tan
     """Return the lowest cost (N,) of distant waves with several free factors, which all come from one position.
 
     The method is Gauss-Newton along the tangents (N, d, d - 1), whose length is one spread. A step is at most one
-    spread.
+    spread. The other arguments are as in `_above_any_place`.
     """
     count, along = tangents.shape[-1], np.swapaxes(tangents, -1, -2)
     first = np.stack(np.meshgrid(*[_OFFSETS] * count), axis=-1).reshape(-1, 1, count)
@@ -151,15 +159,19 @@ def _above_one_place(problem: Problem, there: Array, at: Array, part: Array, tan
 
 
 def _without_prior(problem: Problem) -> Array:
-    """Return the columns of unknown factors of ranges without a prior."""
+    """Return the columns of the unknown scales of ranges that have no prior."""
     scale, least = _scales(problem)
-    levels = scale[~_touch(problem, lambda model: model.ranges is not None)]
+    levels = scale[~_multiplies_kind(problem, lambda model: model.ranges is not None)]
     known = [columns(problem.layout, name, np.array([0]))[0] for name, _, _ in prior_parts(problem)]
     return np.asarray(scale[(least == _STILL) & ~np.isin(scale, np.concatenate([levels, *known]))])
 
 
 def _planes_of(problem: Problem, count: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Return centre, normal, tangents (n, d, d - 1) and spread (m) of coplanar stations, and problem numbers (n,)."""
+    """Return the planes of the stations, for the problems whose stations are coplanar.
+
+    The results are centre (n, d) in m, unit normal (n, d), unit tangents (n, d, d - 1), spread (n,) in m, and the
+    numbers (n,) of these problems. `count` is the number of all problems.
+    """
     places = problem.stations.places
     places = np.broadcast_to(places, (count, *places.shape[-2:]))
     centre, spread = linalg.centre_and_spread(places)
@@ -172,14 +184,14 @@ def _planes_of(problem: Problem, count: int) -> tuple[Array, Array, Array, Array
 
 
 def _scales(problem: Problem) -> tuple[Array, Array]:
-    """Return the columns (n,) of all unknown factors, and the lower bound of each."""
-    falls = _touch(problem, lambda model: model.ranges is not None or _is_level(model))
-    own = [columns(problem.layout, bias.name, np.array([0]))[0] for bias in _multiplying(problem)]
-    return np.concatenate([np.zeros(0, dtype=int), *own]), np.where(falls, _STILL, -np.inf)
+    """Return the columns (n,) of all unknown scales, and the lower bound of each; minus infinity for no bound."""
+    bounded = _multiplies_kind(problem, lambda model: model.ranges is not None or _is_level(model))
+    found = [columns(problem.layout, bias.name, np.array([0]))[0] for bias in _multiplying(problem)]
+    return np.concatenate([np.zeros(0, dtype=int), *found]), np.where(bounded, _STILL, -np.inf)
 
 
 def _multiplying(problem: Problem) -> list[Bias]:
-    """Return the biases that multiply rows."""
+    """Return the biases that multiply rows; their members are the unknown scales."""
     return [bias for bias in problem.biases if form_of(bias).enters == "scales"]
 
 
@@ -188,15 +200,18 @@ def _is_level(model: Model) -> bool:
     return {node for _, node in model.nodes} == {"log range"}
 
 
-def _touch(problem: Problem, of_kind: Callable[[Model], bool]) -> Array:
-    """Return a mask (n,) of the unknown factors that multiply rows of some kinds."""
+def _multiplies_kind(problem: Problem, of_kind: Callable[[Model], bool]) -> Array:
+    """Return a mask (n,) of the unknown scales that multiply rows of the kinds that `of_kind` selects."""
     rows = np.concatenate([np.full(rows.count, of_kind(MODELS[rows.kind])) for rows in problem.rows])
-    own = [np.bincount(bias.member, rows[bias.row], len(bias.members)) > 0 for bias in _multiplying(problem)]
-    return np.concatenate([np.zeros(0, dtype=bool), *own])
+    found = [np.bincount(bias.member, rows[bias.row], len(bias.members)) > 0 for bias in _multiplying(problem)]
+    return np.concatenate([np.zeros(0, dtype=bool), *found])
 
 
 def _rows(problem: Problem, x: Array, at: Array) -> tuple[Array, Array]:
-    """Return whitened residuals (..., r) and derivatives (..., r, size) of all rows and priors at vectors."""
+    """Return whitened residuals (..., r) and derivatives (..., r, size) of all rows and priors at vectors (..., size).
+
+    Station errors are weighted at the vectors `at`.
+    """
     layout, (residual, folded) = problem.layout, differentiate(problem, x)
     n, length, total = layout.n_shared, layout.n_local, layout.size
     design = np.zeros((*folded.shape[:-1], total))
@@ -208,38 +223,41 @@ def _rows(problem: Problem, x: Array, at: Array) -> tuple[Array, Array]:
     for name, mean, precision in prior_parts(problem):
         shared = layout.find(name)[1]
         for epoch in range(1 if shared else problem.epochs):
-            own = columns(layout, name, np.array([epoch]))[0]
+            unknowns = columns(layout, name, np.array([epoch]))[0]
             root = np.swapaxes(np.linalg.cholesky(precision if shared else precision[..., 0, :, :]), -1, -2)
-            known = np.zeros((*x.shape[:-1], len(own), 1 + total))
-            known[..., 1 + own] = root
-            apart = (mean if shared else mean[..., 0, :]) - x[..., own]
-            known[..., 0] = (root @ apart[..., None])[..., 0]
+            known = np.zeros((*x.shape[:-1], len(unknowns), 1 + total))
+            known[..., 1 + unknowns] = root
+            difference = (mean if shared else mean[..., 0, :]) - x[..., unknowns]
+            known[..., 0] = (root @ difference[..., None])[..., 0]
             parts.append(known)
     both = np.concatenate(parts, axis=-2)
     return both[..., 0], both[..., 1:]
 
 
-def _without(basis: Array, values: Array) -> Array:
-    """Return values (..., r, k) minus their projection onto an orthonormal basis, projected twice due to rounding."""
+def _project_out(basis: Array, values: Array) -> Array:
+    """Return values (..., r, k) minus their projection onto an orthonormal basis (..., r, b).
+
+    The projection is repeated, because rounding leaves a small part after one projection.
+    """
     back = np.swapaxes(basis, -1, -2)
     once = values - basis @ (back @ values)
     return np.asarray(once - basis @ (back @ once))
 
 
 def _bounded(column: Array, left: Array, least: Array) -> tuple[Array, Array, Array]:
-    """Return the best steps (..., n) of factors for residuals (..., r, 1), the remaining residuals, and a mask.
+    """Return the best steps (..., n) of the scales, the remaining residuals (..., r, 1), and a mask (..., n).
 
-    A step is at least `least` (..., n). The mask marks factors at this bound; the steps of the other factors are
-    computed again.
+    `column` (..., r, n) are the derivatives by the scales, and `left` (..., r, 1) the residuals before the step. A step
+    is at least `least` (..., n). The mask marks scales at this bound; the steps of the other scales are computed again.
     """
-    held = np.zeros(column.shape[:-2] + column.shape[-1:], dtype=bool)
-    move = np.zeros(held.shape)
-    for _ in range(1 + held.shape[-1]):
-        fixed = np.where(held, least, 0.0)
-        rest = left - column @ np.where(held, fixed, 0.0)[..., None]
-        move = np.where(held, fixed, (np.linalg.pinv(column * ~held[..., None, :]) @ rest)[..., 0])
-        below = ~held & (move < least)
+    at_bound = np.zeros(column.shape[:-2] + column.shape[-1:], dtype=bool)
+    move = np.zeros(at_bound.shape)
+    for _ in range(1 + at_bound.shape[-1]):
+        fixed = np.where(at_bound, least, 0.0)
+        rest = left - column @ np.where(at_bound, fixed, 0.0)[..., None]
+        move = np.where(at_bound, fixed, (np.linalg.pinv(column * ~at_bound[..., None, :]) @ rest)[..., 0])
+        below = ~at_bound & (move < least)
         if not below.any():
             break
-        held |= below
-    return move, left - column @ move[..., None], held
+        at_bound |= below
+    return move, left - column @ move[..., None], at_bound

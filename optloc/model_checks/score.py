@@ -1,6 +1,7 @@
 """Score tests for systematic errors of one channel, and refits that confirm them.
 
 A score test needs no fit of the larger model, so it can rank many possible errors. The best candidates are then fitted.
+A candidate is an error that the problem does not model, and q is the number of its unknowns.
 """
 
 from __future__ import annotations
@@ -145,15 +146,18 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
     for i in order:
         if values[i] <= limit[i] or dof - scores[i][2] < 1:
             continue
-        own = _fitted(problem, x, found[i], scores[i])
-        after = float(tail_probability(own.cost + np.zeros(1), np.array([dof - scores[i][2]]))[0])
-        if after >= FITS and cost[0] - own.cost > limit[i]:
-            explained.append(replace(own, p_before=before, p_after=after))
+        fitted = _fitted(problem, x, found[i], scores[i])
+        after = float(tail_probability(fitted.cost + np.zeros(1), np.array([dof - scores[i][2]]))[0])
+        if after >= FITS and cost[0] - fitted.cost > limit[i]:
+            explained.append(replace(fitted, p_before=before, p_after=after))
     return _distinct(explained)
 
 
 def _distinct(explained: list[Explained]) -> tuple[Explained, ...]:
-    """Return the explanations with almost the lowest cost, in ascending order; of equal ones only the simplest."""
+    """Return the explanations whose cost is almost the lowest, in ascending order of the cost.
+
+    Of explanations of the same station that fit equally well, only the simplest is returned.
+    """
     # for one row, an offset, a scale and a drift are equal, and also for rows of one position
     simple = sorted(explained, key=lambda one: (_is_time_scale(one), _ORDER.index(one.candidate.form), one.cost))
     kept: list[Explained] = []
@@ -166,7 +170,10 @@ def _distinct(explained: list[Explained]) -> tuple[Explained, ...]:
 
 
 def _replaces(other: Explained, one: Explained) -> bool:
-    """Return whether an explanation replaces another explanation of the same station."""
+    """Return whether an explanation `other` makes an explanation `one` of the same station unnecessary.
+
+    It does so if both fit almost equally well. A scale of arrival times must fit much better than another explanation.
+    """
     if _is_time_scale(one) and not _is_time_scale(other):
         return other.cost - one.cost < _STRETCHED_TIME
     return abs(other.cost - one.cost) < _SAME
@@ -179,7 +186,10 @@ def _is_time_scale(one: Explained) -> bool:
 
 
 def _is_of_arrivals(kind: str) -> bool:
-    """Return whether rows of a kind are clock times of their stations: differences, or times since an emission."""
+    """Return whether rows of a kind measure arrival times, so that a clock error changes them.
+
+    These rows are lengths that involve two stations, such as differences, or times since an unknown emission.
+    """
     model = MODELS[kind]
     return model.quantity == "length" and (model.emission or model.stations == 2)
 
@@ -190,16 +200,18 @@ def candidates(problem: Problem) -> tuple[Candidate, ...]:
     present = np.broadcast_to(problem.weight, (1, problem.count))[0] > 0.0
     out: list[Candidate] = []
     for rows, start in zip(problem.rows, problem.starts, strict=True):
-        own = present[start : start + rows.count]
-        if not own.any():
+        inside = present[start : start + rows.count]
+        if not inside.any():
             continue
-        taken = MODELS[rows.kind].stations
-        observing = np.unique(np.concatenate([index[own] for index in (rows.a, rows.b)[:taken]] or [np.zeros(0, int)]))
+        end_count = MODELS[rows.kind].stations
+        observing = np.unique(
+            np.concatenate([index[inside] for index in (rows.a, rows.b)[:end_count]] or [np.zeros(0, int)])
+        )
         for form in _forms(problem, rows.kind):
             out.append(_candidate(problem, form, "kind", rows.kind, None))
             out += [_candidate(problem, form, "station", rows.kind, names[i]) for i in observing if i >= 0]
-    out += list(_turns(problem, present))
-    return (*out, *_steps(problem, out))
+    out += list(_rotations(problem, present))
+    return (*out, *_steps_and_bursts(problem, out))
 
 
 def _forms(problem: Problem, kind: str) -> Iterator[FormName]:
@@ -213,15 +225,21 @@ def _forms(problem: Problem, kind: str) -> Iterator[FormName]:
 
 
 def _candidate(problem: Problem, form: FormName, per: Per, kind: str | None, station: str | None) -> Candidate:
-    """Return a candidate of a form for one station, or for all rows of a kind without a station."""
+    """Return a candidate of a form for one station, or for all rows of a kind if `station` is None.
+
+    `kind` is None if the error affects rows of several kinds.
+    """
     members = None if station is None else (station,)
     names = problem.stations.names
     bias = family(problem.rows, names, f"{form} that is tested", per=per, form=form, kind=kind, members=members)
     return Candidate(bias, per, kind or "")
 
 
-def _turns(problem: Problem, present: Array) -> Iterator[Candidate]:
-    """Yield the rotations of stations in space; rotations in the plane are offsets of the azimuth."""
+def _rotations(problem: Problem, present: Array) -> Iterator[Candidate]:
+    """Yield the rotations of stations in space; rotations in the plane are offsets of the azimuth.
+
+    `present` (m,) marks rows with a weight above zero. A station needs more than three rows of angles.
+    """
     angles = [
         index
         for rows, start in zip(problem.rows, problem.starts, strict=True)
@@ -235,8 +253,11 @@ def _turns(problem: Problem, present: Array) -> Iterator[Candidate]:
                 yield _candidate(problem, "rotation", "station", None, problem.stations.names[i])
 
 
-def _steps(problem: Problem, found: list[Candidate]) -> Iterator[Candidate]:
-    """Yield offsets of stations that start within a run (steps), and offsets that also end within it (bursts)."""
+def _steps_and_bursts(problem: Problem, found: list[Candidate]) -> Iterator[Candidate]:
+    """Yield offsets of stations that start within a run (steps), and offsets that also end within it (bursts).
+
+    `found` are the candidates for the whole run. Runs with few epochs have no steps and bursts.
+    """
     k = problem.epochs
     if k < _STEP_EPOCHS or not np.isfinite(problem.times).all():
         return
@@ -245,29 +266,30 @@ def _steps(problem: Problem, found: list[Candidate]) -> Iterator[Candidate]:
     spans = [*((first, k) for first in cuts), *pairwise(cuts)]
     stations = [one for one in found if one.is_channel_offset]
     for first, last in spans:
-        yield from (made for one in stations for made in _limited(problem, one, first, last))
+        yield from (made for one in stations for made in _in_epochs(problem, one, first, last))
 
 
-def _limited(problem: Problem, one: Candidate, first: int, last: int) -> Iterator[Candidate]:
-    """Yield an offset of the epochs first <= k < last, unless it affects no row or all rows."""
+def _in_epochs(problem: Problem, one: Candidate, first: int, last: int) -> Iterator[Candidate]:
+    """Yield the candidate `one` for the epochs first <= k < last only, unless it then affects no row or all rows."""
     when = problem.epoch[one.bias.row]
     inside = (when >= first) & (when < last)
     if inside.any() and not inside.all():
         until = float(problem.times[last]) if last < problem.epochs else float("nan")
-        yield replace(one, bias=_of_rows(one.bias, inside), since=float(problem.times[first]), until=until)
+        yield replace(one, bias=_restricted(one.bias, inside), since=float(problem.times[first]), until=until)
 
 
 def _sharpened(problem: Problem, x: Array, found: Sequence[Candidate], values: Array) -> list[Candidate]:
     """Return the best step and the best burst with their ends moved to the epochs with the highest test.
 
-    An error of many sigma between two tried times leaves a misfit, which would hide the kind of the error.
+    An error of many sigma between two tried times leaves a misfit, which would hide the kind of the error. `values` are
+    the test statistics of the candidates `found`.
     """
     out, around = [], _search_width(problem)
     for form in ("step", "burst"):
-        own = [i for i, one in enumerate(found) if one.form == form]
-        if not own:
+        numbers = [i for i, one in enumerate(found) if one.form == form]
+        if not numbers:
             continue
-        best = found[max(own, key=lambda i: values[i])]
+        best = found[max(numbers, key=lambda i: values[i])]
         # the permanent offset of the same channel
         whole = next(
             one
@@ -275,28 +297,28 @@ def _sharpened(problem: Problem, x: Array, found: Sequence[Candidate], values: A
             if one.is_channel_offset and (one.kind, one.bias.members) == (best.kind, best.bias.members)
         )
         for end in range(1 if form == "step" else 2):
-            ends = _ends(problem, best)
+            ends = _epochs_of(problem, best)
             near = np.clip(ends[end] + np.arange(-around, around + 1), 1 if end == 0 else ends[0] + 1, problem.epochs)
             spans = [(k, ends[1]) if end == 0 else (ends[0], k) for k in np.unique(near).tolist()]
-            tried = tuple(made for span in spans if span[0] < span[1] for made in _limited(problem, whole, *span))
+            tried = tuple(made for span in spans if span[0] < span[1] for made in _in_epochs(problem, whole, *span))
             best = tried[int(np.argmax([value for value, _, _ in score(problem, x, tried)]))]
         out.append(best)
     return out
 
 
 def _search_width(problem: Problem) -> int:
-    """Return the number of epochs between two times of the first search."""
+    """Return the number of epochs between two neighbouring times that `_steps_and_bursts` tries."""
     return -(-problem.epochs // _STEP_TIMES)
 
 
-def _ends(problem: Problem, one: Candidate) -> tuple[int, int]:
-    """Return the first epoch of a step or burst, and the epoch after its last epoch."""
+def _epochs_of(problem: Problem, one: Candidate) -> tuple[int, int]:
+    """Return the number of the first epoch of a step or burst, and the number of the epoch after its last epoch."""
     last = int(np.searchsorted(problem.times, one.until)) if np.isfinite(one.until) else problem.epochs
     return int(np.searchsorted(problem.times, one.since)), last
 
 
-def _of_rows(bias: Bias, inside: Array) -> Bias:
-    """Return a bias that affects only some of its rows."""
+def _restricted(bias: Bias, inside: Array) -> Bias:
+    """Return a bias that affects only those of its rows that the mask `inside` marks."""
     return replace(bias, row=bias.row[inside], member=bias.member[inside], coefficient=bias.coefficient[inside])
 
 
@@ -304,28 +326,29 @@ def _of_rows(bias: Bias, inside: Array) -> Bias:
 
 
 def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tuple[float, Array, int]]:
-    """Return Rao's statistic, the estimate (q,) of one step and the number q for every candidate.
+    """Return Rao's statistic, the estimate (q,) after one step, and the number q, for every candidate.
 
     Let r be the whitened residual, J the columns of the unknowns and c the columns of the candidate. With u = c - J J^+
-    c the statistic is ``(u'r)' (u'u)^-1 (u'r)``: the part that the other unknowns can absorb is projected out.
-    `problem` is a flat batch of one problem, and `x` (1, size) its fix.
+    c the statistic is ``(u'r)' (u'u)^-1 (u'r)``: the part that the other unknowns can absorb is projected out. If the
+    rows do not determine a candidate, its statistic and its estimate are zero. `problem` is a flat batch of one
+    problem, and `x` (1, size) its fix.
     """
     larger, places = _with_families(problem, found)
     layout = larger.layout
-    information, vector = _shared(larger, _embed(problem, larger, x))
-    own = [slice(*(layout.find(name)[0].start + end for end in ends)) for name, ends in places]
-    inside = np.concatenate([np.arange(part.start, part.stop) for part in own])
+    information, vector = _shared_equations(larger, _embed(problem, larger, x))
+    parts = [slice(*(layout.find(name)[0].start + end for end in ends)) for name, ends in places]
+    inside = np.concatenate([np.arange(part.start, part.stop) for part in parts])
     rest = np.setdiff1d(np.arange(layout.n_shared), inside)
     space = np.eye(layout.n_shared)[:, rest]
-    if (held := Equalities.of(problem)).lasting:
+    if (equalities := Equalities.of(problem)).lasting:
         # the other unknowns move only along the equalities
-        along = held.lasting_space(x)[0]
+        along = equalities.lasting_space(x)[0]
         old = [layout.find(slot.name)[0].start + i for slot in problem.layout.shared for i in range(slot.size)]
         space = np.zeros((layout.n_shared, along.shape[1]))
         space[old] = along
     root = space @ linalg.root(space.T @ information @ space)[0]
     out = []
-    for part in own:
+    for part in parts:
         coupling = root.T @ information[:, part]
         left = information[part, part] - coupling.T @ coupling
         pull = vector[part] - coupling.T @ (root.T @ vector)
@@ -337,39 +360,46 @@ def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tupl
     return out
 
 
-def _shared(problem: Problem, x: Array) -> tuple[Array, Array]:
-    """Return information (n, n) and vector (n,) of the shared unknowns of one problem, local unknowns eliminated."""
+def _shared_equations(problem: Problem, x: Array) -> tuple[Array, Array]:
+    """Return information (n, n) and right side (n,) of the n shared unknowns of one problem at `x` (1, size).
+
+    Local unknowns are eliminated.
+    """
     information, vector = Equalities.of(problem).shared(equations_at(problem, x), x)
     return information[0], vector[0]
 
 
 def _with_families(problem: Problem, found: tuple[Candidate, ...]) -> tuple[Problem, list[tuple[str, tuple[int, int]]]]:
-    """Return the problem with one additional bias per form, and the bias name and entries of each candidate.
+    """Return the problem with one additional bias per form, and the place of each candidate in these biases.
 
-    All candidates of a form are members of one bias: a bias with many members takes no more time than a bias with one.
+    A place is the name of the bias, and the first entry and the entry after the last one. All candidates of a form are
+    members of one bias: a bias with many members takes no more time than a bias with one.
     """
     more, places = [], [("", (0, 0))] * len(found)
     for form in dict.fromkeys(one.bias.form for one in found):
-        own = [i for i, one in enumerate(found) if one.bias.form == form]
-        parts = [found[i].bias for i in own]
+        numbers = [i for i, one in enumerate(found) if one.bias.form == form]
+        parts = [found[i].bias for i in numbers]
         name, size = f"{form} that is tested", prod(FORMS[form].shape(parts[0], problem.dimension)[1:])
         member = np.concatenate([np.full(len(part.row), j) for j, part in enumerate(parts)])
         row, coefficient = (np.concatenate([getattr(part, key) for part in parts]) for key in ("row", "coefficient"))
-        more.append(replace(parts[0], name=name, members=tuple(map(str, own)), row=row, member=member))
+        more.append(replace(parts[0], name=name, members=tuple(map(str, numbers)), row=row, member=member))
         more[-1] = replace(more[-1], coefficient=coefficient)
-        for j, i in enumerate(own):
+        for j, i in enumerate(numbers):
             places[i] = name, (size * j, size * (j + 1))
     return replace(problem, biases=(*problem.biases, *more)), places
 
 
-def _with(problem: Problem, found: tuple[Candidate, ...]) -> Problem:
+def _with_biases(problem: Problem, found: tuple[Candidate, ...]) -> Problem:
     """Return the problem with the candidates as additional biases, each with a unique name."""
     more = tuple(replace(one.bias, name=f"{one.bias.name} {i}") for i, one in enumerate(found))
     return replace(problem, biases=(*problem.biases, *more))
 
 
 def _embed(problem: Problem, larger: Problem, x: Array) -> Array:
-    """Return vectors (N, size) of a problem with more biases; the additional biases are zero."""
+    """Return the vectors `x` (N, size) of `problem` as vectors of `larger`, which has more biases.
+
+    The additional biases are zero.
+    """
     shared, n = np.zeros((len(x), larger.layout.n_shared)), problem.layout.n_shared
     for slot in problem.layout.shared:
         new, _ = larger.layout.find(slot.name)
@@ -378,8 +408,11 @@ def _embed(problem: Problem, larger: Problem, x: Array) -> Array:
 
 
 def _fitted(problem: Problem, x: Array, one: Candidate, scored: tuple[float, Array, int]) -> Explained:
-    """Return the explanation by a candidate after it is estimated together with all other unknowns."""
-    larger = _with(problem, (one,))
+    """Return the explanation by a candidate after the candidate is estimated together with all other unknowns.
+
+    `x` (1, size) is the fix without the candidate, and `scored` the result of `score`. The p-values are NaN here.
+    """
+    larger = _with_biases(problem, (one,))
     slot, _ = larger.layout.find(larger.biases[-1].name)
     part = slice(slot.start, slot.start + slot.size)
     start = _embed(problem, larger, x)
@@ -393,8 +426,8 @@ def _fitted(problem: Problem, x: Array, one: Candidate, scored: tuple[float, Arr
 
 
 def _sigma(problem: Problem, x: Array, part: slice) -> Array:
-    """Return the standard deviations (q,) of a part of the shared unknowns."""
-    information, _ = _shared(problem, x)
+    """Return the standard deviations (q,) of the shared unknowns in the slice `part`, at `x` (1, size)."""
+    information, _ = _shared_equations(problem, x)
     space = Equalities.of(problem).lasting_space(x)[0]
     root = space @ linalg.root(space.T @ information @ space)[0]
     return np.asarray(np.sqrt((root[part] ** 2).sum(-1)))
@@ -416,7 +449,8 @@ _FLAT = 1e6
 def descend(problem: Problem, x: Array) -> tuple[Array, Array]:
     """Return least-squares vectors (M, size) from the starts `x` (M, size), and their costs (M,).
 
-    `problem` is a flat batch of M problems. Equalities hold; inequalities are ignored.
+    `problem` is a flat batch of M problems. The results satisfy equalities; inequalities are ignored. The cost is
+    infinite if a descent fails.
     """
     done = refine(problem, np.array(x), tolerance=_CLOSE, limit=_STEPS, face=exact(problem))
     return done.x, np.where(np.isfinite(done.cost), done.cost, np.inf)
@@ -438,7 +472,7 @@ def fit_anywhere(problem: Problem, more: Array | None = None) -> ScoreFit:
     """Return the best fit of N problems of one position, by descents from starts in all directions around the stations.
 
     The result is not proven. If the search misses the best position, an advice is missing, but no advice is wrong.
-    `more` (N, size) are additional starts; NaN for none.
+    `more` (N, size) is one additional start of each problem; NaN for none.
     """
     n, layout = problem.batch_shape[0], problem.layout
     centre, spread = centre_and_spread(problem.stations.places)

@@ -1,4 +1,8 @@
-"""Shape of the likelihood near a fix: departure from a Gaussian in two coordinate charts, and the cost at infinity."""
+"""Shape of the likelihood near a fix: departure from a Gaussian in two coordinate charts, and the cost at infinity.
+
+Arrays have N problems of d coordinates, n shared unknowns, and q positions tried for each problem. A vector of `size`
+numbers holds all unknowns of a problem. The departure is zero for a Gaussian.
+"""
 
 from __future__ import annotations
 
@@ -40,24 +44,26 @@ def profile(problem: Problem, x: Array, at: Array, passes: int = 1) -> tuple[Arr
         equations = equations_at(problem, x, at=weighed)
         if problem.layout.size == slot.size:
             return equations.cost, equations.shared, equations.shared_vector
-        along = _others(problem, x, part)
+        along = _other_directions(problem, x, part)
         move, _ = step(equations, np.zeros(equations.cost.shape), along)
     # The model is quadratic, so the cost decreases by the product of step and slope. After one step this product is
     # rounding, and the sum of squares without it is never negative.
     cost = equations.cost - decrement(equations, move, n) if passes == 1 else equations.cost
     information, vector, _ = marginal(equations)
-    across = information[..., part, :] @ along
+    # Schur complement: eliminate the other unknowns from the equations of the position.
+    coupling = information[..., part, :] @ along
     turned = np.swapaxes(along, -1, -2)
-    right = np.concatenate([np.swapaxes(across, -1, -2), turned @ vector[..., None]], axis=-1)
+    right = np.concatenate([np.swapaxes(coupling, -1, -2), turned @ vector[..., None]], axis=-1)
     solved, _ = linalg.solve(turned @ information @ along, right)
-    lost = across @ solved
-    return cost, information[..., part, part] - lost[..., :-1], vector[..., part] - lost[..., -1]
+    explained = coupling @ solved
+    return cost, information[..., part, part] - explained[..., :-1], vector[..., part] - explained[..., -1]
 
 
-def _others(problem: Problem, x: Array, part: slice) -> Array:
-    """Return the directions (..., n, q) of the shared unknowns except the position, along the equalities about them.
+def _other_directions(problem: Problem, x: Array, part: slice) -> Array:
+    """Return the directions (..., n, p) of the shared unknowns except the position, along the equalities about them.
 
-    A height that is kept along a course is an equality about the velocity as well.
+    `x` (q, N, size) are vectors and `part` is the slice of the position. A height that is kept along a course is an
+    equality about the velocity as well.
     """
     n, face = problem.layout.n_shared, exact(problem)
     free = np.eye(n)[:, np.r_[0 : part.start, part.stop : n]]
@@ -114,17 +120,17 @@ def departure(problem: Problem, x: Array, covariance: Array, face: Face, centre:
     spread = covariance[:, part, part]
     precision, _ = linalg.inverse(spread)
     pull = covariance[:, :, part] @ (precision if not face else np.linalg.pinv(spread))  # response of the others
-    look = ShapeTest(problem, x, pull, part, face)
+    test = ShapeTest(problem, x, pull, part, face)
     out = np.full((len(x), 2), np.inf)
     position, axes = x[:, part], _axes(spread)
     with np.errstate(all="ignore"):
         moved = AWAY * np.concatenate([axes, -axes], axis=1)
-        out[:, 0] = look.departs(moved, np.full(moved.shape[:2], AWAY))
+        out[:, 0] = test.departs(moved, np.full(moved.shape[:2], AWAY))
         away = position - centre
         distance = np.sqrt((away**2).sum(-1))
         other = np.flatnonzero((out[:, 0] > _SETTLED) & (distance > 0.0)) if not face else np.zeros(0, dtype=int)
         if len(other):
-            out[other, 1] = _in_inverse_range(look.take(other), centre[other], spread[other])
+            out[other, 1] = _in_inverse_range(test.take(other), centre[other], spread[other])
     return out
 
 
@@ -134,7 +140,14 @@ _SETTLED = 0.1
 
 @dataclass(frozen=True, slots=True)
 class ShapeTest:
-    """A batch of fixes, and the response `pull` of the other unknowns to a change of the position."""
+    """A test of the shape of the cost around N fixes.
+
+    - problem: flat batch of the N problems.
+    - x (N, size): the fixes.
+    - pull (N, n, d): response of the n shared unknowns to a change of the position.
+    - part: slice of the position.
+    - face: equality constraints.
+    """
 
     problem: Problem
     x: Array
@@ -143,11 +156,15 @@ class ShapeTest:
     face: Face
 
     def take(self, items: Array) -> ShapeTest:
-        """Return the fixes with these numbers."""
+        """Return the fixes with the numbers `items`."""
         return ShapeTest(self.problem.take(items), self.x[items], self.pull[items], self.part, self.face)
 
     def departs(self, moved: Array, sigmas: Array) -> Array:
-        """Return the largest departure (N,) over displacements (N, k, d) of lengths (N, k) in standard deviations."""
+        """Return the largest departure (N,) over displacements `moved` (N, k, d) of the fixes, m.
+
+        `sigmas` (N, k) are the lengths of the displacements in standard deviations. The departure is the absolute
+        logarithm of the rise of the cost divided by the square of this length; infinite if the cost cannot be computed.
+        """
         most = max(1, _PART // max(1, moved.shape[1]))
         if len(moved) > most:
             parts = [slice(i, i + most) for i in range(0, len(moved), most)]
@@ -169,7 +186,7 @@ class ShapeTest:
 
 
 def _axes(covariance: Array) -> Array:
-    """Return displacements (N, k, d) of one standard deviation along all principal axes.
+    """Return displacements (N, k, d) of one standard deviation along all principal axes of covariances (N, d, d).
 
     For equal variances, axes rotated by 45 degrees are added.
     """
@@ -192,9 +209,12 @@ def _axes(covariance: Array) -> Array:
 _EXACT = 1e-14
 
 
-def _in_inverse_range(look: ShapeTest, centre: Array, covariance: Array) -> Array:
-    """Return the largest departure (N,) along the principal axes of the inverse-range chart."""
-    position = look.x[:, look.part]
+def _in_inverse_range(test: ShapeTest, centre: Array, covariance: Array) -> Array:
+    """Return the largest departure (N,) along the principal axes of the inverse-range chart.
+
+    `centre` (N, d) is the origin of the chart, and `covariance` (N, d, d) belongs to the positions, m^2.
+    """
+    position = test.x[:, test.part]
     chart = Chart(np.full(len(position), INVERSE_RANGE, dtype=np.int8), position, covariance, centre)
     axes = _axes(chart.spread)
     sigmas = np.full((len(axes), 2 * axes.shape[1]), AWAY)
@@ -206,7 +226,7 @@ def _in_inverse_range(look: ShapeTest, centre: Array, covariance: Array) -> Arra
     y[..., -1] += 1.0
     # points (k, N, d) broadcast against the charts of N fixes
     there = np.moveaxis(chart.to_position(np.moveaxis(y, 1, 0)), 0, 1)
-    return look.departs(np.where(still[..., None], 0.0, there - position[:, None]), sigmas)
+    return test.departs(np.where(still[..., None], 0.0, there - position[:, None]), sigmas)
 
 
 # Cost of positions at very large distances.
@@ -241,19 +261,26 @@ def cost_at_infinity(problem: Problem, x: Array) -> Array:
     along = None if not (face := exact(problem)) else tangent_at(problem, face, x)[:, part]
     sphere = _Sphere(problem, x, part, centre, _INFINITE * np.broadcast_to(spread, (len(x),)), along)
     with np.errstate(all="ignore"):
-        own = sphere.direction(x[:, part] - centre)
+        fixed = sphere.direction(x[:, part] - centre)
         spread_out = spread_directions(_DIRECTIONS[slot.size], slot.size)[:, None]
-        tried = sphere.direction(np.broadcast_to(spread_out, (len(spread_out), *own.shape)))
-        cost = sphere.look(tried)[0]
+        tried = sphere.direction(np.broadcast_to(spread_out, (len(spread_out), *fixed.shape)))
+        cost = sphere.evaluate(tried)[0]
         best = np.argsort(cost, axis=0)[:_REFINED]
-        starts = np.concatenate([own[None], np.take_along_axis(tried, best[..., None], axis=0)])
+        starts = np.concatenate([fixed[None], np.take_along_axis(tried, best[..., None], axis=0)])
         least = sphere.descend(starts).min(0)
         return np.fmin(least, cost_beyond_speed(problem, x)) if has_scales(problem) else np.asarray(least)
 
 
 @dataclass(frozen=True, slots=True)
 class _Sphere:
-    """Positions on a sphere so large that only their directions matter."""
+    """Positions on a sphere about the stations, so large that only their directions matter.
+
+    - problem: flat batch of N problems with one position.
+    - x (N, size): start of the other unknowns.
+    - part: slice of the position.
+    - centre (N, d), radius (N,): of the sphere, m.
+    - along (N, d, t): directions of the position that the equality constraints allow; None without equalities.
+    """
 
     problem: Problem
     x: Array
@@ -268,12 +295,16 @@ class _Sphere:
             vector = (self.along @ (np.swapaxes(self.along, -1, -2) @ vector[..., None]))[..., 0]
         return normalised(vector)
 
-    def look(self, direction: Array) -> tuple[Array, Array, Array]:
-        """Return costs (q, N) in directions (q, N, d), and information and vector of the position."""
+    def evaluate(self, direction: Array) -> tuple[Array, Array, Array]:
+        """Return costs (q, N) in directions (q, N, d), with the normal equations of the position.
+
+        These are information (q, N, d, d) and right sides (q, N, d). The cost is infinite if the position violates a
+        constraint.
+        """
         x = np.array(np.broadcast_to(self.x, (len(direction), *self.x.shape)))
         x[..., self.part] = self.centre + self.radius[:, None] * direction
-        own = profile_by_rows if has_scales(self.problem) else profile
-        cost, information, vector = own(self.problem, x, self.x, 2)
+        method = profile_by_rows if has_scales(self.problem) else profile
+        cost, information, vector = method(self.problem, x, self.x, 2)
         if self.problem.constraints:
             broken = np.stack([violation(self.problem, one) for one in x])
             cost = np.where(broken > _BROKEN, np.inf, cost)
@@ -281,7 +312,7 @@ class _Sphere:
 
     def descend(self, direction: Array) -> Array:
         """Return the lowest costs (q, N) near directions (q, N, d), by damped Gauss-Newton on the sphere."""
-        cost, information, vector = self.look(direction)
+        cost, information, vector = self.evaluate(direction)
         damping, growth = np.full(cost.shape, _DAMPING), np.full(cost.shape, FIRST_GROWTH)
         scale = self.radius[:, None, None]
         for _ in range(_STEPS):
@@ -296,7 +327,7 @@ class _Sphere:
             if not (gain > _STILL * (1.0 + cost)).any():
                 break
             trial = self.direction(direction + (across @ move)[..., 0] / self.radius[:, None])
-            new, more, other = self.look(trial)
+            new, more, other = self.evaluate(trial)
             better, _, _, damping, growth = judge(cost, new, gain, ok, 0.0 * cost, damping, growth, 0.0, True)
             direction = np.where(better[..., None], trial, direction)
             information = np.where(better[..., None, None], more, information)

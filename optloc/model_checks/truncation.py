@@ -1,4 +1,8 @@
-"""Truncated normal distributions of fixes at or near bounds, and the shape of the cost inside the bounds."""
+"""Truncated normal distributions of fixes at or near bounds, and the shape of the cost inside the bounds.
+
+Inequality constraints give h bounds. Arrays have N fixes of d coordinates, and n shared unknowns. The slack is the
+distance of a fix from a bound. Near a fix, a bound is replaced by its tangent plane.
+"""
 
 from __future__ import annotations
 
@@ -74,18 +78,22 @@ def law_of(problem: Problem, x: Array, covariance: Array, shift: Array) -> Law |
         if not near.any():
             return None
         slack = np.where(near.any(1)[:, None] & open_ones & (values <= _REACH * sigma), np.maximum(values, 0.0), np.inf)
-        give = _departures(problem, sides, x, spread, values, normal, np.isfinite(slack))
-    bent = np.isfinite(slack) & (give > _FLAT * sigma)
+        departures = _departures(problem, sides, x, spread, values, normal, np.isfinite(slack))
+    bent = np.isfinite(slack) & (departures > _FLAT * sigma)
     # a curved bound that the fix does not touch is treated like a bound far away
     touched = slack <= _ON * sigma
     slack = np.where(bent & ~touched, np.inf, slack)
     along, span = _edges(problem, sides, x, part)
-    truncated = Truncated(normal, slack, along, span, give, shift[:, part], spread)
+    truncated = Truncated(normal, slack, along, span, departures, shift[:, part], spread)
     return Law(truncated, ~(bent & touched).any(1))
 
 
 def _planes(problem: Problem, sides: tuple[Level, ...], x: Array, part: slice) -> tuple[Array, Array]:
-    """Return distances (N, h) of fixes from bounds, m, and the unit outward normals (N, h, d)."""
+    """Return distances (N, h) of fixes from bounds, m, and the unit outward normals (N, h, d).
+
+    `sides` are the bounds, and `part` is the slice of the position in `x` (N, size). A distance is negative outside. It
+    is infinite and the normal is zero if the bound does not depend on the position.
+    """
     values, gradients = levels(problem, sides, x)
     sense = np.array([outwards(problem, side) for side in sides])
     gradients = gradients[..., part] * sense[:, None]
@@ -98,32 +106,39 @@ def _planes(problem: Problem, sides: tuple[Level, ...], x: Array, part: slice) -
 def _departures(
     problem: Problem, sides: tuple[Level, ...], x: Array, spread: Array, values: Array, normal: Array, near: Array
 ) -> Array:
-    """Return the departures (N, h) of near bounds from their tangent planes at three standard deviations, m."""
-    give, d = np.zeros(values.shape), spread.shape[-1]
+    """Return the departures (N, h) of near bounds from their tangent planes at three standard deviations, m.
+
+    `spread` (N, d, d) are the covariances of the positions. `values` (N, h) and `normal` (N, h, d) are from `_planes`.
+    `near` (N, h) marks the bounds to compute; the other departures are zero.
+    """
+    departures, d = np.zeros(values.shape), spread.shape[-1]
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
     curved = np.array([not is_flat(problem, side) for side in sides])
     items = np.flatnonzero((near & curved).any(1))
     if not len(items):
-        return give
-    own, part_of = problem.take(items), x[items]
+        return departures
+    some, x_some = problem.take(items), x[items]
     steps = np.sqrt(np.maximum(np.diagonal(spread[items], axis1=-2, axis2=-1), 0.0))
     worst = np.zeros((len(items), len(sides)))
     for i in range(d):
         for sign in (-AWAY, AWAY):
             # a row of the covariance divided by its deviation is the step that changes this coordinate most
             step = sign * spread[items, i] / np.where(steps[:, i] > 0.0, steps[:, i], 1.0)[:, None]
-            moved = np.array(part_of)
+            moved = np.array(x_some)
             moved[:, part] += step
-            there = _planes(own, sides, moved, part)[0]
+            there = _planes(some, sides, moved, part)[0]
             plane = values[items] - (normal[items] * step[:, None]).sum(-1)
             worst = np.maximum(worst, np.where(np.isfinite(there), np.abs(there - plane), np.inf))
-    give[items] = np.where(near[items] & curved, worst, 0.0)
-    return give
+    departures[items] = np.where(near[items] & curved, worst, 0.0)
+    return departures
 
 
 def _edges(problem: Problem, sides: tuple[Level, ...], x: Array, part: slice) -> tuple[Array, Array]:
-    """Return unit vectors (N, h, d) along the edges of polygons, and their ends (N, h, 2), m from the fix."""
+    """Return unit vectors (N, h, d) along the edges of polygons, and their ends (N, h, 2), m from the fix.
+
+    For a bound that is no edge of a polygon, the vector is zero and the ends are infinite.
+    """
     n, d = len(x), part.stop - part.start
     along, span = np.zeros((n, len(sides), d)), np.tile([-np.inf, np.inf], (n, len(sides), 1))
     for i, side in enumerate(sides):
@@ -148,18 +163,21 @@ def departure_inwards(problem: Problem, x: Array, covariance: Array, law: Trunca
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
     d = slot.size
-    moved, grown = np.zeros((len(x), d, d)), np.ones((len(x), d))
+    moved, increases = np.zeros((len(x), d, d)), np.ones((len(x), d))
     for i in range(len(x)):
         for k, (step, increase) in enumerate(_inward_steps(take(law, i))):
-            moved[i, k], grown[i, k] = step, increase
+            moved[i, k], increases[i, k] = step, increase
     spread = covariance[:, part, part]
     pull = covariance[:, :, part] @ np.linalg.pinv(spread, hermitian=True)
     with np.errstate(all="ignore"):
-        return ShapeTest(problem, x, pull, part, exact(problem)).departs(moved, np.sqrt(grown))
+        return ShapeTest(problem, x, pull, part, exact(problem)).departs(moved, np.sqrt(increases))
 
 
 def _inward_steps(law: Truncated) -> list[tuple[Array, float]]:
-    """Return inward steps (d,) from each bound that a fix touches, m, and the increase of the model at their ends."""
+    """Return inward steps (d,) from each bound that a fix touches, m, and the increase of the quadratic model there.
+
+    `law` is the distribution of one position. A step stays on the other bounds that the fix touches.
+    """
     factor = factor_of(law.covariance)
     turned = law.normal @ factor
     sigma = np.sqrt((turned**2).sum(-1))
@@ -170,15 +188,15 @@ def _inward_steps(law: Truncated) -> list[tuple[Array, float]]:
     rest = replace(law, slack=others)
     found = []
     for k in range(len(touched)):
-        beside = np.delete(unit, k, axis=0)
-        inward = -unit[k] + beside.T @ (np.linalg.pinv(beside.T) @ unit[k]) if len(beside) else -unit[k]
+        other_units = np.delete(unit, k, axis=0)
+        inward = -unit[k] + other_units.T @ (np.linalg.pinv(other_units.T) @ unit[k]) if len(other_units) else -unit[k]
         size = np.sqrt((inward**2).sum())
         if size > _ALONG:
             inward = inward / size
-            lean = float(inward @ middle)
+            mean_along = float(inward @ middle)
             end = float(rest.exits((factor @ inward)[None])[0])
-            length = min(lean + np.sqrt(lean**2 + AWAY**2), end)
-            found.append((length * (factor @ inward), max(length**2 - 2.0 * lean * length, 1e-300)))
+            length = min(mean_along + np.sqrt(mean_along**2 + AWAY**2), end)
+            found.append((length * (factor @ inward), max(length**2 - 2.0 * mean_along * length, 1e-300)))
     return found
 
 

@@ -68,59 +68,68 @@ def advise_on_values(problem: Problem, x: Array) -> Iterator[Advice]:
     items = np.flatnonzero(degrees_of_freedom(batch) > 0)[:_EPOCHS]
     wrong = list(_impossible_advice(problem))
     if len(items) and one_place(batch):
-        own = batch.take(items)
+        tested = batch.take(items)
         start = x if len(batch.weight) == len(x) and x.shape[-1] == batch.layout.size else None
-        refuted, free = _is_refuted(own, start if start is None else start[items])
+        refuted, p_free = _test_as_read(tested, start if start is None else start[items])
         if wrong or refuted:
-            held = [] if wrong or free < _FITS else [_without_constraints(own, free)]
+            constraint_advice = [] if wrong or p_free < _FITS else [_without_constraints(tested, p_free)]
             # impossible values are reported even if no reading explains them
-            yield from held or list(_fitting_readings(own)) or wrong
+            yield from constraint_advice or list(_fitting_readings(tested)) or wrong
             return
     yield from wrong
 
 
-def _is_refuted(problem: Problem, start: Array | None) -> tuple[bool, float]:
-    """Return whether the values fit no position, and the p-value of the best position without constraints."""
+def _test_as_read(problem: Problem, start: Array | None) -> tuple[bool, float]:
+    """Return whether the values fit no position, and the p-value of the best position without constraints.
+
+    The p-value is 1 if the values fit, and 0 if there are no constraints. `start` (N, size) is a fix or None.
+    """
     near = np.inf if start is None or not np.isfinite(start).all() else float(descend(problem, start)[1].sum())
-    if _p(problem, near) >= _MISFIT:
+    if _p_of_cost(problem, near) >= _MISFIT:
         return False, 1.0
-    return _fit(problem, start) < _MISFIT, _fit(replace(problem, constraints=()), start) if problem.constraints else 0.0
+    return _p_of_best_fit(problem, start) < _MISFIT, _p_of_best_fit(
+        replace(problem, constraints=()), start
+    ) if problem.constraints else 0.0
 
 
-def _fit(problem: Problem, start: Array | None = None) -> float:
-    """Return the chi-square probability of the best position; equalities hold, other bounds are ignored."""
+def _p_of_best_fit(problem: Problem, start: Array | None = None) -> float:
+    """Return the chi-square probability of the best position, without inequalities.
+
+    If the values fit without constraints, the position must also satisfy the equalities. If they do not, equalities
+    could only lower the probability further. `start` (N, size) is one more start of the search.
+    """
     free = fit_anywhere(replace(problem, constraints=()), start)
     cost = float(free.cost.sum())
-    if _p(problem, cost) >= _MISFIT and exact(problem):
+    if _p_of_cost(problem, cost) >= _MISFIT and exact(problem):
         # equalities take most of the time: apply them only if the values fit without them
         cost = float(descend(problem, free.x)[1].sum())
-    return _p(problem, cost)
+    return _p_of_cost(problem, cost)
 
 
 def _without_constraints(problem: Problem, p: float) -> Advice:
-    """Return the advice for values that fit with probability p without constraints, but not with them."""
+    """Return the advice for values that fit without constraints with the p-value `p`, but not with them."""
     names = violation_names(problem)
     seen = f"the values fit without the constraints ({names}; p = {p:.2g}), but no position was found that meets both"
     return Advice("constraint", seen, "check their values; heights must be above the ellipsoid, not above the sea")
 
 
-def _p(problem: Problem, cost: float) -> float:
-    """Return the chi-square probability of a whole batch; zero if no fit was found or nothing can be tested."""
+def _p_of_cost(problem: Problem, cost: float) -> float:
+    """Return the chi-square probability of the total cost of a batch; zero if there is no fit or no redundancy."""
     p = float(tail_probability(np.array([cost]), np.array([degrees_of_freedom(problem).sum()]))[0])
     return p if np.isfinite(p) else 0.0
 
 
 def _fitting_readings(problem: Problem) -> Iterator[Advice]:
-    """Yield the readings with a good fit that is unlikely by chance, the most probable reading first."""
+    """Yield advice for the readings with a good fit that is unlikely by chance, the most probable reading first."""
     tried = list(_readings(problem))
     found = []
     for one in tried:
         # noise that is stated in a separate unit keeps its size
-        scaled, stated = _read(problem, one, False), _read(problem, one, True)
+        scaled, stated = _with_reading(problem, one, False), _with_reading(problem, one, True)
         able = [other for other in (scaled, stated) if _chance_of_fit(other) * 2.0 * len(tried) <= _CHANCE]
         if not able or _is_impossible(able[0]):
             continue
-        p = max(_fit(other) for other in able)
+        p = max(_p_of_best_fit(other) for other in able)
         if p >= _FITS:
             found.append((p, one))
     # feet and nanoseconds are so similar that both may fit: the better fit comes first
@@ -146,7 +155,10 @@ def _readings(problem: Problem) -> Iterator[Reading]:
 
 
 def _length_units(kinds: tuple[str, ...]) -> Iterator[Reading]:
-    """Yield readings of lengths for the ratio of every two units, the SI unit first."""
+    """Yield readings of lengths in another unit than stated, one for each ratio of two units.
+
+    The SI unit comes first. Units of time count as lengths: they are multiplied by the speed of light.
+    """
     table = {name: size * (SPEED_OF_LIGHT if name in _TIMES else 1.0) for name, size in UNITS["length"].items()}
     what = " and ".join(kinds)
     seen_before: list[float] = []
@@ -178,7 +190,7 @@ _MAX_PAIRS = 3
 
 
 def _either(pairs: list[str]) -> str:
-    """Return the first few pairs of units as one text."""
+    """Return the first few pairs of units as one text, for instance "km for m or m for mm"."""
     return " or ".join(pairs[:_MAX_PAIRS])
 
 
@@ -205,8 +217,11 @@ def _angle_readings(kinds: tuple[str, ...]) -> Iterator[Reading]:
             yield Reading("compass", bearings, -factor, turned, seen, "state unit and convention", both)
 
 
-def _read(problem: Problem, reading: Reading, stated: bool) -> Problem:
-    """Return the problem with another reading of the values. If `stated`, the noise has a separate unit and stays."""
+def _with_reading(problem: Problem, reading: Reading, stated: bool) -> Problem:
+    """Return the problem with another reading of the values.
+
+    If `stated`, the noise has a separate unit and stays. Otherwise it is multiplied by the factor of the reading.
+    """
     size = np.ones(problem.count)
     rows = []
     for block, start in zip(problem.rows, problem.starts, strict=True):
@@ -229,26 +244,34 @@ def _read_rows(rows: Rows, reading: Reading) -> Rows:
 # Impossible values, and fits by chance.
 
 
-def _reach(problem: Problem) -> float:
-    """Return the largest distance between stations to within a factor of two, m."""
+def _station_extent(problem: Problem) -> float:
+    """Return twice the spread of the stations, m: their largest distance from each other is at most this length."""
     return 2.0 * float(np.max(centre_and_spread(problem.stations.places)[1]))
 
 
 def _chance_of_fit(problem: Problem) -> float:
     """Return the probability that random values fit: each redundant value within four sigma of its prediction.
 
-    Random lengths are anywhere within the array, random angles anywhere on the circle.
+    Random lengths are anywhere within the array, random angles anywhere on the circle. The probability of one value is
+    the median over all rows.
     """
     sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count).max(0)
-    room = np.concatenate(
-        [np.full(r.count, np.pi if MODELS[r.kind].quantity == "angle" else _reach(problem)) for r in problem.rows]
+    width = np.concatenate(
+        [
+            np.full(r.count, np.pi if MODELS[r.kind].quantity == "angle" else _station_extent(problem))
+            for r in problem.rows
+        ]
     )
-    share = np.minimum(1.0, 4.0 * sigma / np.maximum(room, 1e-300))
+    share = np.minimum(1.0, 4.0 * sigma / np.maximum(width, 1e-300))
     return float(np.median(share)) ** int(degrees_of_freedom(problem).sum())
 
 
 def _impossible_rows(problem: Problem) -> Iterator[tuple[Rows, int, float]]:
-    """Yield rows, number and limit (m) of differences above the distance of their stations, and of negative ranges."""
+    """Yield the rows of a kind, the number of an impossible value among them, and the distance of its stations, m.
+
+    A difference is impossible if it exceeds the distance of its stations. A range or a sum of ranges is impossible
+    below this distance; a range has one station, so its limit is zero.
+    """
     sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count)
     observed, weight = (np.reshape(a, (-1, problem.count)) for a in (problem.observed, problem.weight))
     position = problem.stations.position

@@ -11,6 +11,10 @@ need only T = F' P F and t = F' P v, with the columns F = [B, E]:
 - 1 / sqrt(T_jj) is the standard deviation of this estimate.
 - t_j / sqrt(T_jj) is standard normal if column j has no error.
 
+Arrays have N problems (fixes), q errors and g groups. A class is a set of groups with one common variance, and c is the
+number of classes; in `Tested`, c is the number of offsets. Variances are factors of the stated variances, and a
+log-factor is the logarithm of such a factor.
+
 W. Baarda, "A testing procedure for use in geodetic networks" (1968), section 4.
 """
 
@@ -84,7 +88,7 @@ class VarianceFit:
     """Estimated variance factors of g groups of errors.
 
     - variance (g,): factor of the stated variance; NaN for a group without errors.
-    - error (g,): relative standard error of the square root of the factor; NaN if the data do not determine it.
+    - error (g,): relative standard error of the square root of the factor; NaN or infinite if not determined.
     - low, high (g,): interval of 95 % of the factor; NaN if the data do not determine it. `low` is zero if the data are
       also consistent with no error.
     - shared (g,): True for a group whose factor the data do not determine; all these groups have one common factor.
@@ -105,7 +109,13 @@ class VarianceFit:
 
 @dataclass(frozen=True, slots=True)
 class _MaximumLikelihood:
-    """Variances (c,) of classes of errors, their standard errors (c,), gross errors (N, q), and tests without these."""
+    """Result of the maximisation for c classes of errors.
+
+    - variance (c,): variance factors.
+    - error (c,): relative standard errors of the square roots of the factors; infinite if not determined.
+    - gross (N, q): True for gross errors.
+    - tests: tests without the gross errors.
+    """
 
     variance: Array
     error: Array
@@ -113,12 +123,13 @@ class _MaximumLikelihood:
     tests: Tested
 
 
-def fit(made: Elements, left: Array, single: Array) -> VarianceFit:
+def fit(packed: Elements, left: Array, single: Array) -> VarianceFit:
     """Return the variance factors that maximise the penalised restricted likelihood.
 
-    The penalty multiplies the likelihood by every factor (see `_PENALTY`), so a factor of few errors has no maximum at
-    zero. `made` holds N linearised problems with g groups. `left` (g,) marks groups without errors: their factor is
-    zero. `single` (g,) marks groups that keep a separate factor, even if the data do not determine it.
+    The penalty multiplies the likelihood by a power of each factor, at most its square (see `_PENALTY`). So a factor of
+    few errors has no maximum at zero. `packed` holds N linearised problems with g groups. `left` (g,) marks groups
+    without errors: their factor is zero. `single` (g,) marks groups that keep a separate factor, even if the data do
+    not determine it.
 
     The check of which factors the data determine uses one factor for all groups. Otherwise a group with a small
     estimate would wrongly count as not determined.
@@ -133,56 +144,61 @@ def fit(made: Elements, left: Array, single: Array) -> VarianceFit:
     Y. Chung, S. Rabe-Hesketh, V. Dorie, A. Gelman, J. Liu, "A nondegenerate penalized likelihood estimator for variance
     parameters in multilevel models", Psychometrika 78 (2013), section 3.
     """
-    made, size = without_groups(made, left), len(made.names)
-    used = np.flatnonzero(total(made.of_effect, size))
-    count, number = len(used), np.full(size + 1, -1)
-    number[used] = np.arange(count)
-    group, nothing_fixed = number[made.of_effect], np.zeros(count, dtype=bool)
-    if not (tested(made, np.ones(())).dof > 0).any():
+    packed, size = without_groups(packed, left), len(packed.names)
+    with_errors = np.flatnonzero(total(packed.of_effect, size))
+    count, number_of_group = len(with_errors), np.full(size + 1, -1)
+    number_of_group[with_errors] = np.arange(count)
+    group, nothing_fixed = number_of_group[packed.of_effect], np.zeros(count, dtype=bool)
+    if not (tested(packed, np.ones(())).dof > 0).any():
         advice = "add rows, stations or known heights"
         raise InvalidProblem("no fix has more rows than unknowns, so the noise cannot be estimated", "noise", advice)
     # One factor for all groups. If the data do not determine it, they determine no factor.
-    common = _maximise(made, np.minimum(group, 0), np.zeros(1), nothing_fixed[:1], np.zeros(1))
-    begin = np.full(count, np.log(common.variance[0]))
-    shared = ~(_relative_errors(common.tests, group, np.exp(begin), nothing_fixed) < LOOSE) & ~single[used]
+    common = _maximise(packed, np.minimum(group, 0), np.zeros(1), nothing_fixed[:1], np.zeros(1))
+    first_log_factor = np.full(count, np.log(common.variance[0]))
+    shared = (
+        ~(_relative_errors(common.tests, group, np.exp(first_log_factor), nothing_fixed) < LOOSE) & ~single[with_errors]
+    )
     # Groups whose factors are not determined are merged. The merged class has the number of its first group.
     merge = np.where(shared, np.flatnonzero(shared)[0] if shared.any() else 0, np.arange(count))
-    kinds, class_of = np.unique(merge, return_inverse=True)
+    first_groups, class_of = np.unique(merge, return_inverse=True)
     classes = np.append(class_of, -1)[group]
     # If several groups are merged, the data may determine their common factor.
-    undetermined = np.isin(kinds, np.flatnonzero(shared))
+    undetermined = np.isin(first_groups, np.flatnonzero(shared))
     if shared.sum() > 1:
         undetermined &= ~(
-            _relative_errors(common.tests, classes, np.exp(begin[: len(kinds)]), nothing_fixed[: len(kinds)]) < LOOSE
+            _relative_errors(
+                common.tests, classes, np.exp(first_log_factor[: len(first_groups)]), nothing_fixed[: len(first_groups)]
+            )
+            < LOOSE
         )
-    level = np.where(undetermined, 0.0, begin[: len(kinds)])
-    information, _ = _score(common.tests, classes, np.exp(begin[: len(kinds)]), undetermined)
+    log_factor = np.where(undetermined, 0.0, first_log_factor[: len(first_groups)])
+    information, _ = _score(common.tests, classes, np.exp(first_log_factor[: len(first_groups)]), undetermined)
     penalty = np.minimum(_PENALTY, _MAX_PENALTY_SHARE * np.diagonal(information))
-    found = _maximise(made, classes, level, undetermined, penalty)
+    found = _maximise(packed, classes, log_factor, undetermined, penalty)
     low, high = (
         np.where(undetermined, np.nan, end)[class_of] for end in _confidence_interval(found, classes, undetermined)
     )
 
     def per_group(values: Array) -> Array:
-        return np.asarray(np.append(values, np.nan)[number[:-1]])
+        return np.asarray(np.append(values, np.nan)[number_of_group[:-1]])
 
     return VarianceFit(
         np.where(left, 0.0, per_group(found.variance[class_of])),
         per_group(np.where(shared, np.nan, found.error[class_of])),
         per_group(low),
         per_group(high),
-        np.isin(np.arange(size), used[shared]),
+        np.isin(np.arange(size), with_errors[shared]),
         bool(undetermined.any()),
         found.gross,
         found.tests,
     )
 
 
-def without_groups(made: Elements, left: Array) -> Elements:
+def without_groups(packed: Elements, left: Array) -> Elements:
     """Return the elements without the errors of the groups that `left` (g,) marks."""
-    removed = np.append(left, False)[made.of_effect]
-    effect = np.where(removed[:, None], 0.0, made.effect)
-    return replace(made, effect=effect, of_effect=np.where(removed, -1, made.of_effect))
+    removed = np.append(left, False)[packed.of_effect]
+    effect = np.where(removed[:, None], 0.0, packed.effect)
+    return replace(packed, effect=effect, of_effect=np.where(removed, -1, packed.of_effect))
 
 
 # Limit of a score, in standard deviations, above which an excluded group gets a factor. One in a hundred groups without
@@ -190,18 +206,18 @@ def without_groups(made: Elements, left: Array) -> Elements:
 _SIGNIFICANT = 2.33
 
 
-def visible(made: Elements, found: VarianceFit, left: Array) -> Array:
-    """Return the excluded groups (g,) whose errors are significant, by a score test of the factor zero.
+def visible(packed: Elements, found: VarianceFit, left: Array) -> Array:
+    """Return a mask (g,) of the excluded groups whose errors are significant, by a score test of the factor zero.
 
-    `found` is a fit of N problems `made` without the groups that `left` (g,) marks. The test uses the information I and
-    the scores U of all factors. If group g has no errors, U_g divided by the square root of I_gg - I_gh I_hh^-1 I_hg is
-    standard normal (Verbeke and Molenberghs 2003, section 4).
+    `found` is a fit of the N problems `packed` without the groups that `left` (g,) marks. The test uses the information
+    I and the scores U of all factors. If group g has no errors, U_g divided by the square root of I_gg - I_gh I_hh^-1
+    I_hg is standard normal (Verbeke and Molenberghs 2003, section 4). Here h are the groups that are not excluded.
     """
-    size = len(made.names)
+    size = len(packed.names)
     variance = np.append(np.nan_to_num(found.variance), 0.0)
-    tests = without(tested(made, variance[made.of_effect]), found.gross)
+    tests = without(tested(packed, variance[packed.of_effect]), found.gross)
     scale = np.where(left, 1.0, variance[:-1])
-    information, per_fix = _score(tests, made.of_effect, scale, np.zeros(size, dtype=bool))
+    information, per_fix = _score(tests, packed.of_effect, scale, np.zeros(size, dtype=bool))
     rest = np.flatnonzero(~left)
     coupling = information[:, rest]
     remaining = np.diagonal(information) - ((coupling @ _inverse(information[np.ix_(rest, rest)])) * coupling).sum(1)
@@ -209,7 +225,7 @@ def visible(made: Elements, found: VarianceFit, left: Array) -> Array:
     determined = (
         left
         & (remaining > (1.0 - _DETERMINED) ** 2 * np.diagonal(information))
-        & _determinable(tests, made, found, left)
+        & _determinable(tests, packed, found, left)
     )
     return np.asarray(determined & (per_fix.sum(0) > _SIGNIFICANT * np.sqrt(np.where(determined, remaining, 1.0))))
 
@@ -220,48 +236,56 @@ def visible(made: Elements, found: VarianceFit, left: Array) -> Array:
 _TIMES, _RELATIVE = 3.0, 0.25
 
 
-def _determinable(tests: Tested, made: Elements, found: VarianceFit, left: Array) -> Array:
-    """Return the groups (g,) whose level would be determined if it were a few times the level of the rows."""
+def _determinable(tests: Tested, packed: Elements, found: VarianceFit, left: Array) -> Array:
+    """Return a mask (g,) of groups whose level would be determined if it were a few times the level of the rows.
+
+    `found` is a fit without the groups that `left` (g,) marks, and `tests` are the tests with its variances.
+    """
     level = _TIMES**2 * float(np.nanmedian(found.variance[~left]))
     share = tests.size[:, : tests.errors] * level
     # The standard error of a log-variance is the square root of the inverse information. It is twice the error of a
     # log-sigma.
-    information = 0.5 * total(made.of_effect, len(left), (share / (1.0 + share)) ** 2)
+    information = 0.5 * total(packed.of_effect, len(left), (share / (1.0 + share)) ** 2)
     return np.asarray(information * (2.0 * _RELATIVE) ** 2 > 1.0)
 
 
-def _maximise(made: Elements, classes: Array, level: Array, fixed: Array, penalty: Array) -> _MaximumLikelihood:
+def _maximise(packed: Elements, classes: Array, log_factor: Array, fixed: Array, penalty: Array) -> _MaximumLikelihood:
     """Return the variance factors of c classes of errors, their standard errors and the gross errors.
 
-    `classes` (N, q) is the class of each error and `level` (c,) the log-factors at the start. `fixed` (c,) marks
+    `classes` (N, q) is the class of each error and `log_factor` (c,) the log-factors at the start. `fixed` (c,) marks
     factors that keep their value. `penalty` (c,) is added to the scores.
     """
-    count, level = len(level), level.copy()
+    count, log_factor = len(log_factor), log_factor.copy()
     # Start with medians: medians tolerate up to half of the errors as gross, but scores of the likelihood do not.
     for _ in range(_COARSE):
-        step = np.where(fixed, 0.0, _median_step(tested(made, np.exp(level)[classes]), classes, np.exp(level)))
-        level += step
+        step = np.where(
+            fixed, 0.0, _median_step(tested(packed, np.exp(log_factor)[classes]), classes, np.exp(log_factor))
+        )
+        log_factor += step
         if np.abs(step).max() < _NEAR:
             break
     for _ in range(_ROUNDS):
-        before = level.copy()
+        before = log_factor.copy()
         # Gross errors are selected once per round, not in every step. Otherwise the steps would jump when the selection
         # changes.
-        gross, tests = cleaned(made, np.exp(level)[classes])
+        gross, tests = cleaned(packed, np.exp(log_factor)[classes])
         for _ in range(_STEPS):
-            step, sure = _scoring_step(tests, classes, np.exp(level), fixed, penalty)
-            last, level = level, np.maximum(level + step, np.log(_MIN_VARIANCE))
-            tests = without(tested(made, np.exp(level)[classes]), gross)
-            if (np.abs(level - last) <= _CLOSE * sure).all():
+            step, error = _scoring_step(tests, classes, np.exp(log_factor), fixed, penalty)
+            last, log_factor = log_factor, np.maximum(log_factor + step, np.log(_MIN_VARIANCE))
+            tests = without(tested(packed, np.exp(log_factor)[classes]), gross)
+            if (np.abs(log_factor - last) <= _CLOSE * error).all():
                 break
-        if (np.abs(level - before) <= _SETTLED * sure).all():
+        if (np.abs(log_factor - before) <= _SETTLED * error).all():
             break
-    variance = np.exp(level)
+    variance = np.exp(log_factor)
     return _MaximumLikelihood(variance, _relative_errors(tests, classes, variance, fixed[:count]), gross, tests)
 
 
 def _median_step(tests: Tested, classes: Array, variance: Array) -> Array:
-    """Return steps of the log-factors (c,) that make the median of the squared tests the median of normal errors."""
+    """Return steps of the log-factors (c,) that make the median of the squared tests the median of normal errors.
+
+    `classes` (N, q) is the class of each error; -1 for none. `variance` (c,) are the factors before the step.
+    """
     q = classes.shape[1]
     squared, share = tests.sigmas[:, :q] ** 2, tests.size[:, :q] * variance[classes]
     step = np.zeros(len(variance))
@@ -275,7 +299,8 @@ def _median_step(tests: Tested, classes: Array, variance: Array) -> Array:
 def _scoring_step(tests: Tested, classes: Array, variance: Array, fixed: Array, penalty: Array) -> tuple[Array, Array]:
     """Return the scoring step (c,) of the log-factors and the standard errors (c,) of the log-factors.
 
-    The step has no component along a combination of factors that the data do not determine.
+    The step has no component along a combination of factors that the data do not determine. `classes`, `fixed` and
+    `penalty` are as in `_maximise`, and `variance` (c,) are the factors before the step.
     """
     information, per_fix = _score(tests, classes, variance, fixed)
     # The penalty has no curvature in the log-factors. Its size damps steps if the data hardly determine a factor.
@@ -292,18 +317,18 @@ def _score(tests: Tested, classes: Array, variance: Array, fixed: Array) -> tupl
     """
     (n, q), count = classes.shape, len(variance)
     # Errors without a group get an additional last class, which is dropped.
-    number, scale = np.where(classes >= 0, classes, count), np.where(fixed, 0.0, variance)
-    each = 0.5 * (tests.vector[:, :q] ** 2 - tests.size[:, :q])
-    place = (np.arange(n)[:, None] * (count + 1) + number).ravel()
-    per_fix = np.bincount(place, each.ravel(), n * (count + 1)).reshape(n, -1)[:, :count] * scale
-    pair = (number[:, :, None] * (count + 1) + number[:, None, :]).ravel()
+    class_number, scale = np.where(classes >= 0, classes, count), np.where(fixed, 0.0, variance)
+    error_score = 0.5 * (tests.vector[:, :q] ** 2 - tests.size[:, :q])
+    position = (np.arange(n)[:, None] * (count + 1) + class_number).ravel()
+    per_fix = np.bincount(position, error_score.ravel(), n * (count + 1)).reshape(n, -1)[:, :count] * scale
+    pair = (class_number[:, :, None] * (count + 1) + class_number[:, None, :]).ravel()
     squared = 0.5 * tests.matrix[:, :q, :q].ravel() ** 2
     information = np.bincount(pair, squared, (count + 1) ** 2).reshape(count + 1, -1)[:count, :count]
     return information * np.outer(scale, scale), per_fix
 
 
 def _inverse(information: Array) -> Array:
-    """Return the pseudo-inverse of an information matrix, which is scaled to a unit diagonal for its rank."""
+    """Return the pseudo-inverse of an information matrix (c, c); its rank is found after scaling to a unit diagonal."""
     half, _ = linalg.root(information, _RANK_TOLERANCE)
     return np.asarray(half @ half.T)
 
@@ -324,7 +349,10 @@ def _log_variances(tests: Tested, classes: Array, variance: Array, fixed: Array)
 
 
 def _relative_errors(tests: Tested, classes: Array, variance: Array, fixed: Array) -> Array:
-    """Return the relative standard errors (c,) of the square roots of the factors; infinite if not determined."""
+    """Return the relative standard errors (c,) of the square roots of the factors; infinite if not determined.
+
+    The arguments are as in `_scoring_step`.
+    """
     spread, determined, _ = _log_variances(tests, classes, variance, fixed)
     # Convert the error of a log-variance to the error of its square root.
     return np.where(determined, np.sqrt(1.0 + np.sqrt(spread)) - 1.0, np.inf)
@@ -354,7 +382,10 @@ def _confidence_interval(found: _MaximumLikelihood, classes: Array, fixed: Array
 
 
 def total(group: Array, count: int, values: Array | None = None) -> Array:
-    """Return the sum of the values (N, q) over each group (g,); without values, the number of errors per group."""
+    """Return the sum of `values` (N, q) over each of `count` groups; without values, the number of errors per group.
+
+    `group` (N, q) is the group of each error; -1 for none.
+    """
     number = np.where(group >= 0, group, count).ravel()
     return np.bincount(number, None if values is None else values.ravel(), count + 1)[:count].astype(float)
 
@@ -409,18 +440,18 @@ class Tested:
         return Tested(matrix, vector, self.errors, cost, dof)
 
 
-def tested(made: Elements, variance: Array) -> Tested:
+def tested(packed: Elements, variance: Array) -> Tested:
     """Return the test statistics of every error and offset of N problems.
 
     `variance` is theta, the variance of each error (N, q), or one value for all errors.
     """
-    q = made.effect.shape[-1]
-    scaled = made.effect * np.sqrt(np.broadcast_to(variance, made.of_effect.shape))[:, None]
-    covariance = scaled @ np.swapaxes(scaled, 1, 2) + made.fixed
+    q = packed.effect.shape[-1]
+    scaled = packed.effect * np.sqrt(np.broadcast_to(variance, packed.of_effect.shape))[:, None]
+    covariance = scaled @ np.swapaxes(scaled, 1, 2) + packed.fixed
     # P = W' (I - Q Q') W, where W whitens V and Q is an orthonormal basis of W J: no inverse of V is formed.
     whiten = linalg.whitening(covariance)
-    columns = np.concatenate([made.effect, made.offset, made.residual[..., None]], axis=-1)
-    white, known = whiten @ columns, whiten @ made.jacobian
+    columns = np.concatenate([packed.effect, packed.offset, packed.residual[..., None]], axis=-1)
+    white, known = whiten @ columns, whiten @ packed.jacobian
     root, _ = linalg.root(np.swapaxes(known, 1, 2) @ known)
     basis = known @ root
     free = white - basis @ (np.swapaxes(basis, 1, 2) @ white)
@@ -444,29 +475,29 @@ def without(tests: Tested, gross: Array) -> Tested:
     return tests
 
 
-def deviance(made: Elements, found: VarianceFit) -> float:
+def deviance(packed: Elements, found: VarianceFit) -> float:
     """Return twice the negative logarithm of the restricted likelihood, with a penalty for each gross row.
 
     It is the likelihood of K' v, where K is an orthonormal basis of the complement of J. The basis does not depend on
     the variances, so the values for different sets of groups are comparable (Harville 1977, section 3). A gross row is
     an additional unknown.
     """
-    variance = np.append(np.nan_to_num(found.variance), 0.0)[made.of_effect]
-    scaled = made.effect * np.sqrt(variance)[:, None]
-    covariance = scaled @ np.swapaxes(scaled, 1, 2) + made.fixed
+    variance = np.append(np.nan_to_num(found.variance), 0.0)[packed.of_effect]
+    scaled = packed.effect * np.sqrt(variance)[:, None]
+    covariance = scaled @ np.swapaxes(scaled, 1, 2) + packed.fixed
     absent = np.diagonal(covariance, axis1=1, axis2=2) == 0.0
     covariance += absent[:, :, None] * np.eye(covariance.shape[1])
-    basis, sizes, _ = np.linalg.svd(made.jacobian)
+    basis, sizes, _ = np.linalg.svd(packed.jacobian)
     seen = np.zeros((len(basis), basis.shape[-1]), dtype=bool)
     seen[:, : sizes.shape[1]] = sizes > _ROUNDING * sizes[:, :1]
     # Directions of the Jacobian get a unit variance and no residual.
     free = np.swapaxes(basis, 1, 2) * ~seen[:, :, None]
     inside = free @ covariance @ np.swapaxes(free, 1, 2) + seen[:, :, None] * np.eye(basis.shape[-1])
     doubled = float(np.linalg.slogdet(inside)[1].sum())
-    tests = tested(made, variance)
+    tests = tested(packed, variance)
     # With every noise structure the worst rows are excluded at the same penalty, so a single row does not favour a
     # structure.
-    cut = np.where(made.common[made.of_effect], np.inf, np.sqrt(ROW_PRICE))
+    cut = np.where(packed.common[packed.of_effect], np.inf, np.sqrt(ROW_PRICE))
     gross = snooped(tests, slice(0, tests.errors), cut).gross
     items = np.arange(len(variance))
     order = np.argsort(~gross, axis=1, kind="stable")[:, : int(gross.sum(1).max(initial=0))]
@@ -480,15 +511,15 @@ def deviance(made: Elements, found: VarianceFit) -> float:
 # Data snooping.
 
 
-def cleaned(made: Elements, variance: Array) -> tuple[Array, Tested]:
+def cleaned(packed: Elements, variance: Array) -> tuple[Array, Tested]:
     """Return the gross errors (N, q) and the tests without them.
 
-    A row is gross only if its error explains much more than a shared error. Without this rule, epochs with a large
-    shared error would be excluded, and the variance of the shared error would be too small.
+    `variance` is as in `tested`. A row is gross only if its error explains much more than a shared error. Without this
+    rule, epochs with a large shared error would be excluded, and the variance of the shared error would be too small.
     """
-    tests = tested(made, variance)
-    shared = made.common[made.of_effect] & (np.broadcast_to(variance, made.of_effect.shape) > 0.0)
-    cut = np.where(made.common[made.of_effect], _CUT_SHARED, CUT)
+    tests = tested(packed, variance)
+    shared = packed.common[packed.of_effect] & (np.broadcast_to(variance, packed.of_effect.shape) > 0.0)
+    cut = np.where(packed.common[packed.of_effect], _CUT_SHARED, CUT)
     found = snooped(tests, slice(0, tests.errors), cut, shared if shared.any() else None)
     return found.gross, found.tests
 
@@ -540,7 +571,10 @@ def snooped(tests: Tested, columns: slice, cut: float | Array, shared: Array | N
 
 
 def error_sizes(tests: Tested, columns: slice) -> tuple[Array, Array]:
-    """Return the size of an error along each column and its standard deviation, from the other rows; NaN for none."""
+    """Return the size of an error along each column and its standard deviation (N, p), from the other rows.
+
+    Both are NaN if the other rows do not determine the size. `columns` selects p columns of the tests.
+    """
     size, vector = tests.size[:, columns], tests.vector[:, columns]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(size > 0.0, vector / size, np.nan), np.where(size > 0.0, size**-0.5, np.nan)

@@ -1,7 +1,7 @@
 """Tables of fixes and JSON records, the content of result files.
 
 `fix_columns` returns one row for each target and epoch. `fix_detail` returns the values of a single fix that a table
-cannot hold, such as alternatives and biases.
+cannot hold, such as alternatives and biases. Arrays have n fixes or rows, k epochs and d coordinates.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def join_tables(parts: Sequence[Columns]) -> Columns:
 def covariance_columns(covariance: Array, axes: str) -> Columns:
     """Return the upper triangles of covariances (n, d, d) as columns `cov_xx`, `cov_xy` and so on.
 
-    `axes` holds one letter for each axis.
+    `axes` holds one letter for each axis, for instance "xyz" or "enu".
     """
     d = covariance.shape[-1]
     return {f"cov_{axes[i]}{axes[j]}": covariance[:, i, j] for i in range(d) for j in range(i, d)}
@@ -139,20 +139,28 @@ def fix_columns(
 
 
 def _states_of(fix: Fix) -> list[tuple[str, ...]]:
-    """Return the names of position, velocity and acceleration of each estimated target."""
+    """Return the names of position, velocity and acceleration in the layout, for each estimated target.
+
+    A fix with one target has the names "position" and so on; with several targets, the names end in "[0]", "[1]" and so
+    on.
+    """
     names = [slot.name for slot in (*fix.layout.shared, *fix.layout.local)]
     numbers = [name.removeprefix("position") for name in names if name.partition("[")[0] == "position"]
     return [tuple(f"{word}{number}" for word in _STATES if f"{word}{number}" in names) for number in numbers]
 
 
 def _numbered(fix: Fix, targets: int) -> Labels:
-    """Return labels for unnamed fixes: the index in the batch, the index of the epoch and the index of the target."""
+    """Return a function for the argument `labels` of `fix_columns`, for fixes without names.
+
+    Its columns are the index in the batch, the index of the epoch and the index of the target. A column is omitted if
+    it has only one value. `targets` is the number of targets.
+    """
     n, k = len(fix), fix.layout.epochs
 
-    def labels(target: int, spread: bool) -> Columns:
-        rows = n * k if spread else n
-        number = {"number": np.arange(rows) // (k if spread else 1)} if n > 1 else {}
-        epoch = {"epoch": np.tile(np.arange(k), n)} if spread else {}
+    def labels(target: int, by_epoch: bool) -> Columns:
+        rows = n * k if by_epoch else n
+        number = {"number": np.arange(rows) // (k if by_epoch else 1)} if n > 1 else {}
+        epoch = {"epoch": np.tile(np.arange(k), n)} if by_epoch else {}
         return number | epoch | ({"target": np.full(rows, target)} if targets > 1 else {})
 
     return labels
@@ -163,17 +171,18 @@ def _target_rows(
 ) -> Columns:
     """Return the rows of one target; `names` holds the names of its position, velocity and acceleration.
 
-    The columns in `words` (n entries each) are appended; every fix repeats its text in all its rows.
+    `target` is its number, and `labels` and `dimension` are as in `fix_columns`. The columns in `words` (n texts each)
+    are appended; every fix repeats its text in all its rows.
     """
     estimated = names[0] in {slot.name for slot in (*fix.layout.shared, *fix.layout.local)}
     position = fix.take(names[0]) if estimated else np.full((len(fix), dimension), np.nan)
     n, d = len(fix), position.shape[-1]
     # If the target has one position for each epoch of a run, its shape is (1, k, d). Its covariance exists only if the
     # solver was asked to compute it.
-    spread = position.ndim == 3
-    count = position.shape[1] if spread else 1
-    has_covariance = estimated and (not spread or fix.local is not None)
-    columns = dict(labels(target, spread))
+    by_epoch = position.ndim == 3
+    count = position.shape[1] if by_epoch else 1
+    has_covariance = estimated and (not by_epoch or fix.local is not None)
+    columns = dict(labels(target, by_epoch))
     position = position.reshape(n * count, d)
     covariance, undetermined = np.full((n * count, d, d), np.nan), np.zeros((n * count, d), dtype=bool)
     if has_covariance:
@@ -225,7 +234,10 @@ def without_open(covariance: Array, undetermined: Array, axes: str) -> tuple[Arr
 
 
 def _append_names(undetermined: Array, names: Sequence[str], before: Sequence[str]) -> list[str]:
-    """Return the texts in `before` (n), extended by the names of the entries (n, d) that are `undetermined`."""
+    """Return the texts in `before` (n), extended by the names of the undetermined entries of each row.
+
+    `undetermined` (n, d) is True for each undetermined entry, and `names` are the d names of the entries.
+    """
     if not undetermined.any():
         return list(before)
     new_names = [[names[i] for i in np.flatnonzero(row).tolist()] for row in undetermined]
@@ -236,9 +248,10 @@ _LEVEL = {"e": "east", "n": "north", "u": "up"}
 
 
 def _hide_undetermined_levels(local: Columns, limit: Array, before: Sequence[str]) -> tuple[Columns, list[str]]:
-    """Return geodetic columns with NaN for undetermined axes (east, north, up), and all undetermined names (n).
+    """Return geodetic columns with NaN for undetermined axes (east, north, up), and the undetermined names of each row.
 
-    An axis is undetermined if its standard deviation exceeds `limit` (n,), m. `before` (n) holds earlier names.
+    An axis is undetermined if its standard deviation exceeds `limit` (n,), m. `before` holds the names (n texts) that
+    other columns already gave.
     """
     axes = [axis for axis in _LEVEL if f"cov_{axis}{axis}" in local]
     with np.errstate(invalid="ignore"):
@@ -269,7 +282,8 @@ def _repeat(count: int, **texts: Sequence[str]) -> Columns:
 def _text_columns(fix: Fix, constrained: bool) -> dict[str, list[str]]:
     """Return text columns (n entries each): proof, findings, chart, active constraints and suspects.
 
-    "A; B" means A and B together. "A | B" means either A or B explains the data.
+    `constrained` selects the columns of active constraints. "A; B" means A and B together. "A | B" means either A or B
+    explains the data.
     """
     texts = {"proof": [PROOFS[number] for number in fix.claims.proof.tolist()]}
     findings: Any = fix.findings  # In a batch, each fix has one tuple.
@@ -317,7 +331,7 @@ def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
         Observability of the biases. It gives `from_data`, the share of the information that comes from the data.
         Without `seen`, the share is NaN.
     """
-    found = []
+    rows = []
     for slot in fix.layout.shared:
         if not slot.members:
             continue
@@ -325,10 +339,10 @@ def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
         shares = np.full(slot.size, np.nan) if seen is None else seen.from_data[slot.start : slot.start + slot.size]
         for member, value, sigma, share in zip(slot.entries, values, sigmas, shares, strict=True):
             record = {"name": slot.name, "member": member, "value": float(value), "sigma": float(sigma)}
-            found.append(record | {"unit": slot.unit, "from_data": float(share)})
+            rows.append(record | {"unit": slot.unit, "from_data": float(share)})
         for i in np.flatnonzero(fix.undetermined(slot.name)).tolist():
-            found[len(found) - slot.size + i]["undetermined"] = True
-    return found
+            rows[len(rows) - slot.size + i]["undetermined"] = True
+    return rows
 
 
 def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool = False) -> dict[str, Any]:

@@ -59,7 +59,10 @@ class Look:
 
 
 def marks(methods: list[str]) -> dict[str, Look]:
-    """Return the line style of each method, by name."""
+    """Return the line style of each method, by name.
+
+    A method with the same place in the list always has the same style.
+    """
     return {
         name: Look(i, name, _COLOURS[i % len(_COLOURS)], _MARKS[i % len(_MARKS)], _DASHES[(i // 2 + i // 8) % 4])
         for i, name in enumerate(methods)
@@ -150,7 +153,15 @@ def svg_text(figure: Figure) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """A figure as inline SVG, with its name."""
+    """A figure as inline SVG.
+
+    Parameters
+    ----------
+    name : str
+        Name of the figure, which begins all its ids.
+    svg : str
+        The SVG element.
+    """
 
     name: str
     svg: str

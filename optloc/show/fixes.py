@@ -84,7 +84,9 @@ def with_sigma(value: float, sigma: float, unit: str) -> str:
 class FixSheet(NamedTuple):
     """A table of text with a title.
 
-    `head` holds the names of the columns; it is empty if each row is a label with its text.
+    - title: title above the table; may be empty.
+    - head: names of the columns; empty if each row is a label with its text.
+    - rows: cells of each row.
     """
 
     title: str
@@ -150,7 +152,10 @@ def whose(columns: Columns, i: int) -> str:
 
 
 def _state(columns: Columns, i: int, whose: str) -> list[tuple[str, str]]:
-    """Return labels and texts of the state in row `i`: position, velocity, acceleration and accuracy."""
+    """Return labels and texts of the state in row `i`: position, velocity, acceleration and accuracy.
+
+    `whose` is added to each label, to name target and epoch. A row without a position has no lines.
+    """
     if not np.isfinite(columns["x"][i]):
         return []
     axes, undetermined = [axis for axis in "xyz" if axis in columns], _undetermined(columns, i)
@@ -165,10 +170,10 @@ def _state(columns: Columns, i: int, whose: str) -> list[tuple[str, str]]:
         held = " (held)" if len(local) == 3 and local[2] < (_HELD * _EARTH) ** 2 else ""
         height = f"{columns['height'][i] + 0.0:.2f} m{held}".replace("-0.00", "0.00")
         lines.append((f"height{whose}", NOT_DETERMINED if "up" in undetermined else height))
-        known = [(word, v) for word, v in zip(("east", "north", "up"), local, strict=False) if word not in undetermined]
-        if known:
-            sizes = _sizes(np.sqrt(np.maximum([v for _, v in known], 0.0)))
-            lines.append((f"sigma {', '.join(word for word, _ in known)}", ", ".join(sizes) + " m"))
+        shown = [(word, v) for word, v in zip(("east", "north", "up"), local, strict=False) if word not in undetermined]
+        if shown:
+            sizes = _sizes(np.sqrt(np.maximum([v for _, v in shown], 0.0)))
+            lines.append((f"sigma {', '.join(word for word, _ in shown)}", ", ".join(sizes) + " m"))
     for letter, word, unit in (("v", "velocity", "m/s"), ("a", "acceleration", "m/s²")):
         for axis in (axis for axis in axes if f"{letter}{axis}" in columns):
             value, sigma = (columns[f"{prefix}{letter}{axis}"][i] for prefix in ("", "sigma_"))
@@ -237,6 +242,7 @@ def _coordinates(fix: Fix) -> list[tuple[str, str]]:
 
 
 def _chi_square(fix: Fix) -> str:
+    """Return the cost, the degrees of freedom and the p-value as text, with a warning if the p-value is very small."""
     if int(fix.dof) <= 0 or not np.isfinite(fix.cost):
         return "no redundancy: nothing to test"
     p = float(fix.p_value)
@@ -336,6 +342,7 @@ def count_sheet(columns: Columns, title: str) -> FixSheet:
 
 
 def _quantile(values: Array, share: float) -> str:
+    """Return a quantile of the finite values as text; "-" if there are no finite values."""
     finite = values[np.isfinite(values)]
     return f"{np.quantile(finite, share):.3g}" if len(finite) else "-"
 
@@ -344,7 +351,7 @@ def _quantile(values: Array, share: float) -> str:
 
 
 def sheets_of(fix: Fix) -> list[FixSheet]:
-    """Return all sheets of a single fix; for a batch, one sheet that counts the statuses."""
+    """Return all sheets of a single fix; for a batch, one sheet with the number of fixes of each status."""
     if fix.shape:
         return [count_sheet(fix_columns(fix), "")] if fix.code.size else [FixSheet("0 fixes", (), [])]
     found = (fix_sheet(fix), bias_sheet(fix), suspect_sheet(fix), alternative_sheet(fix))
@@ -415,7 +422,10 @@ def dict_of(fix: Fix) -> dict[str, Any]:
 
 
 def frame_of(fix: Fix) -> Any:
-    """Return fixes as a pandas data frame; raise InvalidProblem if pandas is not installed."""
+    """Return fixes as a pandas data frame, with the labels of the fixes as index if there is one row for each label.
+
+    If pandas is not installed, the function raises InvalidProblem.
+    """
     try:
         import pandas as pd
     except ImportError:
@@ -428,7 +438,7 @@ def frame_of(fix: Fix) -> Any:
 
 
 def geojson_of(fix: Fix, problem: Problem | None = None) -> dict[str, Any]:
-    """Return fixes as a GeoJSON feature collection; with the problem, the stations are included."""
+    """Return fixes as a GeoJSON feature collection; with the problem, it also contains stations and 95 % regions."""
     from optloc.show.formats.marks import Results, geojson
 
     return geojson(Results(fix_columns(fix), fix.frame, (fix,), problem))

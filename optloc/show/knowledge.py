@@ -35,7 +35,10 @@ def has_place(fix: Fix) -> bool:
 
 
 def shown_directions(fix: Fix, found: Determined) -> tuple[Direction, ...]:
-    """Return the directions of a single fix to show; empty if the fix has a valid position."""
+    """Return the directions of a single fix to show; empty if the fix has a valid position.
+
+    `found` are the quantities that the data determine, from `fix.determined`.
+    """
     return () if has_place(fix) else found.directions
 
 
@@ -68,15 +71,15 @@ def _centre_text(found: Determined) -> str:
     return "(" + ", ".join(f"{value:.6g}" for value in found.origin) + ") m, the middle of the stations"
 
 
-def _direction_text(found: Determined, one: Direction) -> str:
+def _direction_text(found: Determined, direction: Direction) -> str:
     """Return the text of a direction with its cone, degrees."""
     if found.north:
-        middle, low, high = bearing_of(one.azimuth)
+        middle, low, high = bearing_of(direction.azimuth)
         text = f"bearing {_angle_text(middle, low, high)}"
     else:
-        text = f"azimuth {_angle_text(*np.degrees(one.azimuth).tolist())}"
-    text += f", elevation {_angle_text(*np.degrees(one.elevation).tolist())}" if one.elevation else ""
-    half = " x ".join(f"{value:.2g}" for value in np.degrees(one.half_angles))
+        text = f"azimuth {_angle_text(*np.degrees(direction.azimuth).tolist())}"
+    text += f", elevation {_angle_text(*np.degrees(direction.elevation).tolist())}" if direction.elevation else ""
+    half = " x ".join(f"{value:.2g}" for value in np.degrees(direction.half_angles))
     return f"{text}; cone of ± {half} deg from the middle of the stations"
 
 
@@ -92,16 +95,17 @@ def _angle_text(middle: float, low: float, high: float) -> str:
     return f"{middle:.{digits}f} ({low:.{digits}f} to {high:.{digits}f}) deg"
 
 
-def _range_text(one: Direction) -> str:
-    low, high = one.range[1:]
-    if not one.mixed:
+def _range_text(direction: Direction) -> str:
+    """Return the text of the 95 % interval of the range of a direction, m; it may have no upper end."""
+    low, high = direction.range[1:]
+    if not direction.mixed:
         return f"{low:.4g} m or more, to infinity"
     return f"{low:.4g} to {high:.4g} m"
 
 
-def _quantity_text(one: Quantity) -> str:
+def _quantity_text(quantity: Quantity) -> str:
     """Return the text of an interval."""
-    value, low, high, unit = one.value, one.low, one.high, one.unit
+    value, low, high, unit = quantity.value, quantity.low, quantity.high, quantity.unit
     if unit == "rad":
         return _angle_text(*np.degrees([value, low, high]).tolist())
     far = f"{high:.4g} {unit}" if np.isfinite(high) else "infinity"
@@ -142,10 +146,10 @@ def known_features(fix: Fix, frame: Frame) -> list[tuple[dict[str, Any], dict[st
     return features
 
 
-def reach_of(fix: Fix, one: Direction) -> float:
+def reach_of(fix: Fix, direction: Direction) -> float:
     """Return the distance, m, at which the wedge of an unlimited direction ends."""
     size = 0.0 if fix.reach is None else float(np.nan_to_num(fix.reach))
-    return float(np.clip(max(_LEAST * one.least_range, _SIZES * size), 1.0, _MOST))
+    return float(np.clip(max(_LEAST * direction.least_range, _SIZES * size), 1.0, _MOST))
 
 
 # Pieces of each edge. The surface of the Earth drops about 1 km below a straight line of 100 km, so a long edge needs

@@ -59,16 +59,17 @@ def land(window: Window) -> list[Array]:
         # A ring that crosses the antimeridian can overlap the window after a turn of 360 degrees.
         for turn in (-360.0, 0.0, 360.0):
             if low[0] + turn < east and high[0] + turn > west:
-                cut = _clip(ring + np.array([turn, 0.0]), window)
+                cut = _clip_ring(ring + np.array([turn, 0.0]), window)
                 if len(cut) > 2:
                     found.append(cut)
     return found
 
 
-def _clip(ring: Array, window: Window) -> Array:
+def _clip_ring(ring: Array, window: Window) -> Array:
     """Return a ring (n, 2) clipped to a window, degrees.
 
-    Source: I. E. Sutherland and G. W. Hodgman, "Reentrant polygon clipping", Communications of the ACM 17 (1974).
+    The ring is clipped at one side of the window after the other. Source: I. E. Sutherland and G. W. Hodgman,
+    "Reentrant polygon clipping", Communications of the ACM 17 (1974).
     """
     for axis, limit, sign in ((0, window[0], 1.0), (0, window[1], -1.0), (1, window[2], 1.0), (1, window[3], -1.0)):
         if not len(ring):
@@ -100,6 +101,17 @@ class Plane:
     ----------
     west, east, south, north : float
         Limits of the map, degrees; east can exceed 180.
+
+    Attributes
+    ----------
+    middle : array (2,)
+        Longitude and latitude of the centre of the map, degrees. The drawing has its origin there.
+    squeeze : float
+        Ratio of a degree of longitude to a degree of latitude on the ground.
+    unit : float
+        Units of the drawing in a degree of latitude.
+    half : array (2,)
+        Half the width and half the height of the map, in units of the drawing.
     """
 
     def __init__(self, west: float, east: float, south: float, north: float) -> None:
@@ -149,12 +161,22 @@ class Curve:
     colour: str = ""
     width: float = 0.0
     tell: str = ""
-    shape: ClassVar = "curve"
+    shape: ClassVar = "curve"  # The template selects the SVG element by the shape.
 
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A text at a position of the drawing; `kind` is its class in the style sheet."""
+    """A text at a position of the drawing.
+
+    Parameters
+    ----------
+    kind : str
+        Class of the style sheet.
+    x, y : float
+        Position, in units of the drawing.
+    text : str
+        The text.
+    """
 
     kind: str
     x: float
@@ -165,7 +187,17 @@ class Label:
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """A picture; `x` and `y` are its upper left corner, and `source` is a data URL with its content."""
+    """A picture in a drawing.
+
+    Parameters
+    ----------
+    x, y : float
+        Upper left corner, in units of the drawing.
+    width, height : float
+        Size, in units of the drawing.
+    source : str
+        Data URL with the content.
+    """
 
     x: float
     y: float
@@ -221,7 +253,10 @@ def map_canvas(
 
 
 def path(lines: Sequence[Array], *, close: bool, digits: int = 1) -> str:
-    """Return lines (n, 2), in units of the drawing, as the data of an SVG path."""
+    """Return lines (n, 2), in units of the drawing, as the data of an SVG path.
+
+    With `close`, each line is closed to a ring. `digits` is the number of decimals.
+    """
     end = "Z" if close else ""
     return "".join("M" + "L".join(f"{x:.9g} {y:.9g}" for x, y in np.round(line, digits)) + end for line in lines)
 
@@ -349,7 +384,10 @@ def fixed_spots(problem: Problem, fixes: Sequence[Fix], labels: Sequence[str]) -
 
 
 def sentence(name: str, status: str, place: Array, sigma: float) -> str:
-    """Return the text of a fix: name, status, latitude and longitude, sigma."""
+    """Return the text of a fix: name, status, latitude and longitude, sigma.
+
+    `place` (2,) is longitude and latitude in degrees, and `sigma` is in metres. Missing parts are omitted.
+    """
     parts = [name, status, f"{place[1]:.5f}°, {place[0]:.5f}°" if np.isfinite(place).all() else "no position"]
     return ", ".join(part for part in [*parts, f"sigma {sigma:.3g} m" if np.isfinite(sigma) else ""] if part)
 
@@ -370,7 +408,7 @@ def other_spots(problem: Problem, fixes: Sequence[Fix]) -> Spots:
 
 
 def station_spots(problem: Problem) -> Spots:
-    """Return the marks of the stations in the first epoch; stations in space have no position on a map."""
+    """Return the marks of the stations in the first epoch; a station in space has the place NaN and is not drawn."""
     position = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
     place = degrees(problem, position)
     place[problem.frame.to_geodetic(position)[2] > _SKY] = np.nan
@@ -383,9 +421,9 @@ def ground_tracks(problem: Problem) -> list[tuple[str, Array]]:
 
     Longitudes continue beyond 180 degrees, so that a track has no jump at the antimeridian.
     """
-    used = [index for rows in problem.rows if MODELS[rows.kind].velocity for index in (rows.a, rows.b)]
+    indices = [index for rows in problem.rows if MODELS[rows.kind].velocity for index in (rows.a, rows.b)]
     found = []
-    for station in np.unique(np.concatenate([*used, [-1]]))[1:].tolist():
+    for station in np.unique(np.concatenate([*indices, [-1]]))[1:].tolist():
         track = problem.stations.position.reshape(-1, *problem.stations.position.shape[-3:])[0, :, station]
         lat, lon, height = problem.frame.to_geodetic(thinned(track))
         if height.min() > _SKY:
@@ -395,7 +433,12 @@ def ground_tracks(problem: Problem) -> list[tuple[str, Array]]:
 
 
 def lines_on_map(problem: Problem, fix: Fix, limits: tuple[float, float, float, float]) -> list[tuple[str, Array]]:
-    """Return the lines of position of a single fix at its height: label, and line (n, 2) in degrees."""
+    """Return the lines of position of a single fix at its height: label, and line (n, 2) in degrees.
+
+    A line of position holds the positions that fit one row exactly. `limits` are west, east, south and north of the
+    map, degrees; the lines continue beyond them. The list is empty for several fixes, without a fix, and if the
+    position changes from epoch to epoch.
+    """
     figure_class()  # Raise one clear error if matplotlib, which installs contourpy, is missing.
     flat = fix.flat()
     if len(flat) != 1 or not np.isfinite(flat.x).all() or not flat.layout.shares("position"):
@@ -410,6 +453,9 @@ def lines_on_map(problem: Problem, fix: Fix, limits: tuple[float, float, float, 
 
 
 def _grid_beyond(low: float, high: float) -> Array:
-    """Return grid points from beyond the lower limit to beyond the upper limit: a window can be larger than the map."""
+    """Return grid points from beyond the lower limit to beyond the upper limit, because a window can exceed the map.
+
+    `low` and `high` are the limits of the map along one axis, degrees.
+    """
     rim = _RIM * (high - low)
     return np.linspace(low - rim, high + rim, _GRID)

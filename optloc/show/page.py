@@ -126,6 +126,7 @@ def write_page(
 
 @cache
 def _environment() -> Environment:
+    """Return the environment of the templates, which reads and fills the templates of this package."""
     # Import here: commands that write no page run without jinja2.
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -189,13 +190,13 @@ def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: S
     alone = sum(int(np.sum(fix.unchecked)) for fix in several)
     count = sum(fix.code.size for fix in several)
     which = "" if count == 1 else f"{alone if alone < count else 'all'} of {count} fixes: "
-    return _page(problem, found, others, title, "fix", single, f"{which}{UNCHECKED}." if alone else "")
+    return _marks_page(problem, found, others, title, "fix", single, f"{which}{UNCHECKED}." if alone else "")
 
 
 def track_page(problem: Problem, tracks: Spots, title: str) -> str:
     """Return an HTML page with an interactive map of the scans of tracks; `tracks` are their marks."""
     _on_earth(problem.frame.geodetic)
-    return _page(problem, tracks, Spots(np.zeros((0, 2)), (), np.zeros(0, dtype=bool), ()), title, "track", None)
+    return _marks_page(problem, tracks, Spots(np.zeros((0, 2)), (), np.zeros(0, dtype=bool), ()), title, "track", None)
 
 
 def live_page(problem: Problem, title: str) -> str:
@@ -215,7 +216,7 @@ def live_page(problem: Problem, title: str) -> str:
     """
     _on_earth(problem.frame.geodetic)
     stations = station_spots(problem)
-    limits = _limits([stations.place])
+    limits = _map_limits([stations.place])
     plane, middle = Plane(*limits), (limits[0] + limits[1]) / 2.0
     layers: dict[str, Sequence[Drawn]] = {"stations": _stations(stations, plane, middle), "fixes": ()}
     text = "White: stations. Blue: the latest fixes; orange if the status is not ok. Point at a mark for details."
@@ -239,51 +240,58 @@ def map_page(found: BoundMap, title: str) -> str:
 
 
 def _on_earth(geodetic: bool) -> None:
+    """Raise InvalidProblem if the frame of the positions is not on Earth."""
     if not geodetic:
         advice = 'write a picture (.png, .svg, .pdf), or give a [frame] of kind "geodetic", "ecef" or "enu"'
         raise InvalidProblem("an interactive map needs positions on Earth", "map", advice)
 
 
-def _page(
-    problem: Problem, found: Spots, others: Spots, title: str, what: str, single: Fix | None, first: str = ""
+def _marks_page(
+    problem: Problem, marks: Spots, others: Spots, title: str, role: str, single: Fix | None, first: str = ""
 ) -> str:
-    """Return the page of a map; the paragraph `first`, if there is one, is above the map."""
+    """Return the HTML of a page with the map of fixes or tracks.
+
+    `marks` are the marks of fixes or scans, and `others` the marks of alternatives. `role` names a mark, "fix" or
+    "track". `single` is the fix if there is only one fix, for lines of position. `first` is a paragraph above the map;
+    it may be empty.
+    """
     stations, tracks = station_spots(problem), ground_tracks(problem)
-    limits = _limits([stations.place, found.place, others.place, *(line for _, line in tracks)])
+    limits = _map_limits([stations.place, marks.place, others.place, *(line for _, line in tracks)])
     plane, middle = Plane(*limits), (limits[0] + limits[1]) / 2.0
     lines = [] if single is None else lines_on_map(problem, single, limits)
-    few = len(found.place) <= _FEW
+    few = len(marks.place) <= _FEW
     layers: dict[str, Sequence[Drawn]] = {
         **({"lines of position": _curves(lines, plane)} if lines else {}),
         **({"ground tracks": _curves(_nearest_turn(tracks, middle), plane, "line")} if tracks else {}),
         "stations": _stations(stations, plane, middle),
         **({"alternatives": _dots(others, plane, middle, _MARK)} if len(others.place) else {}),
-        what: [*_ellipses(found, plane, middle), *_dots(found, plane, middle, _MARK if few else _SMALL)],
+        role: [*_ellipses(marks, plane, middle), *_dots(marks, plane, middle, _MARK if few else _SMALL)],
     }
     # A button zooms to the fix: its view is three ellipses wide. A map that is less than twice as wide has no button.
     data: dict[str, object] = {}
-    if focus := _focus(found, plane, middle):
+    if focus := _focus(marks, plane, middle):
         # Allow zooming until a tenth of this view fills the map, and at least as far as on other maps.
         data = {"focus": focus, "nearest": max(200.0, 10.0 * 2.0 * float(plane.half[0]) / focus[2])}
-    text = f"White: stations. Blue: {what}, with 95 % region; orange if not ok. Point at a mark for details."
-    if found.local is not None and found.local.any():
+    text = f"White: stations. Blue: {role}, with 95 % region; orange if not ok. Point at a mark for details."
+    if marks.local is not None and marks.local.any():
         text = text.replace("95 % region;", "95 % region (dotted: a local ellipse, not valid);")
     canvas = map_canvas(plane, "map-1", title, layers, data, text)
     note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
     return write_page(title, [PagePart("map", "Map", first[:1].upper() + first[1:], maps=[canvas], note=note)])
 
 
-def _limits(places: Sequence[Array]) -> tuple[float, float, float, float]:
-    """Return west, east, south, north, degrees, around all points with a margin.
+def _map_limits(places: Sequence[Array]) -> tuple[float, float, float, float]:
+    """Return west, east, south, north, degrees, around all points (n, 2) of `places` with a margin.
 
-    If points are on both sides of the antimeridian, the shorter way around the Earth is used.
+    Points are longitude and latitude, degrees. If points are on both sides of the antimeridian, the shorter way around
+    the Earth is used. Without any finite point, the function raises InvalidProblem.
     """
     points = np.concatenate(places)
     points = points[np.isfinite(points).all(-1)]
     if not len(points):
         raise InvalidProblem("nothing has a position on the map", "map", "see `optloc fix` for the reasons")
     # Move all longitudes to within 180 degrees of the first point.
-    points = _turn(points, points[0, 0])
+    points = _shift_near(points, points[0, 0])
     low, high = points.min(0), points.max(0)
     squeeze = np.array([np.cos(np.radians((low + high)[1] / 2.0)), 1.0])
     half = (0.5 + _RIM) * np.maximum(
@@ -293,22 +301,23 @@ def _limits(places: Sequence[Array]) -> tuple[float, float, float, float]:
     return float(west), float(east), float(max(south, -90.0)), float(min(north, 90.0))
 
 
-def _turn(place: Array, middle: float) -> Array:
+def _shift_near(place: Array, middle: float) -> Array:
     """Return longitude and latitude (n, 2), degrees, with longitudes within 180 degrees of the middle of the map."""
     out = np.array(place, dtype=float)
     out[:, 0] = (out[:, 0] - middle + 180.0) % 360.0 - 180.0 + middle
     return out
 
 
-def _focus(found: Spots, plane: Plane, middle: float) -> list[float] | None:
-    """Return the centre and width of a view of a single fix, in units of the drawing.
+def _focus(marks: Spots, plane: Plane, middle: float) -> list[float] | None:
+    """Return the centre x, y and the width of a view of a single fix, in units of the drawing.
 
-    The width is three times the size of its ellipse. If it is at least half the width of the map, the result is None.
+    The width is three times the size of its ellipse. `middle` is the longitude of the middle of the map, degrees. The
+    result is None if the width is at least half the width of the map, or if there are several marks or no ellipse.
     """
-    rings = [ring for ring in found.rings if len(ring)]
-    if len(found.place) != 1 or not rings:
+    rings = [ring for ring in marks.rings if len(ring)]
+    if len(marks.place) != 1 or not rings:
         return None
-    ring = plane(_turn(rings[0], middle))
+    ring = plane(_shift_near(rings[0], middle))
     (x, y), width = ring.mean(0), 3.0 * float(np.ptp(ring, axis=0).max())
     return [float(x), float(y), width] if width < plane.half[0] else None
 
@@ -319,40 +328,54 @@ def _nearest_turn(lines: Sequence[tuple[str, Array]], middle: float) -> list[tup
 
 
 def _curves(lines: Sequence[tuple[str, Array]], plane: Plane, kind: str = "line thin") -> list[Drawn]:
+    """Return named lines (n, 2), degrees, as curves that show their names while the pointer is on them."""
     return [Curve(kind, path([plane(line)], close=False, digits=3), tell=name) for name, line in lines]
 
 
 def _stations(stations: Spots, plane: Plane, middle: float) -> list[Drawn]:
-    places = plane(_turn(stations.place, middle))
+    """Return the dots and names of the stations that have a position on the map.
+
+    `middle` is the longitude of the middle of the map, degrees.
+    """
+    places = plane(_shift_near(stations.place, middle))
     marks = [_station(name, x, y, f"station {name}") for name, (x, y) in zip(stations.text, places, strict=True)]
     return [one for mark, seen in zip(marks, np.isfinite(places[:, 0]), strict=True) if seen for one in mark]
 
 
 def _station(name: str, x: float, y: float, tell: str) -> tuple[Drawn, ...]:
+    """Return a station at x, y of the drawing: a black dot with a white centre, and its name.
+
+    The page shows the text `tell` while the pointer is on the centre.
+    """
     return dot(x, y, BLACK, _STATION), dot(x, y, "#ffffff", _MIDDLE, tell), Label("name", x, y, name)
 
 
-def _ellipses(found: Spots, plane: Plane, middle: float) -> list[Drawn]:
-    if len(found.rings) > _ELLIPSES:
+def _ellipses(marks: Spots, plane: Plane, middle: float) -> list[Drawn]:
+    """Return the 95 % ellipses and outlines of marks as curves; nothing if there are too many.
+
+    Ellipses that are not valid have another class, so that the style sheet draws them dotted.
+    """
+    if len(marks.rings) > _ELLIPSES:
         return []
-    local = np.zeros(len(found.rings), dtype=bool) if found.local is None else found.local
-    covers = [ring for ring, bare in zip(found.rings, local, strict=True) if not bare]
+    local = np.zeros(len(marks.rings), dtype=bool) if marks.local is None else marks.local
+    covers = [ring for ring, bare in zip(marks.rings, local, strict=True) if not bare]
     drawn: list[Drawn] = []
     for kind, rings in (
-        ("ring", [*covers, *found.more]),
+        ("ring", [*covers, *marks.more]),
         # An ellipse that is not valid must look different from a valid ellipse.
-        ("ring local", [ring for ring, bare in zip(found.rings, local, strict=True) if bare]),
+        ("ring local", [ring for ring, bare in zip(marks.rings, local, strict=True) if bare]),
     ):
-        lines = [plane(_turn(ring, middle)) for ring in rings if len(ring)]
+        lines = [plane(_shift_near(ring, middle)) for ring in rings if len(ring)]
         tell = "local ellipse: not valid as 95 % region" if kind == "ring local" else ""
         drawn += [Curve(kind, path(lines, close=True, digits=_DIGITS), BLUE, tell=tell)] if lines else []
     return drawn
 
 
-def _dots(found: Spots, plane: Plane, middle: float, size: float) -> list[Drawn]:
+def _dots(marks: Spots, plane: Plane, middle: float, size: float) -> list[Drawn]:
+    """Return marks as dots of `size` pixels: blue if the status is `ok`, else orange; none for a missing position."""
     return [
         dot(x, y, BLUE if ok else ORANGE, size, text)
-        for (x, y), ok, text in zip(plane(_turn(found.place, middle)), found.clean, found.text, strict=True)
+        for (x, y), ok, text in zip(plane(_shift_near(marks.place, middle)), marks.clean, marks.text, strict=True)
         if np.isfinite(x)
     ]
 
@@ -385,10 +408,11 @@ def map_element(found: BoundMap, name: str, title: str, trials: tuple[Array, Arr
         **({} if trials is None else {"trials": _trials(plane, *trials)}),
         "stations": _map_stations(found, plane),
     }
-    return map_canvas(plane, name, title, layers, _data(found), _help(found))
+    return map_canvas(plane, name, title, layers, _data(found), _map_text(found))
 
 
-def _help(found: BoundMap) -> str:
+def _map_text(found: BoundMap) -> str:
+    """Return the text below the map of a bound: the range of its colours and the height."""
     steps = levels(found.sigma)
     low, high = _metres(steps[0]), _metres(steps[-1])
     where = f"{found.height:.0f} m above the ellipsoid"
@@ -396,10 +420,12 @@ def _help(found: BoundMap) -> str:
 
 
 def _metres(level: float) -> str:
+    """Return a length in m as text, in km from 1000 m on."""
     return f"{level:g} m" if level < 1e3 else f"{level / 1e3:g} km"
 
 
 def _image(found: BoundMap, plane: Plane) -> Image:
+    """Return the bound as a picture for the map: one pixel for each grid point, transparent where there is no bound."""
     from matplotlib import colormaps
     from matplotlib.colors import LogNorm
     from matplotlib.image import imsave
@@ -420,6 +446,7 @@ def _image(found: BoundMap, plane: Plane) -> Image:
 
 
 def _lines(found: BoundMap, plane: Plane) -> list[Drawn]:
+    """Return the isolines of the bound as curves, with one label for each level."""
     parts: list[Drawn] = []
     for level, lines in isolines(found):
         drawn = [plane(line) for line in lines]
@@ -433,11 +460,16 @@ def _lines(found: BoundMap, plane: Plane) -> list[Drawn]:
 
 
 def _map_stations(found: BoundMap, plane: Plane) -> list[Drawn]:
+    """Return the dots and names of the stations of a bound."""
     places = zip(found.names, plane(found.stations), strict=True)
     return [one for name, (x, y) in places for one in _station(name, x, y, name)]
 
 
 def _trials(plane: Plane, places: Array, off: Array) -> list[Drawn]:
+    """Return at most `_DOTS` trials as dots at longitude and latitude `places` (n, 2), degrees.
+
+    Trials with a wrong result, marked by `off` (n,), are orange and larger.
+    """
     kept = np.unique(np.linspace(0, len(places) - 1, min(_DOTS, len(places))).astype(int))
     order = kept[np.argsort(off[kept], kind="stable")]  # Draw wrong trials last, on top.
     return [
@@ -447,7 +479,11 @@ def _trials(plane: Plane, places: Array, off: Array) -> list[Drawn]:
 
 
 def _data(found: BoundMap) -> dict[str, Any]:
-    """Return the values from which the script of the page reads the bound at the pointer."""
+    """Return the values from which the script of the page reads the bound at the pointer.
+
+    `x` and `y` are first and last grid line, degrees, and their number. `values` are the bounds in m, row by row from
+    the south; None where there is no bound.
+    """
     return {
         "x": [float(found.x[0]), float(found.x[-1]), len(found.x)],
         "y": [float(found.y[0]), float(found.y[-1]), len(found.y)],

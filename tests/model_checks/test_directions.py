@@ -21,7 +21,7 @@ def test_a_look_in_a_direction_is_the_cost_at_its_place_and_its_slope():
         return u, cost(view.centre + view.spread / v[:, None] * u)
 
     u, expected = at(turn, v)
-    found, _, vector = view.look(u, v)
+    found, _, vector = view.evaluate(u, v)
     np.testing.assert_allclose(found, expected, rtol=1e-9)
     slope = (at(turn, v + 1e-6)[1] - at(turn, v - 1e-6)[1]) / 2e-6
     np.testing.assert_allclose(-2.0 * vector[:, -1], slope, rtol=1e-5)

@@ -8,7 +8,7 @@ import pytest
 from show.ranging import ranged
 
 from optloc import InvalidProblem
-from optloc.show.page import PagePart, _limits, _turn, fix_page, write_page
+from optloc.show.page import PagePart, _map_limits, _shift_near, fix_page, write_page
 from optloc.show.sheet import Sheet, TextTable
 
 
@@ -29,17 +29,17 @@ def test_the_page_of_a_fix_names_its_stations():
 
 
 def test_a_map_goes_the_shorter_way_around_the_earth():
-    west, east, south, north = _limits([np.array([[179.0, 10.0], [-179.0, 12.0]])])
+    west, east, south, north = _map_limits([np.array([[179.0, 10.0], [-179.0, 12.0]])])
     assert west < 179.0
     assert 181.0 < east < 190.0
     assert south < 10.0
     assert north > 12.0
     with pytest.raises(InvalidProblem, match="nothing has a position"):
-        _limits([np.full((1, 2), np.nan)])
+        _map_limits([np.full((1, 2), np.nan)])
 
 
 def test_longitudes_are_within_half_a_turn_of_the_middle():
     place = np.array([[-170.0, 1.0], [170.0, 2.0], [539.0, 3.0]])
-    found = _turn(place, 175.0)
+    found = _shift_near(place, 175.0)
     assert found[:, 0] == pytest.approx([190.0, 170.0, 179.0])
     assert found[:, 1].tolist() == [1.0, 2.0, 3.0]

@@ -54,7 +54,9 @@ class Format:
     each: Callable[[Mark], str] | None = None
 
 
-def _text(of: Callable[[Results], str]) -> Callable[[Path, Results], None]:
+def _text_writer(of: Callable[[Results], str]) -> Callable[[Path, Results], None]:
+    """Return a function that writes the text of a format to a file; `of` makes the text from the results."""
+
     def write(path: Path, results: Results) -> None:
         text = of(results) + "\n"
         with written(path) as file:
@@ -103,7 +105,7 @@ FORMATS = {
         "web maps, RFC 7946",
         "95 % ellipse, or outline of the 95 % region; standard deviations as properties",
         "point with its status, no ellipse; alternatives with gap and probability",
-        _text(lambda results: json.dumps(plain(geojson(results)), allow_nan=False, indent=2)),
+        _text_writer(lambda results: json.dumps(plain(geojson(results)), allow_nan=False, indent=2)),
         earth=True,
     ),
     "kml": Format(
@@ -111,7 +113,7 @@ FORMATS = {
         "Google Earth and other maps, OGC KML 2.2",
         "95 % ellipse, or outline of the 95 % region; covariance along east, north, up as data",
         "point in another colour, its status in its name, no ellipse; alternatives as points",
-        _text(kml),
+        _text_writer(kml),
         earth=True,
     ),
     "gpx": Format(
@@ -119,7 +121,7 @@ FORMATS = {
         "receivers and outdoor maps, GPX 1.1",
         "no standard field: text in `desc`, covariance in `extensions`",
         "waypoint with its status in its name; alternatives as waypoints; a gap in a track",
-        _text(gpx),
+        _text_writer(gpx),
         earth=True,
     ),
     "cot": Format(
@@ -127,7 +129,7 @@ FORMATS = {
         "situation displays (TAK), Cursor on Target 2.0, one event on each line",
         "`ce`: standard deviation along the longest axis; `le`: standard deviation of the height",
         "pending event, `ce` and `le` unknown (9999999); alternatives as pending events",
-        _text(cot),
+        _text_writer(cot),
         earth=True,
         each=event,
     ),
@@ -136,7 +138,7 @@ FORMATS = {
         "instruments, NMEA 0183: GGA and GST",
         "GST: ellipse and standard deviations of latitude, longitude, height, 1 sigma",
         "GGA with fix quality 0 and without a position; no alternatives",
-        _text(nmea),
+        _text_writer(nmea),
         earth=True,
         each=sentences,
     ),
@@ -145,14 +147,14 @@ FORMATS = {
         "robots: ROS message PoseWithCovarianceStamped as YAML; covariance of x, y, z and rotations, row by row",
         "covariance in the frame; 1e6 for coordinates that are not estimated",
         "a comment, with alternatives; no message",
-        _text(ros),
+        _text_writer(ros),
     ),
     "g2o": Format(
         (".g2o",),
         "graph optimisation: point vertices and priors",
         "information matrix in the frame, upper triangle",
         "vertex without a prior; alternatives as comments",
-        _text(g2o),
+        _text_writer(g2o),
     ),
 }
 """Formats by name."""

@@ -1,7 +1,8 @@
 """Fixes and tracks as marks: the common input of all map formats, and the GeoJSON format.
 
 A `Mark` is one position with covariance, status and alternatives. `Results` makes the marks from a table of fixes. A
-covariance, an ellipse or a region is *valid* if it covers the true position with the stated probability.
+covariance, an ellipse or a region is *valid* if it covers the true position with the stated probability. A level
+covariance is along east, north and, in space, up.
 """
 
 from __future__ import annotations
@@ -38,7 +39,13 @@ _DATED = 1e8
 
 
 class Other(NamedTuple):
-    """An alternative: `position` (d,) in the frame, m, and `place` (3,): longitude, latitude (degrees), height (m)."""
+    """An alternative: another position that the data do not exclude.
+
+    - position (d,): in the frame, m.
+    - place (3,): longitude, latitude (degrees) and height (m).
+    - gap: cost of the alternative minus cost of the fix.
+    - probability: probability that the alternative is correct, given that either the alternative or the fix is correct.
+    """
 
     position: Array
     place: Array
@@ -47,7 +54,12 @@ class Other(NamedTuple):
 
 
 class Area(NamedTuple):
-    """A 95 % region on a map: the role ("ellipse95" or "region95"), the GeoJSON geometry, and whether it is cut off."""
+    """A 95 % region on a map.
+
+    - role: "ellipse95" or "region95" (an outline).
+    - geometry: GeoJSON geometry.
+    - cut: True if the region continues beyond the drawn outline.
+    """
 
     role: str
     geometry: dict[str, Any]
@@ -106,7 +118,7 @@ class Mark:
 
     @property
     def covers(self) -> bool:
-        """Return whether the mark has a valid covariance."""
+        """Return whether the mark has a covariance; `mark_of` removes covariances that are not valid."""
         return bool(np.isfinite(self.covariance).all())
 
     @property
@@ -206,6 +218,7 @@ class Results:
 
     @property
     def _count(self) -> int:
+        """Return the number of rows of the table."""
         return len(self.columns["status"])
 
     @property
@@ -244,18 +257,22 @@ class Results:
         return [known_features(fix[i], self.frame) for fix in flat for i in range(len(fix))]
 
     def _mark(self, row: dict[str, Any], others: tuple[Other, ...]) -> Mark:
+        """Return the mark of a row of the table, with its alternatives `others`.
+
+        If the fix is Gaussian only in other coordinates than metres, its covariance is not valid and the mark gets NaN.
+        """
         axes = self.axes
         number = {name: np.nan if row.get(name) is None else row[name] for name in row}
         pairs = [["cov_" + "".join(sorted(a + b)) for b in axes] for a in axes]
-        shaped = row.get("chart") not in (None, "", NAMES[CARTESIAN])
-        spread = np.array([[np.nan if shaped else number[name] for name in line] for line in pairs])
-        moving = np.array([number.get(f"v{axis}", np.nan) for axis in axes])
+        other_chart = row.get("chart") not in (None, "", NAMES[CARTESIAN])
+        covariance = np.array([[np.nan if other_chart else number[name] for name in line] for line in pairs])
+        velocity = np.array([number.get(f"v{axis}", np.nan) for axis in axes])
         return mark_of(
             self.frame,
             np.array([number[axis] for axis in axes]),
-            spread,
+            covariance,
             row["status"],
-            velocity=moving if np.isfinite(moving).all() else None,
+            velocity=velocity if np.isfinite(velocity).all() else None,
             name=self._name(row),
             target=str(row.get("target", "target")),
             time=float(number.get("time", np.nan)),
@@ -283,6 +300,10 @@ class Results:
         return found if len(found) == self._count else [()] * self._count
 
     def _alternatives_of(self, fix: Fix, i: int, position: Array) -> tuple[Other, ...]:
+        """Return the alternatives of fix number `i` of a batch; `position` (q, d), m, are their positions.
+
+        Entries with an infinite gap are padding and are omitted.
+        """
         gap, doubt = fix.alternatives.gap[i], fix.alternatives.doubt[i]
         place = np.full((len(gap), 3), np.nan)
         if self.frame.geodetic and len(gap):
@@ -294,6 +315,10 @@ class Results:
         return tuple(Other(position[j], place[j], float(gap[j]), float(doubt[j])) for j in shown)
 
     def _area(self, row: dict[str, Any], region: Outline | None) -> Area | None:
+        """Return the 95 % region of a row: the outline `region` if it is known, else the ellipse; None without either.
+
+        A row has no region if its status or its covariance is not valid.
+        """
         if row.get("lat_deg") is None or row["status"] not in _STATUSES_WITH_REGION:
             return None
         centre = np.array([row[axis] for axis in self.axes])

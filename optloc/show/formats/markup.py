@@ -24,18 +24,23 @@ _HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n'
 
 
 def _add(parent: Element, tag: str, text: str | None = None, /, **attributes: str) -> Element:
-    """Return a new last child of an element; characters that XML cannot contain are escaped."""
+    """Return a new last child of an element; characters that XML cannot contain are escaped.
+
+    `text` is the content of the child, and `attributes` are its attributes.
+    """
     child = SubElement(parent, tag, {key: visible(value) for key, value in attributes.items()})
     child.text = None if text is None else visible(text)
     return child
 
 
 def _document(root: Element) -> str:
+    """Return an XML tree as an indented document with the XML declaration."""
     indent(root)
     return _HEAD + tostring(root, encoding="unicode")
 
 
 def _iso(when: datetime) -> str:
+    """Return a date in UTC as ISO 8601 text with milliseconds and the suffix Z."""
     return when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
@@ -89,22 +94,29 @@ def kml(results: Results) -> str:
 
 
 def _kml_mark(document: Element, mark: Mark, area: Area | None) -> None:
+    """Add a mark to a KML document: its position, its 95 % region and its alternatives.
+
+    A mark without a position is a placemark without a geometry.
+    """
     if not mark.known:
         _placemark(document, mark.name, mark.words, "doubtful", mark)
         return
-    style, flat = "ok" if mark.sure else "doubtful", len(mark.position)
+    style, dimension = "ok" if mark.sure else "doubtful", len(mark.position)
     label = mark.name if mark.sure else f"{mark.name}: {mark.status}"
-    _point(_placemark(document, label, mark.words, style, mark), mark.place, flat)
+    _point(_placemark(document, label, mark.words, style, mark), mark.place, dimension)
     if area is not None:
         word = area.role.replace("95", ", 95 %, cut off" if area.cut else ", 95 %")
         _polygons(_placemark(document, f"{mark.name}: {word}", mark.words, style), area)
     for number, other in enumerate(mark.others, 1):
         place = _placemark(document, _alternative_name(mark, number), _alternative_text(mark, other), "alternative")
-        _point(place, other.place, flat)
+        _point(place, other.place, dimension)
 
 
 def _kml_known(document: Element, mark: Mark, geometry: dict[str, Any], about: dict[str, Any]) -> None:
-    """Add the wedge, ray or curve of a fix that has no valid position."""
+    """Add the wedge, ray or curve of a fix that has no valid position.
+
+    `geometry` is a GeoJSON geometry, and `about` its properties from `known_features`.
+    """
     words = {
         "direction95": "direction, 95 %" + (", cut off" if about.get("cut") else ""),
         "ray": "most likely direction",
@@ -131,7 +143,10 @@ def _alternative_text(mark: Mark, other: Other) -> str:
 
 
 def _placemark(document: Element, name: str, about: str, style: str, mark: Mark | None = None) -> Element:
-    """Return a placemark without a geometry; the caller appends the geometry, which the schema requires last."""
+    """Return a new placemark without a geometry; the caller appends the geometry, which the schema requires last.
+
+    `about` is its description, and `style` a name in `_STYLES`. With `mark`, it also has time, status and covariance.
+    """
     placemark = _add(document, "Placemark")
     _add(placemark, "name", name)
     _add(placemark, "description", about)
@@ -148,22 +163,26 @@ def _placemark(document: Element, name: str, about: str, style: str, mark: Mark 
 
 
 def _height(geometry: Element, dimension: int) -> None:
+    """Add the altitude mode to a geometry: absolute heights for three coordinates, else points on the ground."""
     _add(geometry, "altitudeMode", "absolute" if dimension == 3 else "clampToGround")
 
 
 def _point(placemark: Element, place: Array, dimension: int) -> None:
+    """Add a point at longitude, latitude (degrees) and height (m) to a placemark; `dimension` is 2 or 3."""
     point = _add(placemark, "Point")
     _height(point, dimension)
     _add(point, "coordinates", _line([place]))
 
 
 def _line(places: Iterable[Array]) -> str:
+    """Return places (2,) or (3,) as KML coordinates "lon,lat,height", in degrees and m; a missing height is 0."""
     return " ".join(
         f"{_number(p[0], _DEGREES)},{_number(p[1], _DEGREES)},{_number(p[2] if len(p) > 2 else 0.0)}" for p in places
     )
 
 
 def _polygons(placemark: Element, area: Area) -> None:
+    """Add the polygons of a region to a placemark, with their holes."""
     several, coordinates = area.geometry["type"] == "MultiPolygon", area.geometry["coordinates"]
     parent = _add(placemark, "MultiGeometry") if several else placemark
     for rings in coordinates if several else [coordinates]:
@@ -186,15 +205,16 @@ def gpx(results: Results) -> str:
     A segment ends where the track is lost.
     """
     names = {"xmlns": "http://www.topografix.com/GPX/1/1", "xmlns:optloc": _OWN, "version": "1.1", "creator": "optloc"}
-    root, marks, flat = Element("gpx", names), results.marks(), len(results.axes)
+    root, marks, dimension = Element("gpx", names), results.marks(), len(results.axes)
     _add(_add(root, "metadata"), "name", results.title)
     for name, place in results.stations():
-        _gpx_point(root, "wpt", place, flat, name=name, type="station")
+        _gpx_point(root, "wpt", place, dimension, name=name, type="station")
     for mark in marks:
         if mark.known and not (results.course and mark.sure):
             label = mark.name if mark.sure else f"{mark.name}: {mark.status}"
             _add_extensions(
-                _gpx_point(root, "wpt", mark.place, flat, _time(mark), name=label, desc=mark.words, type="fix"), mark
+                _gpx_point(root, "wpt", mark.place, dimension, _time(mark), name=label, desc=mark.words, type="fix"),
+                mark,
             )
         for number, other in enumerate(mark.others, 1):
             texts = {
@@ -202,18 +222,19 @@ def gpx(results: Results) -> str:
                 "desc": _alternative_text(mark, other),
                 "type": "alternative",
             }
-            _gpx_point(root, "wpt", other.place, flat, _time(mark), **texts)
+            _gpx_point(root, "wpt", other.place, dimension, _time(mark), **texts)
     for target, parts in _courses(marks) if results.course else ():
         track = _add(root, "trk")
         _add(track, "name", target)
         for part in parts:
             segment = _add(track, "trkseg")
             for mark in part:
-                _add_extensions(_gpx_point(segment, "trkpt", mark.place, flat, _time(mark)), mark)
+                _add_extensions(_gpx_point(segment, "trkpt", mark.place, dimension, _time(mark)), mark)
     return _document(root)
 
 
 def _time(mark: Mark) -> str | None:
+    """Return the time of a mark as text; None if it has no date."""
     return None if mark.date is None else _iso(mark.date)
 
 
@@ -273,6 +294,11 @@ def event(mark: Mark) -> str:
 def _event(
     mark: Mark, name: str, place: Array, errors: tuple[float, float], atom: str, about: str, *, moves: bool = True
 ) -> str:
+    """Return one event of Cursor on Target as XML text on one line.
+
+    `place` (3,) is longitude, latitude (degrees) and height (m). `errors` are `ce` and `le`, m. `atom` is the type of
+    the event, and `about` a remark. With `moves`, course and speed of the mark are added.
+    """
     now = datetime.now(UTC)
     start = mark.date or now
     # m-f: made by a machine, fused from several sources.

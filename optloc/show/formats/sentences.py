@@ -54,7 +54,8 @@ def sentences(mark: Mark) -> str:
 def _angle(degrees: float, digits: int) -> str:
     """Return an angle in degrees as the NMEA number dddmm.mmmmmmm.
 
-    The angle is rounded before it is split into degrees and minutes, so that minutes stay below 60.
+    `digits` is the number of digits of the degrees. The angle is rounded before it is split into degrees and minutes,
+    so that minutes stay below 60.
     """
     units = round(abs(float(degrees)) * 60.0 * 10**_MINUTES)
     whole, rest = divmod(units, 60 * 10**_MINUTES)
@@ -63,7 +64,7 @@ def _angle(degrees: float, digits: int) -> str:
 
 
 def _sentence(name: str, *fields: str) -> str:
-    """Return a sentence with its checksum: the exclusive or of all characters between $ and *."""
+    """Return an NMEA sentence with its checksum: the exclusive or of all characters between $ and *."""
     text = f"{_TALKER}{name},{','.join(fields)}"
     return f"${text}*{reduce(lambda sum_, letter: sum_ ^ ord(letter), text, 0):02X}\r\n"
 
@@ -82,6 +83,10 @@ def ros(results: Results) -> str:
 
 
 def _pose(mark: Mark, frame: str) -> str:
+    """Return the YAML document of a mark; comment lines if its status is not `ok` or it has no valid covariance.
+
+    `frame` is the name of the frame in ROS. The orientation is the identity, with an unknown variance.
+    """
     if not (mark.sure and mark.covers):
         return _comment(mark)
     d = len(mark.position)
@@ -115,6 +120,7 @@ def _comment(mark: Mark) -> str:
 
 
 def _spelled(position: Array) -> str:
+    """Return the coordinates of a position as text, m."""
     return " ".join(f"{v:.6f}" for v in position)
 
 

@@ -90,7 +90,10 @@ def plot_status_map(found: StatusMap, title: str = "") -> Figure:
 
 
 def _draw(grid: Grid, values: Array, steps: list[float], norm: Normalize, name: str, title: str) -> Figure:
-    """Return a map of values (ny, nx) with isolines at `steps`."""
+    """Return a map of values (ny, nx) with isolines at the values `steps`.
+
+    `norm` converts values to colours, and `name` is the label of the colour scale.
+    """
     scale = 1.0 if grid.geodetic or max(np.ptp(grid.x), np.ptp(grid.y)) < _FAR else 1e-3
     x, y = grid.x * scale, grid.y * scale
     # A degree of longitude is shorter than a degree of latitude: use the ratio at the middle of the map for both axes.
@@ -119,7 +122,10 @@ def _draw(grid: Grid, values: Array, steps: list[float], norm: Normalize, name: 
 
 
 def _mark_stations(axes: Axes, stations: Array, names: Sequence[str], x: Array, y: Array) -> None:
-    """Draw the stations; if they are few, write their names."""
+    """Draw the stations; if they are few, write the names of the stations on the map.
+
+    `stations` (s, 2) and the grid lines `x` and `y` are in the unit of the axes.
+    """
     style: dict[str, Any] = {"marker": "^", "s": 50, "color": "white", "edgecolors": BLACK, "linewidths": 1.2}
     axes.scatter(stations[:, 0], stations[:, 1], zorder=4, **style)
     inside = (np.abs(stations - [x.mean(), y.mean()]) <= [np.ptp(x) / 2, np.ptp(y) / 2]).all(-1)
@@ -130,6 +136,11 @@ def _mark_stations(axes: Axes, stations: Array, names: Sequence[str], x: Array, 
 
 
 def _drawn(found: BoundMap, *, dilution: bool) -> tuple[Array, str]:
+    """Return the values (ny, nx) of a map and the label of its colour scale.
+
+    The values are the bound in m, or the dilution of precision, which has no unit. If there is nothing to draw, the
+    function raises InvalidProblem.
+    """
     values = found.dilution if dilution else found.sigma
     if dilution and not np.isfinite(found.row):
         advice = "draw the bound in metres"
@@ -141,7 +152,10 @@ def _drawn(found: BoundMap, *, dilution: bool) -> tuple[Array, str]:
 
 
 def levels(values: Array) -> list[float]:
-    """Return the levels of isolines, 1, 2, 5 times powers of ten, around the middle 98 % of the values."""
+    """Return the levels of isolines, 1, 2, 5 times powers of ten, around the middle 98 % of the values.
+
+    Few levels are refined, and of many levels only some remain.
+    """
     good = values[np.isfinite(values) & (values > 0.0)]
     # Near stations the bound approaches zero, and far away it approaches infinity: the outer 1 % at either end has no
     # isoline.
@@ -197,12 +211,14 @@ def map_geojson(found: BoundMap) -> dict[str, Any]:
 
 
 def _demand_earth(grid: Grid) -> None:
+    """Raise InvalidProblem if the grid of a map is not on Earth."""
     if not grid.geodetic:
         advice = 'give a [frame] of kind "geodetic", "ecef" or "enu"'
         raise InvalidProblem("GeoJSON needs positions on Earth, but the frame is cartesian", "map", advice)
 
 
 def _station_features(grid: Grid) -> list[dict[str, Any]]:
+    """Return the stations of a map as GeoJSON points."""
     return [
         feature(point_geometry(place, _DIGITS), {"role": "station", "name": name})
         for name, place in zip(grid.names, grid.stations, strict=True)

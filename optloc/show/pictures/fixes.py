@@ -1,4 +1,8 @@
-"""Pictures of fixes: stations, estimates, 95 % ellipses or regions, alternatives and lines of position."""
+"""Pictures of fixes: stations, estimates, 95 % ellipses or regions, alternatives and lines of position.
+
+A panel shows two axes of the scene, its view, in a unit of `size` metres. A line of position holds the positions that
+fit one row exactly; it is found as a zero line of the residual of the row on a grid.
+"""
 
 from __future__ import annotations
 
@@ -127,7 +131,10 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
 
 
 def _draw_overview(panel: Axes, scene: PictureScene, view: View) -> float:
-    """Draw stations, fixes, alternatives and tracks, and return the size of the unit of the axes, m."""
+    """Draw stations, fixes, alternatives and tracks, and return the size of the unit of the axes, m.
+
+    The size is 1 for metres and 1000 for kilometres.
+    """
     lines = (*scene.tracks, *scene.paths, *scene.other_paths, *scene.known)
     everything = np.concatenate([scene.stations, scene.fixes, scene.alternatives, *lines])
     unit, size = unit_of(everything[:, view])
@@ -143,7 +150,7 @@ def _draw_overview(panel: Axes, scene: PictureScene, view: View) -> float:
 
 
 def _draw_constraints(panel: Axes, scene: PictureScene, size: float) -> None:
-    """Draw the regions of constraints: polygons and boxes."""
+    """Draw the regions of constraints, polygons and boxes, in a plan with the unit `size`, m."""
     label: str | None = "region"
     for corners in scene.regions:
         ring = np.concatenate([corners, corners[:1]]) / size
@@ -166,7 +173,10 @@ def _draw_tracks(panel: Axes, scene: PictureScene, view: View, size: float) -> N
 
 
 def _draw_directions(panel: Axes, problem: Problem, fixes: Sequence[Fix], size: float) -> None:
-    """Draw the directions of a single fix without a valid position as wedges and rays up to the limits of the plan."""
+    """Draw the directions of a single fix without a valid position as wedges and rays up to the limits of the plan.
+
+    If the data determine a curve, the curve is drawn. Other fixes have no directions to draw.
+    """
     if len(fixes) != 1 or fixes[0].code.size != 1 or int(fixes[0].code.ravel()[0]) not in WITHOUT_PLACE:
         return
     from matplotlib.collections import Collection, LineCollection, PolyCollection
@@ -175,9 +185,9 @@ def _draw_directions(panel: Axes, problem: Problem, fixes: Sequence[Fix], size: 
     if found is None:
         return
     reach = size * _BEYOND * float(np.ptp((panel.get_xlim(), panel.get_ylim()), axis=1).max())
-    wedges = [_plan(problem, found.wedge(one, reach, whole=True)) / size for one in found.directions]
-    rays = [_plan(problem, found.ray(one, reach)) / size for one in found.directions]
-    curves = [] if found.curve is None else [_plan(problem, found.curve) / size]
+    wedges = [_horizontal(problem, found.wedge(one, reach, whole=True)) / size for one in found.directions]
+    rays = [_horizontal(problem, found.ray(one, reach)) / size for one in found.directions]
+    curves = [] if found.curve is None else [_horizontal(problem, found.curve) / size]
     drawn: list[Collection] = []
     if wedges:
         drawn.append(PolyCollection(wedges, color=SKY, alpha=0.35, label="95 % direction", zorder=0))
@@ -188,7 +198,7 @@ def _draw_directions(panel: Axes, problem: Problem, fixes: Sequence[Fix], size: 
         panel.add_collection(each, autolim=False)
 
 
-def _plan(problem: Problem, line: Array) -> Array:
+def _horizontal(problem: Problem, line: Array) -> Array:
     """Return the horizontal coordinates (n, 2), m, of a line (n, d) in the frame of the problem."""
     local = local_frame(problem)
     return np.asarray((line if local is None else local.from_ecef(line))[:, :2])
@@ -199,13 +209,16 @@ def _needs_surroundings(scene: PictureScene) -> bool:
     known = np.asarray(np.isfinite(scene.fixes).all(-1))
     if not known.any():
         return True
-    reach = _reach(scene, known, np.median(scene.fixes[known][:, :2], axis=0))
+    reach = _half_side(scene, known, np.median(scene.fixes[known][:, :2], axis=0))
     # Tracks count too: the extent of a single moving station is the extent of its track.
     return reach < _CLOSE * float(np.ptp(np.concatenate([scene.stations, *scene.tracks])[:, :2]))
 
 
 def _draw_surroundings(panel: Axes, scene: PictureScene) -> float:
-    """Draw the surroundings of the fixes with their ellipses, and return the size of the unit of the axes, m."""
+    """Draw the surroundings of the fixes with their ellipses, and return the size of the unit of the axes, m.
+
+    The origin of the panel is the median of the fixes. If there is no fix, the panel contains only a text.
+    """
     known: Array = np.asarray(np.isfinite(scene.fixes).all(-1))
     view = PLAN
     if not known.any():
@@ -214,9 +227,9 @@ def _draw_surroundings(panel: Axes, scene: PictureScene) -> float:
         return 1.0
     # Use medians, so that one outlier among many fixes does not move the panel.
     centre = np.median(scene.fixes[known][:, view], axis=0)
-    extent = _reach(scene, known, centre)
+    extent = _half_side(scene, known, centre)
     unit, size = unit_of(np.array([centre - extent, centre + extent]) - centre)
-    shifted = _shift(scene, centre)
+    shifted = _centred(scene, centre)
     _draw_constraints(panel, shifted, size)
     style.ellipses(panel, shifted, view, size)
     _draw_tracks(panel, shifted, view, size)
@@ -230,13 +243,19 @@ def _draw_surroundings(panel: Axes, scene: PictureScene) -> float:
     return size
 
 
-def _shift(scene: PictureScene, centre: Array) -> PictureScene:
+def _centred(scene: PictureScene, centre: Array) -> PictureScene:
+    """Return the scene with the origin of the plan at the point `centre` (2,), m."""
     shift = np.zeros(scene.stations.shape[-1])
     shift[:2] = centre
     return replace(scene.moved(lambda place: place - shift), regions=tuple(ring - centre for ring in scene.regions))
 
 
-def _reach(scene: PictureScene, known: Array, centre: Array) -> float:
+def _half_side(scene: PictureScene, known: Array, centre: Array) -> float:
+    """Return half the side of the panel around the fixes, m.
+
+    `known` (n,) marks the fixes with a position, and `centre` (2,) is the centre of the panel, m. The panel holds most
+    fixes and the largest ellipse or region.
+    """
     outlined = np.array([bool(regions) for regions in scene.outlines] or [False] * len(known))
     semi_axes, _ = error_ellipse(scene.covariances[known & ~outlined][:, :2, :2])
     largest = np.max(semi_axes[np.isfinite(semi_axes)], initial=0.0)
@@ -245,8 +264,8 @@ def _reach(scene: PictureScene, known: Array, centre: Array) -> float:
             # Only the part around the fix counts; other parts are other positions, which the overview shows.
             if (line.min(0) <= 0.0).all() and (line.max(0) >= 0.0).all():
                 largest = max(float(largest), float(np.abs(fix[:2] + line - centre).max()) / _SPREAD)
-    away = np.abs(scene.fixes[known][:, :2] - centre).max(-1)
-    reach = _SEMI_AXES * float(largest) + _SPREAD * float(np.quantile(away, 0.95))
+    distance = np.abs(scene.fixes[known][:, :2] - centre).max(-1)
+    reach = _SEMI_AXES * float(largest) + _SPREAD * float(np.quantile(distance, 0.95))
     return reach if reach > 0.0 else _HELD * float(np.ptp(scene.stations[:, :2]) or 1.0)
 
 
@@ -254,7 +273,12 @@ def _reach(scene: PictureScene, known: Array, centre: Array) -> float:
 
 
 class PositionLine(NamedTuple):
-    """The positions that fit one row exactly: a line (p, 2) in x and y, m. `kind` and `name` give kind and stations."""
+    """The positions that fit one row exactly.
+
+    - kind: kind of the row, or "isodoppler".
+    - name: names of the stations.
+    - line (p, 2): the positions in x and y, in the units of the grid.
+    """
 
     kind: str
     name: str
@@ -334,7 +358,11 @@ def _only_target(flat: Problem, answer: Fix) -> int | None:
 
 
 def _lines_of(problem: Problem, rows: Rows, target: int, residual: Array, x: Array, y: Array) -> list[PositionLine]:
-    """Return the zero lines of the residuals (n, m) on a grid, for the rows of one kind and one target."""
+    """Return the zero lines of residuals on a grid, for the rows of one kind and one target.
+
+    `residual` (points, m) are the residuals of the m rows at the points of the grid, x fastest. `x` and `y` are the
+    grid lines.
+    """
     from contourpy import contour_generator
 
     model, names = MODELS[rows.kind], problem.stations.names
@@ -389,7 +417,7 @@ def isodopplers(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -
     places = np.concatenate([places, answer.position.reshape(1, -1)])
     velocity = answer.velocity.reshape(-1) if flat.motions[target].order else np.zeros(flat.dimension)
     found = []
-    for rows, row in _spread(rates, target):
+    for rows, row in _chosen_rows(rates, target):
         value = _rate(flat, rows, row, places, velocity)
         excess = np.ma.masked_invalid((value[:-1] - value[-1]).reshape(len(y), len(x)))
         ends = " – ".join(flat.stations.names[k] for k in (rows.a[row], rows.b[row]) if k >= 0)
@@ -398,15 +426,21 @@ def isodopplers(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -
     return found
 
 
-def _spread(rates: Sequence[Rows], target: int) -> list[tuple[Rows, int]]:
-    """Return the rows of a target with positive weight; if they are many, evenly chosen rows."""
+def _chosen_rows(rates: Sequence[Rows], target: int) -> list[tuple[Rows, int]]:
+    """Return the rows of a target with positive weight as pairs of rows and number.
+
+    If there are more than `_CURVES` rows, only evenly chosen rows are returned.
+    """
     present = [(rows.weight.reshape(-1, rows.count)[0] > 0.0) & (rows.target == target) for rows in rates]
     every = [(rows, i) for rows, mask in zip(rates, present, strict=True) for i in np.flatnonzero(mask).tolist()]
     return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(_CURVES, len(every))).astype(int)).tolist()]
 
 
 def _rate(problem: Problem, rows: Rows, row: int, places: Array, velocity: Array) -> Array:
-    """Return the modelled value of a row for a target at positions (n, d), m, with `velocity`, m/s."""
+    """Return the modelled value (n,) of a row, m/s, for a target at positions (n, d), m, with `velocity` (d,), m/s.
+
+    `row` is the number of the row in `rows`.
+    """
 
     def at(array: Array | None, index: int) -> tuple[float, ...]:
         if array is None:
@@ -434,11 +468,15 @@ def _at_height(problem: Problem, fix: Fix, plan: Array) -> Array:
     if not frame.geodetic:
         return np.column_stack([plan, np.full(len(plan), fixed[0, 2])])
     height = float(problem.frame.to_geodetic(fixed)[2][0])
-    return placed_points(problem, np.column_stack([plan, _up(frame, plan, height)]))[0]
+    return placed_points(problem, np.column_stack([plan, _third_coordinate(frame, plan, height)]))[0]
 
 
-def _up(frame: Frame, plan: Array, height: float) -> Array:
-    """Return the third coordinate (n,), m, of points above a plan that have a given height above the ellipsoid."""
+def _third_coordinate(frame: Frame, plan: Array, height: float) -> Array:
+    """Return the third coordinate (n,), m, of points above a plan that have a given height above the ellipsoid.
+
+    `frame` has the axes east, north and up, and `plan` (n, 2) are the first two coordinates, m. A point beyond the
+    horizon gets NaN.
+    """
     across = np.linalg.norm(plan, axis=1)
     near = across < _STEEP
     centre = np.linalg.norm(frame.origin_ecef())

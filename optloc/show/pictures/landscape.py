@@ -1,4 +1,7 @@
-"""Pictures of the cost around a fix, and of the starts from which iterations reach the best fit."""
+"""Pictures of the cost around a fix, and of the starts from which iterations reach the best fit.
+
+A panel shows the plan of the scene in a unit of `size` metres.
+"""
 
 from __future__ import annotations
 
@@ -109,7 +112,10 @@ def single(problem: Problem, fix: Fix) -> tuple[Problem, Fix]:
 
 
 def limits(scene: PictureScene, widen: float = 0.25) -> Array:
-    """Return the square [[x0, y0], [x1, y1]], m, that holds stations, fix and alternatives with a margin."""
+    """Return the square [[x0, y0], [x1, y1]], m, that holds stations, fix and alternatives with a margin.
+
+    `widen` is the margin on each side as a share of the extent of these points.
+    """
     points = np.concatenate([scene.stations, scene.fixes, scene.alternatives])[:, :2]
     low, high = points.min(0), points.max(0)
     half = (0.5 + widen) * float((high - low).max() or 1.0)
@@ -145,6 +151,10 @@ def _excess(problem: Problem, fix: Fix, points: Array, fixed: int) -> Array:
 
 
 def _draw_overview(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
+    """Draw the cost over the whole scene with its isolines, stations, fix and alternatives.
+
+    In three dimensions, the cost is at the height of the fix.
+    """
     from matplotlib.colors import LogNorm
 
     corners = limits(scene)
@@ -158,13 +168,17 @@ def _draw_overview(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene)
     panel.contour(x / size, y / size, excess, levels=steps, colors="white", linewidths=0.7)
     style.stations(panel, scene, PLAN, size, edgecolors="white", linewidths=0.8)
     style.points(panel, scene, PLAN, size)
-    _square(panel, scene, corners / size, unit)
+    _set_plan_axes(panel, scene, corners / size, unit)
     panel.set_title("overview" if problem.dimension == 2 else "overview, at the height of the fix")
     bar = panel.figure.colorbar(drawn, ax=panel, label=_NAME, ticks=steps, format=lambda value, _: f"{value:g}")
     bar.ax.minorticks_off()
 
 
 def _draw_surroundings(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
+    """Draw the cost around the fix with its isolines, the 95 % line of the cost and the 95 % ellipse.
+
+    Without a covariance, the panel contains only a text.
+    """
     centre, spread = scene.fixes[0], np.sqrt(np.diagonal(scene.covariances[0])[:2])
     if not np.isfinite(spread).all():
         panel.set_axis_off()
@@ -185,11 +199,12 @@ def _draw_surroundings(panel: Axes, problem: Problem, fix: Fix, scene: PictureSc
     moved = scene.moved(lambda place: place - np.pad(centre[:2], (0, len(centre) - 2)))
     style.ellipses(panel, moved, PLAN, size, color=BLACK, linestyle="--", linewidth=1.4)
     panel.scatter(0.0, 0.0, marker="o", s=50, color=BLUE, edgecolors="white", zorder=4)
-    _square(panel, scene, corners, unit)
+    _set_plan_axes(panel, scene, corners, unit)
     panel.set_title(f"around {scene.axes[0]} {centre[0]:.1f} m, {scene.axes[1]} {centre[1]:.1f} m")
 
 
-def _square(panel: Axes, scene: PictureScene, corners: Array, unit: str) -> None:
+def _set_plan_axes(panel: Axes, scene: PictureScene, corners: Array, unit: str) -> None:
+    """Give a plan axes with names and units, equal scales, no grid, and the limits `corners` (2, 2) in its unit."""
     style.name_axes(panel, scene, PLAN, unit)
     panel.grid(visible=False)
     panel.set_aspect("equal", adjustable="box")
@@ -250,8 +265,8 @@ def plot_convergence(
     panels[2].set_title(f"optloc needs no start:\n{verdict(answer)}")
     draw_lines(panels[2], lines_of_position(flat, answer, x, y, places), np.zeros(2), size)
     for panel in panels:
-        _marks(panel, scene, size, corners / size, unit, last=panel is panels[2])
-    _legend(figure, panels[2])
+        _draw_marks(panel, scene, size, corners / size, unit, last=panel is panels[2])
+    _add_legend(figure, panels[2])
     finish(figure, f"{title}: from which starts is the best fit found?" if title else "")
     _draw_inset(panels[2], scene)
     separate_notes(figure)
@@ -290,13 +305,19 @@ def verdict(fix: Fix) -> str:
 
 
 def _draw_ends(panel: Axes, found: Basins, x: Array, y: Array) -> None:
+    """Colour each start by the result of its iteration; `x` and `y` are the grid lines in the unit of the axes."""
     from matplotlib.colors import ListedColormap
 
     colours = ListedColormap([_COLOURS[end] for end in End])
     panel.pcolormesh(x, y, found.ends, cmap=colours, vmin=-0.5, vmax=2.5, rasterized=True, shading="nearest")
 
 
-def _marks(panel: Axes, scene: PictureScene, size: float, corners: Array, unit: str, *, last: bool) -> None:
+def _draw_marks(panel: Axes, scene: PictureScene, size: float, corners: Array, unit: str, *, last: bool) -> None:
+    """Draw stations and the fix in a panel of starts, and set its axes and limits.
+
+    `corners` (2, 2) are the limits in the unit of the axes. The `last` panel also has the ellipse, the alternatives and
+    a grid.
+    """
     style.stations(panel, scene, PLAN, size, named=False, s=36, edgecolors="white", linewidths=0.8)
     if last:
         style.ellipses(panel, scene, PLAN, size)
@@ -312,7 +333,8 @@ def _marks(panel: Axes, scene: PictureScene, size: float, corners: Array, unit: 
     panel.label_outer()
 
 
-def _legend(figure: Figure, panel: Axes) -> None:
+def _add_legend(figure: Figure, panel: Axes) -> None:
+    """Add a legend below the panels: the colours of the results, and the labels of `panel`."""
     from matplotlib.patches import Patch
 
     patches = [Patch(facecolor=_COLOURS[end], label=f"a start here leads to {_ENDS[end]}") for end in End]

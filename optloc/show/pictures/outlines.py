@@ -1,7 +1,8 @@
 """Outlines of 95 % regions whose ellipse is not valid, in pictures and as GeoJSON on Earth.
 
 An ellipse is *valid* if it covers the true position with the stated probability. The region of a far fix is egg-shaped;
-other regions can be bananas or rings. GeoJSON lines are cut at the antimeridian and closed around the poles.
+other regions can be bananas or rings. GeoJSON lines are cut at the antimeridian and closed around the poles. A place is
+longitude, latitude (degrees) and, if known, height (m).
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ def feature(geometry: dict[str, Any], properties: dict[str, Any]) -> dict[str, A
 
 def point_geometry(place: Array, digits: int = _DIGITS) -> dict[str, Any]:
     """Return a GeoJSON point from longitude, latitude (degrees) and an optional height (m): (2,) or (3,)."""
-    return {"type": "Point", "coordinates": _rounded(_wrapped(place[None]), digits)[0]}
+    return {"type": "Point", "coordinates": _rounded(_wrap_longitudes(place[None]), digits)[0]}
 
 
 def line_geometry(lines: Sequence[Array], digits: int = _DIGITS) -> dict[str, Any]:
@@ -111,7 +112,7 @@ def line_geometry(lines: Sequence[Array], digits: int = _DIGITS) -> dict[str, An
 
     Each line is (n, 2) or (n, 3): longitude, latitude (degrees) and an optional height (m).
     """
-    parts = [_rounded(part, digits) for line in lines for part in _parts(_wrapped(line))]
+    parts = [_rounded(part, digits) for line in lines for part in _parts_between_crossings(_wrap_longitudes(line))]
     return {"type": "MultiLineString", "coordinates": [part for part in parts if len(part) > 1]}
 
 
@@ -127,7 +128,7 @@ def polygon_geometry(polygons: Sequence[Sequence[Array]], digits: int = _DIGITS)
     digits : int
         Decimals of a degree.
     """
-    found = [piece for polygon in polygons for piece in _cut([_wrapped(line) for line in polygon])]
+    found = [piece for polygon in polygons for piece in _cut_polygon([_wrap_longitudes(line) for line in polygon])]
     rounded = [[ring for line in piece if len(ring := _rounded(line, digits)) > 3] for piece in found]
     kept = [piece for piece in rounded if piece]
     if len(kept) == 1:
@@ -154,22 +155,25 @@ def earth_points(frame: Frame, position: Array) -> Array:
     return np.stack([np.degrees(lon), np.degrees(lat), height], axis=-1)
 
 
-def _wrapped(place: Array) -> Array:
-    """Return points with longitudes within ±180 degrees."""
+def _wrap_longitudes(place: Array) -> Array:
+    """Return places (n, 2) or (n, 3) with longitudes within ±180 degrees."""
     out = np.array(place, dtype=float)
     out[:, 0] = np.clip((out[:, 0] + 180.0) % 360.0 - 180.0, -180.0 + _INSIDE, 180.0 - _INSIDE)
     return out
 
 
 def _rounded(line: Array, digits: int) -> list[list[float]]:
-    """Return a line as lists of rounded numbers, without repeated points."""
+    """Return a line of places as lists of rounded numbers, without repeated points.
+
+    `digits` are the decimals of the degrees; heights have three decimals.
+    """
     out = np.round(line, digits)
     out[:, 2:] = np.round(line[:, 2:], _MILLIMETRES)
     kept = np.append(True, (np.diff(out[:, :2], axis=0) != 0.0).any(-1))
     return out[kept].tolist()  # type: ignore[no-any-return]
 
 
-def _parts(line: Array) -> list[Array]:
+def _parts_between_crossings(line: Array) -> list[Array]:
     """Return the parts of a line between its crossings of the antimeridian; each cut adds a point on either side."""
     parts, part = [], [line[0]]
     for one, two in pairwise(line):
@@ -186,7 +190,7 @@ def _parts(line: Array) -> list[Array]:
     return [*parts, np.stack(part)]
 
 
-def _cut(rings: Sequence[Array]) -> list[list[Array]]:
+def _cut_polygon(rings: Sequence[Array]) -> list[list[Array]]:
     """Return a polygon as polygons within the map: the parts of its lines are joined along the edge of the map.
 
     The interior is on the left of every line. From the end of a part, the outline continues along the edge,
@@ -196,22 +200,26 @@ def _cut(rings: Sequence[Array]) -> list[list[Array]]:
     parts: list[Array] = []
     for ring in rings:
         closed = ring if (ring[0] == ring[-1]).all() else np.concatenate([ring, ring[:1]])
-        found = _parts(closed)
+        found = _parts_between_crossings(closed)
         if len(found) == 1:
             whole.append(closed)
         else:  # The start of the ring is no cut: join the last and the first part.
             parts += [np.concatenate([found[-1], found[0][1:]]), *found[1:-1]]
     if not parts:
         return [whole]
-    outers = [[line] for line in _joined(parts)]
+    outers = [[line] for line in _join_along_edge(parts)]
     for hole in whole:
         next((piece for piece in outers if holds(piece[0][:, :2], hole[0])), outers[0]).append(hole)
     return outers
 
 
-def _joined(parts: list[Array]) -> list[Array]:
-    """Return closed lines from parts that begin and end on the edge of the map, joined along the edge."""
-    begins = [_along(part[0]) for part in parts]
+def _join_along_edge(parts: list[Array]) -> list[Array]:
+    """Return closed lines from parts that begin and end on the edge of the map, joined along the edge.
+
+    From the end of a part, the next start along the edge, counter-clockwise, continues the line. Corners of the map
+    between them become points of the line.
+    """
+    begins = [_distance_along_edge(part[0]) for part in parts]
     unused, found = set(range(len(parts))), []
     while unused:
         first = here = min(unused)
@@ -219,7 +227,7 @@ def _joined(parts: list[Array]) -> list[Array]:
         while here != first or not line:
             unused.discard(here)
             line.append(parts[here])
-            end = _along(parts[here][-1])
+            end = _distance_along_edge(parts[here][-1])
             here = min({*unused, first}, key=lambda i: (begins[i] - end) % _AROUND)
             way = (begins[here] - end) % _AROUND
             for corner, place in sorted(_EDGES.items(), key=lambda each: (each[0] - end) % _AROUND):
@@ -229,6 +237,6 @@ def _joined(parts: list[Array]) -> list[Array]:
     return found
 
 
-def _along(place: Array) -> float:
+def _distance_along_edge(place: Array) -> float:
     """Return the distance along the edge of the map, degrees, of a point on its left or right side."""
     return float(90.0 + place[1] if place[0] > 0.0 else 630.0 - place[1])

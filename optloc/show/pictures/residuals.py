@@ -82,14 +82,18 @@ def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
     sigma = np.broadcast_to(np.sqrt(variances(with_station_noise(part, vectors).noise, part.count)), residual.shape)
     weight = np.broadcast_to(part.weight, residual.shape)
     sets = [
-        _sets(part, rows, rows.sense * residual[:, cols], sigma[:, cols], weight[:, cols])
+        _residuals_by_station(part, rows, rows.sense * residual[:, cols], sigma[:, cols], weight[:, cols])
         for rows, start in zip(part.rows, part.starts, strict=True)
         for cols in [slice(start, start + rows.count)]
     ]
     return _draw([rows.kind for rows in part.rows], sets, title)
 
 
-def _sets(problem: Problem, rows: Rows, residual: Array, sigma: Array, weight: Array) -> Sets:
+def _residuals_by_station(problem: Problem, rows: Rows, residual: Array, sigma: Array, weight: Array) -> Sets:
+    """Return the residuals of one kind of rows by station or pair, for the stations with the largest residuals.
+
+    `residual`, `sigma` and `weight` (N, m) belong to the m rows of N problems. Rows of weight zero are absent.
+    """
     names = problem.stations.names
     labels = [_label(names, a, b) for a, b in zip(rows.a, rows.b, strict=True)]
     found: Sets = {}
@@ -104,10 +108,12 @@ def _sets(problem: Problem, rows: Rows, residual: Array, sigma: Array, weight: A
 
 
 def _label(names: Sequence[str], a: int, b: int) -> str:
+    """Return the names of the stations of a row, or "all" for a row without stations; -1 means no station."""
     return " – ".join(names[i] for i in (a, b) if i >= 0) or "all"
 
 
 def _draw(kinds: Sequence[str], sets: Sequence[Sets], title: str) -> Figure:
+    """Return a figure with one panel of residuals for each kind, and a common legend."""
     figure, panels = _rows_of_panels([len(one) for one in sets], 7.6, 0.3)
     for panel, kind, one in zip(panels, kinds, sets, strict=True):
         _panel(panel, kind, one)
@@ -126,6 +132,10 @@ def _rows_of_panels(counts: Sequence[int], width: float, line: float) -> tuple[F
 
 
 def _panel(panel: Axes, kind: str, sets: Sets) -> None:
+    """Draw the residuals of one kind, one line for each station or pair.
+
+    Few residuals are single points. Many residuals are a box of the middle half with a line of 95 %.
+    """
     unit = SI_UNIT[MODELS[kind].quantity]  # type: ignore[index]  # the table holds known quantities only
     # Use milliradians: residuals in radians have too many zeros.
     factor, unit = (1e3, f"m{unit}") if unit == "rad" else (1.0, unit)
@@ -165,6 +175,7 @@ def _panel(panel: Axes, kind: str, sets: Sets) -> None:
 
 
 def _label_of_first(place: int, label: str) -> str:
+    """Return the label for line number 0, else an empty text, so that the legend lists each label once."""
     return "" if place else label
 
 
@@ -192,21 +203,25 @@ def plot_health(health: Health, *, title: str = "") -> Figure:
         The picture; write it with `optloc.show.pictures.save`.
     """
     units = list(dict.fromkeys(health.units))
-    chosen = [_choose(health, unit) for unit in units]
+    chosen = [_groups_to_draw(health, unit) for unit in units]
     figure, panels = _rows_of_panels([len(groups) for groups in chosen], 8.0, 0.27)
     for panel, unit, groups in zip(panels, units, chosen, strict=True):
         _health_panel(panel, health, unit, groups)
     return finish(figure, title, panels[:1], 4, fontsize=8)
 
 
-def _choose(health: Health, unit: str) -> Array:
+def _groups_to_draw(health: Health, unit: str) -> Array:
     """Return the groups of a unit to draw: those with the most fixes, sorted by bias."""
-    groups = np.flatnonzero(np.array(health.units) == unit)
-    groups = groups[np.argsort(-health.count[groups], kind="stable")[:_SHOWN]]
-    return groups[np.argsort(np.nan_to_num(health.bias[groups]), kind="stable")]
+    numbers = np.flatnonzero(np.array(health.units) == unit)
+    numbers = numbers[np.argsort(-health.count[numbers], kind="stable")[:_SHOWN]]
+    return numbers[np.argsort(np.nan_to_num(health.bias[numbers]), kind="stable")]
 
 
 def _health_panel(panel: Axes, health: Health, unit: str, groups: Array) -> None:
+    """Draw the left-out residuals of some groups of a unit, with their biases and their shares of outliers.
+
+    `groups` are the numbers of the groups in `health`, from the bottom of the panel to its top.
+    """
     place = np.arange(len(groups))
     quantiles = np.array([np.percentile(_well_checked(health, g), (*_WHISKERS, *_MIDDLE, 50.0)) for g in groups]).T
     factor, shown = (1e3, f"m{unit}") if unit == "rad" else (1.0, unit)
@@ -219,7 +234,7 @@ def _health_panel(panel: Axes, health: Health, unit: str, groups: Array) -> None
     style: dict[str, Any] = {"fmt": "D", "color": ORANGE, "markersize": 4, "capsize": 3, "zorder": 4}
     error = 2.0 * factor * health.bias_error[groups]
     panel.errorbar(factor * health.bias[groups], place, xerr=error, label="bias ± 2 standard errors", **style)
-    _limit(panel, np.abs([low, high]).max(0), factor * health.bias[groups], shown)
+    _set_limits(panel, np.abs([low, high]).max(0), factor * health.bias[groups], shown)
     panel.axvline(0.0, color=BLACK, linewidth=0.8, zorder=0)
     panel.set_yticks(place, [literal(health.names[g]) for g in groups])
     label = "measured minus predicted from other stations"
@@ -240,8 +255,11 @@ def _well_checked(health: Health, group: int) -> Array:
     return np.asarray(health.residual[mask][sigma <= _VAGUE * np.median(sigma)])
 
 
-def _limit(panel: Axes, whisker: Array, bias: Array, unit: str) -> None:
-    """Set the limits so that boxes differ visibly; if a bias is far beyond the limits, write its value at the edge."""
+def _set_limits(panel: Axes, whisker: Array, bias: Array, unit: str) -> None:
+    """Set the limits so that boxes differ visibly; if a bias is far beyond the limits, write its value at the edge.
+
+    `whisker` and `bias` have one number for each line of the panel, in its unit.
+    """
     # Use the 80 % quantile of the whiskers: a fifth of the stations can be worse, and the other boxes stay large.
     most = np.quantile(whisker, 0.8)
     bias = np.nan_to_num(bias)

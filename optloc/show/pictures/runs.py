@@ -139,6 +139,11 @@ def plot_course(
 
 
 def _course_panel(panel: Axes, course: Course, known: Course | None, slot: Slot) -> None:
+    """Draw the bound of one family of unknowns against time.
+
+    A state of a target has a curve for each axis and for all axes together. A large family of biases has one curve, the
+    root mean square.
+    """
     word, unit = _WORDS.get(slot.name.partition("[")[0], (slot.name, slot.unit))
     sigma, entries = course.sigma(slot.name), slot.entries
     if slot.members and slot.size > _MANY:
@@ -201,6 +206,10 @@ def plot_biases(
 
 
 def _bias_panel(panel: Axes, found: GrowingRun, slot: Slot, truth: Array | None) -> None:
+    """Draw the estimates of one family against time with their 95 % intervals.
+
+    If `truth` is given, the true values are drawn as dotted lines.
+    """
     values, sigma = found.take(slot.name)
     for i, entry in enumerate(slot.entries[:_MOST]):
         colour, band = _BIAS_COLOURS[i % len(_BIAS_COLOURS)], _95 * sigma[:, i]
@@ -211,7 +220,7 @@ def _bias_panel(panel: Axes, found: GrowingRun, slot: Slot, truth: Array | None)
         )
         if truth is not None:
             panel.axhline(np.ravel(truth)[i], color=BLACK, linewidth=1.0, linestyle=":", zorder=2)
-    _window(panel, values[:, :_MOST], sigma[:, :_MOST])
+    _limit_to_estimates(panel, values[:, :_MOST], sigma[:, :_MOST])
     hidden = len(slot.entries) - _MOST
     panel.set_title(literal(slot.name) + (f" (first {_MOST} of {len(slot.entries)})" if hidden > 0 else ""))
     panel.set_xlabel("time (s)")
@@ -220,10 +229,11 @@ def _bias_panel(panel: Axes, found: GrowingRun, slot: Slot, truth: Array | None)
     grid(panel)
 
 
-def _window(panel: Axes, values: Array, sigma: Array) -> None:
+def _limit_to_estimates(panel: Axes, values: Array, sigma: Array) -> None:
     """Limit the vertical axis to the last estimates plus and minus a margin.
 
-    The margin is `_RIM` times the largest standard deviation half way through the run.
+    `values` and `sigma` (k, p) are p estimates after each of k epochs. The margin is `_RIM` times the largest standard
+    deviation half way through the run.
     """
     known = np.flatnonzero(np.isfinite(values).all(-1))
     if not len(known):

@@ -1,6 +1,7 @@
 """Common parts of all pictures: colours, units of axes, labels without overlap, the scene of a fix, and image files.
 
-An ellipse is *valid* if it covers the true position with the stated probability.
+An ellipse is *valid* if it covers the true position with the stated probability. A plan is drawn in a unit of `size`
+metres: coordinates in metres are divided by `size`.
 """
 
 from __future__ import annotations
@@ -88,7 +89,10 @@ _LETTER, _HANDLE = 0.07, 6
 
 
 def finish(figure: Figure, title: str, panels: Sequence[Axes] = (), ncols: int = 5, **style: Any) -> Figure:
-    """Return the figure after adding its title and a legend below the panels, with each label of `panels` once."""
+    """Return the figure after adding its title and a legend below the panels, with each label of `panels` once.
+
+    The legend has at most `ncols` columns, or fewer if they do not fit. `style` holds further options of the legend.
+    """
     shown: dict[str, Any] = {}
     for panel in panels:
         handles, labels = panel.get_legend_handles_labels()
@@ -157,7 +161,7 @@ def scale_bar(panel: Axes, unit: str) -> None:
     most = _BAR * (east - west)
     power = 10.0 ** np.floor(np.log10(most))
     length = power * next(n for n in (5.0, 2.0, 1.0) if n * power <= most)
-    marks = panel.transData.inverted().transform(_marks(panel))
+    marks = panel.transData.inverted().transform(_mark_positions(panel))
     share = (marks - [west, south]) / [east - west, north - south]
     counts = {
         name: int(((np.abs(share[:, 0] - x) < 1.3 * _CORNER) & (share[:, 1] < _CORNER)).sum())
@@ -188,14 +192,14 @@ def separate_notes(figure: Figure) -> None:
         if not notes:
             continue
         spots = panel.transData.transform(np.array([note.xy for note in notes]))
-        taken = [_box(x - _MARK, y - _MARK, x + _MARK, y + _MARK) for x, y in _marks(panel)]
+        taken = [_box(x - _MARK, y - _MARK, x + _MARK, y + _MARK) for x, y in _mark_positions(panel)]
         taken += [text.get_window_extent() for text in panel.texts if text not in notes and text.get_visible()]
         for note, (x, y) in zip(notes, spots, strict=True):
             # A note may touch the box of its mark, because it is drawn next to the mark.
-            taken.append(_settle(note, panel, [box for box in taken if not box.contains(x, y)]))
+            taken.append(_move_to_free_place(note, panel, [box for box in taken if not box.contains(x, y)]))
 
 
-def _marks(panel: Axes) -> Array:
+def _mark_positions(panel: Axes) -> Array:
     """Return the positions (n, 2) of the marks of a panel on the canvas, pixels."""
     from matplotlib.collections import PathCollection
 
@@ -205,29 +209,36 @@ def _marks(panel: Axes) -> Array:
 
 
 def _movable(note: Annotation) -> bool:
+    """Return whether a note is visible and placed relative to its point."""
     return note.anncoords == "offset points" and note.get_visible()
 
 
 def _box(*corners: float) -> Any:
+    """Return a box of matplotlib from x0, y0, x1, y1, pixels."""
     from matplotlib.transforms import Bbox
 
     return Bbox.from_extents(*corners)
 
 
-def _settle(note: Annotation, panel: Axes, taken: list[Any]) -> Any:
-    """Move a note to its first free position, and return its box there."""
+def _move_to_free_place(note: Annotation, panel: Axes, taken: list[Any]) -> Any:
+    """Move a note to its first free position, and return its box there.
+
+    A position is free if it is inside the panel and does not overlap the boxes `taken`. If no position is free, the
+    note takes the first position.
+    """
     inside = panel.get_window_extent()
     for place in _PLACES:
-        _put(note, place)
+        _place_note(note, place)
         box = note.get_window_extent()
         fits = inside.x0 <= box.x0 and box.x1 <= inside.x1 and inside.y0 <= box.y0 and box.y1 <= inside.y1
         if fits and not any(box.overlaps(other) for other in taken):
             return box
-    _put(note, _PLACES[0])
+    _place_note(note, _PLACES[0])
     return note.get_window_extent()
 
 
-def _put(note: Annotation, place: tuple[int, int]) -> None:
+def _place_note(note: Annotation, place: tuple[int, int]) -> None:
+    """Move a note to an offset from its point, in points of 1/72 inch, and align its text away from the point."""
     note.set_position(place)
     note.set_horizontalalignment(_ASIDE[int(np.sign(place[0]))])
     note.set_verticalalignment(_ABOVE[int(np.sign(place[1]))])
@@ -333,11 +344,15 @@ def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) 
         outlines=outlines,
         local=is_local(fixes, [bool(each) for each in outlines], len(position)),
     )
-    return _local(problem, scene) if problem.frame.kind == "ecef" else scene
+    return _along_local_axes(problem, scene) if problem.frame.kind == "ecef" else scene
 
 
 def _outlines(problem: Problem, fixes: Sequence[Fix], count: int) -> tuple[dict[View, Outline], ...]:
-    """Return the 95 % regions of fixes in the plan and, in three dimensions, in the view of the height."""
+    """Return the 95 % regions of fixes without a valid ellipse, by view: the plan and, in three dimensions, the height.
+
+    Each fix has one dict, which is empty if its ellipse is valid. Without any dict, the regions are unknown
+    (see `regions_of`); `count` is as there.
+    """
     views = (PLAN, HEIGHT) if problem.dimension == 3 else (PLAN,)
     local = local_frame(problem)
     axes = np.eye(problem.dimension) if local is None else local.rotation_to_ecef().T
@@ -404,7 +419,7 @@ def placed_points(problem: Problem, points: Array) -> tuple[Array, Array]:
     return local.to_ecef(points), local.rotation_to_ecef().T
 
 
-def _local(problem: Problem, scene: PictureScene) -> PictureScene:
+def _along_local_axes(problem: Problem, scene: PictureScene) -> PictureScene:
     """Return a scene in ECEF along east, north and up at the centre of the stations."""
     local = local_frame(problem)
     assert local is not None
@@ -428,7 +443,7 @@ def thinned(track: Array) -> Array:
 
 
 def _paths(problem: Problem, fixes: Sequence[Fix]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Return the paths (k, d), m, of the moving targets of a run: first of the fix, then of its alternatives."""
+    """Return the paths (k, d), m, of the moving targets of a run: first of its only fix, then of the alternatives."""
     if len(fixes) != 1 or fixes[0].shape or problem.epochs == 1:
         return (), ()
     others = fixes[0].alternatives
@@ -444,6 +459,7 @@ def _paths(problem: Problem, fixes: Sequence[Fix]) -> tuple[tuple[Array, ...], t
 
 
 def _path(problem: Problem, fix: Fix, target: int, x: Array) -> Array:
+    """Return the path (k, d), m, of a moving target at the epochs of a run, from the parameter vector `x` (size,)."""
     motion = problem.motions[target]
     states = [fix.layout.take(x, name) for name in state_names(target, len(problem.motions), motion.order)]
     if motion.span == "epoch":
@@ -491,6 +507,7 @@ def states_of(fix: Fix) -> list[tuple[Array, Array, Array]]:
 
 
 def _alternatives(fixes: Sequence[Fix], d: int) -> tuple[Array, Array]:
+    """Return the positions (q, d), m, and the cost gaps (q,) of the alternatives of all fixes."""
     points, gaps = [], []
     for fix in fixes:
         flat = fix if len(fix.shape) == 1 else fix.flat()
@@ -506,7 +523,7 @@ def _alternatives(fixes: Sequence[Fix], d: int) -> tuple[Array, Array]:
 
 
 def xy(points: Array, view: View, size: float) -> tuple[Array, Array]:
-    """Return the two coordinates of points (n, d), m, that a panel shows, in the unit of the panel."""
+    """Return the two coordinates of points (n, d), m, that a panel shows, in the unit of the panel (`size` metres)."""
     return points[:, view[0]] / size, points[:, view[1]] / size
 
 
@@ -521,7 +538,7 @@ def stations(panel: Axes, scene: PictureScene, view: View, size: float, *, named
 
 
 def note(panel: Axes, text: str, x: float, y: float, colour: str = BLACK) -> None:
-    """Write a note next to a point, readable over lines and colours."""
+    """Write a note next to the point x, y, in the unit of the axes, readable over lines and colours."""
     from matplotlib.patheffects import withStroke
 
     style: dict[str, Any] = {"fontsize": 8, "color": colour, "zorder": 6, "annotation_clip": True}
@@ -574,7 +591,7 @@ def ellipse_line(covariance: Array) -> Array:
 
 
 def name_axes(panel: Axes, scene: PictureScene, view: View, unit: str) -> None:
-    """Give both axes of a plan the same scale, names and units."""
+    """Give both axes of a plan the same scale, and write their names and their unit; `view` selects the axes."""
     panel.margins(0.12)
     # With different scales, an ellipse would have a wrong shape.
     panel.set_aspect("equal", adjustable="datalim")

@@ -66,7 +66,14 @@ class PlottedTrack:
 class _Line:
     """A track as arrays over its k scans, along the axes of the picture.
 
-    `starts` marks the scans at which the track started or restarted; `bad` marks the scans whose status is not ok.
+    - name: name of the target.
+    - times (k,): times, s.
+    - position (k, d), cov (k, d, d): estimates, m, and their covariances, m^2.
+    - sigma (k,): root of the trace of the covariance, m.
+    - nis (k,): normalised innovation squared.
+    - count (k,): number of rows in the scan.
+    - starts (k,): True for scans at which the track started or restarted.
+    - bad (k,): True for scans whose status is not ok.
     """
 
     name: str
@@ -96,27 +103,27 @@ def plot_tracks(drawn: Sequence[PlottedTrack], title: str = "") -> Figure:
     matplotlib.figure.Figure
         The picture; write it with `optloc.show.pictures.save`.
     """
-    lines, stations, axes = _along(drawn)
+    lines, stations, axes = _along_picture_axes(drawn)
     names = ["height", "sigma", "nis"][3 - stations.shape[-1] :]
     figure = figure_class()(figsize=(12.5, 2.4 + 2.2 * len(names)), layout="constrained")
     panels = figure.subplot_mosaic([["plan", name] for name in names])
-    _plan(panels["plan"], lines, stations, axes)
+    _draw_plan(panels["plan"], lines, stations, axes)
     if "height" in panels:
-        _heights(panels["height"], lines, axes[2])
-    _sigmas(panels["sigma"], lines)
-    _innovations(panels["nis"], lines)
+        _draw_heights(panels["height"], lines, axes[2])
+    _draw_sigmas(panels["sigma"], lines)
+    _draw_innovations(panels["nis"], lines)
     for name in names:
         panels[name].grid(color=GREY, alpha=0.35, linewidth=0.6)
         panels[name].sharex(panels[names[-1]]) if name != names[-1] else panels[name].set_xlabel("time (s)")
     return finish(figure, title, [panels["plan"]], 6)
 
 
-def _along(drawn: Sequence[PlottedTrack]) -> tuple[list[_Line], Array, tuple[str, ...]]:
+def _along_picture_axes(drawn: Sequence[PlottedTrack]) -> tuple[list[_Line], Array, tuple[str, ...]]:
     """Return tracks and stations (s, d) of the first scan along the axes of the picture, and the names of the axes."""
     first = drawn[0].problem
     d = first.dimension
     stations = first.stations.position.reshape(-1, first.stations.count, d)[0]
-    lines = [_line(each, d) for each in drawn]
+    lines = [_track_arrays(each, d) for each in drawn]
     axes = ("east", "north", "up") if first.frame.geodetic else ("x", "y", "z")
     if first.frame.kind != "ecef":
         return lines, stations, axes[:d]
@@ -129,7 +136,8 @@ def _along(drawn: Sequence[PlottedTrack]) -> tuple[list[_Line], Array, tuple[str
     return moved, local.from_ecef(stations), axes
 
 
-def _line(drawn: PlottedTrack, d: int) -> _Line:
+def _track_arrays(drawn: PlottedTrack, d: int) -> _Line:
+    """Return a track as arrays in the frame of its problem; `d` is the number of coordinates."""
     entries = drawn.entries
     cov = np.stack([e.updated.cov[:d, :d] for e in entries])
     return _Line(
@@ -145,20 +153,22 @@ def _line(drawn: PlottedTrack, d: int) -> _Line:
     )
 
 
-def _colour(lines: Sequence[_Line]) -> list[tuple[_Line, str]]:
+def _with_colours(lines: Sequence[_Line]) -> list[tuple[_Line, str]]:
+    """Return each track with its colour; colours repeat after five tracks."""
     return [(line, _CYCLE[i % len(_CYCLE)]) for i, line in enumerate(lines)]
 
 
-def _plan(panel: Axes, lines: Sequence[_Line], stations: Array, axes: Sequence[str]) -> None:
+def _draw_plan(panel: Axes, lines: Sequence[_Line], stations: Array, axes: Sequence[str]) -> None:
+    """Draw the plan: stations near the tracks, tracks with their starts and their bad scans, and ellipses."""
     position = np.concatenate([line.position for line in lines])[:, :2]
     known = position[np.isfinite(position).all(-1)]
-    spots = stations[_near(stations[:, :2], known), :2]
+    spots = stations[_is_near(stations[:, :2], known), :2]
     unit, size = unit_of(np.concatenate([spots, known]))
     if len(spots):
         panel.scatter(
             spots[:, 0] / size, spots[:, 1] / size, marker="^", s=50, color=BLACK, label="station, first scan", zorder=3
         )
-    for i, (line, colour) in enumerate(_colour(lines)):
+    for i, (line, colour) in enumerate(_with_colours(lines)):
         path = line.position[:, :2] / size
         panel.plot(
             *path.T, color=colour, linewidth=1.5, zorder=4, label=literal(line.name) if len(lines) > 1 else "track"
@@ -169,7 +179,7 @@ def _plan(panel: Axes, lines: Sequence[_Line], stations: Array, axes: Sequence[s
             panel.scatter(
                 path[line.bad, 0], path[line.bad, 1], marker="x", s=22, color=ORANGE, zorder=5, label="status not ok"
             )
-        _ellipses(panel, line, size, None if i else "95 % ellipse")
+        _draw_ellipses(panel, line, size, None if i else "95 % ellipse")
     panel.set_aspect("equal", adjustable="datalim")
     panel.set_xlabel(f"{axes[0]} ({unit})")
     panel.set_ylabel(f"{axes[1]} ({unit})")
@@ -177,15 +187,16 @@ def _plan(panel: Axes, lines: Sequence[_Line], stations: Array, axes: Sequence[s
     panel.grid(color=GREY, alpha=0.35, linewidth=0.6)
 
 
-def _near(stations: Array, known: Array) -> Array:
-    """Return whether each station (s,) is near enough to positions (n, 2) to be in the picture."""
+def _is_near(stations: Array, known: Array) -> Array:
+    """Return a mask (s,) of the stations near enough to positions (n, 2), m, to be in the picture."""
     if not len(known):
         return np.ones(len(stations), dtype=bool)
     centre, extent = known.mean(0), max(float(np.ptp(known, axis=0).max()), 1.0)
     return np.asarray(np.linalg.norm(stations - centre, axis=-1) < _OUT * extent)
 
 
-def _ellipses(panel: Axes, line: _Line, size: float, label: str | None) -> None:
+def _draw_ellipses(panel: Axes, line: _Line, size: float, label: str | None) -> None:
+    """Draw the 95 % ellipses of some scans of a track in a plan with the unit `size`, m."""
     known = np.flatnonzero(np.isfinite(line.cov).all((-1, -2)))
     for i in known[:: max(1, len(known) // _ELLIPSES)]:
         edge = (line.position[i, :2] + ellipse_line(line.cov[i, :2, :2])) / size
@@ -193,8 +204,9 @@ def _ellipses(panel: Axes, line: _Line, size: float, label: str | None) -> None:
         label = None
 
 
-def _heights(panel: Axes, lines: Sequence[_Line], name: str) -> None:
-    for line, colour in _colour(lines):
+def _draw_heights(panel: Axes, lines: Sequence[_Line], name: str) -> None:
+    """Draw the height of each track against time with its 95 % interval; `name` is the name of the third axis."""
+    for line, colour in _with_colours(lines):
         sigma = np.sqrt(line.cov[:, 2, 2])
         panel.plot(line.times, line.position[:, 2], color=colour, linewidth=1.2)
         band = (line.position[:, 2] - _95 * sigma, line.position[:, 2] + _95 * sigma)
@@ -203,32 +215,33 @@ def _heights(panel: Axes, lines: Sequence[_Line], name: str) -> None:
     panel.set_title("height, with 95 % interval")
 
 
-def _sigmas(panel: Axes, lines: Sequence[_Line]) -> None:
-    for line, colour in _colour(lines):
+def _draw_sigmas(panel: Axes, lines: Sequence[_Line]) -> None:
+    """Draw the standard deviation of the position of each track, all axes together, against time."""
+    for line, colour in _with_colours(lines):
         panel.plot(line.times, line.sigma, color=colour, linewidth=1.2)
-    _decades(panel, np.concatenate([line.sigma for line in lines]))
+    _use_log_axis(panel, np.concatenate([line.sigma for line in lines]))
     panel.set_ylabel("sigma (m)")
     panel.set_title("standard deviation of the position, all axes together")
 
 
-def _innovations(panel: Axes, lines: Sequence[_Line]) -> None:
+def _draw_innovations(panel: Axes, lines: Sequence[_Line]) -> None:
     """Draw the NIS, and the 99.9 % quantile of chi-square for the number of rows of each scan."""
     from scipy.special import gammaincinv
 
     # The NIS of m rows is chi-square with m degrees of freedom, so the line depends on the number of rows of each scan.
-    for i, (line, colour) in enumerate(_colour(lines)):
+    for i, (line, colour) in enumerate(_with_colours(lines)):
         tested = np.isfinite(line.nis) & (line.count > 0)
         panel.plot(line.times[tested], line.nis[tested], color=colour, linestyle="", marker=".", markersize=4)
         limit = 2.0 * gammaincinv(0.5 * np.maximum(line.count, 1), _ALLOWED)
         label = None if i else "99.9 % of the chi-square"
         panel.plot(line.times, np.where(tested, limit, np.nan), color=ORANGE, linewidth=1.0, label=label)
-    _decades(panel, np.concatenate([line.nis for line in lines]))
+    _use_log_axis(panel, np.concatenate([line.nis for line in lines]))
     panel.set_ylabel("NIS")
     panel.set_title("normalised innovation squared of each scan")
     panel.legend(frameon=False, fontsize=8, loc="lower right")
 
 
-def _decades(panel: Axes, values: Array) -> None:
+def _use_log_axis(panel: Axes, values: Array) -> None:
     """Make the vertical axis logarithmic, with plain numbers, if the values span more than a decade."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 

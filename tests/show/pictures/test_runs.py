@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem
-from optloc.show.pictures.runs import _window, plot_accuracy, plot_biases
+from optloc.show.pictures.runs import _limit_to_estimates, plot_accuracy, plot_biases
 
 NOISE = np.array([0.1, 1.0, 10.0])
 
@@ -30,7 +30,7 @@ def test_numbers_that_are_no_curve_are_refused(noise, errors, words):
 def test_the_axis_holds_the_last_estimates_and_their_early_errors():
     limits = []
     panel = SimpleNamespace(set_ylim=lambda *both: limits.append(both))
-    _window(panel, np.array([[900.0], [3.0], [2.0], [np.nan]]), np.array([[100.0], [1.0], [0.5], [np.nan]]))
+    _limit_to_estimates(panel, np.array([[900.0], [3.0], [2.0], [np.nan]]), np.array([[100.0], [1.0], [0.5], [np.nan]]))
     assert limits == [(2.0 - 8.0, 2.0 + 8.0)]
 
 

@@ -9,7 +9,7 @@ from show.ranging import ENU, PLACES
 
 from optloc import Motion, assemble, measured
 from optloc.problem import ECEF
-from optloc.show.pictures.track import PlottedTrack, _along, _near, plot_tracks
+from optloc.show.pictures.track import PlottedTrack, _along_picture_axes, _is_near, plot_tracks
 
 
 def drawn(frame=ENU, places=PLACES, origin=None):
@@ -42,7 +42,7 @@ def test_a_picture_has_the_path_its_doubts_and_the_limit_of_the_nis():
 def test_tracks_in_ecef_are_drawn_along_east_north_and_up():
     origin = ECEF.from_geodetic(np.radians(47.0), np.radians(8.0), 400.0)
     places = origin + np.pad(PLACES, ((0, 0), (0, 1)))
-    lines, stations, axes = _along([drawn(ECEF, places, origin)])
+    lines, stations, axes = _along_picture_axes([drawn(ECEF, places, origin)])
     turn = ECEF.enu_axes(origin)
     assert axes == ("east", "north", "up")
     assert lines[0].position == pytest.approx(100.0 * np.arange(3)[:, None] * turn[:, 0], abs=1e-6)
@@ -51,5 +51,5 @@ def test_tracks_in_ecef_are_drawn_along_east_north_and_up():
 
 def test_stations_beyond_a_hundred_times_the_track_are_left_out():
     known = np.array([[0.0, 0.0], [10.0, 0.0]])
-    assert _near(np.array([[500.0, 0.0], [2000.0, 0.0]]), known).tolist() == [True, False]
-    assert _near(np.array([[500.0, 0.0]]), known[:0]).tolist() == [True]
+    assert _is_near(np.array([[500.0, 0.0], [2000.0, 0.0]]), known).tolist() == [True, False]
+    assert _is_near(np.array([[500.0, 0.0]]), known[:0]).tolist() == [True]
