@@ -1,7 +1,8 @@
 """The data that all problems of a plan share, the workspace of a block of problems, and the arrays of the answers.
 
 A block has W = LANES problems, one in each lane; the last axis of every array of a block is the lane. The integer
-constants name rows of these arrays.
+constants name rows of these arrays. Letters: m rows, s stations, d coordinates, p refined unknowns, k constraints, c of
+them exact.
 """
 
 from __future__ import annotations
@@ -121,7 +122,12 @@ class EngineModel(NamedTuple):
 
 
 class EngineResult(NamedTuple):
-    """One row of `Answer.number`; `Answer` has the columns under the same names."""
+    """The numbers of one fix: one row of `Answer.number`. `Answer` has the columns under the same names.
+
+    `cost` and `rival_cost` are chi-square values of fix and rival. `settled` is 1.0 if the fix is valid, else 0.0.
+    `infinity` is the least cost at infinity. `kappa` and `kappa_far` measure the deviation from a Gaussian, in metres
+    and in inverse range.
+    """
 
     cost: float
     rival_cost: float
@@ -200,17 +206,17 @@ class Answer(NamedTuple):
 
     @property
     def multiplier(self) -> Array:
-        """Multipliers (N, k) of the exact constraints."""
+        """Lagrange multipliers (N, k) of the exact constraints; zero for bounds."""
         return self.side[..., MULTIPLIER]
 
     @property
     def quantity(self) -> Array:
-        """Values (N, k) of the constrained quantities."""
+        """Values (N, k) of the constrained quantities at the fix, in the unit of each constraint."""
         return self.side[..., VALUE]
 
     @property
     def normal(self) -> Array:
-        """Gradients (N, k, d) of the constrained quantities."""
+        """Gradients (N, k, d) of the constrained quantities at the fix."""
         return self.side[..., GRADIENT:]
 
 
@@ -272,7 +278,11 @@ class EngineWorkspace(NamedTuple):
 
 @compiled
 def make_room(model: EngineModel, stations: int, d: int, unknowns: int, others: int) -> EngineWorkspace:
-    """Return the workspace of a block, for numbers of stations, coordinates, unknowns and other linear rows."""
+    """Return the workspace of a block.
+
+    The arguments after `model` are numbers of stations, of coordinates, of refined unknowns, and of linear rows of
+    other kinds than ranges.
+    """
     s, p, m = stations, unknowns, model.row.shape[1]
     c, k = model.admission.exact, model.admission.level.shape[1]
     return EngineWorkspace(
