@@ -221,8 +221,7 @@ def project_step(model: EngineModel, room: EngineWorkspace) -> None:
 
 @compiled
 def _keep_off(room: EngineWorkspace, move: Array, p: int) -> None:
-    """Subtract a combination of the vectors `room.push` from `move` (p, W), so that `move` is tangent to the surfaces.
-    """
+    """Subtract a combination of the vectors `room.push` from `move` (p, W): the result is tangent to the surfaces."""
     face, push, part, d = room.face[0], room.push, room.part, room.d
     _square(face, push, room, d)
     for k in range(len(push)):

@@ -511,10 +511,10 @@ def measure_infinity(block: RangeBlock, room: EngineWorkspace) -> None:
 def _begin(
     u: Array, block: RangeBlock, room: EngineWorkspace, g: Array, gap: Array, total: Array, least: Array, more: Array
 ) -> None:
-    """Write gradient g, gaps of the eigenvalues, cost without ranges, least eigenvalue, and the first multiplier `more`.
+    """Write gradient g, gaps of the eigenvalues, cost without ranges, least eigenvalue, and the first multiplier.
 
-    Multipliers are relative to minus the least eigenvalue, where no digits cancel. The first is the largest for which
-    one component alone has length one: Newton's steps converge from this side.
+    Multipliers (`more`) are relative to minus the least eigenvalue, where no digits cancel. The first is the largest
+    for which one component alone has length one: Newton's steps converge from this side.
     """
     q, d = len(u), len(g)
     for lane in range(LANES):
@@ -539,8 +539,7 @@ def _begin(
 def _step(
     scalar: Array, g: Array, gap: Array, total: Array, least: Array, more: Array, low: Array, todo: Array
 ) -> bool:
-    """Write lower bounds of the cost to `low` (W,), take Newton steps if a bound is low; return whether a lane took one.
-    """
+    """Write lower bounds of the cost to `low` (W,), and step multipliers of low bounds; return whether any moved."""
     d, square, cube = len(g), scalar[SPARE], todo
     for lane in range(LANES):
         low[lane], square[lane], cube[lane] = total[lane] + least[lane] - more[lane], 0.0, 0.0

@@ -48,7 +48,7 @@ def digest_of(kernel: Compilable) -> str:
 
 
 def closure(kernel: Compilable) -> set[Compilable]:
-    """Return a kernel and all kernels that it calls, directly or indirectly."""
+    """Return a set: the kernel and all kernels that it calls, directly or indirectly."""
     found, left = {kernel}, [kernel]
     while left:
         new = set(callees(left.pop())) - found
@@ -74,7 +74,10 @@ def callers(kernels: Iterable[Compilable], known: Iterable[Compilable]) -> set[C
 
 @cache
 def _own(function: Callable[..., Any]) -> tuple[str, tuple[Compilable, ...]]:
-    """Return the digest of a function without its callees, and its callees."""
+    """Return the digest of a function without its callees, and its callees.
+
+    The result is cached, because many call graphs contain the same function.
+    """
     texts, called = list[str](), list[Compilable]()
     for text, callee in _parts(function, set()):
         texts.append(text)
@@ -84,7 +87,10 @@ def _own(function: Callable[..., Any]) -> tuple[str, tuple[Compilable, ...]]:
 
 
 def _parts(function: Callable[..., Any], seen: set[FunctionType]) -> Iterator[tuple[str, Compilable | None]]:
-    """Yield (text, callee) for each part of a function; callee is None unless the text is the name of a kernel."""
+    """Yield (text, callee) for each part of a function that changes its machine code.
+
+    `callee` is None unless the text is the name of a kernel. `seen` contains the functions that were visited already.
+    """
     assert isinstance(function, FunctionType)
     if function in seen:
         return
@@ -103,9 +109,9 @@ def _parts(function: Callable[..., Any], seen: set[FunctionType]) -> Iterator[tu
 
 
 def _value(name: str, value: Any, names: list[str], seen: set[FunctionType]) -> Iterator[tuple[str, Compilable | None]]:
-    """Yield (text, callee) for a value whose name a function uses.
+    """Yield (text, callee) for a value whose name a function uses; see `_parts`.
 
-    For a module, the attributes that the function may use are included.
+    `names` are all names in the function: for a module, its attributes with these names are included.
     """
     if isinstance(value, Compilable):
         yield f"{name} calls {value.function.__module__}.{value.function.__qualname__}", value
@@ -140,6 +146,7 @@ def _record(kind: Any) -> str:
 
 
 def _is_library(module: str) -> bool:
+    """Return whether a module belongs to numpy, numba or the standard library, whose versions are covered elsewhere."""
     return module.partition(".")[0] in _LIBRARIES
 
 
@@ -153,7 +160,10 @@ def _names(code: CodeType) -> set[str]:
 
 
 def _text(value: Any, documentation: str | None = None) -> str:
-    """Return a text that two values share only if they compile to the same machine code."""
+    """Return a text that two values share only if they compile to the same machine code.
+
+    `documentation` is the docstring of a function whose code is the value; the text does not contain it.
+    """
     if isinstance(value, CodeType):
         # The docstring is the first constant; some Python versions put None there if there is no docstring.
         constants = value.co_consts[value.co_consts[:1] in ((documentation,), (None,)) :]

@@ -222,7 +222,7 @@ def _predict(move: Move, one: int, mean: Array, cov: Array, s: _Space) -> None:
 
 @compiled
 def _update(rows: ScanRows, item: int, one: int, how: Filtering, s: _Space, memory: Array, out: Filtered) -> float:
-    """Write a state after the scan, and return its status."""
+    """Write state number `one` after the scan to `out`, and return its status; GENERAL if nothing was written."""
     n, values, mean, cov = len(s.x), out.values[one], out.mean[one], out.cov[one]
     broken = _take(rows, item, one, s)
     if not _root(s.P, s.root):
@@ -284,7 +284,7 @@ def _take(rows: ScanRows, item: int, one: int, s: _Space) -> bool:
 
 @compiled
 def _root(cov: Array, root: Array) -> bool:
-    """Write the lower triangular root of a covariance, and return whether the covariance is positive semidefinite."""
+    """Write the lower triangular root L of a covariance to `root`; return False if it is not semidefinite."""
     n, most = len(cov), 0.0
     for i in range(n):
         most = max(most, cov[i, i])
@@ -310,7 +310,7 @@ def _root(cov: Array, root: Array) -> bool:
 
 @compiled
 def _evaluate(rows: ScanRows, s: _Space, x: Array) -> None:
-    """Write residuals and derivatives times root of the used rows at a state."""
+    """Write residuals, and derivatives times L, of the used rows at a state x (n,) to `s.rows`."""
     t, n = rows.tables, len(x)
     for i in range(n):
         s.m[s.room.trial + i, 0] = x[i]
@@ -331,7 +331,7 @@ def _evaluate(rows: ScanRows, s: _Space, x: Array) -> None:
 
 @compiled
 def _gate(rows: ScanRows, item: int, how: Filtering, s: _Space, values: Array) -> None:
-    """Leave out the rows whose innovation is outside the gate, and count the rejected rows."""
+    """Set the weights of rows whose innovation is outside the gate to zero, and count the rejected rows."""
     n, own = len(s.x), _of(len(rows.covariance), item)
     for i in range(len(s.used)):
         if s.used[i] > 0.0:
@@ -384,7 +384,7 @@ def _whitener(rows: ScanRows, item: int, s: _Space) -> tuple[float, float]:
 
 @compiled
 def _entry(rows: ScanRows, own: int, i: int, j: int) -> float:
-    """Return entry (i, j) of the covariance of the rows."""
+    """Return entry (i, j) of the covariance of the rows; `own` is the row of the scan in `rows.covariance`."""
     m = rows.z.shape[2]
     if rows.covariance.shape[1] == m:
         return float(rows.covariance[own, i]) if i == j else 0.0
@@ -487,7 +487,7 @@ def _remember(rows: ScanRows, item: int, s: _Space, memory: Array, values: Array
 
 @compiled
 def _write_rows(t: Tables, s: _Space, out: Array) -> None:
-    """Write derivatives, residual and weight of each row at the prediction; zeros for rows that are left out."""
+    """Add derivatives, residual and weight of each used row to `out`, which has n + 2 zeros for each of the m rows."""
     n = len(s.x)
     begin = t.table[t.group, GROUP_COLUMN]
     columns = t.table[t.group + 1, GROUP_COLUMN] - begin
@@ -501,7 +501,7 @@ def _write_rows(t: Tables, s: _Space, out: Array) -> None:
 
 @compiled
 def _size(rows: ScanRows, own: int, i: int) -> float:
-    """Return the standard deviation of the error of each station of a row: all its stations have the same."""
+    """Return the standard deviation of the error of each station of row i: all its stations have the same."""
     return sqrt(_entry(rows, own, i, i) / (2.0 if rows.station[i, 1] >= 0 else 1.0))
 
 
@@ -570,7 +570,7 @@ def _modify(rows: ScanRows, s: _Space, cov: Array) -> None:
 
 @compiled
 def _place(s: _Space, share: float, out: Array) -> None:
-    """Write the state at the given share of y."""
+    """Write the state ``mean + share * L y`` to `out`, with the predicted mean."""
     for i in range(len(s.x)):
         out[i] = s.x[i]
         for k in range(i + 1):
@@ -590,7 +590,7 @@ def _covariance(s: _Space, out: Array) -> None:
 
 @compiled
 def _square(A: Array, out: Array) -> None:
-    """Write ``A A'``."""
+    """Write the matrix ``A A'`` to `out`."""
     for i in range(A.shape[0]):
         for j in range(i + 1):
             value = 0.0

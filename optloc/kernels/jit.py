@@ -70,7 +70,10 @@ _KERNELS: list[_Kernel] = []
 
 
 class _Kernel(Compilable):
-    """A function of scalars and arrays in three forms: plain, compiled for Python, and compiled for calling kernels."""
+    """A function of scalars and arrays in three forms: plain, compiled for Python, and compiled for calling kernels.
+
+    `taken_in` is True if every caller inlines the function. `ready` is True if this process has used the machine code.
+    """
 
     def __init__(self, function: Callable[..., Any], *, taken_in: bool) -> None:
         super().__init__(function, taken_in=taken_in)
@@ -91,7 +94,10 @@ class _Kernel(Compilable):
         return self._form(callee=False)
 
     def _form(self, *, callee: bool) -> Any:
-        """Return a compiled form, shared by all threads: numba infers types again for each new form."""
+        """Return a compiled form, shared by all threads: numba infers types again for each new form.
+
+        `callee` is True for the form that other kernels call, False for the form that Python calls.
+        """
         made = self._forms.get(callee)  # a local name, because another thread may discard the form meanwhile
         if made is None:
             with _LOCK:
@@ -118,6 +124,7 @@ class _Kernel(Compilable):
         return getattr(self._form(callee=True), name)
 
     def __call__(self, *args: Any) -> Any:
+        """Run the machine code, or the plain function if machine code is disabled."""
         if not enabled():
             return self.function(*args)
         if not self.ready:
@@ -167,7 +174,7 @@ def compiling(tell: Callable[[str, bool], None]) -> Iterator[None]:
 
 
 def _listen(tell: Callable[[str, bool], None]) -> Callable[[], None]:
-    """Register a listener for compilations, and return the function that removes it."""
+    """Register `tell(name, done)` for compilations, and return the function that removes it."""
     from numba.core import event
 
     events: Any = event  # without types
@@ -190,7 +197,7 @@ _BEGUN: set[str] = set()
 
 
 def _text() -> str:
-    """Return the progress line."""
+    """Return the progress line: how many functions are compiled, or that machine code is loaded."""
     if not _BEGUN:
         return "loading machine code"
     loaded = {kernel.name for kernel in _KERNELS}

@@ -43,7 +43,7 @@ class Limits:
     high: Array
 
     def take(self, items: Array) -> Limits:
-        """Return the limits of the selected refinements."""
+        """Return the limits of the selected refinements; `items` are indices or a mask."""
         return Limits(self.column, self.low[items], self.high[items])
 
     def clip(self, x: Array) -> Array:
@@ -53,7 +53,10 @@ class Limits:
         return out
 
     def reached(self, x: Array, within: float = 0.0) -> Array:
-        """Return (M,) -1 for vectors (M, size) at the low limit, 1 at the high limit, and 0 between the limits."""
+        """Return -1 (M,) for vectors (M, size) at the low limit, 1 at the high limit, and 0 between the limits.
+
+        A vector is at a limit if its distance from the limit is at most `within`, in the unit of the unknown.
+        """
         z = x[:, self.column]
         return np.where(z - self.low <= within, -1, np.where(self.high - z <= within, 1, 0))
 
@@ -157,7 +160,7 @@ def refine(
 
 
 def _remade(problem: Problem, start: Array, rules: StopRules, face: Face = (), limits: Limits | None = None) -> Refined:
-    """Return the refinement by numpy, with weights at the start."""
+    """Return the refinement by numpy, with weights computed at the start."""
     return _iterate(problem, start, _Weights.of(problem, start), rules, face, None, limits)
 
 
@@ -198,7 +201,7 @@ def _iterate(
     folded: Folded | None,
     limits: Limits | None,
 ) -> Refined:
-    """Return the refinement with fixed weights."""
+    """Return the refinement by numpy with fixed weights; `face`, `folded` and `limits` are those of `refine`."""
     with np.errstate(all="ignore"):
         start = Equalities.of(problem, face).restore(start) if face else start
         start = start if limits is None else limits.clip(start)
@@ -219,7 +222,11 @@ def _iterate(
 
 @dataclass(slots=True)
 class _DescentState:
-    """The state of the iteration of every problem; a step changes only the entries of active problems."""
+    """The state of the iteration of N problems; a step changes only the entries of active problems.
+
+    `x` (N, size) are the vectors with the normal equations at them. `damping` and `growth` (N,) are Marquardt's factor
+    and its change after a rejected step. `status` (N,) are numbers of `Status`, `iterations` (N,) the steps tried.
+    """
 
     x: Array
     equations: Normal
@@ -247,7 +254,10 @@ class _DescentState:
 
 @dataclass(frozen=True, slots=True)
 class _ActiveProblems:
-    """The active problems of a refinement, with their weights and constraints."""
+    """The problems of a refinement that have not ended, with their weights and constraints.
+
+    `blur` (N,) is the rounding error of the whitened residuals.
+    """
 
     problem: Problem
     weights: _Weights
@@ -300,7 +310,10 @@ def _blur_of_face(problem: Problem, face: Face, equations: Normal) -> Array | fl
 
 
 def _advance(part: _ActiveProblems, state: _DescentState, active: Array, rules: StopRules, iteration: int) -> None:
-    """Try one step of every active problem."""
+    """Try one step of every active problem, and write the result to `state`.
+
+    `active` are the numbers of the problems of `part` in `state`. `iteration` is the number of this step, from 0.
+    """
     # In most batches all problems end together: while all are active, arrays are not copied.
     everything = len(active) == len(state.x)
     now = state.equations if everything else _at(state.equations, active)
@@ -336,7 +349,7 @@ def _advance(part: _ActiveProblems, state: _DescentState, active: Array, rules: 
 
 
 def _keep(state: _DescentState, active: Array, better: Array, x: Array, after: Normal) -> None:
-    """Store accepted vectors and their equations in the state."""
+    """Store accepted vectors x and their equations `after` in the state; `better` marks the accepted steps."""
     if better.all() and len(active) == len(state.x):
         state.x, state.equations = x, _own(after)
         return
@@ -366,7 +379,10 @@ _WEIGHED = 2**21
 
 
 def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: StopRules) -> Refined | None:
-    """Return the refinement by machine code, or None if machine code does not support the problem."""
+    """Return the refinement by machine code, or None if machine code does not support the problem.
+
+    The arguments are those of `refine`.
+    """
     most = _OF_RUNS if problem.layout.n_local and problem.epochs > 1 else _UNKNOWNS
     few = problem.layout.n_shared + problem.layout.n_local <= most
     if not few or not serves(problem, len(start)):
@@ -391,7 +407,7 @@ def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: 
 def _refine_with_weights(
     problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: StopRules
 ) -> Refined | None:
-    """Return the refinement by machine code with given weights, or None if machine code is not supported."""
+    """Return the refinement by machine code with the weights `noise`, or None if machine code is not supported."""
     found = packed(problem, noise)
     if found is None:
         return None

@@ -1,4 +1,9 @@
-"""The numbers of problems as plain arrays for the compiled kernels; `optloc.kernels.tables` has the indices."""
+"""The numbers of problems as plain arrays for the compiled kernels; `optloc.kernels.tables` has the indices.
+
+Numbers that all problems share are stored once; the other numbers have one row for each problem. Letters: N problems or
+runs, m rows, k epochs of a run, r rows of a group or epoch. A *group* contains rows whose noise is correlated; g is a
+number of groups.
+"""
 
 from __future__ import annotations
 
@@ -97,7 +102,7 @@ def pack(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
 
 
 class PackedRuns(NamedTuple):
-    """Runs in the form for machine code: their epochs as problems, and the number of epochs of each run."""
+    """Runs in the form for machine code: their epochs as problems (`packed`), and the number of epochs of a run."""
 
     packed: Packed
     epochs: int
@@ -137,7 +142,7 @@ def observed(problem: Problem) -> Array:
 
 
 def _plain(values: Array, core: int) -> Array:
-    """Return an array (..., core axes) of a flat batch as contiguous doubles (N or 1, numbers)."""
+    """Return an array as contiguous doubles (N or 1, numbers); its last `core` axes belong to one problem."""
     shape = values.shape
     flat = values.reshape(shape[0] if len(shape) > core else 1, int(np.prod(shape[len(shape) - core :])))
     return np.require(flat, np.float64, ["C", "W"])
@@ -145,21 +150,25 @@ def _plain(values: Array, core: int) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Divided:
-    """Shared numbers (numbers,), numbers of each problem (N or 1, numbers), and the indices of both."""
+    """Numbers of several parts, split into shared numbers and numbers of each problem.
+
+    `common` (numbers,) are the shared numbers, `own` (N or 1, numbers) the others. `place` (parts, 4) begins with the
+    index of each part: >= 0 in `common`, or -1 - its index in `own`.
+    """
 
     common: Array
     own: Array
     place: Array
 
     def size(self, own: bool) -> int:
-        """Return the count of the numbers of each problem, or the count of the shared numbers."""
+        """Return the number of separate numbers of a problem if `own` is True, else the number of shared ones."""
         return self.own.shape[1] if own else len(self.common)
 
     @classmethod
     def of(cls, parts: list[Array]) -> Divided:
         """Return parts (N or 1, numbers) split into shared and separate numbers.
 
-        `place` (parts, 4) begins with their indices.
+        A part with one row is shared.
         """
         place, lengths = np.zeros((len(parts), _COLUMNS), dtype=np.int64), [0, 0]
         for i, part in enumerate(parts):
@@ -243,9 +252,10 @@ class Folding:
         return len(self.rows[0])
 
     def groups(self, row: Array) -> tuple[Array, Array] | None:
-        """Return the groups (q, r) of one epoch, and their numbers (k, q) in each epoch, from groups of rows (g, r).
+        """Return the groups (q, r) of rows of one epoch, and their numbers (k, q) in each epoch.
 
-        The result is None if a group has rows of several epochs, or if the groups of two epochs differ.
+        `row` (g, r) are the groups of the run. The result is None if a group has rows of several epochs, or if the
+        groups of two epochs differ.
         """
         epoch, local = self.epoch[row], self.local[row]
         own = _alike(epoch[:, 0], self.epochs, local)
@@ -253,7 +263,10 @@ class Folding:
 
 
 def _alike(epoch: Array, epochs: int, *values: Array) -> Array | None:
-    """Return the entries (k, q) of each epoch, or None if the values (n, ...) of the entries differ between epochs."""
+    """Return the entries (k, q) of each epoch, or None if they differ between epochs.
+
+    `epoch` (n,) is the epoch of each entry. The arrays `values` (n, ...) must be equal in all epochs, also in order.
+    """
     if not len(epoch) or len(epoch) % epochs:
         return np.zeros((epochs, 0), dtype=np.int64) if not len(epoch) else None
     own = np.argsort(epoch, kind="stable").reshape(epochs, -1)
@@ -352,19 +365,22 @@ def fold(problem: Problem, found: Folding) -> Problem:
 
 
 def _fold_bias(bias: Bias, own: Array, found: Folding) -> Bias:
-    """Return a bias for the batch of epochs."""
+    """Return a bias for the batch of epochs; `own` are its entries in the rows of one epoch."""
     return replace(bias, row=found.local[bias.row[own]], member=bias.member[own], coefficient=bias.coefficient[own])
 
 
 def fold_whiteners(noise: tuple[Whitener, ...], found: Folding, count: int) -> tuple[Whitener, ...] | None:
-    """Return the whitening matrices of N runs for the batch of `fold`, or None if the groups of two epochs differ."""
+    """Return the whitening matrices of `count` runs for the batch of `fold`.
+
+    The result is None if the groups of two epochs differ.
+    """
     if any(found.groups(whitener.row) is None for whitener in noise):
         return None
     return tuple(Whitener(*_fold_groups(whitener.row, whitener.matrix, found, count)) for whitener in noise)
 
 
 def _fold_rows(rows: Rows, own: Array, count: int) -> Rows:
-    """Return rows of one kind for the batch of epochs."""
+    """Return rows of one kind for the batch of epochs of `count` runs; `own` (k, r) are the rows of each epoch."""
     first = own[0]
     return replace(
         rows,
@@ -379,7 +395,10 @@ def _fold_rows(rows: Rows, own: Array, count: int) -> Rows:
 
 
 def _fold_values(values: Array, own: Array, count: int) -> Array:
-    """Return values (N or none, m) of rows as (N k, r), or (r,) if all epochs have the same values."""
+    """Return values (N or none, m) of rows as (N k, r), or (r,) if all epochs have the same values.
+
+    `own` (k, r) are the rows of each epoch, `count` is N.
+    """
     picked = values[..., own]
     if values.ndim == 1 and (picked == picked[:1]).all():
         return np.asarray(picked[0])
@@ -387,7 +406,7 @@ def _fold_values(values: Array, own: Array, count: int) -> Array:
 
 
 def _fold_groups(row: Array, matrix: Array, found: Folding, count: int) -> tuple[Array, Array]:
-    """Return groups (g, r) and matrices (N or none, g or 1, r, r) for the batch of epochs."""
+    """Return groups (g, r) and matrices (N or none, g or 1, r, r) for the batch of epochs; `count` is N."""
     groups = found.groups(row)
     assert groups is not None
     local, own = groups

@@ -63,7 +63,10 @@ def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None
 
 
 def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None) -> Normal | None:
-    """Return the normal equations computed by machine code, or None if machine code does not support the problem."""
+    """Return the normal equations computed by machine code, or None if machine code does not support the problem.
+
+    The arguments are those of `summed`. The result is also None if the leading axes of x do not belong to the problems.
+    """
     count, shape = x.size // x.shape[-1], x.shape[:-1]
     # one vector for each problem, or several vectors for each problem
     alike = problem.batch_shape in {(), (1,), (count,)} if x.ndim == 2 else problem.batch_shape == shape[-1:]
@@ -79,7 +82,10 @@ def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | N
 
 
 def packed(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | PackedRuns | None:
-    """Return problems in the form for machine code, or None if it does not support them; arguments as for `pack`."""
+    """Return problems in the form for machine code, or None if machine code does not support them.
+
+    The arguments are those of `pack`.
+    """
     runs = pack_runs(problem, noise) if is_run(problem) else None
     return pack(problem, noise) if runs is None and problem.count <= _LONGEST else runs
 

@@ -1,9 +1,10 @@
 """Small symmetric positive definite systems side by side in lanes; a singular system does not affect the other lanes.
 
 Systems of unknowns with mixed units (metres, radians, seconds) are scaled to a unit diagonal. They are flagged if a
-pivot vanishes, as in `optloc.base.linalg`. Their matrices and vectors are stored in cells of a memory (cells, B), row
-by row. Systems of lengths only, such as positions from ranges, are factored without scaling. This takes no square
-roots, and the number of lanes is known when they are compiled.
+pivot vanishes, as in `optloc.base.linalg`. Their matrices and vectors are stored in cells of a memory m (cells, B) of B
+lanes, row by row; arguments such as `right` are their first cells. Systems of lengths only, such as positions from
+ranges, are factored without scaling. This takes no square roots, and the number of lanes is known when they are
+compiled.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def factor(m: Array, matrix: int, n: int, scale: int, ok: int, least: float, lan
 
 @compiled
 def forward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
-    """Replace a vector by the inverse of the factor times the scaled vector."""
+    """Replace the vector (n,) at cell `right` by the inverse of the factor times the scaled vector."""
     for i in range(n):
         for b in range(lanes):
             m[right + i, b] *= m[scale + i, b]
@@ -85,7 +86,7 @@ def forward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) ->
 
 @compiled
 def backward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
-    """Replace a vector that `forward` returned by the solution."""
+    """Replace the vector (n,) at cell `right`, which `forward` returned, by the solution."""
     for i in range(n - 1, -1, -1):
         for k in range(i + 1, n):
             for b in range(lanes):
@@ -265,7 +266,7 @@ _FELT = 1e-13
 
 @compiled
 def eliminate_last(A: Array, right: Array, cost: Array, diagonal: Array, keep: int) -> None:
-    """Eliminate the last unknowns from normal equations: the result holds for any values of the others.
+    """Eliminate the last unknowns from normal equations: they take the best values for any values of the others.
 
     Parameters
     ----------
@@ -526,7 +527,7 @@ def principal_axes(matrix: Array, axes: Array, spare: Array) -> None:
 
 @compiled
 def _is_left(matrix: Array, trace: Array) -> bool:
-    """Return whether an off-diagonal entry is more than rounding."""
+    """Return whether an off-diagonal entry is more than rounding in any lane; `trace` (W,) is scratch."""
     n, left = len(matrix), 0.0
     for lane in range(LANES):
         trace[lane] = 0.0
@@ -547,7 +548,7 @@ def _is_left(matrix: Array, trace: Array) -> bool:
 
 @compiled
 def _turn(matrix: Array, axes: Array, p: int, q: int) -> None:
-    """Rotate axes p < q so that the entry (q, p) vanishes."""
+    """Rotate the axes p < q so that the entry (q, p) of the matrices vanishes."""
     n = len(matrix)
     for lane in range(LANES):
         entry, first, second = matrix[q, p, lane], matrix[p, p, lane], matrix[q, q, lane]

@@ -1,6 +1,8 @@
 """The indices that the compiled kernels follow, computed once for problems of equal structure.
 
-They define which data enter which row, and which unknowns a row depends on.
+They define which data enter which row, and which unknowns a row depends on. A *group* contains rows whose noise is
+correlated. An *input* is a component of a point of the measurement function, for instance a coordinate. Letters: m
+rows, g groups, n entries of a table.
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ class RowGroups:
 
     @classmethod
     def sorted(cls, problem: Problem, groups: tuple[Array, ...]) -> RowGroups:
-        """Return the groups (g, r) of a problem, sorted by epoch."""
+        """Return the groups of a problem, sorted by epoch; `groups` has one array (g, r) for each number r of rows."""
         rows = np.concatenate([group.ravel() for group in groups])
         size = np.concatenate([np.full(len(group), group.shape[1]) for group in groups])
         head = starts(size)[:-1]
@@ -272,7 +274,10 @@ class Sources:
         return tuple(array.ndim > core and array.shape[0] > 1 for array, core in self.arrays)
 
     def numbered(self, problem: Problem) -> Problem:
-        """Return the problem with each entry of these arrays replaced by its number."""
+        """Return the problem with each number of these arrays replaced by its index, counted for one problem.
+
+        After the usual operations on the data, the indices in the inputs show their sources.
+        """
         places = iter(
             start + np.arange(np.prod(array.shape[array.ndim - core :]), dtype=float).reshape(array.shape[-core:])
             for (array, core), start in zip(self.arrays, self.start, strict=True)
@@ -348,7 +353,10 @@ def _spanning(problem: Problem, groups: tuple[Array, ...]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _TracedRows:
-    """A block of rows, its tape, and the number in `Sources` of each input of each row."""
+    """A block of rows, its tape, and the number in `Sources` of each input of each row.
+
+    `inputs` maps the seed of an input to these numbers (m,).
+    """
 
     links: BlockLinks
     trace: Traced
@@ -356,7 +364,7 @@ class _TracedRows:
 
 
 def _fill(problem: Problem, groups: RowGroups, found: list[_TracedRows], lookup: Array) -> CachedTables:
-    """Return the tables of traced blocks of rows."""
+    """Return the tables of traced blocks of rows; `lookup` is the result of `Sources.lookup`."""
     pairs = list(zip(found, problem.starts, strict=True))
     feeds = Entries.joined([Entries.feeds(kind.links, kind.trace, start) for kind, start in pairs])
     scales = Entries.joined([Entries.terms(kind.links.gains, start) for kind, start in pairs])
@@ -417,7 +425,10 @@ def _table(*columns: Array) -> Array:
 
 
 def _sources(found: list[_TracedRows], source_at: Array, order: Order, lookup: Array) -> Array:
-    """Return the index of each input of each evaluated row, see `Sources.lookup`."""
+    """Return the index of each input of each evaluated row, see `Sources.lookup`.
+
+    `source_at` is the first input of each evaluated row.
+    """
     out, start = np.zeros(int(source_at[-1]), dtype=np.int64), 0
     for kind in found:
         count = kind.links.block.count
@@ -432,7 +443,11 @@ def _sources(found: list[_TracedRows], source_at: Array, order: Order, lookup: A
 def _list(
     parts: list[Entries], slots: list[Array], owners: list[Array], counts: list[int]
 ) -> tuple[Array, Array, list[Array]]:
-    """Return entries sorted by owner (an input or a row): indices, factors, and the first entry of each owner."""
+    """Return entries sorted by owner (an input or a row): indices, factors, and the first entry of each owner.
+
+    For each part, `slots` has the columns of its entries in their group, `owners` the owner of each entry, and `counts`
+    the number of owners.
+    """
     terms, factors, at, start = [], [], [], 0
     for part, slot, owner, count in zip(parts, slots, owners, counts, strict=True):
         order = np.argsort(owner, kind="stable")
@@ -444,7 +459,7 @@ def _list(
 
 
 def _tapes(found: list[_TracedRows]) -> tuple[Array, dict[str, Array]]:
-    """Return the constants of the tapes of all kinds, and the tapes one after the other."""
+    """Return the constants of the tapes of all kinds, and four tables by name: code, kind, constant, input."""
     tapes = [kind.trace.tape for kind in found]
     constants = [pair for tape in tapes for pair in tape.constants]
     inputs: list[tuple[int, int]] = []

@@ -1,7 +1,7 @@
 """Measurement functions with their derivatives as tapes; each kind is traced once, including user-defined kinds.
 
-To trace a function means to call it with symbols that record every operation. A *tape* is the list of these operations
-on registers; machine code runs it without calling Python.
+To trace a function means to call it with symbols that record every operation. A *node* is a recorded operation, input
+or constant. A *tape* is the list of the operations on registers; machine code runs it without calling Python.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Recorder:
     known: dict[tuple[int, Any, Any], int] = field(default_factory=dict)
 
     def input(self, seed: int) -> Symbol:
-        """Return the symbol of an input."""
+        """Return the symbol of an input; `seed` is the number of the input."""
         return Symbol(self, self._number((INPUT, seed, 0)))
 
     def node(self, value: Any) -> int:
@@ -99,7 +99,7 @@ class Recorder:
         return self.known[key]
 
     def _simplify(self, operation: int, u: int, v: int) -> int:
-        """Return the node of an operation.
+        """Return the number of the node of an operation on the nodes u and v.
 
         Constants are evaluated, and equivalent forms with identical rounding are used.
         """
@@ -116,7 +116,7 @@ class Recorder:
         return self._number((operation, u, v))
 
     def _is(self, node: int, operation: int) -> bool:
-        """Return whether a node is a given operation."""
+        """Return whether a node is the given operation."""
         return self.nodes[node][0] == operation
 
     def _add(self, u: int, v: int) -> int | None:
@@ -204,9 +204,11 @@ class Symbol:
     node: int
 
     def __elementary__(self) -> ModuleType:
+        """Return this module, whose functions `optloc.models.primitives` calls for symbols."""
         return sys.modules[__name__]
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        """Record a function of numpy that was called with symbols."""
         if method != "__call__" or options or ufunc.__name__ not in _NUMBER:
             return NotImplemented
         return self.recorder.apply(_NUMBER[ufunc.__name__], *inputs)
@@ -321,7 +323,7 @@ def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
 
 
 def _trace_back(recorder: Recorder, wanted: list[int]) -> list[int]:
-    """Return the nodes that the wanted nodes depend on, in the order in which they were recorded."""
+    """Return the nodes that the `wanted` nodes depend on, in the order in which they were recorded."""
     found: set[int] = set()
     ahead = list(wanted)
     while ahead:
@@ -334,7 +336,7 @@ def _trace_back(recorder: Recorder, wanted: list[int]) -> list[int]:
 
 
 def _last_uses(recorder: Recorder, needed: list[int], wanted: list[int]) -> dict[int, int]:
-    """Return the last node that uses each node; outputs are used after all nodes."""
+    """Return a dictionary with the last node that uses each node; outputs are used after all nodes."""
     last: dict[int, int] = {}
     for node in needed:
         operation, left, right = recorder.nodes[node]

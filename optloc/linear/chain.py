@@ -1,8 +1,10 @@
 """Symmetric block tridiagonal systems of epochs that are coupled to the next epoch.
 
-The time to solve them is linear in the number of epochs. Regular systems are banded matrices, which LAPACK factors.
-Blocks of the inverse, and systems with singular blocks, use cyclic reduction: every other block is eliminated, and the
-rest is a chain of half the length. For positive definite matrices this is Cholesky's method in another order.
+The time to solve them is linear in the number k of epochs. Every epoch has a block of l unknowns. Regular systems are
+banded matrices, which LAPACK factors. Blocks of the inverse, and systems with singular blocks, use cyclic reduction:
+every other (odd) block is eliminated, and the even blocks are a chain of half the length. For positive definite
+matrices this is Cholesky's method in another order.
+
 B. L. Buzbee, G. H. Golub, C. W. Nielson, "On direct methods for solving Poisson's equations", SIAM J. Numer. Anal. 7
 (1970) 627-656.
 """
@@ -54,7 +56,10 @@ def solve(block: Array, link: Array, right: Array) -> tuple[Array, Array]:
 
 
 def _banded(block: Array, link: Array, right: Array) -> Array | None:
-    """Return the solution (k, l, p) of one chain by a banded factor, or None if the chain is not safely regular."""
+    """Return the solution (k, l, p) of one chain by a banded factor, or None if the chain is not safely regular.
+
+    The arguments are those of `solve`, without batch axes.
+    """
     from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
     k, length = block.shape[:2]
@@ -79,21 +84,32 @@ def _banded(block: Array, link: Array, right: Array) -> Array | None:
 
 
 def inverse_blocks(block: Array, link: Array) -> tuple[Array, Array]:
-    """Return the diagonal blocks (..., k, l, l) of the inverse of a chain, and whether the chain is regular."""
+    """Return the diagonal blocks (..., k, l, l) of the inverse of a chain, and whether the chain is regular.
+
+    The blocks are NaN if the chain is singular.
+    """
     none = np.zeros((*block.shape[:-1], 0))
     _, (inner, _), ok = _reduce(block, link, none, np.abs(block).max((-1, -2, -3)), inverse=True)
     return inner, ok
 
 
 class _ChainParts(NamedTuple):
-    """Blocks of an inverse: on its diagonal, and next to it (each block with the next)."""
+    """Blocks of the inverse of a chain.
+
+    `inner` (..., k, l, l) are the blocks on the diagonal. `beside` (..., k - 1, l, l) are the blocks above it: rows of
+    an epoch, columns of the next.
+    """
 
     inner: Array
     beside: Array
 
 
 def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool) -> tuple[Array, _ChainParts, Array]:
-    """Return solutions, blocks of the inverse (empty if not requested), and whether the chain is regular."""
+    """Return the solutions, blocks of the inverse, and whether the chain is regular, by cyclic reduction.
+
+    `size` is the largest absolute entry of the blocks; a remainder that is rounding relative to it counts as zero. The
+    blocks of the inverse are computed only if `inverse` is True. The function calls itself for the even blocks.
+    """
     k, length = block.shape[-3:-1]
     eye = np.broadcast_to(np.eye(length) if inverse else np.zeros((length, 0)), (*block.shape[:-1], length * inverse))
     if k == 1:
@@ -127,14 +143,18 @@ def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool)
 
 
 def _following_even(even: Array, count: int) -> Array:
-    """Return the values of the even blocks that follow the odd ones; zero after the last block."""
+    """Return, for each of `count` odd blocks, the value of the even block after it; zero if none follows."""
     out = np.zeros((*even.shape[:-3], count, *even.shape[-2:]))
     out[..., : even.shape[-3] - 1, :, :] = even[..., 1:, :, :]
     return out
 
 
 def _inner(parts: _ChainParts, back: Array, on: Array, own: Array, k: int) -> _ChainParts:
-    """Return the blocks of the inverse from the blocks of the even ones: x_odd = own - back x_before - on x_after."""
+    """Return the blocks of the inverse of the whole chain of k epochs, from the blocks of the even epochs.
+
+    The odd unknowns are ``x_odd = own - back x_before - on x_after``: `own` is the inverse of the odd blocks, `back`
+    and `on` are the coefficients of the even blocks before and after.
+    """
     m, first = k // 2, parts.inner[..., : k // 2, :, :]
     second, across = _following_even(parts.inner, m), np.zeros_like(back)
     across[..., : parts.beside.shape[-3], :, :] = parts.beside
@@ -150,7 +170,7 @@ def _inner(parts: _ChainParts, back: Array, on: Array, own: Array, k: int) -> _C
 
 
 def _regular(block: Array, right: Array) -> Array:
-    """Return the solutions of separate blocks, of least norm if a block is singular."""
+    """Return the solutions of separate systems with matrices `block`, of least norm if a matrix is singular."""
     solved, good = linalg.solve(block, right, _OPEN)
     if not good.all():
         root, _ = linalg.root(block[~good])

@@ -1,6 +1,8 @@
-"""Constraints: functions for users to state them, and the faces on which an estimate may lie.
+"""Constraints: functions for users to state them, and the faces on which an estimate may be.
 
-A *face* is a set of constraints that hold with equality together.
+A *level* is one bound of one constraint, satisfied with equality. A *face* is a set of levels that are satisfied
+together. Letters: N vectors x, `size` unknowns in a vector, the first n of which all epochs share, d coordinates, c
+levels of a face. A *band* is a constraint ``lower <= g(x) <= upper``; its *quantity* is g.
 """
 
 from __future__ import annotations
@@ -87,8 +89,9 @@ def reported(
 ) -> tuple[Motion, tuple[Band, ...]]:
     """Return motion and constraint of a target whose height is known at every epoch.
 
-    An example is an aircraft that reports its height. The way over ground has the given order. The height is the
-    reported one. If it is known only within a band, a constant and a rate may be added.
+    An example is an aircraft that reports its height. The course over ground is a polynomial of the given order. Its
+    height at each epoch is the reported height plus a polynomial of time, which the constraint bounds: it is zero if
+    `within` is zero.
 
     Parameters
     ----------
@@ -97,9 +100,9 @@ def reported(
     times : array (k,)
         Times of the epochs, seconds, ascending.
     within : float or str
-        Half the width of the band: metres, or text such as "50 ft"; zero: exact.
+        Half the width of the band about the reported height: metres, or text such as "50 ft"; 0: the height is exact.
     order : 1 or 2
-        Order of the motion.
+        Order of the motion over ground: 1 for a constant velocity, 2 for a constant acceleration.
     reference : float, optional
         Time to which the state belongs, seconds; the first epoch by default.
     target : int
@@ -108,7 +111,8 @@ def reported(
     Returns
     -------
     Motion
-        Motion over ground, with the shape of the height.
+        Motion over ground. Its field `rise` (..., k, 2) contains the heights relative to the height at the reference
+        time, metres, and their rates, m/s.
     tuple of Band
         The height at the reference time, and therefore at every epoch.
 
@@ -181,7 +185,7 @@ def _metres(value: Any, where: str) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """A constraint of a problem that holds with equality.
+    """A constraint of a problem that an estimate satisfies with equality.
 
     Parameters
     ----------
@@ -225,13 +229,16 @@ def decisive_epochs(problem: Problem, constraint: Band | Polygon) -> list[int | 
 
 
 def holds_along(problem: Problem, band: Band) -> bool:
-    """Return whether a band bounds a course: its target moves, and its state lasts for the run."""
+    """Return whether a band bounds a whole course.
+
+    This needs three conditions: the band applies along the course, the target moves, and its state lasts for the run.
+    """
     motion = problem.motions[band.target]
     return band.along and motion.span == "run" and motion.order > 0
 
 
 def faces(problem: Problem) -> list[Face]:
-    """Return every set of constraints that can hold with equality together.
+    """Return every set of levels that an estimate can satisfy together, sorted by their number.
 
     The set with only the equalities is the first.
     """
@@ -247,7 +254,7 @@ def faces(problem: Problem) -> list[Face]:
 
 
 def _meetings(sides: list[Face], epochs: list[int | None]) -> list[Face]:
-    """Return the sides of a constraint at each of some epochs, and the combinations of several epochs."""
+    """Return all combinations of the `sides` of one constraint at the given epochs: at one epoch, or at several."""
     found: list[Face] = [()]
     for epoch in epochs:
         here = [tuple(replace(level, epoch=epoch) for level in side) for side in sides]
@@ -256,13 +263,13 @@ def _meetings(sides: list[Face], epochs: list[int | None]) -> list[Face]:
 
 
 def _most_at_once(problem: Problem, face: Face) -> int:
-    """Return the greatest number of levels of positions that a face has at one epoch."""
+    """Return the greatest number of levels at one epoch; levels of speed do not count, since they bound no position."""
     count = Counter(level.epoch for level in face if _kind(problem, level) != "speed")
     return max(count.values(), default=0)
 
 
 def on_face(problem: Problem, face: Face) -> Problem:
-    """Return the problem whose only constraints are equalities: the levels of a face, at the reference time."""
+    """Return the problem whose only constraints are the levels of a face, as equalities at the reference time."""
     bands = []
     for level in face:
         band = _band(problem.constraints[level.constraint], level.side)
@@ -315,7 +322,7 @@ def is_held(problem: Problem, face: Face, x: Array, descent: Array) -> Array:
 
 
 def bounds(problem: Problem) -> Face:
-    """Return every single side of the inequalities of a problem, at the reference time."""
+    """Return every single bound of the inequalities of a problem, at the reference time, without polygon corners."""
     sides = (side for i, c in enumerate(problem.constraints) if not is_exact(c) for side in _sides(i, c))
     return tuple(side[0] for side in sides if len(side) == 1)
 
@@ -334,7 +341,7 @@ def is_flat(problem: Problem, level: Level) -> bool:
 
 
 def _corner(region: Polygon, edges: list[str | int]) -> Array:
-    """Return the corner (3, 2) between two successive edges of a polygon."""
+    """Return three points (3, 2) of a polygon: start of an edge, the corner at its end, and end of the next edge."""
     first, count = edges[0], len(region.vertices)
     assert isinstance(first, int)
     return region.vertices[[first, (first + 1) % count, (first + 2) % count]]
@@ -377,7 +384,7 @@ def needs_velocity(constraint: Band | Polygon) -> bool:
 
 
 def _sides(i: int, constraint: Band | Polygon) -> Iterator[Face]:
-    """Yield the finite bounds of a band, or the edges and corners of a polygon."""
+    """Yield the finite bounds of constraint number i if it is a band, or the edges and corners of a polygon."""
     if isinstance(constraint, Band):
         if np.isfinite(constraint.lower).all():
             yield (Level(i, "lower"),)
@@ -404,7 +411,10 @@ def levels(problem: Problem, face: Face, x: Array) -> tuple[Array, Array]:
 
 
 def restore(problem: Problem, face: Face, x: Array) -> Array:
-    """Return vectors (N, size) projected onto a face along the shortest way, by Newton steps."""
+    """Return vectors (N, size) projected onto a face along the shortest way, by Newton steps.
+
+    Local unknowns do not move.
+    """
     n = problem.layout.n_shared
     # Newton squares a small relative distance: three steps reduce 1e-2 to rounding, and five are in reserve.
     for _ in range(8):
@@ -418,12 +428,12 @@ def restore(problem: Problem, face: Face, x: Array) -> Array:
 
 
 def tangent_at(problem: Problem, face: Face, x: Array) -> Array:
-    """Return a basis (N, n, n - c) of the tangent space of a face at vectors (N, size)."""
+    """Return a basis (N, n, n - c) of the directions that stay on a face, at vectors (N, size)."""
     return tangent(levels(problem, face, x)[1], np.ones((len(x), problem.layout.n_shared))).along
 
 
 def _band(constraint: Band | Polygon, side: str | int) -> Band:
-    """Return the band of a level; the edge of a polygon becomes a plane."""
+    """Return the band of a level; the edge with number `side` of a polygon becomes a plane."""
     if isinstance(constraint, Band):
         return constraint
     assert isinstance(side, int)
@@ -439,7 +449,7 @@ def _band(constraint: Band | Polygon, side: str | int) -> Band:
 
 
 def conjunction(problem: Problem) -> list[Band]:
-    """Return the constraints as bands that must all hold.
+    """Return the constraints as bands that a valid estimate satisfies all together.
 
     Edges of convex polygons are included. Concave polygons are left out.
     """
@@ -465,7 +475,10 @@ def conjunction(problem: Problem) -> list[Band]:
 
 
 def face_of(problem: Problem, x: Array) -> Array:
-    """Return the number (N,) of the face in `faces` on which vectors x (N, size) lie: the face with most levels."""
+    """Return the number (N,) of the face in `faces` on which vectors x (N, size) are: the face with most levels.
+
+    A vector that satisfies no face with equality gets 0.
+    """
     found = np.zeros(len(x), dtype=int)
     for number, face in enumerate(faces(problem)):
         if face:
@@ -476,7 +489,10 @@ def face_of(problem: Problem, x: Array) -> Array:
 
 
 def violation(problem: Problem, x: Array) -> Array:
-    """Return the relative violation (N,) of the worst constraint at vectors x (N, size), or 0."""
+    """Return the violation (N,) of the worst constraint at vectors x (N, size); 0 if all constraints are satisfied.
+
+    The violation is divided by one plus the absolute bound, or for a polygon by one plus its greatest coordinate.
+    """
     worst = np.zeros(len(x))
     for c in problem.constraints:
         if isinstance(c, Polygon):
@@ -507,7 +523,10 @@ def violation_names(problem: Problem) -> str:
 
 
 def _quantity(problem: Problem, band: Band, x: Array, epoch: int | None = None) -> tuple[Jet, dict[int, int]]:
-    """Return the bounded quantity at an epoch with its derivatives, and the column of x for each seed."""
+    """Return the bounded quantity (N,) at an epoch with its derivatives, and the column of x for each derivative.
+
+    The second result maps the seed of each derivative to the column. The epoch None is the reference time.
+    """
     d, columns, states = problem.dimension, dict[int, int](), []
     for j, name in enumerate(state_names(band.target, len(problem.motions), problem.motions[band.target].order)):
         slot, shared = problem.layout.find(name)
@@ -558,7 +577,7 @@ def _horizontal(problem: Problem, target: int, x: Array) -> Array:
 
 
 def _outside(region: Polygon, points: Array) -> Array:
-    """Return the distance of points (N, 2) from a polygon relative to its size; 0 inside."""
+    """Return the distance of points (N, 2) from a polygon, divided by one plus its greatest coordinate; 0 inside."""
     a, b = region.vertices, np.roll(region.vertices, -1, axis=0)
     p = points[:, None]
     along, to = b - a, p - a

@@ -1,4 +1,8 @@
-"""Equality constraints of a run, for states that last for the run and for states of each epoch."""
+"""Equality constraints of a run, for states that last for the run and for states of each epoch.
+
+M problems have k epochs; a vector has n shared unknowns and l local ones for each epoch, `size` in all. c is the number
+of equalities of a state.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +30,10 @@ class Equalities:
     lasting : Face
         Equalities of states that all epochs share.
     single : Problem, optional
-        The states of one epoch, with their equalities and bounds (M or 1, k or 1). None if no epoch has own equalities.
+        The states of one epoch, with their equalities and bounds (M or 1, k or 1). None if every constrained state
+        lasts for the run.
     each : Face
-        Equalities of `single`, which hold in every epoch.
+        Equalities of `single`, which every epoch satisfies.
     """
 
     problem: Problem
@@ -60,7 +65,7 @@ class Equalities:
         return self.restore(x + move)
 
     def step(self, equations: Normal, damping: Array, x: Array) -> tuple[Array, Array]:
-        """Return the damped steps (M, size) that keep the equalities to first order, and whether they exist (M,).
+        """Return the damped steps (M, size) that satisfy the equalities to first order, and whether they exist (M,).
 
         Parameters
         ----------
@@ -83,7 +88,7 @@ class Equalities:
     def shared(self, equations: Normal, x: Array) -> tuple[Array, Array]:
         """Return information (M, n, n) and right side (M, n) of the shared unknowns, with the local ones eliminated.
 
-        The local unknowns keep their equalities.
+        The local unknowns continue to satisfy their equalities.
         """
         if self.single is not None:
             equations = _within(equations, self._own_space(x))
@@ -91,13 +96,13 @@ class Equalities:
         return information, vector
 
     def lasting_space(self, x: Array) -> Array:
-        """Return a basis (M, n, n - c) of the shared unknowns along their equalities."""
+        """Return a basis (M, n, n - c) of the steps of the shared unknowns that stay on their equalities."""
         if not self.lasting:
             return np.broadcast_to(np.eye(n := self.problem.layout.n_shared), (len(x), n, n))
         return tangent_at(self.problem, self.lasting, x)
 
     def _own_space(self, x: Array) -> Array:
-        """Return bases (M, k, l, l - c) of the local unknowns of every epoch along its equalities."""
+        """Return bases (M, k, l, l - c) of the steps of the local unknowns that stay on the equalities."""
         layout = self.problem.layout
         _, gradients = levels(self._single(x), self.each, self._states(x))
         local = np.zeros((*gradients.shape[:2], layout.n_local))
@@ -118,7 +123,7 @@ class Equalities:
         return self.single
 
     def _slots(self) -> list[tuple[slice, slice]]:
-        """Return pairs of slices of each state: in the local unknowns of the run, and in the vector of an epoch."""
+        """Return pairs of slices for each state: in the local unknowns of the run, and in the vector of an epoch."""
         own = {slot.name: slice(slot.start, slot.start + slot.size) for slot in self._epoch.layout.shared}
         local = [slot for slot in self.problem.layout.local if slot.name in own]
         return [(slice(slot.start, slot.start + slot.size), own[slot.name]) for slot in local]
@@ -155,7 +160,7 @@ def spare_rows(problem: Problem) -> Array:
 
 
 def _spread(band: Band | Polygon, shape: tuple[int, int]) -> Band | Polygon:
-    """Return an equality with one bound for each of M problems and k epochs, as one axis."""
+    """Return an equality whose bounds and coefficients have one axis (M k,), for M problems with k epochs each."""
     if isinstance(band, Polygon):
         return band
     lower, upper = (b if b.ndim == 0 else np.broadcast_to(b, shape).ravel() for b in (band.lower, band.upper))
@@ -165,12 +170,15 @@ def _spread(band: Band | Polygon, shape: tuple[int, int]) -> Band | Polygon:
 
 
 def _target(problem: Problem, constraint: int) -> int:
-    """Return the target of a constraint."""
+    """Return the number of the target of a constraint."""
     return problem.constraints[constraint].target
 
 
 def _within(equations: Normal, basis: Array) -> Normal:
-    """Return normal equations whose local unknowns move only along a basis (M, k, l, l - c)."""
+    """Return normal equations whose local unknowns move only along `basis` (M, k, l, l - c).
+
+    The new local unknowns are the l - c coefficients of the basis.
+    """
     turned = np.swapaxes(basis, -1, -2)
     return Normal(
         equations.shared,

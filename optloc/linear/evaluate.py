@@ -1,6 +1,8 @@
 """Predicted measurements and their derivatives at a point, for all rows at once.
 
-The indices from unknowns to rows are computed once for each structure.
+The indices from unknowns to rows are computed once for each structure. A *block* contains the m rows of one kind. An
+*input* is a component of a point of the measurement function h, for instance a coordinate of the target; its *seed* is
+its number. Vectors x (..., size) contain all unknowns; a *column* is a position in x.
 """
 
 from __future__ import annotations
@@ -125,7 +127,7 @@ class BlockLinks:
 
 
 def columns(layout: Layout, name: str, epoch: Array) -> Array:
-    """Return the columns (m, size) of a slot in the full parameter vector for rows of given epochs."""
+    """Return the columns (m, size) of the unknown `name` in the full parameter vector, for rows of epochs (m,)."""
     slot, shared = layout.find(name)
     # Local unknowns of epoch k follow those of all earlier epochs.
     base = slot.start + (0 if shared else layout.n_shared + epoch * layout.n_local)
@@ -175,7 +177,10 @@ def _adds(problem: Problem, block: Rows, start: int) -> Terms:
 
 
 def _terms(problem: Problem, block: Rows, start: int, enters: str) -> Terms:
-    """Return the linear terms of the biases that enter a block of rows in the given way."""
+    """Return the linear terms of the biases that enter a block in the way `enters`: "adds" or "scales".
+
+    `start` is the number of the first row of the block.
+    """
     parts = [Terms(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))]
     for bias in _entering(problem, enters):
         inside = (bias.row >= start) & (bias.row < start + block.count)
@@ -188,7 +193,7 @@ def _terms(problem: Problem, block: Rows, start: int, enters: str) -> Terms:
 
 
 def _entering(problem: Problem, enters: str) -> list[Bias]:
-    """Return the biases that enter rows in the given way, see `BiasForm.enters`."""
+    """Return the biases that enter rows in the way `enters`: "adds", "scales", "turns" or "moves", see `BiasForm`."""
     return [bias for bias in problem.biases if form_of(bias).enters == enters]
 
 
@@ -200,7 +205,7 @@ def _append(parts: list[Terms]) -> Terms:
 
 
 def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
-    """Return the contributions of the states of targets to positions and rates."""
+    """Return the contributions of the states of targets to the positions and rates of the targets."""
     feeds, count = [], len(problem.motions)
     for i, motion in enumerate(problem.motions):
         if motion.known is not None or not np.any(block.target == i):
@@ -238,7 +243,10 @@ def _station_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
 
 
 def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
-    """Return the contributions of mount errors to the rotation of axes."""
+    """Return the contributions of mount errors (angles, radians) to the rotation of the axes of stations.
+
+    `start` is the number of the first row of the block.
+    """
     feeds = []
     for bias in _entering(problem, "turns"):
         left = np.flatnonzero((bias.row >= start) & (bias.row < start + block.count))
@@ -256,7 +264,11 @@ def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
 
 
 def _course_feeds(problem: Problem, block: Rows, model: Model, start: int) -> list[Feed]:
-    """Return the contributions of time offsets along a course to positions and rates of stations, to first order."""
+    """Return the contributions of time offsets along a course to positions and rates of stations, to first order.
+
+    `start` is the number of the first row of the block. Rows contain the offset with factor +1 for the first station
+    and -1 for the second.
+    """
     feeds: list[Feed] = []
     for bias in _entering(problem, "moves"):
         rates = course(problem)
@@ -276,7 +288,7 @@ def _course_feeds(problem: Problem, block: Rows, model: Model, start: int) -> li
 
 
 def checked_vectors(problem: Problem, x: Array) -> Array:
-    """Return the parameter vectors (..., size); raise `InvalidProblem` for vectors of another length."""
+    """Return the parameter vectors (..., size) unchanged; raise `InvalidProblem` for vectors of another length."""
     size = problem.layout.size
     if x.shape[-1:] != (size,):
         raise InvalidProblem(f"a vector of shape {x.shape} for {size} unknowns", "vector", "order it by problem.layout")
@@ -384,7 +396,10 @@ def given(problem: Problem, links: BlockLinks) -> dict[int, Any]:
 
 
 def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> dict[int, Any]:
-    """Return the components of a per-station vector (rank 1) or set of axes (rank 2) at each row."""
+    """Return the components of a vector (rank 1) or set of axes (rank 2) of the station of each row, by seed.
+
+    `index` (m,) are the station numbers, `seed` is the number of the first component.
+    """
     epochs, count = array.shape[-2 - rank : -rank]
     # Epoch and station as one index, so that one table gathers rows of moving stations.
     joint = library(array).reshape(array, (*array.shape[: -2 - rank], epochs * count, *array.shape[-rank:]))
@@ -396,7 +411,7 @@ def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> d
 
 
 def _feed(value: Any, feed: Feed, x: Array, count: int) -> Any:
-    """Return the value of an input plus the contribution of an unknown."""
+    """Return the value (..., m) of an input plus the contribution of an unknown; `count` is the number of rows m."""
     column, gain = feed.table(count)
     part = gather(x, column)
     # Most unknowns have the factor one; a product with ones would cost as much as the rest.
@@ -462,7 +477,7 @@ _Terms = list[tuple[Array, Array, Any]]
 
 
 def _derive(problem: Problem, links: BlockLinks, x: Array) -> tuple[Any, _Terms]:
-    """Return the values (..., m) of one block, including biases, and their derivatives."""
+    """Return the values (..., m) of one block, including biases, and their derivatives as terms."""
     jet, m, fold = (
         links.model.h(*points(problem, links, x, differentiate=True)),
         links.block.count,
@@ -485,7 +500,10 @@ def _derive(problem: Problem, links: BlockLinks, x: Array) -> tuple[Any, _Terms]
 
 
 def _fold(layout: Layout) -> Any:
-    """Return the map from columns of the full vector to columns of [shared, local of the row's epoch]."""
+    """Return a function that maps columns of the full vector to columns of the Jacobian.
+
+    The Jacobian has the shared unknowns first, then the local unknowns of the row's epoch.
+    """
     n, length = layout.n_shared, layout.n_local
 
     def fold(column: Array) -> Array:
@@ -495,7 +513,10 @@ def _fold(layout: Layout) -> Any:
 
 
 def _bias(links: BlockLinks, x: Array, value: Any) -> tuple[Any, Any]:
-    """Return values with scales, offsets, drifts and emission times, and the factor that scales them, or None."""
+    """Return the values (..., m) with scales, offsets, drifts and emission times, and the factor that scales them.
+
+    The factor is None if no scale applies.
+    """
     m, gain = links.block.count, None
     if links.gains.row.size:
         gain = 1.0 + links.gains.total(x, m)
@@ -514,7 +535,7 @@ def _residual(block: Rows, value: Any, periodic: bool) -> Any:
 
 
 def _add(terms: _Terms, jacobian: Array) -> None:
-    """Add derivatives to the block's part of the Jacobian."""
+    """Add derivatives to the block's part of the Jacobian (..., m, n + l)."""
     for column, coefficient, factor in terms:
         # If all rows of the block have the same column (a shared position), a slice is enough; otherwise a scatter is
         # needed.

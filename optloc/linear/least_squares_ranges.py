@@ -3,6 +3,9 @@
 Rows z = D r + n (range, tdoa, toa, range_sum; D contains 0 and +-1) connect stations into a graph. In each connected
 group, the ranges that fit best are r = c + sign * t: known (t = 0), or known up to one unknown t, the range to a
 reference station. c and its covariance contain all information of these rows.
+
+A *node* is an unknown of the rows: the range to a station at an epoch, or an emission time. Letters: N problems, m
+rows, q nodes, the first s of which are ranges.
 """
 
 from __future__ import annotations
@@ -166,7 +169,7 @@ def reduce(problem: Problem) -> Problem:
 
 
 def _check(problem: Problem) -> None:
-    """Raise `InvalidProblem` if the rows have no common ranges: several targets, or unknown errors."""
+    """Raise `InvalidProblem` if the rows cannot be reduced: several targets, or biases."""
     if len(problem.motions) > 1:
         raise InvalidProblem("there are several targets", "reduce", "reduce the rows of one target")
     if problem.biases:
@@ -177,7 +180,10 @@ def _check(problem: Problem) -> None:
 
 
 def _keep_noise(noise: Noise, others: Array) -> list[Block]:
-    """Return the noise of the rows that stay."""
+    """Return the noise blocks of the rows `others`, which stay.
+
+    `InvalidProblem` is raised if noise correlates them with range rows.
+    """
     blocks = []
     for block in noise.blocks:
         stays = np.isin(block.row, others)
@@ -222,7 +228,7 @@ def _stays(problem: Problem) -> bool:
 
 
 def _design(problem: Problem) -> tuple[Array, Array, Array]:
-    """Return D (m, q) over nodes, and station and epoch of the station nodes."""
+    """Return D (m, q), and station and epoch (s,) of the nodes that are ranges."""
     moving = problem.stations.position.shape[-3] > 1 or (problem.epochs > 1 and not _stays(problem))
     entries: list[tuple[int, tuple[int, int, int], float]] = []
     coefficient: float
@@ -301,7 +307,10 @@ def _connect(design: Array) -> tuple[Array, Array]:
 
 
 def _least_squares(problem: Problem, design: Array, pinned: Array) -> tuple[Array, Array, Array]:
-    """Return the values of all nodes (N, q), their covariance (N or 1, q, q) and the misfit (N,)."""
+    """Return the values of all nodes (N, q), metres, their covariance (N or 1, q, q), m^2, and the misfit (N,).
+
+    `pinned` (N, q) marks nodes whose value is set to zero. The misfit is the chi-square of the redundant rows.
+    """
     q = design.shape[1]
     used = np.any(design != 0.0, axis=1)
     z = np.where(used & (problem.weight > 0.0), problem.observed, 0.0)[..., None]

@@ -95,7 +95,7 @@ def _local_unknowns(problem: Problem, states: Array, emissions: Array) -> Array:
 
 
 def _targets(problem: Problem) -> tuple[list[Array], list[Array]]:
-    """Return the targets of the rows of each kind, and whether the rows contain the emission time."""
+    """Return, for each kind, the targets of its rows, and whether its rows contain the emission time."""
     targets = [np.asarray(rows.target) for rows in problem.rows]
     return targets, [np.full(rows.count, MODELS[rows.kind].emission) for rows in problem.rows]
 

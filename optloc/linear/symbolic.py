@@ -1,6 +1,7 @@
 """Residuals and constraints of a problem as CasADi expressions, for nonlinear programs.
 
-They use the same models and the same indices as the numerical code.
+They use the same models and the same indices as the numerical code. Letters: m rows, p or q numbers that are parameters
+of the expressions.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Parameter vectors from positions: the other unknowns get their prior mean, or the value that fits best."""
+"""Parameter vectors from positions: the other unknowns get their prior mean, or the value that fits best.
+
+Letters: N problems, q positions of each, d coordinates, `size` unknowns of a problem.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +51,10 @@ def complete(problem: Problem, shared: Array) -> Array:
 
 
 def _fit_emission_times(problem: Problem, x: Array) -> Array:
-    """Return vectors (N, q, size) with the emission times that fit best: the mean of the remaining residuals."""
+    """Return vectors (N, q, size) with the emission times that fit best: the mean of the residuals without them.
+
+    Vectors with NaN are not changed.
+    """
     size, q = x.shape[:2]
     part, out = problem.take(np.repeat(np.arange(size), q)), x.reshape(size * q, x.shape[-1]).copy()
     usable = np.asarray(np.isfinite(out).all(-1))
