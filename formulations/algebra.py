@@ -110,7 +110,7 @@ def uncentre(c: Array, middle: Array, half: Array) -> Array:
 
 
 def normal(B: Array, g: Array) -> tuple[Array, Array]:
-    """Return ``B'B`` and ``B'g``.
+    """Return the normal equations of rows: the matrix ``B'B`` and the right side ``B'g``.
 
     Parameters
     ----------

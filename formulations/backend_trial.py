@@ -31,7 +31,10 @@ _NEAR = 1e-2
 
 
 def _conic(name: str) -> str:
-    """Return the failure of a conic solver, or "" if it works."""
+    """Return the failure of a conic solver, or "" if it works.
+
+    The solver must solve a program with a known position, and must not report a common point of cones that do not meet.
+    """
     from formulations.minimax_cone import common
     from formulations.squared_range import paraboloid
     from formulations.squared_range_conic import hull, shor
@@ -53,7 +56,10 @@ def _conic(name: str) -> str:
 
 
 def _nonlinear(name: str) -> str:
-    """Return the failure of a nonlinear solver, or "" if it works."""
+    """Return the failure of a nonlinear solver, or "" if it works.
+
+    The solver must solve programs with a known position, and must not report success for programs without a solution.
+    """
     free, held = _solve(name), _solve(name, inequalities=lambda x, p: [0.5 - x[0]])
     if isinstance(free, str) or isinstance(held, str):
         return str(free if isinstance(free, str) else held)
@@ -75,7 +81,10 @@ def _nonlinear(name: str) -> str:
 
 
 def _solve(name: str, start: Array | None = None, ranges: Array = _RANGES, **constraints: Callable[..., Any]) -> Any:
-    """Return the solution of a solver, or the message of its failure."""
+    """Return the solution of the nonlinear solver `name` for the position, or the message of its failure.
+
+    `constraints` are the equalities and inequalities of `formulations.nls.Program`.
+    """
     import casadi as ca
 
     from formulations.nls import Program

@@ -58,7 +58,13 @@ class BearingCourses:
 
 @dataclass(frozen=True, slots=True)
 class _CourseRun:
-    """The data of a fit: stations (N, m, d), axes, powers of the times (N, m, order + 1), rows and right sides."""
+    """The data of a fit of N courses to m bearings each, in d dimensions.
+
+    `station` (N, m, d) are the positions, `axes` the axes of the stations (None: the axes of the frame). `powers` (N,
+    m, order + 1) are the powers of the scaled times. `normal` (N, rows, d) are the vectors g, `right` (N, rows) the
+    right sides. `both` is True if elevations follow the azimuths, so that there are 2 m rows. `least` (N, 1) is the
+    shortest range in a weight.
+    """
 
     station: Array
     axes: Array | None
@@ -69,16 +75,16 @@ class _CourseRun:
     least: Array
 
     def design(self, normal: Array) -> Array:
-        """Return the rows G, shape (N, rows, n), made of normals (N, rows, d)."""
+        """Return the rows G (N, rows, n) of the n course coefficients, made of normals (N, rows, d)."""
         powers = np.concatenate([self.powers, self.powers], axis=1) if self.both else self.powers
         return (powers[..., :, None] * normal[..., None, :]).reshape(*normal.shape[:2], -1)
 
     def line(self, c: Array) -> Array:
-        """Return the lines of sight (N, m, d) to a course, in the frame of the stations."""
+        """Return the lines of sight (N, m, d) to a course c (N, order + 1, d), in the frame of the stations."""
         return np.asarray(self.powers @ c - self.station)
 
     def own(self, c: Array) -> Array:
-        """Return the lines of sight (N, m, d) to a course, in the axes of each station."""
+        """Return the lines of sight (N, m, d) to a course c, in the axes of each station."""
         return self.line(c) if self.axes is None else np.einsum("nmij,nmj->nmi", self.axes, self.line(c))
 
 
@@ -153,7 +159,7 @@ def sight_courses(
 
 
 def _run(S: Array, axes: Array | None, powers: Array, seen: BearingRays, both: bool) -> _CourseRun:
-    """Return the data of a fit, with the least range in a weight."""
+    """Return the data of a fit; the arguments are those of `_CourseRun`, and the directions of sight."""
     normal = seen.normals
     right = dot(normal, np.concatenate([S, S], axis=1) if both else S)
     size = np.sqrt(dot(S, S)).max(axis=-1, keepdims=True)
@@ -162,7 +168,11 @@ def _run(S: Array, axes: Array | None, powers: Array, seen: BearingRays, both: b
 
 
 def _balance(Z: Array, G: Array, b: Array, W: Array, order: int) -> Array:
-    """Return the solution (N, order + 1, d) of ``Z' W^2 (G c - b) = 0``; NaN if it is not unique."""
+    """Return the solution c (N, order + 1, d) of ``Z' W^2 (G c - b) = 0``; NaN if it is not unique.
+
+    Z (N, rows, n) are the instruments, G the rows, b the right sides, W (N, rows) the weights. With Z = G it is
+    weighted least squares.
+    """
     n = G.shape[-1]
     # triangularised, not squared: an orthonormal base of the instruments' columns replaces Z' W
     share = np.where(W > 0.0, W / W.max(axis=-1, keepdims=True), 0.0)[..., None]

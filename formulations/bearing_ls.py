@@ -285,13 +285,19 @@ def lengths(line: Array, least: Array) -> Array:
 
 
 def _local(point: Array, S: Array, turn: Array | None) -> Array:
-    """Return the lines of sight to a point, in the axes of each station."""
+    """Return the lines of sight (..., N, d) from stations S to a point, in the axes of each station.
+
+    `turn` (..., N, d, d) are the axes; None: the axes of the frame.
+    """
     line = point[..., None, :] - S
     return line if turn is None else np.einsum("...ij,...j->...i", turn, line)
 
 
 def _balance(Z: Array, G: Array, b: Array, W: Array) -> Array:
-    """Return the solution of ``Z' W^2 (G p - b) = 0``, with one step of refinement; NaN if it is not unique."""
+    """Return the solution p (..., d) of ``Z' W^2 (G p - b) = 0``, with one step of refinement; NaN if it is not unique.
+
+    Z are the instruments, G the rows, b the right sides, W the weights. With Z = G it is weighted least squares.
+    """
     left = Z * np.where(W > 0.0, W / W.max(axis=-1, keepdims=True), 0.0)[..., None] ** 2
     inverse = _inverse(np.einsum("...ki,...kj->...ij", left, G))
     point = np.zeros(inverse.shape[:-1])
@@ -303,7 +309,7 @@ def _balance(Z: Array, G: Array, b: Array, W: Array) -> Array:
 
 
 def _inverse(M: Array) -> Array:
-    """Return the inverse of 2 x 2 or 3 x 3 matrices by cofactors; NaN if singular."""
+    """Return the inverse of matrices (..., 2, 2) or (..., 3, 3) by cofactors; NaN if singular."""
     if M.shape[-1] == 2:
         first, second = M[..., 0, :], M[..., 1, :]
         columns = np.stack(

@@ -212,7 +212,11 @@ def course(
 
 
 def _fit(normals: Array, right: Array, powers: Array, weight: Array) -> tuple[Array, Mask]:
-    """Return the weighted least-squares solution (N, order + 1, 3), and whether the system has full rank."""
+    """Return the weighted least-squares course (N, order + 1, 3), and whether the system has full rank (N,).
+
+    Each epoch has three rows: `normals` (N, k, 3, 3), right sides and weights (N, k, 3). `powers` (N, k, order + 1) are
+    those of the time.
+    """
     count, order = len(right), powers.shape[-1]
     n = 3 * order
     B = powers[:, :, None, :, None] * (normals * weight[..., None])[:, :, :, None]

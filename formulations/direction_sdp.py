@@ -307,7 +307,11 @@ def _relaxation(count: int, backend: str) -> Relaxation:
 
 @dataclass(frozen=True, slots=True)
 class _Cost:
-    """Coefficients in ``v - v^``, and the largest sum of ``|v - v^|^2`` of any relevant point."""
+    """A quadratic cost of N directions: ``constant + 2 linear'w + sum square w^2`` with w the change from a reference.
+
+    `linear` and `square` have the shape (N, 3). `reach` is the largest sum of ``|v - v^|^2`` of any relevant point,
+    with the reference directions v^.
+    """
 
     constant: float
     linear: Array
@@ -316,14 +320,20 @@ class _Cost:
 
 
 def _frames(angle: Array, axes: ArrayLike | None) -> Array:
-    """Return the frames (N, 3, 3) of directions: direction, tangent of azimuth, tangent of elevation."""
+    """Return the frames (N, 3, 3) of directions `angle` (N, 2), radians.
+
+    The rows are the direction, the tangent of azimuth, and the tangent of elevation.
+    """
     seen = rays(angle[:, 0], angle[:, 1], axes)
     assert seen.upward is not None
     return np.stack([seen.ahead, seen.across, seen.upward], axis=1)
 
 
 def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
-    """Return the solution of the relaxation for a quadratic cost."""
+    """Return the solution of the relaxation for a quadratic cost in the frames (N, 3, 3) of the reference directions.
+
+    S (N, 3) are the stations.
+    """
     count = len(S)
     # w in units in which the largest tangent weight is one; otherwise the lift of errors of a milliradian would vanish
     size = float(cost.square[:, 1:].max()) or 1.0

@@ -100,7 +100,7 @@ class Shape:
 
     @property
     def places(self) -> tuple[int, int, int, int]:
-        """Return the first indices of beta, r and w in y, and the length of y."""
+        """Return four indices of y: the first of beta, the first of r, the first of w, and its length."""
         beta = 1 + self.dimension
         r = beta + self.unknowns + len(self.second)
         return beta, r, r + self.nodes, r + self.nodes + len(self.product)
@@ -212,7 +212,11 @@ class DopplerScene:
         return cls(shape, place, speed, rows, first, whiten, own, origin, length, rate, unit, unit * mean)
 
     def parameters(self, far: Array, reach: float) -> tuple[dict[str, Array], float]:
-        """Return the parameters of the programme for the ranges of the previous pass, and the unit of its cost."""
+        """Return the parameters of the programme by name, and the unit of its cost.
+
+        `far` (m,) are the ranges of the previous pass, which divide the rows; `reach` is the greatest distance of the
+        source.
+        """
         form = self.whiten @ (self.rows / far[:, None])
         gram = form.T @ form
         size = float(np.abs(gram).max()) or 1.0
@@ -240,7 +244,7 @@ class DopplerScene:
         return values, size
 
     def longest(self, reach: float) -> float:
-        """Return the greatest length of Y for any source within the reach."""
+        """Return the greatest length of Y for any source within the reach; the bound from the dual needs it."""
         far = reach if self.surface is None else float(np.linalg.eigvalsh(self.surface.shape)[0]) ** -0.5
         r = far + np.sqrt((self.place**2).sum(axis=1))
         slow = np.sqrt((self.speed**2).sum(axis=1))
@@ -346,7 +350,10 @@ def doppler(
 
 
 def _read_off(scene: DopplerScene, far: Array, size: float, answer: ConicAnswer) -> DopplerStart:
-    """Return the start in the units of the caller from a solution of the relaxation."""
+    """Return the start in the units of the caller from a solution of the relaxation.
+
+    `far` (m,) are the ranges that divided the rows, scaled; `size` is the unit of the cost.
+    """
     lift, d = answer.values["lift"], scene.shape.dimension
     point, beta = lift[0, 1 : 1 + d], scene.shape.places[0]
     spread, axes = np.linalg.eigh(lift[1 : 1 + d, 1 : 1 + d] - np.outer(point, point))
@@ -368,14 +375,17 @@ def _read_off(scene: DopplerScene, far: Array, size: float, answer: ConicAnswer)
 
 
 def _nothing(dimension: int, design: tuple[int, ...], answer: ConicAnswer | None) -> DopplerStart:
-    """Return a start of NaN."""
+    """Return a start of NaN, for `design` of the shape (rows, unknowns)."""
     rows, unknowns = design
     point, none = np.full((1 + 2 * dimension, dimension), np.nan), np.full(unknowns, np.nan)
     return DopplerStart(point, none, np.full(rows, np.nan), np.nan, -np.inf, np.nan, answer)
 
 
 def _ends(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
-    """Return the node whose range multiplies a row, the node whose rate is an unknown, -1 for none, and the sign."""
+    """Return three arrays (m,): the node whose range multiplies a row, the node whose rate is an unknown, and the sign.
+
+    A node is -1 if there is none. The sign is the coefficient of the first node.
+    """
     if (np.abs(rates).sum(axis=1) > 2.0).any() or (np.abs(rates.sum(axis=1)) > 1.0).any():
         raise ValueError("a row of rates must be one rate, or the difference of two")
     # a rate that is always zero needs no unknown; a rate that many rows share should be only one unknown
@@ -392,7 +402,11 @@ def _ends(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
 
 
 def _shape(nodes: tuple[int, ...], first: Array, second: Array, design: Array, rate: Mask, surface: bool) -> Shape:
-    """Return the structure of the programme for the given rows."""
+    """Return the structure of the programme.
+
+    `nodes` is the shape (M, d) of the nodes. `first` and `second` are the results of `_ends`. `design` (m, p) are the
+    coefficients of b. `rate` marks rows of rates, `surface` is True for a source on an ellipsoid.
+    """
     known = design.shape[1]
     others = tuple(int(node) for node in np.unique(second[second >= 0]))
     of = {node: known + i for i, node in enumerate(others)}
@@ -406,7 +420,10 @@ def _shape(nodes: tuple[int, ...], first: Array, second: Array, design: Array, r
 def _forms(
     shape: Shape, place: Array, speed: Array, z: Array, ranges: Array, first: Array, second: Array, design: Array
 ) -> Array:
-    """Return the rows as linear forms in y: measured minus predicted values."""
+    """Return the rows (m, length of y) as linear forms in y: measured minus predicted values.
+
+    The form of a row of rates is multiplied by the range of its node `first`.
+    """
     beta, r, w, size = shape.places
     at = {pair: w + k for k, pair in enumerate(shape.product)}
     of = {node: j for j, node in shape.rate_of.items()}

@@ -92,7 +92,7 @@ class LowRank:
     cost: Array
 
     def take(self, which: Any) -> LowRank:
-        """Return the selected fits."""
+        """Return the selected fits; `which` is an index, a mask or a slice."""
         s, p = self.stations, self.pulses
         return LowRank(
             StationFactors(s.alpha[which], s.u[which], s.b[which]),
@@ -147,7 +147,10 @@ def fit_low_rank(z: Array, weight: Array, emission: Array, start: StationFactors
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """The data of a fit; each method is a part of one step for all starts at once."""
+    """The data of a fit; each method is a part of one step for all S starts at once.
+
+    The fields are arguments of `fit_low_rank`: `z` and `weight` (N, M), `emission` (N,), `clocks`.
+    """
 
     z: Array
     weight: Array
@@ -178,13 +181,20 @@ class _Fit:
         return LowRank(at, here.pulses, here.cost)
 
     def distance(self, at: StationFactors, pulses: Pulses) -> Array:
-        """Return distances (S, N, M): the mean of the distances from the arrival and from the fit, above a minimum."""
+        """Return distances (S, N, M), which divide the equations.
+
+        A distance is the mean of the distances from the arrival and from the fit; short distances are raised to a
+        minimum.
+        """
         by_time = np.abs(self.z - at.b[:, None] - pulses.o[:, :, None])
         square = at.alpha[:, None] + (pulses.beta + pulses.o**2)[:, :, None] + pulses.v @ np.swapaxes(at.u, 1, 2)
         return np.maximum(0.5 * (by_time + np.sqrt(np.maximum(square, 0.0))), _NEAR)
 
     def project(self, at: StationFactors, scale: Array) -> _Projected:
-        """Return the residuals that remain for the best pulses."""
+        """Return the residuals that remain for the best pulses, at stations `at`.
+
+        `scale` (S, N, M) multiplies the equations.
+        """
         shifted = self.z - at.b[:, None]
         u = np.broadcast_to(at.u[:, None], (*scale.shape, at.u.shape[-1]))
         ones = np.ones((*scale.shape, 1))
@@ -201,7 +211,10 @@ class _Fit:
         return _Projected(pulses, q, residual, scale, np.sum(residual**2, axis=(1, 2)))
 
     def moved(self, at: StationFactors, here: _Projected, damping: Array) -> StationFactors:
-        """Return stations after one damped step of Gauss and Newton."""
+        """Return stations after one damped step of Gauss and Newton from `at`, whose projection is `here`.
+
+        `damping` (S,) is Marquardt's factor of each start.
+        """
         count, n, m = here.scale.shape
         d = at.u.shape[-1]
         columns = [np.ones((count, n, m, 1)), np.broadcast_to(here.pulses.v[:, :, None], (count, n, m, d))]
@@ -225,7 +238,11 @@ class _Fit:
 
 @dataclass(frozen=True, slots=True)
 class _Projected:
-    """The pulses that fit best, an orthonormal basis of their columns, the residuals, and the sum of their squares."""
+    """The result of a projection: the pulses that fit best, and the residuals.
+
+    `q` (S, N, M, d + 2) is an orthonormal basis of the columns of the pulses. `residual` (S, N, M) are the scaled
+    residuals, `cost` (S,) the sums of their squares. `scale` (S, N, M) multiplied the equations.
+    """
 
     pulses: Pulses
     q: Array
@@ -290,7 +307,7 @@ def orthonormal(a: Array) -> tuple[Array, Array]:
 
 
 def _back(r: Array, part: Array) -> Array:
-    """Return the solution of an upper triangular system; zero where its pivot is infinite."""
+    """Return the solution of the upper triangular system ``r x = part``; zero where its pivot is infinite."""
     out = np.zeros_like(part)
     for i in range(part.shape[-1] - 1, -1, -1):
         known = part[..., i] - np.einsum("...k,...k->...", r[..., i, i + 1 :], out[..., i + 1 :])

@@ -70,7 +70,10 @@ def upgrade(fit: LowRank) -> tuple[Array, Array, Array]:
 
 
 def _white(fit: LowRank, s: int) -> tuple[Array, Array, Array, Array]:
-    """Return centred and white stations, the pulses for these stations, and their squares."""
+    """Return the data of fit number s with centred and white stations u (M, d).
+
+    The results are u, the pulses v (N, d) for these stations, alpha (M,), and beta + o^2 (N,).
+    """
     u, v = fit.stations.u[s], fit.pulses.v[s]
     middle = u.mean(axis=0)
     centred = u - middle
@@ -81,7 +84,10 @@ def _white(fit: LowRank, s: int) -> tuple[Array, Array, Array, Array]:
 
 
 def _sides(u: Array, v: Array, alpha: Array, square: Array) -> list[tuple[Array, Array]]:
-    """Return the candidates (H, h), with H (d, d) and h (d,), from each side with enough points."""
+    """Return the candidates (H, h), with H (d, d) and h (d,), from each side with enough points.
+
+    `alpha` (M,) and `square` (N,) are the values of the two quadrics, for the stations u and the pulses v.
+    """
     d, out = u.shape[1], []
     if len(u) >= unknowns(d):
         H, h = _quadric(u, alpha)
@@ -98,7 +104,7 @@ def _sides(u: Array, v: Array, alpha: Array, square: Array) -> list[tuple[Array,
 
 
 def _quadric(x: Array, value: Array) -> tuple[Array, Array]:
-    """Return Q (d, d) and q (d,) of the fit ``x'Qx + x'q + constant`` to values."""
+    """Return Q (d, d) and q (d,) of the fit ``x'Qx + x'q + constant`` to values (n,) at points x (n, d)."""
     d = x.shape[1]
     i, k = np.triu_indices(d)
     columns = np.concatenate([x[:, i] * x[:, k] * np.where(i == k, 1.0, 2.0), x, np.ones((len(x), 1))], axis=1)
@@ -109,7 +115,10 @@ def _quadric(x: Array, value: Array) -> tuple[Array, Array]:
 
 
 def _positive(Q: Array) -> list[Array]:
-    """Return matrices with eigenvalues raised to each floor; only one matrix if no eigenvalue is below a floor."""
+    """Return matrices with eigenvalues raised to each floor of `_FLOORS`.
+
+    The list has one matrix if no eigenvalue is below a floor, and none if Q is zero or not finite.
+    """
     width, axes = np.linalg.eigh(Q)
     largest = np.abs(width).max()
     if not np.isfinite(largest) or largest <= 0.0:

@@ -237,7 +237,7 @@ def angles(point: Array, direction: Array, station: Array) -> Array:
 
 
 def _at(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
-    """Return the common points of cones whose half-angles are `level` times their scale."""
+    """Return the common points of cones whose half-angles are `level` times `scale` (N,), at most `_WIDEST`."""
     theta = np.where(np.isfinite(scale), np.minimum(level * scale, _WIDEST), np.inf)
     return common(u, S, theta, backend=backend)
 
@@ -305,7 +305,10 @@ def edge_problem(count: int, dim: int) -> Any:
 
 
 def _cones(point: Any, radius: Any, count: int, dim: int) -> list[Any]:
-    """Return the constraints of the cones, with new parameters."""
+    """Return the constraints of the cones, with new parameters.
+
+    If `radius` is not None, a ball of this radius about the point must be inside the cones.
+    """
     import cvxpy as cp
 
     rows = dim - 1

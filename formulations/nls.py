@@ -249,9 +249,10 @@ class Program:
         )
 
     def _contradiction(self, x: Any, data: Array, status: str) -> str:
-        """Return why a point is not a solution although the solver reports success; "" if there is no contradiction.
+        """Return the reason why a point is not a solution although the solver reports success; "" if there is none.
 
-        Some solvers report success at their time limit, or at a start without a gradient.
+        Some solvers report success at their time limit, or at a start without a gradient. `data` are the parameters of
+        the solve, `status` is the status in the solver's words.
         """
         if "limit" in status.lower():
             return "it stopped at a limit"
@@ -285,7 +286,10 @@ hold_in_forks(_LOCKS)
 
 
 def _options(choice: Choice | None, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a CasADi solver; the options of IPOPT are in a separate table."""
+    """Return the options of a CasADi solver: options that suppress output, then `settings` or those of the choice.
+
+    The options of IPOPT are in a separate table.
+    """
     name = "ipopt" if choice is None else choice.name
     own = dict(settings if choice is None else choice.settings)
     silent = _SILENCE.get(name, {})
@@ -295,7 +299,7 @@ def _options(choice: Choice | None, settings: Mapping[str, Any]) -> dict[str, An
 
 
 def _column(expressions: Any, count: int | None = None) -> Any:
-    """Return expressions as one CasADi column."""
+    """Return expressions as one CasADi column; raise ValueError if there are not `count` of them."""
     import casadi as ca
 
     listed = isinstance(expressions, Sequence)

@@ -105,7 +105,7 @@ def _relaxation(stations: int, pulses: int, backend: str) -> Relaxation:
 
 
 def _across(n: int) -> Array:
-    """Return n - 1 orthonormal columns that are orthogonal to ones (Helmert's)."""
+    """Return a matrix (n, n - 1) of orthonormal columns that are orthogonal to ones (Helmert's)."""
     row, k = np.arange(n)[:, None], np.arange(1, n)
     return np.asarray(np.where(row < k, 1.0, np.where(row == k, -k, 0.0)) / np.sqrt(k * (k + 1)))
 

@@ -78,7 +78,10 @@ def covariances(design: Design, w: Array) -> Array:
 
 
 def of_places(covariance: Array, criterion: Criterion) -> Array:
-    """Return the criterion f (...) of covariances (..., d, d), m^2."""
+    """Return the criterion f (...) of covariances (..., d, d) in m^2.
+
+    The unit is m^2 for A and E; D is the logarithm of a determinant.
+    """
     if criterion == "A":
         return np.asarray(np.trace(covariance, axis1=-2, axis2=-1))
     if criterion == "D":
@@ -101,7 +104,7 @@ def value(design: Design, w: Array, criterion: Criterion, *, worst: bool = False
 
 
 def gradients(design: Design, w: Array, criterion: Criterion) -> tuple[Array, Array]:
-    """Return f (P,) and its gradients (P, n) at weights (n,); a subgradient for a repeated eigenvalue."""
+    """Return f (P,) and its gradients (P, n) by the weights w (n,); a subgradient for a repeated eigenvalue."""
     information = design.prior + np.einsum("prmn,n,prkn->pmk", design.rows, np.asarray(w, float), design.rows)
     inverse = np.linalg.inv(information)
     d = design.dimension
@@ -121,6 +124,9 @@ def semidefinite(
     design: Design, rules: Array, limits: Array, criterion: Criterion, *, worst: bool = False
 ) -> tuple[float, Array]:
     """Return the least value over 0 <= w <= 1, rules @ w <= limits, and w (n,), by Clarabel's interior-point method.
+
+    The value is a lower bound for all sets of sites. `rules` (R, n) and `limits` (R,) are the linear rules; `worst`
+    minimises the maximum over places instead of their mean.
 
     Raises
     ------
@@ -276,13 +282,13 @@ class PlacementGround:
     height: Array
 
     def function(self) -> Any:
-        """Return the height as a function of CasADi, from (2,) to a number."""
+        """Return the height as a function of CasADi, from plan coordinates (2,), metres, to metres."""
         import casadi as ca
 
         return ca.interpolant("ground", "bspline", [self.x, self.y], self.height.ravel(order="F"))
 
     def at(self, points: Array) -> Array:
-        """Return the heights (q,) at points (q, 2)."""
+        """Return the heights (q,), metres, at points (q, 2); points beyond the grid get the height at its edge."""
         spline = self.function()
         low, high = [self.x[0], self.y[0]], [self.x[-1], self.y[-1]]
         return np.array([float(spline(np.clip(point, low, high))) for point in points])
@@ -306,7 +312,7 @@ class PlacementRegion:
     high: float = 0.0
 
     def excess(self, place: Array, ground: PlacementGround | None) -> Array:
-        """Return the violation of each rule by a place (d,); no value is positive inside the region."""
+        """Return the violation of each rule by a place (d,), metres; no value is positive inside the region."""
         plan = self.edges @ place[:2] - self.offsets
         if len(place) == 2:
             return np.asarray(plan)
@@ -394,9 +400,9 @@ def refine(
 
 
 def _symbolic(ca: Any, matrix: Any, d: int, criterion: Criterion) -> Any:
-    """Return the criterion of the covariance of a symbolic information matrix.
+    """Return the criterion of the covariance of a symbolic information matrix; `ca` is the module casadi.
 
-    For E, a root of the trace of a power.
+    For E, the result is a root of the trace of a power, which is smooth.
     """
     covariance = ca.inv(matrix)[:d, :d]
     if criterion == "A":

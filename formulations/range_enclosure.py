@@ -62,12 +62,12 @@ class Ranged:
 
     @property
     def excess(self) -> Array:
-        """Return the vector d, shape (M - 1,)."""
+        """Return the vector d, shape (M - 1,): known differences of the ranges from the range of the reference."""
         return self.offset[1:] if self.free else self.offset[1:] - self.offset[0]
 
     @property
     def spread(self) -> Array:
-        """Return the covariance R of w, shape (M - 1, M - 1)."""
+        """Return the covariance R of the errors w, shape (M - 1, M - 1)."""
         inner = self.covariance[1:, 1:]
         if self.free:
             return inner
@@ -177,7 +177,10 @@ def ball(ranged: Ranged, centre: Array, radius: float) -> EnclosingBox:
 
 
 def _left_inverse(system: Array, away: Array, root: Array) -> Array | None:
-    """Return the left inverse weighted for squared ranges, or None if the columns are not independent."""
+    """Return the left inverse of `system`, weighted for squared ranges, or None if the columns are not independent.
+
+    `away` (M - 1,) are distances from the stations, `root` is the Cholesky factor of the covariance of the ranges.
+    """
     rows, columns = system.shape
     if rows < columns:
         return None
@@ -193,7 +196,11 @@ def _left_inverse(system: Array, away: Array, root: Array) -> Array | None:
 
 @dataclass(frozen=True, slots=True)
 class _Error:
-    """Bounds of the effect of range errors on linear functions of the squared equations."""
+    """Bounds of the effect of range errors w on linear functions of the squared equations, for a cost of at most rho^2.
+
+    `root` is the Cholesky factor of the covariance R of w, `variance` its diagonal. `side` are the signs, `excess` is
+    the vector d of the ranges.
+    """
 
     rho: float
     root: Array
@@ -211,7 +218,10 @@ class _Error:
         return max(0.0, (middle - rest) / (1.0 + slope)), (middle + rest) / (1.0 - slope)
 
     def position(self, row: Array, low: float, high: float) -> float:
-        """Return a bound of the effect of the errors on a coordinate."""
+        """Return a bound of the effect of the errors on a coordinate, for reference ranges from `low` to `high`.
+
+        `row` (M - 1,) is the row of the left inverse for this coordinate.
+        """
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         both = self._along(row * (self.excess + self.side * middle)) + half * self._along(row * self.side)
         return both + self._square(row)
@@ -228,7 +238,7 @@ class _Error:
 def _box(
     ranged: Ranged, point: Array, left: Array, right: Array, error: _Error, reach: tuple[float, float]
 ) -> EnclosingBox:
-    """Return the box of ``x' = left (right - phi)`` in principal axes.
+    """Return the box of ``x' = left (right - phi)`` in principal axes; `reach` is the interval of the reference range.
 
     A measured reference range is an extra unknown.
     """
@@ -242,7 +252,7 @@ def _box(
 
 
 def _principal(ranged: Ranged, point: Array) -> Array:
-    """Return the principal axes of the errors of a fix as columns, each one standard deviation long."""
+    """Return the principal axes (d, d) of the errors of a fix at `point`, in columns of one standard deviation."""
     apart = point - ranged.station
     # at a station the direction is undefined: the row is left out, which avoids a division by zero
     unit = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)

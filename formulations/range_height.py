@@ -233,13 +233,16 @@ def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> Heig
 
 
 def _reshape(found: HeightCandidates, lead: tuple[int, ...]) -> HeightCandidates:
-    """Return candidates with the batch axis reshaped to `lead`."""
+    """Return candidates (N, ...) with the batch axis reshaped to `lead`, the shape of the caller's batch."""
     x, ranges = (v.reshape(*lead, *v.shape[1:]) for v in (found.x, found.ranges))
     return HeightCandidates(x, ranges, found.valid.reshape(*lead, _SLOTS))
 
 
 def _meet(curve: HeightCurve, stations: Array, A: Array, centre: Array, *, positive: bool) -> HeightCandidates:
-    """Return all common points of N curves and their ellipsoids."""
+    """Return all common points of N curves and their ellipsoids; shapes A (N, 3, 3), centres (N, 3).
+
+    If `positive` is True, points with a negative range to one of the `stations` are dropped.
+    """
     with np.errstate(all="ignore"):
         E, L, alpha = curve.on_ellipsoid(A, centre)
         t, mu = _starts(curve.square, E, L, alpha)
@@ -420,7 +423,7 @@ def two_stations(stations: Array, ranges: Array, towards: Array) -> HeightCurve:
 
 
 def _perpendicular(axis: Array, hint: Array) -> Array:
-    """Return the unit vector normal to the axis, towards the hint if the hint is off the axis."""
+    """Return unit vectors (N, 3) normal to the axes (N, 3), towards the hint (N, 3) if the hint is off the axis."""
     least = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
     off = hint - axis * dot(axis, hint)[:, None]
     weak = dot(off, off) <= _AXIAL * dot(hint, hint)
@@ -476,7 +479,10 @@ def _roots(c: Array) -> Array:
 
 
 def _starts(square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Array]:
-    """Return starts near every real intersection, two slots for each root; NaN without a start."""
+    """Return starts (t, mu), each (N, 8), near every real intersection, two slots for each root.
+
+    t is NaN if a slot has no start. The arguments are those of `quartic`.
+    """
     roots = _roots(quartic(square, E, L, alpha))
     t = np.tile(roots.real, 2)
     # a pair slightly off the real axis may be a double root
@@ -488,7 +494,11 @@ def _starts(square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Arr
 
 
 def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Array]:
-    """Return the results of Newton's iteration on the two conics; residuals reveal slots that did not converge."""
+    """Return the results (t, mu) of Newton's iteration on the two conics.
+
+    Slots that did not converge are not marked; the caller finds them by their residuals. The coefficients are those of
+    `quartic`.
+    """
     go = np.isfinite(t)
     for _ in range(_NEWTON):
         one = mu * mu - _value(square, t)
@@ -509,5 +519,5 @@ def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array
 
 
 def _value(c: Array, t: Array) -> Array:
-    """Return the values of polynomials at t; coefficients are constant first."""
+    """Return the values of quadratic polynomials c (N, 3) at t (N, K); coefficients are constant first."""
     return np.asarray(c[:, :1] + t * (c[:, 1:2] + t * c[:, 2:]))

@@ -247,7 +247,7 @@ class RegistrationWindows:
         return float(np.einsum("ki,kij,kj", rest, self.gram, rest) + self.prior @ shift**2), shift
 
     def place(self, target: Array) -> Array:
-        """Return position at time zero, and velocity of a moving target, (1 or 2, d) as given."""
+        """Return the target (1 or 2, d) in the units of the caller: position at time zero, and velocity if it moves."""
         found = self.scale * target.reshape(-1, len(self.origin))
         if len(found) == 2:  # back from time relative to its middle, in half spans
             found[1] /= self.clock[1]
@@ -346,7 +346,10 @@ def _parameters(run: RegistrationWindows) -> dict[str, Array]:
 
 
 def _read_off(run: RegistrationWindows, weight: Array, price: float, answer: ConicAnswer) -> RegistrationStart:
-    """Return the start in the units of the caller from a solution of the relaxation."""
+    """Return the start in the units of the caller from a solution of the relaxation.
+
+    `weight` (n, n) is the form of the mean of |p_k|^2 over the windows, which `price` multiplies.
+    """
     shared, inside = answer.values["shared"], slice(1, 1 + len(weight))
     target = shared[0, inside]
     cost, shift = run.cost(target)
@@ -365,6 +368,6 @@ def _read_off(run: RegistrationWindows, weight: Array, price: float, answer: Con
 
 
 def _block(answer: ConicAnswer, window: int) -> Array:
-    """Return the block of a window from a solution of the relaxation."""
+    """Return the block of a window from a solution of the relaxation: the lift of (1, p, v, delta, r_1, f)."""
     across = answer.values[f"across {window}"]
     return np.block([[answer.values["shared"], across], [across.T, answer.values[f"own {window}"]]])

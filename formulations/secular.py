@@ -131,7 +131,10 @@ def everything(equation: Secular) -> Roots:
 
 
 def _start(equation: Secular, pole: Array, weight: Array, sign: float) -> tuple[Array, Mask]:
-    """Return distances from the poles that are not beyond the first root, and whether a root is possible."""
+    """Return distances from the poles that are not beyond the first root, and whether a root is possible.
+
+    `pole` and `weight` (K, N) belong to the slots; `sign` is 1 for roots above the poles, -1 for roots below them.
+    """
     level, slope = equation.level + equation.slope * pole, equation.slope
     positive = level > 0.0
     safe = np.where(positive, level, 1.0)
@@ -152,7 +155,11 @@ def _start(equation: Secular, pole: Array, weight: Array, sign: float) -> tuple[
 
 
 def _climb(equation: Secular, origin: Array, gap: Array, sign: Array, start: Array, free: Mask) -> Roots:
-    """Return the results of Newton's monotone iteration; ``gap[k, i]`` is the distance of origin i from pole k."""
+    """Return the roots after Newton's monotone iteration from distances `start` (K, N) of the origins.
+
+    `gap[k, i]` is the distance of origin i from pole k. `sign` is 1 for slots above their origin, -1 below. `free`
+    marks slots in which a root is possible.
+    """
     weight = equation.weight[:, None]
     level = equation.level + equation.slope * origin
     slope = equation.slope * sign
