@@ -79,9 +79,9 @@ def span(when: Array, heard: Mask) -> tuple[Array, Array]:
     """
     first = np.min(np.where(heard, when, np.inf), axis=-1, keepdims=True)
     last = np.max(np.where(heard, when, -np.inf), axis=-1, keepdims=True)
-    some = last >= first
-    half = np.where(some, 0.5 * (last - first), 0.0)
-    return np.where(some, 0.5 * (first + last), 0.0), np.where(half > 0.0, half, 1.0)
+    any_time = last >= first
+    half = np.where(any_time, 0.5 * (last - first), 0.0)
+    return np.where(any_time, 0.5 * (first + last), 0.0), np.where(half > 0.0, half, 1.0)
 
 
 def uncentre(c: Array, middle: Array, half: Array) -> Array:
@@ -217,13 +217,13 @@ def bordered(D: Array, q: Array, corner: float | Array, right: Array, last: Arra
     """
     # Elimination divides by the entries of D; the entry with the largest q^2 / |D| is eliminated by the border instead.
     pivot = np.argmax(q * q / np.abs(D), axis=0)[None]
-    own, edge = np.take_along_axis(D, pivot, axis=0)[0], np.take_along_axis(q, pivot, axis=0)[0]
-    share = q * own / D
-    np.put_along_axis(share, pivot, edge[None], axis=0)
-    multiplier = ((share * right).sum(axis=0) - last * own) / ((share * q).sum(axis=0) - corner * own)
+    pivot_entry, pivot_border = np.take_along_axis(D, pivot, axis=0)[0], np.take_along_axis(q, pivot, axis=0)[0]
+    share = q * pivot_entry / D
+    np.put_along_axis(share, pivot, pivot_border[None], axis=0)
+    multiplier = ((share * right).sum(axis=0) - last * pivot_entry) / ((share * q).sum(axis=0) - corner * pivot_entry)
     out = (right - multiplier * q) / D
     np.put_along_axis(out, pivot, 0.0, axis=0)
-    rest = (last - corner * multiplier - (q * out).sum(axis=0)) / edge
+    rest = (last - corner * multiplier - (q * out).sum(axis=0)) / pivot_border
     np.put_along_axis(out, pivot, rest[None], axis=0)
     return np.asarray(out)
 
@@ -241,5 +241,5 @@ def correct(y: Array, move: Array) -> Array:
     Array, shape (n, K, N)
         ``y + move`` or ``y``.
     """
-    good = np.abs(move).max(axis=0) <= _CORRECTION * np.abs(y).max(axis=0)
-    return np.where(good, y + move, y)
+    short = np.abs(move).max(axis=0) <= _CORRECTION * np.abs(y).max(axis=0)
+    return np.where(short, y + move, y)

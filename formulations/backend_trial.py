@@ -30,7 +30,7 @@ _RANGES = np.sqrt(((_PLACE - _STATION) ** 2).sum(1))
 _NEAR = 1e-2
 
 
-def _conic(name: str) -> str:
+def _conic_failure(name: str) -> str:
     """Return the failure of a conic solver, or "" if it works.
 
     The solver must solve a program with a known position, and must not report a common point of cones that do not meet.
@@ -55,7 +55,7 @@ def _conic(name: str) -> str:
     return ""
 
 
-def _nonlinear(name: str) -> str:
+def _nonlinear_failure(name: str) -> str:
     """Return the failure of a nonlinear solver, or "" if it works.
 
     The solver must solve programs with a known position, and must not report success for programs without a solution.
@@ -99,10 +99,10 @@ def _solve(name: str, start: Array | None = None, ranges: Array = _RANGES, **con
         return str(trouble).partition("\n")[0]
 
 
-def _tried(kind: str, name: str) -> str:
+def _failure_of(kind: str, name: str) -> str:
     """Return the failure of a solver of a kind, "conic" or "nonlinear", or "" if it works."""
     try:
-        return _conic(name) if kind == "conic" else _nonlinear(name)
+        return _conic_failure(name) if kind == "conic" else _nonlinear_failure(name)
     except Exception as trouble:  # noqa: BLE001  (any exception of a solver is its failure)
         return f"{type(trouble).__name__}: {trouble}".partition("\n")[0]
 
@@ -133,7 +133,7 @@ def main(seconds: float, choices: list[str]) -> None:
         timer = Timer(seconds, stop, (name,))
         timer.daemon = True
         timer.start()
-        fault = _tried(kind, name)
+        fault = _failure_of(kind, name)
         timer.cancel()
         say(FAILED if fault else PASSED, name, fault)
 

@@ -143,14 +143,14 @@ def sight_courses(
         middle, half = span(when, use)
         powers = ((when - middle) / half)[..., None] ** np.arange(order + 1.0)
         seen = rays(A, E if both else None, axes)
-        run = _run(S, axes, powers, seen, both)
+        run = _course_run(S, axes, powers, seen, both)
         G = run.design(run.normal)
-        c = plain = _balance(G, G, run.right, W, order)
+        c = plain = _weighted_solution(G, G, run.right, W, order)
         for _ in range(passes):
-            c = _balance(G, G, run.right, W / lengths(run.own(c), run.least), order)
+            c = _weighted_solution(G, G, run.right, W / lengths(run.own(c), run.least), order)
         own = run.own(c)
         instruments = run.design(look(own, axes).normals)
-        final = _balance(instruments, G, run.right, W / lengths(own, run.least), order)
+        final = _weighted_solution(instruments, G, run.right, W / lengths(own, run.least), order)
         # a bearing and its opposite give the same row, so the side of the target is checked here
         front = dot(run.line(final), seen.ahead) > 0.0
         ok = np.asarray(np.isfinite(final).all(axis=(-2, -1)))
@@ -158,7 +158,7 @@ def sight_courses(
     return BearingCourses(three[0], three[1], three[2], ok, ok & (front | ~use).all(axis=-1))
 
 
-def _run(S: Array, axes: Array | None, powers: Array, seen: BearingRays, both: bool) -> _CourseRun:
+def _course_run(S: Array, axes: Array | None, powers: Array, seen: BearingRays, both: bool) -> _CourseRun:
     """Return the data of a fit; the arguments are those of `_CourseRun`, and the directions of sight."""
     normal = seen.normals
     right = dot(normal, np.concatenate([S, S], axis=1) if both else S)
@@ -167,7 +167,7 @@ def _run(S: Array, axes: Array | None, powers: Array, seen: BearingRays, both: b
     return _CourseRun(S, axes, powers, normal, right, both, np.maximum(_NEAR * size, 1e-300))
 
 
-def _balance(Z: Array, G: Array, b: Array, W: Array, order: int) -> Array:
+def _weighted_solution(Z: Array, G: Array, b: Array, W: Array, order: int) -> Array:
     """Return the solution c (N, order + 1, d) of ``Z' W^2 (G c - b) = 0``; NaN if it is not unique.
 
     Z (N, rows, n) are the instruments, G the rows, b the right sides, W (N, rows) the weights. With Z = G it is

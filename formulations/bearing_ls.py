@@ -176,11 +176,11 @@ def sight(
         G, W = seen.normals, np.concatenate([wA, wE], axis=-1) if E is not None else wA
         own = np.concatenate([S, S], axis=-2) if E is not None else S
         b = dot(G, own)
-        point = plain = _balance(G, G, b, W)
+        point = plain = _weighted_solution(G, G, b, W)
         for _ in range(passes):
-            point = _balance(G, G, b, W / lengths(_local(point, S, turn), least))
-        line = _local(point, S, turn)
-        final = _balance(look(line, turn).normals, G, b, W / lengths(line, least))
+            point = _weighted_solution(G, G, b, W / lengths(_lines_in_axes(point, S, turn), least))
+        line = _lines_in_axes(point, S, turn)
+        final = _weighted_solution(look(line, turn).normals, G, b, W / lengths(line, least))
         # an azimuth and its opposite give the same row, so the side of the target is checked here
         front = dot(final[..., None, :] - S, seen.ahead) > 0.0
     ok = np.asarray(np.isfinite(final).all(axis=-1))
@@ -209,7 +209,7 @@ def predict(point: Array, station: Array, axes: ArrayLike | None = None) -> Arra
     -----
     Plain geometry.
     """
-    line = _local(point, station, None if axes is None else np.asarray(axes, dtype=np.float64))
+    line = _lines_in_axes(point, station, None if axes is None else np.asarray(axes, dtype=np.float64))
     flat = np.hypot(line[..., 0], line[..., 1])
     return np.stack([np.arctan2(line[..., 1], line[..., 0]), np.arctan2(line[..., 2], flat)], axis=-1)
 
@@ -284,7 +284,7 @@ def lengths(line: Array, least: Array) -> Array:
     return flat if line.shape[-1] == 2 else np.concatenate([flat, np.hypot(flat, line[..., 2])], axis=-1)
 
 
-def _local(point: Array, S: Array, turn: Array | None) -> Array:
+def _lines_in_axes(point: Array, S: Array, turn: Array | None) -> Array:
     """Return the lines of sight (..., N, d) from stations S to a point, in the axes of each station.
 
     `turn` (..., N, d, d) are the axes; None: the axes of the frame.
@@ -293,7 +293,7 @@ def _local(point: Array, S: Array, turn: Array | None) -> Array:
     return line if turn is None else np.einsum("...ij,...j->...i", turn, line)
 
 
-def _balance(Z: Array, G: Array, b: Array, W: Array) -> Array:
+def _weighted_solution(Z: Array, G: Array, b: Array, W: Array) -> Array:
     """Return the solution p (..., d) of ``Z' W^2 (G p - b) = 0``, with one step of refinement; NaN if it is not unique.
 
     Z are the instruments, G the rows, b the right sides, W the weights. With Z = G it is weighted least squares.

@@ -187,11 +187,11 @@ def course(
     with np.errstate(all="ignore"):
         d = np.sqrt(dot(A, A))[:, None]
         L = path + d
-        heard = np.isfinite(L + when + e.sum(axis=(-2, -1))) & (L > 0.0)
-        present = heard[..., None] & (deviation > 0.0) & np.isfinite(deviation)
-        heard &= present.any(axis=-1)
-        middle, spread = span(when, heard)
-        powers = np.where(heard, (when - middle) / spread, 0.0)[..., None] ** np.arange(order + 1.0)
+        usable = np.isfinite(L + when + e.sum(axis=(-2, -1))) & (L > 0.0)
+        present = usable[..., None] & (deviation > 0.0) & np.isfinite(deviation)
+        usable &= present.any(axis=-1)
+        middle, spread = span(when, usable)
+        powers = np.where(usable, (when - middle) / spread, 0.0)[..., None] ** np.arange(order + 1.0)
         normals = np.concatenate([e[:, :, :2], (e[:, :, 2] - A[:, None] / L[..., None])[:, :, None, :]], axis=2)
         normals = np.where(present[..., None], normals, 0.0)
         right = np.where(present, [0.0, 0.0, 1.0] * ((L * L - d * d) / (2.0 * L))[..., None], 0.0)
@@ -203,15 +203,15 @@ def course(
         for _ in range(_PASSES):
             path_row = np.hypot(across / L * deviation[..., 2], far * bend)
             scale = np.stack([far * deviation[..., 0], far * deviation[..., 1], path_row], axis=-1)
-            c, ok = _fit(normals, right, powers, np.where(present, 1.0 / scale, 0.0))
+            c, ok = _fit_course(normals, right, powers, np.where(present, 1.0 / scale, 0.0))
             p = np.einsum("nkj,nji->nki", powers, c)
             far, across = np.sqrt(dot(p, p)), np.sqrt(dot(p - A[:, None], p - A[:, None]))
-        ok &= ((dot(p, e[:, :, 2]) > 0.0) | ~heard).all(axis=-1)
+        ok &= ((dot(p, e[:, :, 2]) > 0.0) | ~usable).all(axis=-1)
         c = np.where(ok[:, None, None], uncentre(c, middle, spread), np.nan)
     return BistaticCourse(c.reshape(*lead, order + 1, 3), ok.reshape(lead))
 
 
-def _fit(normals: Array, right: Array, powers: Array, weight: Array) -> tuple[Array, Mask]:
+def _fit_course(normals: Array, right: Array, powers: Array, weight: Array) -> tuple[Array, Mask]:
     """Return the weighted least-squares course (N, order + 1, 3), and whether the system has full rank (N,).
 
     Each epoch has three rows: `normals` (N, k, 3, 3), right sides and weights (N, k, 3). `powers` (N, k, order + 1) are

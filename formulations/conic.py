@@ -151,14 +151,14 @@ class Relaxation:
         backend, settings = (self.backend, self.settings) if choice is None else (choice.name, dict(choice.settings))
         if data is None or backend != "CLARABEL":
             with _CVXPY:
-                answer = self._elsewhere(values, backend, settings)
+                answer = self._solve_by_cvxpy(values, backend, settings)
         else:
-            answer = self._directly(data, values, {**self.settings, **settings}, bound=bound, reach=reach)
+            answer = self._solve_by_clarabel(data, values, {**self.settings, **settings}, bound=bound, reach=reach)
         count(backend, answer.iterations)
         record(Ending(backend, answer.status, answer.message, bool(np.isfinite(answer.primal))))
         return answer
 
-    def _directly(
+    def _solve_by_clarabel(
         self,
         data: Data,
         values: Mapping[str, Array],
@@ -188,13 +188,13 @@ class Relaxation:
         primal = 0.5 * quadratic + float(data.q @ at) + data.d
         return ConicAnswer(data.recover(at), primal, low, status, status == "Solved", int(solution.iterations))
 
-    def _elsewhere(self, values: Mapping[str, Array], backend: str, settings: Mapping[str, Any]) -> ConicAnswer:
+    def _solve_by_cvxpy(self, values: Mapping[str, Array], backend: str, settings: Mapping[str, Any]) -> ConicAnswer:
         """Return the solution by another back end through cvxpy; it has no lower bound."""
         import cvxpy
 
         for name, value in values.items():
             self.parameters[name].value = value
-        _forget(self.problem)
+        _clear_values(self.problem)
         status, message = cvxpy.settings.SOLVER_ERROR, ""
         try:
             with warnings.catch_warnings():
@@ -231,7 +231,7 @@ _REGULAR = {"static_regularization_constant": 1e-7}
 _REDUCED = ("ECOS", "QOCO")
 
 
-def _forget(problem: Any) -> None:
+def _clear_values(problem: Any) -> None:
     """Remove the values of the previous solve from a cvxpy problem, because a failed solve does not overwrite them."""
     for variable in problem.variables():
         variable.save_value(None)

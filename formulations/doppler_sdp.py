@@ -195,7 +195,7 @@ class DopplerScene:
         rate = float(np.sqrt((speed**2).sum(axis=1).max())) or 1.0
         of_rate = np.asarray(rates.any(axis=1))
         size = np.where(of_rate, rate, length)
-        first, second, sign = _ends(rates, speed)
+        first, second, sign = _nodes_of_rows(rates, speed)
         scaled = design / size[:, None]
         unit = 1.0 / np.maximum(np.abs(scaled).max(axis=0, initial=0.0), np.finfo(float).tiny)
         scaled = scaled * unit
@@ -334,7 +334,7 @@ def doppler(
     S, V, values, W, R, Q = (np.asarray(part, dtype=np.float64) for part in (place, speed, z, whiten, ranges, rates))
     A = np.zeros((len(values), 0)) if design is None else np.asarray(design, dtype=np.float64)
     if not all(np.isfinite(part).all() for part in (S, V, values, W, A)):
-        return _nothing(S.shape[1], A.shape, None)
+        return _no_start(S.shape[1], A.shape, None)
     scene = DopplerScene.of(S, V, values, W, R, Q, A, surface)
     relaxation, far = _relaxation(scene.shape, backend), np.ones(len(values))
     for _ in range(_PASSES):
@@ -342,7 +342,7 @@ def doppler(
         answer = relaxation.solve(given, reach=scene.longest(reach))
         lift = answer.values["lift"]
         if not np.isfinite(lift).all():
-            return _nothing(S.shape[1], A.shape, answer)
+            return _no_start(S.shape[1], A.shape, answer)
         weighted, point = far, lift[0, 1 : 1 + S.shape[1]]
         apart = np.sqrt(((point - scene.place) ** 2).sum(axis=1))
         far = np.where(scene.pivot < 0, 1.0, np.maximum(apart[scene.pivot], _NEAREST))
@@ -374,14 +374,14 @@ def _read_off(scene: DopplerScene, far: Array, size: float, answer: ConicAnswer)
     )
 
 
-def _nothing(dimension: int, design: tuple[int, ...], answer: ConicAnswer | None) -> DopplerStart:
+def _no_start(dimension: int, design: tuple[int, ...], answer: ConicAnswer | None) -> DopplerStart:
     """Return a start of NaN, for `design` of the shape (rows, unknowns)."""
     rows, unknowns = design
     point, none = np.full((1 + 2 * dimension, dimension), np.nan), np.full(unknowns, np.nan)
     return DopplerStart(point, none, np.full(rows, np.nan), np.nan, -np.inf, np.nan, answer)
 
 
-def _ends(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
+def _nodes_of_rows(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
     """Return three arrays (m,): the node whose range multiplies a row, the node whose rate is an unknown, and the sign.
 
     A node is -1 if there is none. The sign is the coefficient of the first node.
@@ -404,8 +404,8 @@ def _ends(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
 def _shape(nodes: tuple[int, ...], first: Array, second: Array, design: Array, rate: Mask, surface: bool) -> Shape:
     """Return the structure of the programme.
 
-    `nodes` is the shape (M, d) of the nodes. `first` and `second` are the results of `_ends`. `design` (m, p) are the
-    coefficients of b. `rate` marks rows of rates, `surface` is True for a source on an ellipsoid.
+    `nodes` is the shape (M, d) of the nodes. `first` and `second` are the results of `_nodes_of_rows`. `design` (m, p)
+    are the coefficients of b. `rate` marks rows of rates, `surface` is True for a source on an ellipsoid.
     """
     known = design.shape[1]
     others = tuple(int(node) for node in np.unique(second[second >= 0]))
@@ -457,7 +457,7 @@ def lifted_size(dimension: int, ranges: Array, rates: Array, design: Array) -> i
     int
         The length; beyond `SIZE` the programme takes seconds.
     """
-    first, second, _ = _ends(rates, np.ones((rates.shape[1], 1)))
+    first, second, _ = _nodes_of_rows(rates, np.ones((rates.shape[1], 1)))
     rate = np.asarray(rates.any(axis=1))
     return _shape((rates.shape[1], dimension), first, second, design, rate, False).places[-1]
 

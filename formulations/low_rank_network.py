@@ -142,11 +142,11 @@ def fit_low_rank(z: Array, weight: Array, emission: Array, start: StationFactors
     LowRank
         S fits, in the order of the starts.
     """
-    return _Fit(z, weight, emission, clocks).run(start)
+    return _NetworkFit(z, weight, emission, clocks).run(start)
 
 
 @dataclass(frozen=True, slots=True)
-class _Fit:
+class _NetworkFit:
     """The data of a fit; each method is a part of one step for all S starts at once.
 
     The fields are arguments of `fit_low_rank`: `z` and `weight` (N, M), `emission` (N,), `clocks`.
@@ -173,7 +173,7 @@ class _Fit:
                 trial = self.moved(at, here, damping)
                 there = self.project(trial, scale)
                 good = there.cost < here.cost
-                at, here = _chosen(good, trial, at), here.replaced(good, there)
+                at, here = _choose_stations(good, trial, at), here.replaced(good, there)
                 damping = np.clip(np.where(good, damping * _EASE, damping * _STIFFEN), _LEAST, _MOST)
                 calm = calm + 1 if (np.abs(here.cost - before) <= _SETTLED * before).all() else 0
                 if calm == _CALM:
@@ -205,7 +205,7 @@ class _Fit:
         target = scale * (shifted**2 - at.alpha[:, None])
         part = np.einsum("snik,sni->snk", q, target)
         residual = target - np.einsum("snik,snk->sni", q, part)
-        found = _back(r, part)
+        found = _back_substitute(r, part)
         d = at.u.shape[-1]
         pulses = Pulses(found[..., 0], found[..., 1 : 1 + d], found[..., 1 + d])
         return _Projected(pulses, q, residual, scale, np.sum(residual**2, axis=(1, 2)))
@@ -268,7 +268,7 @@ def _where(mask: Mask, one: Array, other: Array) -> Array:
     return np.where(mask.reshape(-1, *[1] * (one.ndim - 1)), one, other)
 
 
-def _chosen(mask: Mask, one: StationFactors, other: StationFactors) -> StationFactors:
+def _choose_stations(mask: Mask, one: StationFactors, other: StationFactors) -> StationFactors:
     """Return stations of `one` where the mask (S,) is True, else of `other`."""
     return StationFactors(
         _where(mask, one.alpha, other.alpha), _where(mask, one.u, other.u), _where(mask, one.b, other.b)
@@ -306,7 +306,7 @@ def orthonormal(a: Array) -> tuple[Array, Array]:
     return q, r
 
 
-def _back(r: Array, part: Array) -> Array:
+def _back_substitute(r: Array, part: Array) -> Array:
     """Return the solution of the upper triangular system ``r x = part``; zero where its pivot is infinite."""
     out = np.zeros_like(part)
     for i in range(part.shape[-1] - 1, -1, -1):

@@ -55,8 +55,8 @@ def upgrade(fit: LowRank) -> tuple[Array, Array, Array]:
     """
     found: list[tuple[Array, Array, int]] = []
     for s in range(len(fit.cost)):
-        u, v, alpha, square = _white(fit, s)
-        for H, h in _sides(u, v, alpha, square):
+        u, v, alpha, square = _whitened_fit(fit, s)
+        for H, h in _candidates_of_sides(u, v, alpha, square):
             T = np.linalg.cholesky(H)
             found.append((u @ T, -0.5 * np.linalg.solve(T, (v + h).T).T, s))
     d = fit.stations.u.shape[-1]
@@ -69,7 +69,7 @@ def upgrade(fit: LowRank) -> tuple[Array, Array, Array]:
     )
 
 
-def _white(fit: LowRank, s: int) -> tuple[Array, Array, Array, Array]:
+def _whitened_fit(fit: LowRank, s: int) -> tuple[Array, Array, Array, Array]:
     """Return the data of fit number s with centred and white stations u (M, d).
 
     The results are u, the pulses v (N, d) for these stations, alpha (M,), and beta + o^2 (N,).
@@ -83,7 +83,7 @@ def _white(fit: LowRank, s: int) -> tuple[Array, Array, Array, Array]:
     return np.linalg.solve(root, centred.T).T, v @ root, fit.stations.alpha[s], beta + fit.pulses.o[s] ** 2
 
 
-def _sides(u: Array, v: Array, alpha: Array, square: Array) -> list[tuple[Array, Array]]:
+def _candidates_of_sides(u: Array, v: Array, alpha: Array, square: Array) -> list[tuple[Array, Array]]:
     """Return the candidates (H, h), with H (d, d) and h (d,), from each side with enough points.
 
     `alpha` (M,) and `square` (N,) are the values of the two quadrics, for the stations u and the pulses v.
@@ -91,13 +91,13 @@ def _sides(u: Array, v: Array, alpha: Array, square: Array) -> list[tuple[Array,
     d, out = u.shape[1], []
     if len(u) >= unknowns(d):
         H, h = _quadric(u, alpha)
-        out += [(positive, h) for positive in _positive(H)]
+        out += [(positive, h) for positive in _with_floors(H)]
     if len(v) >= unknowns(d):
         # 4 K and 2 K h of a quadric in v; pulses may be far away, so they have another unit of length
         length = np.sqrt(np.mean(v * v))
         K, Kh = _quadric(v / length, square)
         K, Kh = 4.0 * K / length**2, 2.0 * Kh / length
-        for positive in _positive(K):
+        for positive in _with_floors(K):
             inverse = np.asarray(np.linalg.inv(positive), dtype=float)
             out.append((0.5 * (inverse + inverse.T), inverse @ Kh))
     return out
@@ -114,7 +114,7 @@ def _quadric(x: Array, value: Array) -> tuple[Array, Array]:
     return Q, found[len(i) : len(i) + d]
 
 
-def _positive(Q: Array) -> list[Array]:
+def _with_floors(Q: Array) -> list[Array]:
     """Return matrices with eigenvalues raised to each floor of `_FLOORS`.
 
     The list has one matrix if no eigenvalue is below a floor, and none if Q is zero or not finite.

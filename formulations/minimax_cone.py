@@ -192,7 +192,7 @@ def minimax(
     u, S, scale = (np.asarray(part, dtype=np.float64) for part in (direction, station, sigma))
     # the widest cones first: if they do not meet, no point is in front of all stations
     level, low = _WIDEST / float(scale[np.isfinite(scale)].min()), 0.0
-    found = _at(u, S, scale, level, backend)
+    found = _common_at_level(u, S, scale, level, backend)
     if not found.meet:
         nowhere = level if found.meet is False else 0.0
         return Minimax(np.full(u.shape[1], np.nan), np.inf, nowhere, found.meet, 1)
@@ -200,7 +200,7 @@ def minimax(
     level = float((angles(point, u, S) / scale).max())
     while level - low > tolerance * level and level > _EXACT and solves < most:
         middle = 0.5 * (low + level)
-        found, solves = _at(u, S, scale, middle, backend), solves + 1
+        found, solves = _common_at_level(u, S, scale, middle, backend), solves + 1
         if found.meet:
             # the angles at the found point are below the requested level: faster than bisection alone
             point, level = found.point, float((angles(found.point, u, S) / scale).max())
@@ -236,7 +236,7 @@ def angles(point: Array, direction: Array, station: Array) -> Array:
     return np.asarray(2.0 * np.arctan2(away, along))
 
 
-def _at(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
+def _common_at_level(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
     """Return the common points of cones whose half-angles are `level` times `scale` (N,), at most `_WIDEST`."""
     theta = np.where(np.isfinite(scale), np.minimum(level * scale, _WIDEST), np.inf)
     return common(u, S, theta, backend=backend)

@@ -94,7 +94,7 @@ def nuclear_problem(stations: int, pulses: int) -> Any:
     squares = cp.Parameter((stations - 1, pulses - 1), name="squares")
     factor = cp.Parameter((stations - 1, pulses), name="factor")
     slope, most = cp.Parameter(pulses, name="slope"), cp.Parameter(pulses, name="most")
-    G = squares - 2 * factor @ cp.diag(offset) @ _across(pulses)
+    G = squares - 2 * factor @ cp.diag(offset) @ _centring_columns(pulses)
     return cp.Problem(cp.Minimize(cp.normNuc(G) - slope @ offset), [offset <= most])
 
 
@@ -104,7 +104,7 @@ def _relaxation(stations: int, pulses: int, backend: str) -> Relaxation:
     return Relaxation(nuclear_problem(stations, pulses), backend=backend)
 
 
-def _across(n: int) -> Array:
+def _centring_columns(n: int) -> Array:
     """Return a matrix (n, n - 1) of orthonormal columns that are orthogonal to ones (Helmert's)."""
     row, k = np.arange(n)[:, None], np.arange(1, n)
     return np.asarray(np.where(row < k, 1.0, np.where(row == k, -k, 0.0)) / np.sqrt(k * (k + 1)))
@@ -136,7 +136,7 @@ def nuclear_offsets(z: ArrayLike, d: int, *, passes: int = 20, backend: str = "C
     """
     Z = np.asarray(z, dtype=np.float64).T
     m, n = Z.shape
-    left, right = _across(m), _across(n)
+    left, right = _centring_columns(m), _centring_columns(n)
     squares, factor = left.T @ (Z * Z) @ right, left.T @ Z
     relaxation = _relaxation(m, n, backend)
     slope, before, bound = np.zeros(n), np.full(n, np.inf), -np.inf

@@ -143,7 +143,7 @@ def enclosure(ranged: Ranged, point: Array, cost: float) -> EnclosingBox | None:
     away = np.maximum(np.linalg.norm(point - ranged.station[1:], axis=1), _NEAR)
     root: Array = np.asarray(np.linalg.cholesky(ranged.spread), dtype=np.float64)
     left = _left_inverse(system, away, root)
-    error = _Error(rho, root, side, d, np.array(np.diag(ranged.spread)))
+    error = _ErrorBounds(rho, root, side, d, np.array(np.diag(ranged.spread)))
     if not ranged.free:
         # the reference is measured: it is an unknown in an interval, not a column of the system
         slack = rho * float(np.sqrt(ranged.covariance[0, 0]))
@@ -195,7 +195,7 @@ def _left_inverse(system: Array, away: Array, root: Array) -> Array | None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Error:
+class _ErrorBounds:
     """Bounds of the effect of range errors w on linear functions of the squared equations, for a cost of at most rho^2.
 
     `root` is the Cholesky factor of the covariance R of w, `variance` its diagonal. `side` are the signs, `excess` is
@@ -211,8 +211,8 @@ class _Error:
     def reference(self, row: Array, middle: float) -> tuple[float, float] | None:
         """Return the interval of r_1 from its row of the left inverse, or None if the errors are too large."""
         # r_1 <= middle + rest + slope r_1: if the slope reaches one, the errors grow with the range without bound
-        slope = self._along(row * self.side)
-        rest = self._along(row * self.excess) + self._square(row)
+        slope = self._linear_bound(row * self.side)
+        rest = self._linear_bound(row * self.excess) + self._square_bound(row)
         if slope >= 1.0 or middle + rest < 0.0:
             return None
         return max(0.0, (middle - rest) / (1.0 + slope)), (middle + rest) / (1.0 - slope)
@@ -223,27 +223,27 @@ class _Error:
         `row` (M - 1,) is the row of the left inverse for this coordinate.
         """
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
-        both = self._along(row * (self.excess + self.side * middle)) + half * self._along(row * self.side)
-        return both + self._square(row)
+        both = self._linear_bound(row * (self.excess + self.side * middle)) + half * self._linear_bound(row * self.side)
+        return both + self._square_bound(row)
 
-    def _along(self, row: Array) -> float:
+    def _linear_bound(self, row: Array) -> float:
         """Return a bound of twice ``row' w`` for errors w with a cost of at most rho^2."""
         return 2.0 * self.rho * float(np.linalg.norm(self.root.T @ row))
 
-    def _square(self, row: Array) -> float:
+    def _square_bound(self, row: Array) -> float:
         """Return a bound of ``row' w^2`` for errors w with a cost of at most rho^2."""
         return self.rho**2 * float(np.abs(row) @ self.variance)
 
 
 def _box(
-    ranged: Ranged, point: Array, left: Array, right: Array, error: _Error, reach: tuple[float, float]
+    ranged: Ranged, point: Array, left: Array, right: Array, error: _ErrorBounds, reach: tuple[float, float]
 ) -> EnclosingBox:
     """Return the box of ``x' = left (right - phi)`` in principal axes; `reach` is the interval of the reference range.
 
     A measured reference range is an extra unknown.
     """
     low, high = reach
-    axes = _principal(ranged, point)
+    axes = _principal_axes(ranged, point)
     rows = np.linalg.inv(axes) @ left
     half = np.array([error.position(row, low, high) for row in rows])
     if not ranged.free:
@@ -251,7 +251,7 @@ def _box(
     return EnclosingBox(ranged.station[0] + left @ right, axes * (half * _ROUND), low / _ROUND, high * _ROUND)
 
 
-def _principal(ranged: Ranged, point: Array) -> Array:
+def _principal_axes(ranged: Ranged, point: Array) -> Array:
     """Return the principal axes (d, d) of the errors of a fix at `point`, in columns of one standard deviation."""
     apart = point - ranged.station
     # at a station the direction is undefined: the row is left out, which avoids a division by zero

@@ -195,7 +195,7 @@ def locate(
         flatten(surface.centre, (3,), lead),
     )
     curve = three_stations(flat, flatten(sign, (3,), lead), flatten(offset, (3,), lead))
-    return _reshape(_meet(curve, flat, A, centre, positive=positive), lead)
+    return _reshape(_curve_points(curve, flat, A, centre, positive=positive), lead)
 
 
 def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> HeightCandidates:
@@ -229,7 +229,7 @@ def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> Heig
     )
     known = flatten(ranges, (2,), lead)
     curve = two_stations(flat, known, centre)
-    return _reshape(_meet(curve, flat, A, centre, positive=True), lead)
+    return _reshape(_curve_points(curve, flat, A, centre, positive=True), lead)
 
 
 def _reshape(found: HeightCandidates, lead: tuple[int, ...]) -> HeightCandidates:
@@ -238,7 +238,7 @@ def _reshape(found: HeightCandidates, lead: tuple[int, ...]) -> HeightCandidates
     return HeightCandidates(x, ranges, found.valid.reshape(*lead, _SLOTS))
 
 
-def _meet(curve: HeightCurve, stations: Array, A: Array, centre: Array, *, positive: bool) -> HeightCandidates:
+def _curve_points(curve: HeightCurve, stations: Array, A: Array, centre: Array, *, positive: bool) -> HeightCandidates:
     """Return all common points of N curves and their ellipsoids; shapes A (N, 3, 3), centres (N, 3).
 
     If `positive` is True, points with a negative range to one of the `stations` are dropped.

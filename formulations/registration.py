@@ -122,7 +122,7 @@ def candidates(course: RegistrationCourse, order: int = 0) -> tuple[Array, Array
         state = np.full((len(course.offset), 1, order + 1, course.station.shape[-1]), np.nan)
         for _ in range(_LIFTED_PASSES):
             state, guess = _tie_ranges(course, guess, order)
-        branches = _branches(course, state[:, 0], guess.reference)
+        branches = _plane_branches(course, state[:, 0], guess.reference)
     return np.concatenate([state, branches], axis=1), guess.bias
 
 
@@ -296,7 +296,7 @@ def _reference(course: RegistrationCourse, theta: Array, lifts: Array, order: in
     return np.asarray(lifts @ _powers(course, 2 * order + 1).T - 2.0 * inner + (first**2).sum(-1))
 
 
-def _branches(course: RegistrationCourse, state: Array, reference: Array) -> Array:
+def _plane_branches(course: RegistrationCourse, state: Array, reference: Array) -> Array:
     """Return two courses (N, 2, order + 1, d), one on each side of the plane in which the stations spread most.
 
     The distance from the plane follows from the reference ranges (N, B); the part of `state` along the plane stays.

@@ -84,8 +84,8 @@ def draw_ranges(one: Problem, admission: Admission) -> PlanArrays | None:
     # If no row links two stations, their ranges are not related.
     if found is None or len(found.groups[0]) != 1:
         return None
-    node = _nodes(one, found)
-    model = _model(one, found, node, admission)
+    node = _station_nodes(one, found)
+    model = _start_maps(one, found, node, admission)
     if model is None or _start_of(one, found, admission, 0) != BY_SQUARES:
         return None
     turned, made = _range_rows(with_station_noise(one), node[1])
@@ -103,8 +103,8 @@ def draw_tapes(one: Problem, admission: Admission, dof: int) -> PlanArrays | Non
     above which a candidate fits poorly.
     """
     found = _find_ranges(one)
-    node = _nodes(one, found)
-    model = _model(one, found, node, admission)
+    node = _station_nodes(one, found)
+    model = _start_maps(one, found, node, admission)
     if model is None:
         return None
     places = {(int(station), int(epoch)): i for i, (epoch, station) in enumerate(node.T)}
@@ -178,13 +178,13 @@ def _unit_measurements(problem: Problem) -> Problem:
     return replace(problem, rows=rows, stations=replace(problem.stations, velocity=None, axes=None))
 
 
-def _nodes(one: Problem, found: Ranges | None) -> Array:
+def _station_nodes(one: Problem, found: Ranges | None) -> Array:
     """Return epoch and number (2, s) of the stations that have rows, first those whose ranges are known.
 
     The epoch is 0 if stations do not move.
     """
     moving = one.stations.position.shape[-3] > 1
-    known = _known(found)
+    known = _stations_with_ranges(found)
     first = [] if found is None else list(zip(found.epoch[known].tolist(), found.station[known].tolist(), strict=True))
     others = {
         (int(rows.epoch[i]) if moving else 0, int(end[i]))
@@ -195,17 +195,17 @@ def _nodes(one: Problem, found: Ranges | None) -> Array:
     return np.array([*first, *sorted(others - {*first})], dtype=np.int64).reshape(-1, 2).T
 
 
-def _known(found: Ranges | None) -> Array:
+def _stations_with_ranges(found: Ranges | None) -> Array:
     """Return the numbers of the stations in `found` whose ranges the rows determine, at least up to t."""
     return np.zeros(0, dtype=np.int64) if found is None else np.flatnonzero(found.inside[0])
 
 
-def _model(one: Problem, found: Ranges | None, node: Array, admission: Admission) -> EngineModel | None:
+def _start_maps(one: Problem, found: Ranges | None, node: Array, admission: Admission) -> EngineModel | None:
     """Return the maps from measurements of one problem to a start by squares; None if the noise is singular.
 
-    `node` (2, s) is the result of `_nodes`; `admission` contains the constraints of the position.
+    `node` (2, s) is the result of `_station_nodes`; `admission` contains the constraints of the position.
     """
-    count, s, flat, known = one.count, node.shape[1], one.flat(), _known(found)
+    count, s, flat, known = one.count, node.shape[1], one.flat(), _stations_with_ranges(found)
     white = np.eye(s)
     if found is not None:
         white[: len(known), : len(known)] = whitening(found.covariance[0, known[:, None], known])
@@ -236,15 +236,15 @@ def _observed_stations(one: Problem, node: Array) -> tuple[Array, Array]:
     They are the rows HEARD and SEEN of `EngineModel.station`.
     """
     moving = one.stations.position.shape[-3] > 1
-    heard, seen = np.zeros(node.shape[1]), np.zeros(node.shape[1])
+    has_row, has_angle = np.zeros(node.shape[1]), np.zeros(node.shape[1])
     for rows in one.rows:
         model = MODELS[rows.kind]
         for index in (rows.a, rows.b)[: model.stations]:
             for i in np.flatnonzero(rows.weight > 0.0):
-                own = (node[1] == index[i]) & (node[0] == (rows.epoch[i] if moving else 0))
-                heard[own] = 1.0
-                seen[own] = 1.0 if model.quantity == "angle" else seen[own]
-    return heard, seen
+                same = (node[1] == index[i]) & (node[0] == (rows.epoch[i] if moving else 0))
+                has_row[same] = 1.0
+                has_angle[same] = 1.0 if model.quantity == "angle" else has_angle[same]
+    return has_row, has_angle
 
 
 def _anchors(one: Problem) -> tuple[Array, Array]:

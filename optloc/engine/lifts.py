@@ -244,15 +244,15 @@ class _LiftedProblem:
             return None
         out, sigma = _Block(made, [], []), np.sqrt(variances(problem.noise, problem.count))
         for i in np.flatnonzero(present).tolist():
-            own = [self._source(seed, rows, i, start, beside) for seed, _ in made.inputs]
-            if not all(which >= 0 for _, which in own):
+            sources = [self._source_of_input(seed, rows, i, start, beside) for seed, _ in made.inputs]
+            if not all(which >= 0 for _, which in sources):
                 return None  # a range is unknown
-            out.source.append(own)
+            out.source.append(sources)
             # a row of weight w counts as a row of variance sigma^2 / w
             out.sigma.append(float(sigma[start + i] / np.sqrt(rows.weight[i])))
         return out
 
-    def _source(self, seed: int, rows: Rows, i: int, start: int, beside: Array | None) -> tuple[int, int]:
+    def _source_of_input(self, seed: int, rows: Rows, i: int, start: int, beside: Array | None) -> tuple[int, int]:
         """Return source and index of an input of the tape of row i; the index is -1 if the input does not exist.
 
         `seed` is the number of the input, see `_M` and the constants after it. `start` is the number of the first row
@@ -261,7 +261,9 @@ class _LiftedProblem:
         if seed in (_M, _AZIMUTH):
             return SEEN, int(start + i if beside is None or seed == _M else beside[i])
         if seed >= _T:
-            return (POINT, seed - _T) if seed < _AXES else (NUMBER, self._keep(self._axis(rows, i, seed - _AXES)))
+            return (
+                (POINT, seed - _T) if seed < _AXES else (NUMBER, self._add_constant(self._axis(rows, i, seed - _AXES)))
+            )
         second = seed >= _B if seed >= _A else seed in (_KNOWN_B, _SIGN_B)
         epoch = int(rows.epoch[i]) if self.problem.stations.position.shape[-3] > 1 else 0
         station = int((rows.b if second else rows.a)[i])
@@ -274,7 +276,7 @@ class _LiftedProblem:
             return OFFSET, -1
         if seed in (_KNOWN_A, _KNOWN_B):
             return OFFSET, place
-        return NUMBER, self._keep(float(self.found.sign[0, known.argmax()]) if self.on_cone else 0.0)
+        return NUMBER, self._add_constant(float(self.found.sign[0, known.argmax()]) if self.on_cone else 0.0)
 
     def _axis(self, rows: Rows, i: int, cell: int) -> float:
         """Return a component of the axes of the station of row i; `cell` numbers the d * d components row by row."""
@@ -282,7 +284,7 @@ class _LiftedProblem:
         assert axes is not None
         return float(axes[int(rows.epoch[i]) if len(axes) > 1 else 0, rows.a[i], cell // d, cell % d])
 
-    def _keep(self, value: float) -> int:
+    def _add_constant(self, value: float) -> int:
         """Append a constant of the structure, and return its index."""
         self.number.append(value)
         return len(self.number) - 1
@@ -310,10 +312,10 @@ def lift(problem: Problem, found: Ranges | None, node: dict[tuple[int, int], int
     ]
     blocks = [block for block in lifted if block is not None and block.source]
     d, tapes = problem.dimension, [block.tape for block in blocks]
-    every = [own for block in blocks for own in block.source]
+    every = [sources for block in blocks for sources in block.source]
     source = np.zeros((len(every), max(map(len, every), default=0), 2), dtype=np.int64)
-    for row, own in zip(source, every, strict=True):
-        row[: len(own)] = own
+    for row, sources in zip(source, every, strict=True):
+        row[: len(sources)] = sources
     return Lifts(
         found is None and all((one.outputs[d], 0.0) in one.constants for one in tapes),
         tape_table(tapes, [one.outputs for one in tapes]),

@@ -146,8 +146,19 @@ class Plan:
 
         def work(first: int) -> int:
             part = slice(first, min(first + _CHUNK, count))
-            own, some = load.take(part), Answer(*(array[part] for array in answer))
-            return int(kernel(own.model, own.rows, _owned(z[part]), _owned(own.place), TOLERANCE, LIMIT, given, some))
+            loaded, written = load.take(part), Answer(*(array[part] for array in answer))
+            return int(
+                kernel(
+                    loaded.model,
+                    loaded.rows,
+                    _contiguous(z[part]),
+                    _contiguous(loaded.place),
+                    TOLERANCE,
+                    LIMIT,
+                    given,
+                    written,
+                )
+            )
 
         return answer, max(map_on_threads(work, range(0, count, _CHUNK), threads), default=0)
 
@@ -218,7 +229,7 @@ def blank_answer(count: int, d: int, size: int, shared: int, sides: int) -> Answ
     )
 
 
-def _owned(values: Array) -> Array:
+def _contiguous(values: Array) -> Array:
     """Return values as the array type that machine code takes: float, C order, writable."""
     return np.require(values, dtype=float, requirements=["C", "W"])
 
@@ -239,7 +250,7 @@ def plan_of(problem: Problem) -> Plan | None:
     """
     if not (is_planned(problem) and enabled()):
         return None
-    return _KEPT.find(key_of(problem), lambda: _make(problem))
+    return _KEPT.find(key_of(problem), lambda: _make_plan(problem))
 
 
 def key_of(problem: Problem) -> tuple[Hashable, ...]:
@@ -309,13 +320,13 @@ def _is_taped(problem: Problem) -> bool:
 # How a plan is made.
 
 
-def _make(problem: Problem) -> Plan | None:
+def _make_plan(problem: Problem) -> Plan | None:
     """Return the plan of problems, or None if a plan is impossible.
 
     Reasons are negative degrees of freedom, a position that is not first among the unknowns, constraints or rows
     without tapes, or rows without a start.
     """
-    one = _bare(problem)
+    one = _without_measurements(problem)
     dof = int(degrees_of_freedom(one.flat())[0])
     if dof < 0 or problem.layout.find("position")[0].start:
         return None
@@ -336,7 +347,7 @@ def _make(problem: Problem) -> Plan | None:
     )
 
 
-def _bare(problem: Problem) -> Problem:
+def _without_measurements(problem: Problem) -> Problem:
     """Return one problem of a batch with zero measurements and without levels of constraints, as a plan needs it."""
     stations = problem.stations
     place = stations.position.reshape(-1, *stations.position.shape[-3:])[0]

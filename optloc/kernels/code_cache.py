@@ -65,11 +65,11 @@ def folder() -> Path | None:
 def _clear(place: Path) -> None:
     """Remove folders for other compilers except the most recent ones; a process that still uses one compiles again."""
     others = [path for path in place.parent.glob(f"{PREFIX}*") if path != place and path.is_dir()]
-    for path in sorted(others, key=_used, reverse=True)[_LEFT:]:
+    for path in sorted(others, key=_last_use, reverse=True)[_LEFT:]:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def _used(path: Path) -> float:
+def _last_use(path: Path) -> float:
     """Return the time at which a folder was last used, seconds; 0 if it no longer exists."""
     try:
         return path.stat().st_mtime
@@ -262,7 +262,7 @@ def _leave_last(place: Path, name: str, base: str) -> None:
     `base` is the file name of the present version, which stays.
     """
     others = [path for path in place.glob(f"{file_prefix_of(name, '*')}.nbi") if path.stem != base]
-    for path in sorted(others, key=_used, reverse=True)[_LEFT - 1 :]:
+    for path in sorted(others, key=_last_use, reverse=True)[_LEFT - 1 :]:
         for file in (path, *place.glob(f"{path.stem}.*.nbc")):
             file.unlink(missing_ok=True)
 
@@ -296,7 +296,7 @@ def start_background_compiler() -> None:
         _LOG.warning("cannot start the process that compiles machine code: %s", error)
 
 
-def _holds(file: IO[bytes], *, wait: bool) -> bool:
+def _lock_file(file: IO[bytes], *, wait: bool) -> bool:
     """Lock a file until it is closed, and return whether this succeeded.
 
     If `wait` is True, the function waits for the lock. The result is True if the system or file system has no locks.
@@ -320,7 +320,7 @@ def sole_compiler() -> Iterator[bool]:
         yield False
         return
     with (place / "all.lock").open("ab") as file:
-        yield _holds(file, wait=False)
+        yield _lock_file(file, wait=False)
 
 
 @contextmanager
@@ -339,5 +339,5 @@ def locked(kernel: Compilable) -> Iterator[None]:
         except OSError:  # the folder was removed, so it is created again
             yield
             return
-        _holds(file, wait=True)
+        _lock_file(file, wait=True)
         yield

@@ -41,7 +41,7 @@ class Compilable:
 def digest_of(kernel: Compilable) -> str:
     """Return the digest of a kernel's call graph; kernels that call each other have the same digest."""
     own = sorted(
-        f"{one.function.__module__}.{one.function.__qualname__} {one.taken_in} {_own(one.function)[0]}"
+        f"{one.function.__module__}.{one.function.__qualname__} {one.taken_in} {_digest_and_callees(one.function)[0]}"
         for one in closure(kernel)
     )
     return sha256("\n".join(own).encode()).hexdigest()[:_DIGITS]
@@ -59,7 +59,7 @@ def closure(kernel: Compilable) -> set[Compilable]:
 
 def callees(kernel: Compilable) -> tuple[Compilable, ...]:
     """Return the compiled functions whose names a kernel uses."""
-    return _own(kernel.function)[1]
+    return _digest_and_callees(kernel.function)[1]
 
 
 def callers(kernels: Iterable[Compilable], known: Iterable[Compilable]) -> set[Compilable]:
@@ -73,7 +73,7 @@ def callers(kernels: Iterable[Compilable], known: Iterable[Compilable]) -> set[C
 
 
 @cache
-def _own(function: Callable[..., Any]) -> tuple[str, tuple[Compilable, ...]]:
+def _digest_and_callees(function: Callable[..., Any]) -> tuple[str, tuple[Compilable, ...]]:
     """Return the digest of a function without its callees, and its callees.
 
     The result is cached, because many call graphs contain the same function.

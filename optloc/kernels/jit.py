@@ -289,11 +289,11 @@ def require_code(kernel: Callable[..., Any]) -> None:
 def is_available(kernel: Callable[..., Any]) -> bool:
     """Return whether the machine code of a kernel was used in this process, or was on disk at the first check."""
     assert isinstance(kernel, _Kernel)
-    return enabled() and (kernel.ready or _was_kept(kernel))
+    return enabled() and (kernel.ready or _was_cached(kernel))
 
 
 @cache  # cached, because a look into the folder takes longer than the work of the kernel
-def _was_kept(kernel: _Kernel) -> bool:
+def _was_cached(kernel: _Kernel) -> bool:
     """Return whether the machine code of a kernel is on disk."""
     return is_cached(kernel)
 

@@ -151,7 +151,7 @@ def refine(
     if weights is not None:
         return _iterate(problem, start, weights, rules, face, folded, limits)
     for _ in range(WEIGHINGS):
-        done = _remade(problem, start, rules, face, limits)
+        done = _refine_by_numpy(problem, start, rules, face, limits)
         start = done.x
     return done
 
@@ -159,7 +159,9 @@ def refine(
 # Refinement by numpy: all problems of a batch side by side; converged problems leave the batch.
 
 
-def _remade(problem: Problem, start: Array, rules: StopRules, face: Face = (), limits: Limits | None = None) -> Refined:
+def _refine_by_numpy(
+    problem: Problem, start: Array, rules: StopRules, face: Face = (), limits: Limits | None = None
+) -> Refined:
     """Return the refinement by numpy, with weights computed at the start."""
     return _iterate(problem, start, _Weights.of(problem, start), rules, face, None, limits)
 
@@ -239,7 +241,7 @@ class _DescentState:
     def begin(cls, problem: Problem, start: Array, weights: _Weights) -> _DescentState:
         """Return the state at given starts (N, size)."""
         count = len(start)
-        equations = _own(weights.equations(problem, start))
+        equations = _writable(weights.equations(problem, start))
         status = np.full(count, int(Status.MAX_ITERATIONS), dtype=np.int8)
         status[~np.isfinite(equations.cost)] = Status.NUMERICAL
         return cls(
@@ -316,7 +318,7 @@ def _advance(part: _ActiveProblems, state: _DescentState, active: Array, rules: 
     """
     # In most batches all problems end together: while all are active, arrays are not copied.
     everything = len(active) == len(state.x)
-    now = state.equations if everything else _at(state.equations, active)
+    now = state.equations if everything else _selected(state.equations, active)
     here = state.x[active]
     damping = state.damping[active] if rules.damped else np.zeros(len(active))
     held = part.held
@@ -336,7 +338,7 @@ def _advance(part: _ActiveProblems, state: _DescentState, active: Array, rules: 
         rules.damped,
     )
     state.iterations[active] = iteration + 1
-    _keep(state, active, found.better, x, after)
+    _store_accepted(state, active, found.better, x, after)
     state.damping[active], state.growth[active] = found.damping, found.growth
     if part.limits is not None:
         # a step that stays at the limit is stalled: it could only move along the limit, as on a face
@@ -348,10 +350,10 @@ def _advance(part: _ActiveProblems, state: _DescentState, active: Array, rules: 
         state.status[active[~found.better]] = Status.NUMERICAL
 
 
-def _keep(state: _DescentState, active: Array, better: Array, x: Array, after: Normal) -> None:
+def _store_accepted(state: _DescentState, active: Array, better: Array, x: Array, after: Normal) -> None:
     """Store accepted vectors x and their equations `after` in the state; `better` marks the accepted steps."""
     if better.all() and len(active) == len(state.x):
-        state.x, state.equations = x, _own(after)
+        state.x, state.equations = x, _writable(after)
         return
     to = active[better]
     state.x[to] = x[better]
@@ -359,12 +361,12 @@ def _keep(state: _DescentState, active: Array, better: Array, x: Array, after: N
         mine[to] = new[better]
 
 
-def _own(equations: Normal) -> Normal:
+def _writable(equations: Normal) -> Normal:
     """Return normal equations whose arrays are writable."""
     return Normal(*(array if array.flags.writeable else np.array(array) for array in equations.parts))
 
 
-def _at(equations: Normal, index: Array) -> Normal:
+def _selected(equations: Normal, index: Array) -> Normal:
     """Return the normal equations of the selected problems."""
     return Normal(*(part[index] for part in equations.parts))
 
@@ -420,7 +422,7 @@ def _refine_with_weights(
         done, lost = refine.refined(found, item, start, rules)
     # numpy refines the runs in which an epoch does not determine its local unknowns: it takes the step of least norm.
     if lost.any():
-        more = _remade(problem.take(item[lost]), start[lost], rules)
+        more = _refine_by_numpy(problem.take(item[lost]), start[lost], rules)
         for name in ("x", "cost", "status", "iterations"):
             getattr(done, name)[lost] = getattr(more, name)
 

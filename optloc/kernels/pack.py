@@ -84,7 +84,7 @@ def pack(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
         one.place[:, AT] += np.where(one.place[:, AT] >= 0, shared, -own)
     # An empty array means that all rows are present, so that no kernel reads it.
     weight = problem.weight
-    present = np.zeros((1, 0)) if np.all(weight > 0.0) else _plain(weight > 0.0, 1)
+    present = np.zeros((1, 0)) if np.all(weight > 0.0) else _contiguous(weight > 0.0, 1)
     return Packed(
         kept.tables,
         Numbers(
@@ -95,7 +95,7 @@ def pack(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
             prior.own,
             observed(problem),
             present,
-            _plain(np.sqrt(variances(problem.noise, problem.count)), 1),
+            _contiguous(np.sqrt(variances(problem.noise, problem.count)), 1),
             coarseness(problem),
         ),
     )
@@ -137,11 +137,11 @@ def coarseness(problem: Problem) -> Array:
 def observed(problem: Problem) -> Array:
     """Return the measurements less corrections of a flat batch of problems, (N or 1, m), for `Numbers.observed`."""
     if len(problem.rows) == 1 and not problem.rows[0].correction.any():
-        return _plain(problem.rows[0].z, 1)
-    return _plain(problem.observed, 1)
+        return _contiguous(problem.rows[0].z, 1)
+    return _contiguous(problem.observed, 1)
 
 
-def _plain(values: Array, core: int) -> Array:
+def _contiguous(values: Array, core: int) -> Array:
     """Return an array as contiguous doubles (N or 1, numbers); its last `core` axes belong to one problem."""
     shape = values.shape
     flat = values.reshape(shape[0] if len(shape) > core else 1, int(np.prod(shape[len(shape) - core :])))
@@ -185,13 +185,13 @@ class Divided:
 
 def sources(problem: Problem) -> Divided:
     """Return the data arrays of a flat batch of problems, see `optloc.kernels.tables.Sources`."""
-    parts = [_plain(array, core) for array, core in Sources.of(problem).arrays]
+    parts = [_contiguous(array, core) for array, core in Sources.of(problem).arrays]
     return Divided.of([np.zeros((1, 1)), *parts])
 
 
 def _whiteners(noise: tuple[Whitener, ...]) -> Divided:
     """Return whitening matrices as `Divided`, with one line of `place` for each group."""
-    divided, lines = Divided.of([_plain(w.matrix, 3) for w in noise]), []
+    divided, lines = Divided.of([_contiguous(w.matrix, 3) for w in noise]), []
     for start, w in zip(divided.place[:, AT], noise, strict=True):
         count, size = w.row.shape
         step = size * size if w.matrix.shape[-3] > 1 else 0
@@ -208,7 +208,7 @@ def _priors(problem: Problem) -> Divided:
     for name, mean, precision in prior_parts(problem):
         slot, shared = layout.find(name)
         arrays = (mean, precision) if shared else (_single(mean, 1), _single(precision, 2))
-        both = (_plain(arrays[0], 1), _plain(arrays[1], 2))
+        both = (_contiguous(arrays[0], 1), _contiguous(arrays[1], 2))
         count = max(len(part) for part in both)
         parts.append(np.concatenate([np.broadcast_to(part, (count, part.shape[1])) for part in both], axis=1))
         heads.append((slot.start, slot.size, int(not shared)))
@@ -258,11 +258,11 @@ class Folding:
         groups of two epochs differ.
         """
         epoch, local = self.epoch[row], self.local[row]
-        own = _alike(epoch[:, 0], self.epochs, local)
+        own = _entries_of_epochs(epoch[:, 0], self.epochs, local)
         return None if own is None or (epoch != epoch[:, :1]).any() else (local[own[0]], own)
 
 
-def _alike(epoch: Array, epochs: int, *values: Array) -> Array | None:
+def _entries_of_epochs(epoch: Array, epochs: int, *values: Array) -> Array | None:
     """Return the entries (k, q) of each epoch, or None if they differ between epochs.
 
     `epoch` (n,) is the epoch of each entry. The arrays `values` (n, ...) must be equal in all epochs, also in order.
@@ -292,7 +292,7 @@ def _fold(problem: Problem) -> Folding | None:
     """Return the common rows of the epochs, see `folding`."""
     k, rows, local, start = problem.epochs, [], np.zeros(problem.count, dtype=np.int64), 0
     for block, first in zip(problem.rows, problem.starts, strict=True):
-        own = _alike(block.epoch, k, block.a, block.b, block.target)
+        own = _entries_of_epochs(block.epoch, k, block.a, block.b, block.target)
         if own is None:
             return None
         rows.append(own)
@@ -300,7 +300,7 @@ def _fold(problem: Problem) -> Folding | None:
         start += own.shape[1]
     epoch, touches = problem.epoch, []
     for bias in problem.biases:
-        own = _alike(epoch[bias.row], k, local[bias.row], bias.member, bias.coefficient)
+        own = _entries_of_epochs(epoch[bias.row], k, local[bias.row], bias.member, bias.coefficient)
         form = form_of(bias)
         # Errors that depend on the time are a different function of their unknowns in each epoch.
         if own is None or form.changes or form.enters == "moves":

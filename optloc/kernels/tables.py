@@ -341,7 +341,7 @@ def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> Ca
         if made is None:
             return None
         found.append(_TracedRows(links, made, inputs))
-    return _fill(problem, RowGroups.sorted(problem, groups), found, sources.lookup())
+    return _build_tables(problem, RowGroups.sorted(problem, groups), found, sources.lookup())
 
 
 def _spanning(problem: Problem, groups: tuple[Array, ...]) -> bool:
@@ -363,7 +363,7 @@ class _TracedRows:
     inputs: dict[int, Array]
 
 
-def _fill(problem: Problem, groups: RowGroups, found: list[_TracedRows], lookup: Array) -> CachedTables:
+def _build_tables(problem: Problem, groups: RowGroups, found: list[_TracedRows], lookup: Array) -> CachedTables:
     """Return the tables of traced blocks of rows; `lookup` is the result of `Sources.lookup`."""
     pairs = list(zip(found, problem.starts, strict=True))
     feeds = Entries.joined([Entries.feeds(kind.links, kind.trace, start) for kind, start in pairs])
@@ -375,7 +375,7 @@ def _fill(problem: Problem, groups: RowGroups, found: list[_TracedRows], lookup:
     inputs = np.concatenate([np.full(k.links.block.count, len(t.inputs)) for k, t in zip(found, tapes, strict=True)])
     source_at = starts(inputs[order.row])
     place = source_at[order.at[feeds.row]] + feeds.place
-    term, factor, at = _list(
+    term, factor, at = _sort_by_owner(
         [feeds, scales, adds],
         slots,
         [place, order.at[scales.row], order.at[adds.row]],
@@ -440,7 +440,7 @@ def _sources(found: list[_TracedRows], source_at: Array, order: Order, lookup: A
     return np.asarray(lookup[out])
 
 
-def _list(
+def _sort_by_owner(
     parts: list[Entries], slots: list[Array], owners: list[Array], counts: list[int]
 ) -> tuple[Array, Array, list[Array]]:
     """Return entries sorted by owner (an input or a row): indices, factors, and the first entry of each owner.

@@ -296,7 +296,7 @@ class Tape:
 def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
     """Return the tape of the operations that the given outputs (symbols or numbers) need."""
     wanted = [recorder.node(value) for value in outputs]
-    needed = _trace_back(recorder, wanted)
+    needed = _needed_nodes(recorder, wanted)
     last = _last_uses(recorder, needed, wanted)
     # Registers whose values are not needed later are used again, so that fewer registers stay in the cache.
     free: list[int] = []
@@ -322,7 +322,7 @@ def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
     )
 
 
-def _trace_back(recorder: Recorder, wanted: list[int]) -> list[int]:
+def _needed_nodes(recorder: Recorder, wanted: list[int]) -> list[int]:
     """Return the nodes that the `wanted` nodes depend on, in the order in which they were recorded."""
     found: set[int] = set()
     ahead = list(wanted)

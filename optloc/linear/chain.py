@@ -123,23 +123,25 @@ def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool)
     after[..., : (k - 1) // 2, :, :] = link[..., 1::2, :, :]
     before = link[..., ::2, :, :].mT
     sides = np.concatenate([before, after, right[..., 1::2, :, :], eye[..., 1::2, :, :]], axis=-1)
-    solved = _regular(block[..., 1::2, :, :], sides)
-    back, on, own, self_ = np.split(solved, np.cumsum([length, length, right.shape[-1]]), axis=-1)
+    solved = _solve_blocks(block[..., 1::2, :, :], sides)
+    gain_before, gain_after, solved_right, own_inverse = np.split(
+        solved, np.cumsum([length, length, right.shape[-1]]), axis=-1
+    )
     # the reduced system of the even blocks
     rest, vector = block[..., ::2, :, :].copy(), right[..., ::2, :, :].copy()
     m = k // 2
-    rest[..., :m, :, :] -= before.mT @ back
-    vector[..., :m, :, :] -= before.mT @ own
+    rest[..., :m, :, :] -= before.mT @ gain_before
+    vector[..., :m, :, :] -= before.mT @ solved_right
     follow = (k - 1) // 2
-    rest[..., 1:, :, :] -= (after.mT @ on)[..., :follow, :, :]
-    vector[..., 1:, :, :] -= (after.mT @ own)[..., :follow, :, :]
-    between = -(before.mT @ on)[..., :follow, :, :]
+    rest[..., 1:, :, :] -= (after.mT @ gain_after)[..., :follow, :, :]
+    vector[..., 1:, :, :] -= (after.mT @ solved_right)[..., :follow, :, :]
+    between = -(before.mT @ gain_after)[..., :follow, :, :]
     even, parts, ok = _reduce(rest, between, vector, size, inverse)
     out = np.empty((*block.shape[:-3], k, length, right.shape[-1]))
     out[..., ::2, :, :] = even
     behind = _following_even(even, m)
-    out[..., 1::2, :, :] = own - back @ even[..., :m, :, :] - on @ behind
-    return out, _inner(parts, back, on, self_, k) if inverse else parts, ok
+    out[..., 1::2, :, :] = solved_right - gain_before @ even[..., :m, :, :] - gain_after @ behind
+    return out, _inverse_blocks_of_chain(parts, gain_before, gain_after, own_inverse, k) if inverse else parts, ok
 
 
 def _following_even(even: Array, count: int) -> Array:
@@ -149,27 +151,29 @@ def _following_even(even: Array, count: int) -> Array:
     return out
 
 
-def _inner(parts: _ChainParts, back: Array, on: Array, own: Array, k: int) -> _ChainParts:
+def _inverse_blocks_of_chain(
+    parts: _ChainParts, gain_before: Array, gain_after: Array, own_inverse: Array, k: int
+) -> _ChainParts:
     """Return the blocks of the inverse of the whole chain of k epochs, from the blocks of the even epochs.
 
     The odd unknowns are ``x_odd = own - back x_before - on x_after``: `own` is the inverse of the odd blocks, `back`
     and `on` are the coefficients of the even blocks before and after.
     """
     m, first = k // 2, parts.inner[..., : k // 2, :, :]
-    second, across = _following_even(parts.inner, m), np.zeros_like(back)
+    second, across = _following_even(parts.inner, m), np.zeros_like(gain_before)
     across[..., : parts.beside.shape[-3], :, :] = parts.beside
-    with_before = -(back @ first + on @ across.mT)
-    with_after = -(back @ across + on @ second)
-    inner = np.empty((*back.shape[:-3], k, *back.shape[-2:]))
+    with_before = -(gain_before @ first + gain_after @ across.mT)
+    with_after = -(gain_before @ across + gain_after @ second)
+    inner = np.empty((*gain_before.shape[:-3], k, *gain_before.shape[-2:]))
     inner[..., ::2, :, :] = parts.inner
-    inner[..., 1::2, :, :] = own - with_before @ back.mT - with_after @ on.mT
-    beside = np.empty((*back.shape[:-3], k - 1, *back.shape[-2:]))
+    inner[..., 1::2, :, :] = own_inverse - with_before @ gain_before.mT - with_after @ gain_after.mT
+    beside = np.empty((*gain_before.shape[:-3], k - 1, *gain_before.shape[-2:]))
     beside[..., ::2, :, :] = with_before.mT
     beside[..., 1::2, :, :] = with_after[..., : (k - 1) // 2, :, :]
     return _ChainParts(inner, beside)
 
 
-def _regular(block: Array, right: Array) -> Array:
+def _solve_blocks(block: Array, right: Array) -> Array:
     """Return the solutions of separate systems with matrices `block`, of least norm if a matrix is singular."""
     solved, good = linalg.solve(block, right, _OPEN)
     if not good.all():

@@ -151,9 +151,9 @@ def visible(points: ArrayLike, *, elevation: Amount = 0.0, target: int = 0) -> t
         Number of the target.
     """
     # The bounded quantity is the sine, see `optloc.models.surfaces`, which increases with the elevation.
-    least = _number(np.sin(in_si(elevation, "angle", "elevation")))
+    least = _float_array(np.sin(in_si(elevation, "angle", "elevation")))
     return tuple(
-        Band("visible", least, _number(np.inf), point, f"sight of point {i}", target)
+        Band("visible", least, _float_array(np.inf), point, f"sight of point {i}", target)
         for i, point in enumerate(np.asarray(points, dtype=float))
     )
 
@@ -162,7 +162,11 @@ def speed(upper: Amount, *, lower: Amount = 0.0, target: int = 0) -> tuple[Band,
     """Return the constraint on a target's speed: metres per second, or text such as "90 km/h"."""
     upper, lower = float(in_si(upper, "speed", "speed")), float(in_si(lower, "speed", "speed"))
     # A lower bound of zero is left out: no speed is negative, and at zero the gradient does not exist.
-    return (Band("speed", _number(lower if lower > 0.0 else -np.inf), _number(upper), np.zeros(0), "speed", target),)
+    return (
+        Band(
+            "speed", _float_array(lower if lower > 0.0 else -np.inf), _float_array(upper), np.zeros(0), "speed", target
+        ),
+    )
 
 
 def polygon(vertices: ArrayLike, *, target: int = 0) -> tuple[Polygon, ...]:
@@ -170,14 +174,14 @@ def polygon(vertices: ArrayLike, *, target: int = 0) -> tuple[Polygon, ...]:
     return (Polygon(np.asarray(vertices, dtype=float), "polygon", target),)
 
 
-def _number(value: Any) -> Array:
+def _float_array(value: Any) -> Array:
     """Return a value as an array of floats."""
     return np.asarray(value, dtype=float)
 
 
 def _metres(value: Any, where: str) -> Array:
     """Return a length in metres, from a number or a text with a unit."""
-    return _number(in_si(value, "length", where, place=True))
+    return _float_array(in_si(value, "length", where, place=True))
 
 
 # Faces: sides that hold with equality together, and the projection of vectors onto them.
@@ -245,7 +249,9 @@ def faces(problem: Problem) -> list[Face]:
     found = [exact(problem)]
     for i, constraint in enumerate(problem.constraints):
         sides = (
-            [] if is_exact(constraint) else _meetings(list(_sides(i, constraint)), decisive_epochs(problem, constraint))
+            []
+            if is_exact(constraint)
+            else _combined_sides(list(_sides(i, constraint)), decisive_epochs(problem, constraint))
         )
         # More sides than dimensions have no common point. Speeds bound other unknowns, and do not count.
         wider = [(*face, *side) for face in found for side in sides]
@@ -253,7 +259,7 @@ def faces(problem: Problem) -> list[Face]:
     return sorted(found, key=len)
 
 
-def _meetings(sides: list[Face], epochs: list[int | None]) -> list[Face]:
+def _combined_sides(sides: list[Face], epochs: list[int | None]) -> list[Face]:
     """Return all combinations of the `sides` of one constraint at the given epochs: at one epoch, or at several."""
     found: list[Face] = [()]
     for epoch in epochs:
@@ -317,7 +323,7 @@ def is_held(problem: Problem, face: Face, x: Array, descent: Array) -> Array:
         if isinstance(constraint, Polygon):
             # at a concave corner, both sides are admitted, and the cost decreases along one of them
             here = [other.side for other in face if other.constraint == level.constraint]
-            out &= len(here) < 2 or _turn(constraint.vertices) * _turn(_corner(constraint, here)) > 0.0
+            out &= len(here) < 2 or _orientation(constraint.vertices) * _orientation(_corner(constraint, here)) > 0.0
     return out
 
 
@@ -331,7 +337,7 @@ def outwards(problem: Problem, level: Level) -> float:
     """Return 1 if the quantity of a level increases out of its bound, -1 if it decreases, 0 for an equality."""
     constraint = problem.constraints[level.constraint]
     if isinstance(constraint, Polygon):
-        return _turn(constraint.vertices)
+        return _orientation(constraint.vertices)
     return 0.0 if is_exact(constraint) else 1.0 if level.side == "upper" else -1.0
 
 
@@ -347,7 +353,7 @@ def _corner(region: Polygon, edges: list[str | int]) -> Array:
     return region.vertices[[first, (first + 1) % count, (first + 2) % count]]
 
 
-def _turn(vertices: Array) -> float:
+def _orientation(vertices: Array) -> float:
     """Return 1 if corners (v, 2) are in counter-clockwise order around their interior, -1 if clockwise."""
     (x, y), (u, v) = vertices.T, np.roll(vertices, -1, axis=0).T
     return float(np.sign((x * v - u * y).sum()))
@@ -441,7 +447,7 @@ def _band(constraint: Band | Polygon, side: str | int) -> Band:
     along = there - here
     # Unit length, so that a level is in metres; it points outwards if corners are counter-clockwise.
     normal = np.array([along[1], -along[0]]) / np.hypot(*along)
-    value = _number(normal @ here)
+    value = _float_array(normal @ here)
     return Band("plane", value, value, normal, constraint.name, constraint.target)
 
 
@@ -468,7 +474,10 @@ def conjunction(problem: Problem) -> list[Band]:
                 plane = _band(c, i)
                 bands.append(
                     replace(
-                        plane, coefficients=sign * plane.coefficients, upper=sign * plane.upper, lower=_number(-np.inf)
+                        plane,
+                        coefficients=sign * plane.coefficients,
+                        upper=sign * plane.upper,
+                        lower=_float_array(-np.inf),
                     )
                 )
     return bands
@@ -496,24 +505,24 @@ def violation(problem: Problem, x: Array) -> Array:
     worst = np.zeros(len(x))
     for c in problem.constraints:
         if isinstance(c, Polygon):
-            worst = np.maximum(worst, _outside(c, _horizontal(problem, c.target, x)))
+            worst = np.maximum(worst, _polygon_violation(c, _horizontal(problem, c.target, x)))
             continue
         with np.errstate(all="ignore"):  # the speed of a target at rest has no derivative, and none is needed here
             values = [_quantity(problem, c, x, epoch)[0].value for epoch in decisive_epochs(problem, c)]
         for value in values:
-            worst = np.maximum(worst, _short(c, value))
+            worst = np.maximum(worst, _band_violation(c, value))
     return worst
 
 
-def _short(band: Band, value: Array) -> Array:
+def _band_violation(band: Band, value: Array) -> Array:
     """Return the violation (N,) of a band by values (N,), relative to its size; negative if the band is satisfied."""
     worst = np.full(len(value), -np.inf)
     for bound, sign in ((band.lower, 1.0), (band.upper, -1.0)):
         with np.errstate(invalid="ignore"):
-            short = np.where(np.isfinite(bound), sign * (bound - value), -np.inf)
+            lacking = np.where(np.isfinite(bound), sign * (bound - value), -np.inf)
         # One measure for metres of a height and sines of an elevation: relative to the bound, absolute near zero.
         size = 1.0 + np.where(np.isfinite(bound), np.abs(bound), 0.0)
-        worst = np.maximum(worst, short / size)
+        worst = np.maximum(worst, lacking / size)
     return worst
 
 
@@ -576,7 +585,7 @@ def _horizontal(problem: Problem, target: int, x: Array) -> Array:
     return x[:, slot.start : slot.start + 2]
 
 
-def _outside(region: Polygon, points: Array) -> Array:
+def _polygon_violation(region: Polygon, points: Array) -> Array:
     """Return the distance of points (N, 2) from a polygon, divided by one plus its greatest coordinate; 0 inside."""
     a, b = region.vertices, np.roll(region.vertices, -1, axis=0)
     p = points[:, None]

@@ -58,7 +58,7 @@ class Equalities:
         x = restore(self.problem, self.lasting, x) if self.lasting else x
         if self.single is None:
             return x
-        return self._put(x, restore(self._single(x), self.each, self._states(x)))
+        return self._with_states(x, restore(self._single(x), self.each, self._states(x)))
 
     def retract(self, x: Array, move: Array) -> Array:
         """Return the vectors (M, size) after steps (M, size), projected onto the equalities."""
@@ -79,7 +79,7 @@ class Equalities:
         along = tangent_at(self.problem, self.lasting, x) if self.lasting else None
         if self.single is None:
             return step(equations, damping, along)
-        basis = self._own_space(x)
+        basis = self._local_space(x)
         move, ok = step(_within(equations, basis), damping, along)
         n, (m, k, _, free) = self.problem.layout.n_shared, basis.shape
         local = (basis @ move[:, n:].reshape(m, k, free, 1))[..., 0] if free else np.zeros(basis.shape[:-1])
@@ -91,7 +91,7 @@ class Equalities:
         The local unknowns continue to satisfy their equalities.
         """
         if self.single is not None:
-            equations = _within(equations, self._own_space(x))
+            equations = _within(equations, self._local_space(x))
         information, vector, _ = marginal(equations)
         return information, vector
 
@@ -101,7 +101,7 @@ class Equalities:
             return np.broadcast_to(np.eye(n := self.problem.layout.n_shared), (len(x), n, n))
         return tangent_at(self.problem, self.lasting, x)
 
-    def _own_space(self, x: Array) -> Array:
+    def _local_space(self, x: Array) -> Array:
         """Return bases (M, k, l, l - c) of the steps of the local unknowns that stay on the equalities."""
         layout = self.problem.layout
         _, gradients = levels(self._single(x), self.each, self._states(x))
@@ -136,7 +136,7 @@ class Equalities:
             out[:, there] = local.reshape(len(out), -1)[:, here]
         return out
 
-    def _put(self, x: Array, states: Array) -> Array:
+    def _with_states(self, x: Array, states: Array) -> Array:
         """Return vectors (M, size) whose epochs have the given states (M k, size of an epoch)."""
         shared, local = self.problem.layout.split(x)
         local = local.reshape(len(states), -1).copy()
@@ -153,10 +153,10 @@ def spare_rows(problem: Problem) -> Array:
         return found
     # an epoch without a row has no unknowns to constrain
     weight = np.atleast_2d(problem.weight)
-    heard = np.zeros((len(weight), problem.epochs), dtype=bool)
+    observed = np.zeros((len(weight), problem.epochs), dtype=bool)
     for i, row in enumerate(weight > 0.0):
-        heard[i, problem.epoch[row]] = True
-    return np.asarray(found + own * (heard.sum(1) - 1))
+        observed[i, problem.epoch[row]] = True
+    return np.asarray(found + own * (observed.sum(1) - 1))
 
 
 def _spread(band: Band | Polygon, shape: tuple[int, int]) -> Band | Polygon:

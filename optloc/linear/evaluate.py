@@ -250,16 +250,16 @@ def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
     feeds = []
     for bias in _entering(problem, "turns"):
         left = np.flatnonzero((bias.row >= start) & (bias.row < start + block.count))
-        turns = 1 if problem.dimension == 2 else 3
+        angles = 1 if problem.dimension == 2 else 3
         while (
             left.size
         ):  # a row rotated by several members takes one pass for each, since a feed contains a row only once
             rows, first = np.unique(bias.row[left] - start, return_index=True)
-            touch, left = left[first], np.delete(left, first)
+            entries, left = left[first], np.delete(left, first)
             column = columns(problem.layout, bias.name, rows)
-            for c in range(turns):
-                picked = column[np.arange(len(rows)), bias.member[touch] * turns + c]
-                feeds.append(Feed(TURN + c, picked, bias.coefficient[touch], rows))
+            for c in range(angles):
+                picked = column[np.arange(len(rows)), bias.member[entries] * angles + c]
+                feeds.append(Feed(TURN + c, picked, bias.coefficient[entries], rows))
     return feeds
 
 
@@ -273,10 +273,10 @@ def _course_feeds(problem: Problem, block: Rows, model: Model, start: int) -> li
     for bias in _entering(problem, "moves"):
         rates = course(problem)
         inside = (bias.row >= start) & (bias.row < start + block.count)
-        for side, station, place, rate in ((1.0, block.a, A, RATE_A), (-1.0, block.b, B, RATE_B)):
-            touch = np.flatnonzero(inside & (bias.coefficient == side))
-            rows = bias.row[touch] - start
-            column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), bias.member[touch]]
+        for sign, station, place, rate in ((1.0, block.a, A, RATE_A), (-1.0, block.b, B, RATE_B)):
+            entries = np.flatnonzero(inside & (bias.coefficient == sign))
+            rows = bias.row[entries] - start
+            column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), bias.member[entries]]
             epoch = block.epoch[rows] if len(rates[0]) > 1 else np.zeros_like(rows)
             for seed, grows in ((place, rates[0]), (rate, rates[1]))[: 1 + model.velocity if len(rows) else 0]:
                 picked = grows[epoch, station[rows]]
@@ -312,7 +312,7 @@ def points(problem: Problem, links: BlockLinks, x: Array, differentiate: bool) -
     # First data, then contributions of unknowns: an offset of a station is added to its surveyed position.
     inputs = {seed: as_array_like(value, x) for seed, value in given(problem, links).items()}
     for feed in links.feeds:
-        inputs[feed.seed] = _feed(inputs.get(feed.seed, 0.0), feed, x, links.block.count)
+        inputs[feed.seed] = _add_feed(inputs.get(feed.seed, 0.0), feed, x, links.block.count)
     if isinstance(x, Portable):  # data are computed in the same way as inputs from the vector
         inputs = {seed: np.asarray(value).view(Portable) for seed, value in inputs.items()}
     if differentiate:
@@ -410,7 +410,7 @@ def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> d
     return {seed + 3 * i + c: picked[..., i, c] for i in d for c in d}
 
 
-def _feed(value: Any, feed: Feed, x: Array, count: int) -> Any:
+def _add_feed(value: Any, feed: Feed, x: Array, count: int) -> Any:
     """Return the value (..., m) of an input plus the contribution of an unknown; `count` is the number of rows m."""
     column, gain = feed.table(count)
     part = gather(x, column)

@@ -55,7 +55,7 @@ def with_station_noise(problem: Problem, x: Array | None = None) -> Problem:
         # Ranges do not depend on velocities.
         nothing = np.zeros((stations.count, problem.dimension, problem.dimension))
         covariance = nothing if stations.covariance is None else stations.covariance
-        more = [_alike(problem, members, covariance) for members in groups]
+        more = [_isotropic_covariance(problem, members, covariance) for members in groups]
     else:
         # G is the Jacobian with respect to station errors as unknowns, which are the last of the local ones.
         named, x = with_offsets(problem, x, np.zeros(()))
@@ -117,7 +117,7 @@ def _groups(problem: Problem) -> list[Array]:
     return group_members(epoch)
 
 
-def _alike(problem: Problem, members: Array, covariance: Array) -> Array:
+def _isotropic_covariance(problem: Problem, members: Array, covariance: Array) -> Array:
     """Return the covariance (..., g, r, r) that isotropic station errors add to groups of rows `members` (g, r), m^2.
 
     `covariance` (..., s, d, d) belongs to the station positions. The errors have the effect of arrival errors with the
@@ -128,12 +128,12 @@ def _alike(problem: Problem, members: Array, covariance: Array) -> Array:
     ends = []
     for place in (0, 1):
         station = np.concatenate([(rows.a, rows.b)[place] for rows in problem.rows])
-        sign = np.concatenate([np.full(rows.count, _signs(rows)[place]) for rows in problem.rows])
+        sign = np.concatenate([np.full(rows.count, _range_signs(rows)[place]) for rows in problem.rows])
         ends.append((station[members], sign[members]))
     return arrivals(ends, variance)
 
 
-def _signs(rows: Rows) -> tuple[int, int]:
+def _range_signs(rows: Rows) -> tuple[int, int]:
     """Return the coefficients of the ranges to both stations of rows; zeros if the kind has none."""
     return MODELS[rows.kind].ranges or (0, 0)
 
@@ -384,10 +384,10 @@ def _solve_local(equations: Normal, right: Array) -> tuple[Array, Array]:
     """Return solutions (..., k, l, p) of the local systems, of least norm if they are singular, and ok (...)."""
     local, xp = equations.local, library(equations.local)
     if equations.link is not None:
-        return chain.solve(_hold_untouched(local), equations.link, right)
+        return chain.solve(_fix_unused(local), equations.link, right)
     # If a single epoch leaves its local unknowns undetermined, so is the fix; the caller handles this case.
     if local.shape[-3] == 1:
-        solved, good = linalg.solve(_hold_untouched(local), right)
+        solved, good = linalg.solve(_fix_unused(local), right)
         return solved, xp.all(good, axis=-1)
     solved, good = linalg.solve(local, right, OPEN)
     # In a run, an epoch may leave a combination undetermined (one arrival, unknown emission time). The least norm moves
@@ -401,7 +401,7 @@ def _solve_local(equations: Normal, right: Array) -> tuple[Array, Array]:
     return solved, xp.ones_like(solved[..., 0, 0, 0], dtype=xp.bool)
 
 
-def _hold_untouched(local: Array) -> Array:
+def _fix_unused(local: Array) -> Array:
     """Return local blocks with 1 on the diagonal for unknowns without rows, so that their step is zero."""
     dead = library(local).linalg.diagonal(local) == 0.0
     grown: Array = local + as_number(dead, local)[..., None] * eye(local.shape[-1], local)
@@ -424,7 +424,7 @@ def local_covariance(equations: Normal, shared: Array, size: int) -> Array:
         inverse, good = linalg.inverse(equations.local, OPEN)
         gain = inverse @ np.swapaxes(equations.cross, -1, -2)
     else:
-        held = _hold_untouched(equations.local)
+        held = _fix_unused(equations.local)
         inverse, whole = chain.inverse_blocks(held, equations.link)
         gain, _ = chain.solve(held, equations.link, equations.cross.mT)
         # an epoch may still leave some of its other local unknowns undetermined
@@ -451,7 +451,7 @@ def step(equations: Normal, damping: Array, along: Array | None = None) -> tuple
     if equations.link is not None:
         # Walks follow the shared unknowns, so that the rows have little information about these unknowns. This
         # information is damped.
-        information = _grow(information, damping)
+        information = _scale_diagonal(information, damping)
     if along is not None:
         shared, good = linalg.solve_within(information, vector, along)
         ok = ok & good
@@ -470,16 +470,16 @@ def step(equations: Normal, damping: Array, along: Array | None = None) -> tuple
 
 def _damp(equations: Normal, damping: Array) -> Normal:
     """Return normal equations with the diagonal times 1 + damping; the local unknowns of walks are not damped."""
-    local = _grow(equations.local, damping[..., None])
+    local = _scale_diagonal(equations.local, damping[..., None])
     if equations.link is None:
-        return replace(equations, shared=_grow(equations.shared, damping), local=local)
+        return replace(equations, shared=_scale_diagonal(equations.shared, damping), local=local)
     # Walks are linear. Their steps have a high precision compared with the rows, and damping would keep them from
     # moving.
     walking = np.diagonal(equations.link, axis1=-2, axis2=-1).any(tuple(range(equations.link.ndim - 2)))
     return replace(equations, local=np.where(walking, equations.local, local))
 
 
-def _grow(matrix: Array, factor: Array) -> Array:
+def _scale_diagonal(matrix: Array, factor: Array) -> Array:
     """Return a matrix with its diagonal times (1 + factor): Marquardt's scaling is independent of units."""
     grown: Array = matrix * (1.0 + factor[..., None, None] * eye(matrix.shape[-1], matrix))
     return grown

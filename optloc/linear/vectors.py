@@ -68,9 +68,9 @@ def _fit_emission_times(problem: Problem, x: Array) -> Array:
         if len(column):
             order = np.argsort(column, kind="stable")
             columns_of_rows, first = np.unique(column[order], return_index=True)
-            heard = np.add.reduceat(1.0 * present[:, rows[order]], first, axis=-1)
+            counts = np.add.reduceat(1.0 * present[:, rows[order]], first, axis=-1)
             total = np.add.reduceat(np.where(present, left, 0.0)[:, rows[order]], first, axis=-1)
-            out[:, columns_of_rows] += np.where(usable[:, None], total / np.maximum(heard, 1.0), 0.0)
+            out[:, columns_of_rows] += np.where(usable[:, None], total / np.maximum(counts, 1.0), 0.0)
     return out.reshape(size, q, -1)
 
 
