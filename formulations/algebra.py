@@ -1,8 +1,8 @@
 r"""Linear algebra of small matrices in batches, for most problems of this package.
 
-Every product is a fixed chain of elementwise operations: an item that is singular or not finite changes no bit of its
-neighbours, and problems of three or four unknowns cost no call per matrix. Two layouts occur. Geometry keeps the batch
-in front and the vector on the last axis. The squared-range solvers keep the *batch on the last axis*, so that every
+Every product is a fixed chain of elementwise operations. So an item that is singular or not finite changes no bit of
+its neighbours, and no function is called for each matrix. There are two layouts. Geometry has the batch on the first
+axes and the vector on the last axis. The squared-range solvers have the *batch on the last axis*, so that every
 operation of a small matrix runs along contiguous memory.
 
 Sources: textbook formulas; the bordered system is the one of a Newton step on the optimality conditions, J. Nocedal
@@ -29,7 +29,7 @@ _CORRECTION = 1e-2
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return the inner products along the last axis.
+    """Return the inner products of vectors along the last axis.
 
     Parameters
     ----------
@@ -63,7 +63,9 @@ def flatten(value: ArrayLike, last: tuple[int, ...], lead: tuple[int, ...]) -> A
 
 
 def span(when: Array, heard: Mask) -> tuple[Array, Array]:
-    """Return the middle and the half length of the observed times, so that powers of scaled times are of order one.
+    """Return the middle and the half length of the observed times; polynomials use times relative to them.
+
+    Scaled powers of time are then of order one.
 
     Parameters
     ----------
@@ -198,6 +200,8 @@ def eigen(S: Array) -> tuple[Array, Array]:
 
 def bordered(D: Array, q: Array, corner: float | Array, right: Array, last: Array) -> Array:
     """Return the solution v of ``[diag D, q; q', corner] (v, .) = (right, last)``, in which one entry of D may vanish.
+
+    Newton steps on a constrained minimum have this form. Only v is returned, not the last unknown.
 
     Parameters
     ----------

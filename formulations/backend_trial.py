@@ -81,9 +81,9 @@ def _nonlinear_failure(name: str) -> str:
 
 
 def _solve(name: str, start: Array | None = None, ranges: Array = _RANGES, **constraints: Callable[..., Any]) -> Any:
-    """Return the solution of the nonlinear solver `name` for the position, or the message of its failure.
+    """Return the solution of the nonlinear solver `name` for the position (2,), or the message of its failure.
 
-    `constraints` are the equalities and inequalities of `formulations.nls.Program`.
+    `constraints` are the equalities and inequalities of `formulations.nls.Program`. `ranges` (3,) are the measurements.
     """
     import casadi as ca
 

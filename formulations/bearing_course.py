@@ -5,13 +5,15 @@ A target at :math:`p(t) = \sum_j c_j t^j`, seen at time t from S with azimuth A 
 .. math:: g^\top \Bigl(\sum_j c_j t^j - S\Bigr) = 0, \quad g_A = (\sin A, -\cos A, 0), \quad
    g_E = (\sin E \cos A, \sin E \sin A, -\cos E),
 
-with errors :math:`\rho \sin n_A` and, to first order, :math:`D n_E` (horizontal and slant range). With rows
-:math:`G_{kj} = t_k^j g_k`, right sides :math:`b = g^\top S` and weights W:
+with errors :math:`\rho \sin n_A` and, to first order, :math:`D n_E`. Here :math:`n_A` and :math:`n_E` are the errors of
+the angles, :math:`\rho` is the horizontal range and D the slant range. With rows :math:`G_{kj} = t_k^j g_k`, right
+sides :math:`b = g^\top S` and weights W:
 
 - *plain*: :math:`\min |W_0 (G c - b)|^2`, :math:`W_0 = 1/\sigma`;
-- *weighted*: the same with :math:`1/(\rho \sigma_A)`, :math:`1/(D \sigma_E)` on the course before;
-- *instrumental*: :math:`Z^\top W^2 (G c - b) = 0`, `Z` being `G` at the angles predicted by the weighted course. A run
-  has many rays, and the noise in `G` is what biases the first two, more than it scatters them; `Z` does not share it.
+- *weighted*: the same with the weights :math:`1/(\rho \sigma_A)`, :math:`1/(D \sigma_E)` at the previous course;
+- *instrumental*: :math:`Z^\top W^2 (G c - b) = 0`, with the instruments `Z`: the rows `G` at the angles that the
+  weighted course predicts. The noise in `G` biases the first two courses. In a run of many rays, this bias is larger
+  than the scatter. `Z` does not contain the noise.
 
 No epoch needs enough rows for a separate fix: one station that manoeuvres may be enough.
 
@@ -159,7 +161,7 @@ def sight_courses(
 
 
 def _course_run(S: Array, axes: Array | None, powers: Array, seen: BearingRays, both: bool) -> _CourseRun:
-    """Return the data of a fit; the arguments are those of `_CourseRun`, and the directions of sight."""
+    """Return the data of a fit, see `_CourseRun`; `seen` are the directions of sight."""
     normal = seen.normals
     right = dot(normal, np.concatenate([S, S], axis=1) if both else S)
     size = np.sqrt(dot(S, S)).max(axis=-1, keepdims=True)

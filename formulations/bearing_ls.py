@@ -4,14 +4,15 @@ A station S with azimuth A and elevation E (in its own axes) sees p in two plane
 
 .. math:: g_A = (\sin A, -\cos A, 0), \quad g_E = (\sin E \cos A, \sin E \sin A, -\cos E), \qquad g^\top (p - S) = 0,
 
-with errors :math:`\rho \sin n_A` and, to first order, :math:`D n_E` (horizontal and slant range); in the plane only
-the first row. With rows `G`, right sides :math:`b = g^\top S` and weights `W`:
+with errors :math:`\rho \sin n_A` and, to first order, :math:`D n_E`. Here :math:`n_A` and :math:`n_E` are the errors of
+the angles, :math:`\rho` is the horizontal range and D the slant range. In the plane there is only the first row. With
+rows `G`, right sides :math:`b = g^\top S` and weights `W`:
 
 - *plain*: :math:`\min |W_0 (G p - b)|^2`, :math:`W_0 = 1/\sigma`;
-- *weighted*: the same with :math:`1/(\rho \sigma_A)`, :math:`1/(D \sigma_E)` at the fix before;
-- *instrumental*: :math:`Z^\top W^2 (G p - b) = 0`, `Z` being `G` at the angles predicted by the weighted fix. The
-  noise in `G` is what biases the first two (with many rays towards the stations, by about :math:`-(G^\top G)^{-1}
-  \sum \sigma^2 (\rho u_h + D u)`); `Z` does not share it.
+- *weighted*: the same with the weights :math:`1/(\rho \sigma_A)`, :math:`1/(D \sigma_E)` at the previous fix;
+- *instrumental*: :math:`Z^\top W^2 (G p - b) = 0`, with the instruments `Z`: the rows `G` at the angles that the
+  weighted fix predicts. The noise in `G` biases the first two fixes: with many rays, towards the stations by about
+  :math:`-(G^\top G)^{-1} \sum \sigma^2 (\rho u_h + D u)`. `Z` does not contain the noise.
 
 Source: K. Dogancay, "Bias compensation for the bearings-only pseudolinear target track estimator", IEEE Trans. Signal
 Process. 54 (2006), and "3D pseudolinear target motion analysis from angle measurements", IEEE Trans. Signal Process.

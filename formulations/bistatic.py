@@ -5,16 +5,16 @@ With :math:`d = |A|`, unit direction u and excess path :math:`l = r + |r u - A| 
 .. math:: r = \frac{l^2 + 2 d l}{2\,[\,d - u^\top A + l\,]}, \qquad
    \frac{\partial l}{\partial r} = 1 + \frac{r - u^\top A}{|r u - A|} \ge 0.
 
-Between the receiver and the illuminator l vanishes and with it the slope: the quotient is 0/0 there.
+Between the receiver and the illuminator, l and the slope are zero, so that the quotient is 0/0.
 
 A target :math:`p(t) = \sum_k c_k t^k` meets, exactly and linearly in c,
 
 .. math:: e_1^\top p = 0, \quad e_2^\top p = 0, \quad (u - A/L)^\top p = \frac{L^2 - d^2}{2 L}, \qquad L = l + d,
 
 with :math:`e_1, e_2` normal to u; for angle errors :math:`\sigma_1, \sigma_2` and path error :math:`\sigma_l` the rows
-have the deviations :math:`r \sigma_1`, :math:`r \sigma_2` and, to first order, :math:`\sigma_l |p - A| / L`. The second
-order, :math:`r \delta^2 / 2` for an angle error :math:`\delta`, must be added to the last: a path weighted too
-well turns the errors of u in its row into information about the direction.
+have the deviations :math:`r \sigma_1`, :math:`r \sigma_2` and, to first order, :math:`\sigma_l |p - A| / L`. An angle
+error :math:`\delta` changes the last row by :math:`r \delta^2 / 2` in second order, which must be added to its
+deviation. Otherwise a precise path would turn the errors of u in its row into wrong information about the direction.
 
 Source: M. I. Skolnik, "An analysis of bistatic radar", IRE Trans. Aerosp. Navig. Electron. ANE-8 (1961) (the ellipse);
 the linear rows are its polar equation.
@@ -215,7 +215,7 @@ def _fit_course(normals: Array, right: Array, powers: Array, weight: Array) -> t
     """Return the weighted least-squares course (N, order + 1, 3), and whether the system has full rank (N,).
 
     Each epoch has three rows: `normals` (N, k, 3, 3), right sides and weights (N, k, 3). `powers` (N, k, order + 1) are
-    those of the time.
+    powers of the time.
     """
     count, order = len(right), powers.shape[-1]
     n = 3 * order

@@ -566,7 +566,7 @@ def _second_order(z: Array) -> Array:
 
 
 def _semidefinite(z: Array, size: int) -> Array:
-    """Return the projection of a scaled upper triangle, stored column by column, on the semidefinite cone."""
+    """Return the projection of a scaled upper triangle z, stored column by column, on the semidefinite cone."""
     if not np.isfinite(z).all():
         return z
     column, row, scale = _triangle(size)

@@ -1,15 +1,15 @@
 r"""Bearings as unknown unit directions: a semidefinite relaxation, and a lower bound of the angular ML cost.
 
-Station i at :math:`S_i` measured azimuth and elevation, that is a unit vector :math:`u_i` with tangents
-:math:`a_i`, :math:`e_i`. The unknowns are the unit directions :math:`v_i` themselves,
+Station i at :math:`S_i` measured azimuth and elevation, which are a unit vector :math:`u_i` with tangents :math:`a_i`,
+:math:`e_i`. The unknowns are the unit directions :math:`v_i` themselves,
 
 .. math:: \min \sum_i q_i(v_i) \quad\text{subject to}\quad |v_i| = 1, \quad v_i^\top [S_j - S_i]_\times v_j = 0,
    \quad (S_j - S_i)^\top (v_i - v_j) \ge 0,
 
 the last two for every pair: two lines of sight lie in one plane, and they do not diverge (without this linear
-inequality, rays that meet behind the stations would be accepted). All is quadratic in `v`; with :math:`v_i =
-F_i^\top (e_1 + \sigma w_i)`, the rows of :math:`F_i` being a reference direction and its tangents, the lift :math:`Y
-= (1, w)(1, w)^\top` of size 3N + 1 is relaxed to :math:`Y \succeq 0`.
+inequality, rays that meet behind the stations would be accepted). The problem is quadratic in `v`; with :math:`v_i =
+F_i^\top (e_1 + \sigma w_i)`, the rows of :math:`F_i` being a reference direction and its tangents, the lift :math:`Y =
+(1, w)(1, w)^\top` of size 3N + 1 is relaxed to :math:`Y \succeq 0`.
 
 *Chordal* (a start without a guess): :math:`q_i = (u_i - v_i)^\top W_i (u_i - v_i)`, :math:`W_i = a_i a_i^\top /
 (\sigma_A \cos E)^2 + e_i e_i^\top / \sigma_E^2 + w_r u_i u_i^\top`. Its bound bounds the chordal cost only: on the
@@ -211,13 +211,13 @@ def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minor
        w_0 |v - \hat v|^2
 
     is at most a multiple of :math:`\eta^2` or :math:`\epsilon^2` (from :math:`|x - \sin x| \le |x|^3/6`, :math:`1 -
-    \cos x \le x^2/2` and the mean value theorem for cos), and the three weights are what is left of :math:`1/\sigma^2`.
-    Hence :math:`q \le f` on the cap and :math:`q(\hat v) = f(\hat v)`. A point with total cost at most :math:`\rho^2`
-    has all its directions in their caps, so the least sum of `q` over any set that holds the best point is at most the
-    least sum of `f`.
+    \cos x \le x^2/2` and the mean value theorem for cos), and the three weights are :math:`1/\sigma^2` less these
+    multiples. Hence :math:`q \le f` on the cap and :math:`q(\hat v) = f(\hat v)`. A point with total cost at most
+    :math:`\rho^2` has all its directions in their caps, so the least sum of `q` over any set that contains the best
+    point is at most the least sum of `f`.
 
-    Near the zenith, or with caps so wide that a remainder eats a weight, that direction's quadratic is zero: still a
-    minorant. Derived here.
+    Near the zenith, or with caps so wide that a remainder exceeds a weight, the quadratic of this direction is zero,
+    which is still a minorant. Derived here.
     """
     (dA, dE), (sA, sE), rho = error.T, sigma.T, np.sqrt(cost)
     # the cap: its elevations, the largest cosine and sine among them, and the largest eta and epsilon

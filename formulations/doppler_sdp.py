@@ -4,9 +4,9 @@ A node is a station at one epoch: place :math:`s_i`, velocity :math:`v_i`. Range
 
 .. math:: r_i = |x - s_i|, \qquad r_i\, q_i = -(x - s_i) \cdot v_i,
 
-and the rows say :math:`z_m = q_a - q_b + A_m \cdot b + n_m` (without `b` if one station measures the Doppler shift) or
-:math:`z_l = R_l \cdot r + A_l \cdot b + n_l` with unknowns `b`, an offset of the emitter's frequency for instance. A
-row of rates times :math:`r_a` has no quotient left:
+and the rows are :math:`z_m = q_a - q_b + A_m \cdot b + n_m` (without :math:`q_b` if one station measures the Doppler
+shift) or :math:`z_l = R_l \cdot r + A_l \cdot b + n_l` with unknowns `b`, an offset of the emitter's frequency for
+instance. A row of rates times :math:`r_a` has no quotient:
 
 .. math:: \varepsilon_m = r_a n_m = z_m r_a + (x - s_a) \cdot v_a + q_b r_a - A_m \cdot b\, r_a .
 
@@ -420,7 +420,7 @@ def _shape(nodes: tuple[int, ...], first: Array, second: Array, design: Array, r
 def _forms(
     shape: Shape, place: Array, speed: Array, z: Array, ranges: Array, first: Array, second: Array, design: Array
 ) -> Array:
-    """Return the rows (m, length of y) as linear forms in y: measured minus predicted values.
+    """Return the rows (m, length of y) as linear forms in y: measured values z minus predicted values.
 
     The form of a row of rates is multiplied by the range of its node `first`.
     """

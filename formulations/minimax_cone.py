@@ -4,8 +4,8 @@ The angle between p - S_i and the measured unit direction :math:`u_i` is at most
 
 .. math:: |T_i (p - S_i)| \le \tan(\theta_i) \, u_i^\top (p - S_i), \qquad T_i^\top T_i = I - u_i u_i^\top,
 
-a second-order cone that no point behind the station satisfies. A ball of radius r about p lies in it exactly if
-:math:`|T_i (p - S_i)| + r / \cos\theta_i \le \tan(\theta_i) u_i^\top (p - S_i)`, so one problem,
+a second-order cone that no point behind the station satisfies. A ball of radius r about p is inside this cone exactly
+if :math:`|T_i (p - S_i)| + r / \cos\theta_i \le \tan(\theta_i) u_i^\top (p - S_i)`, so one problem,
 
 .. math:: \max_{p,\, r \le 1} \; r \quad\text{subject to these N cones},
 
@@ -323,7 +323,8 @@ def _cones(point: Any, radius: Any, count: int, dim: int) -> list[Any]:
 def _cone_data(u: Array, S: Array, theta: Array, *, ball: bool) -> dict[str, Array]:
     """Return the parameters of both problems at half-angles (N,) below pi/2; an infinite angle drops its cone.
 
-    Each cone is multiplied by the cosine of its half-angle, so that wide cones have small numbers.
+    `ball` is True for the problem with a ball. Each cone is multiplied by the cosine of its half-angle, so that wide
+    cones have small numbers.
     """
     _count, dim = u.shape
     held = np.isfinite(theta)

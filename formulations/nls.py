@@ -3,9 +3,9 @@ r"""Weighted nonlinear least squares with bounds, equalities and inequalities, a
 .. math:: \min_x \; |W\, e(x, p, z)|^2 + (x - m)^\top M (x - m) \quad\text{subject to}\quad
    l \le x \le u, \quad c(x, p) = 0, \quad d(x, p) \ge 0,
 
-with :math:`e = z - h(x, p)` unless another residual is given (angles must wrap). The functions h, c, d are injected
-and differentiated exactly by CasADi; data, weights, prior, bounds and start are arguments of the solve, so that a
-program is compiled once per structure. Threads may share a program: they take turns.
+with :math:`e = z - h(x, p)` unless another residual is given (residuals of angles must be wrapped). The functions h, c,
+d are arguments of the program; CasADi differentiates them exactly. Data, weights, prior, bounds and start are arguments
+of the solve, so that a program is compiled once per structure. Threads may share a program: they take turns.
 
 Sources: A. Waechter and L. T. Biegler, "On the implementation of an interior-point filter line-search algorithm for
 large-scale nonlinear programming", Math. Program. 106 (2006); J. A. E. Andersson et al., "CasADi", Math. Program.
@@ -286,7 +286,7 @@ hold_in_forks(_LOCKS)
 
 
 def _options(choice: Choice | None, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a CasADi solver: options that suppress output, then `settings` or those of the choice.
+    """Return the options of a CasADi solver: options that suppress output, then settings of the choice or `settings`.
 
     The options of IPOPT are in a separate table.
     """

@@ -15,8 +15,8 @@ so that the least nuclear norm is between the true times and the times at the ne
 `o` the solution is beyond them.
 
 *Further passes*, :math:`W = U_d V_d^\top` of the pass before: the truncated nuclear norm, the sum of the singular
-values beyond the first d, decreased by linearising what is concave in it. It is zero at the true times without noise,
-and where the passes arrive there, they are exact; a local method from one start.
+values beyond the first d, decreased by linearising its concave part. Without noise it is zero at the true times. If the
+passes end there, they are exact. They are a local method from one start.
 
 Times of emission make the network affine by one singular value decomposition, and :mod:`formulations.metric_upgrade`
 gives the positions. Stations without a common clock are not supported: their term :math:`b \, o^\top` is not affine.

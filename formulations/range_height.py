@@ -17,8 +17,8 @@ coordinate is a root of
 .. math:: Q(t)^2 - L(t)^2\, q(t) = 0,
 
 at most four real ones. Squaring also admits the problem with flipped signs, whose points have a negative range; they
-are dropped. Each root starts a Newton iteration on the two conics from both signs of :math:`\mu`, which gives back the
-digits the squares lost and needs no rule for :math:`L = 0`.
+are dropped. Each root starts a Newton iteration on the two conics from both signs of :math:`\mu`, which restores the
+digits that squaring has lost, and needs no special case for :math:`L = 0`.
 
 Points on the far side of the ellipsoid are not visible. The polar plane of an outside point `s`, :math:`(x - c)^\top A
 (s - c) = 1`, touches the ellipsoid where the tangents from `s` do: it cuts off exactly the part that is seen from `s`.
@@ -481,7 +481,7 @@ def _roots(c: Array) -> Array:
 def _starts(square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Array]:
     """Return starts (t, mu), each (N, 8), near every real intersection, two slots for each root.
 
-    t is NaN if a slot has no start. The arguments are those of `quartic`.
+    t is NaN if a slot has no start. See `quartic` for the arguments.
     """
     roots = _roots(quartic(square, E, L, alpha))
     t = np.tile(roots.real, 2)
@@ -494,10 +494,10 @@ def _starts(square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Arr
 
 
 def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Array]:
-    """Return the results (t, mu) of Newton's iteration on the two conics.
+    """Return the results (t, mu) of Newton's iteration on the two conics, from starts (N, K).
 
-    Slots that did not converge are not marked; the caller finds them by their residuals. The coefficients are those of
-    `quartic`.
+    Slots that did not converge are not marked; the caller finds them by their residuals. See `quartic` for the
+    coefficients.
     """
     go = np.isfinite(t)
     for _ in range(_NEWTON):

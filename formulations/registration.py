@@ -25,7 +25,7 @@ stations and target are of order one to a hundred.
 
 Sources: Y. T. Chan and K. C. Ho, "A simple and efficient estimator for hyperbolic location", IEEE Trans. Signal
 Process. 42 (1994), for the lifted rows; A. Beck, P. Stoica, J. Li, IEEE Trans. Signal Process. 56 (2008), for the exact
-constraint. Biases, free reference ranges over time and branches are this package's own.
+constraint. Biases, free reference ranges over time and branches were derived for this package.
 """
 
 from __future__ import annotations

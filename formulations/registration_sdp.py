@@ -22,8 +22,8 @@ matrix, because the graph of this pattern is chordal. The best moments of the bi
 `K` blocks of a dozen rows are the same relaxation as the lift of all windows, whose time grows with the sixth power of
 them.
 
-Small unknowns are lifted in small units: the lift contains the remainders, not the
-ranges :math:`r_i`, compared with whose squares they would be rounding for an interior-point method.
+Small unknowns are lifted in small units: the lift contains the remainders, not the ranges :math:`r_i`. Compared with
+the squares of ranges, the remainders would be rounding for an interior-point method.
 
 Both the price and the prior are needed. A misfit `m` of the second equality can be absorbed in the moments alone,
 :math:`2 \operatorname{cov}(r_1, f) = m`, for which :math:`\operatorname{var}(r_1) \operatorname{var}(f) \ge m^2 / 4`

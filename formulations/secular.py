@@ -2,17 +2,17 @@ r"""The secular equation of least squares with one quadratic constraint.
 
 .. math:: \sum_j \frac{c_j^2}{(t - p_j)^2} = \kappa + \sigma t, \qquad \sigma \ge 0,
 
-with poles :math:`p_1 \le \dots \le p_d`. Put :math:`T(t)` for the left side. By Cauchy's inequality
-:math:`3 T'^2 \le 2 T T''`, so :math:`T^{-1/2}` is concave between two poles, :math:`(\kappa + \sigma t)^{-1/2}` is
-convex where it exists, and
+with poles :math:`p_1 \le \dots \le p_d`. :math:`T(t)` is the left side. By Cauchy's inequality :math:`3 T'^2 \le 2 T
+T''`, so :math:`T^{-1/2}` is concave between two poles, :math:`(\kappa + \sigma t)^{-1/2}` is convex where it exists,
+and
 
 .. math:: k(t) = T(t)^{-1/2} - (\kappa + \sigma t)^{-1/2}
 
 is concave in every interval. Newton's iteration on `k`, started near a pole where `k <= 0`, therefore climbs
 monotonically to the first root on that side of the pole, or reaches `k' <= 0`, which proves that no root exists. Every
-interval holds at most two roots, one per end, so the two sides of all poles, and for ``sigma > 0`` the zero of the
-right side, list all real roots without a polynomial and without a bracket. Each root is stored as the distance from its
-pole: roots that fall onto a pole (the "hard case", ``c_j`` near 0) keep their full relative accuracy.
+interval contains at most two roots, one at each end. So the two sides of all poles, and for ``sigma > 0`` the zero of
+the right side, list all real roots without a polynomial and without a bracket. Each root is stored as the distance from
+its pole: roots that fall onto a pole (the "hard case", ``c_j`` near 0) keep their full relative accuracy.
 
 Sources: J. J. More and D. C. Sorensen, "Computing a trust region step", SIAM J. Sci. Stat. Comput. 4 (1983), section 3
 (the concave form on the last interval); the use on every interval is the same inequality.

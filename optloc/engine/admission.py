@@ -4,8 +4,8 @@ Every constrained quantity is a tape: elementary operations that compute its val
 along the exact surfaces, and its positions are projected back onto them. Bounds and lines of sight are checked after
 the refinement.
 
-A block has W problems, one in each lane; the lane is the last axis of the arrays. d is the number of coordinates, p of
-unknowns, c of exact constraints. `room` is the workspace of the block. Names in capitals, such as X or MOVE, are rows
+A block has W problems, one in each lane; the lane is the last axis of the arrays. A problem has d coordinates, p
+unknowns and c exact constraints. `room` is the workspace of the block. Names in capitals, such as X or MOVE, are rows
 of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 

@@ -135,7 +135,7 @@ def _choose(model: EngineModel, room: EngineWorkspace, spot: Array) -> None:
 def _is_apart(room: EngineWorkspace, spot: Array, row: int, lane: int) -> bool:
     """Return whether a candidate is more than three standard deviations from a row of `room.vector`, in one lane.
 
-    `row` is FIX or OTHER. The standard deviations are those of the candidate in FIX.
+    `row` is FIX or OTHER. FIX gives the standard deviations.
     """
     apart = 0.0
     for i in range(room.d):

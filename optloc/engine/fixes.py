@@ -172,9 +172,10 @@ def fixes(
 
 @compiled
 def _take(item: Array, order: Array | None, first: int, count: int) -> int:
-    """Write the problem number of each lane to `item`, and return the number of problems in the block.
+    """Write the number of the problem of each lane to `item` (W,), and return the number of problems in the block.
 
-    The problems are those from `first` on, in the given order or as stored. The last problem fills up the block.
+    The problems are those from `first` on, of `count`, in the given order or as stored. The last problem fills the
+    other lanes.
     """
     size = min(LANES, count - first)
     for lane in range(LANES):
@@ -267,7 +268,7 @@ def _write_fixes(model: EngineModel, rows: Any, z: Array, room: EngineWorkspace,
 
 @compiled
 def _place(vector: Array, item: Array, x: Array, mark: Array, marked: bool, size: int) -> None:
-    """Write the refined positions of the first `size` lanes to x (N, size), metres.
+    """Write the refined positions of the first `size` lanes to x (N, p), metres; `item` are the problems of the lanes.
 
     If `marked` is True, only the lanes with a nonzero `mark` are written.
     """
@@ -369,7 +370,7 @@ def _measure_closely(
 
 @compiled
 def _look_beyond(model: EngineModel, rows: Any, room: EngineWorkspace, size: int, answer: Answer) -> None:
-    """Write the least cost at infinity of the fixes whose kappa exceeds STRAIGHT."""
+    """Write the least cost at infinity of the fixes whose kappa exceeds STRAIGHT: far positions may fit as well."""
     number = answer.number
     search_infinity(model, rows, room)
     for lane in range(size):

@@ -1,7 +1,7 @@
 """Rows that are sums of ranges, with emission times as the only other unknowns: a linear map of ranges, and loops.
 
 A block has W problems, one in each lane; s stations, d coordinates, q whitened rows, e emission times. K (q, s) maps
-ranges to rows, u (q, W) are whitened measurements, `loop` (W,) is the cost of the loops, `place` (s, d, W) are the
+ranges to rows; u (q, W) are whitened measurements. `loop` (W,) is the cost of the loops, `place` (s, d, W) are the
 stations. `left` and `spare` are scratch. `room` is the `EngineWorkspace` of the block: capitals, such as COST, name
 rows of its arrays.
 """
@@ -201,7 +201,7 @@ def bow_of(block: RangeBlock, room: EngineWorkspace) -> float:
 
 @compiled
 def note_nearest(block: RangeBlock, room: EngineWorkspace, least: Array) -> None:
-    """Write the range (W,) to the nearest station, metres."""
+    """Write the range to the nearest station, metres, to `least` (W,)."""
     r = block.r
     for lane in range(LANES):
         least[lane] = np.inf

@@ -114,7 +114,7 @@ class TapeBlock(NamedTuple):
 
 @compiled
 def count_unknowns(rows: TapeRows, d: int, size: int) -> int:
-    """Return the number of all unknowns."""
+    """Return the number of all unknowns, `size`: they are refined together."""
     return size
 
 
@@ -408,4 +408,4 @@ def search_infinity(model: EngineModel, block: TapeBlock, room: EngineWorkspace)
 
 @compiled
 def finish(block: TapeBlock, z: Array, room: EngineWorkspace, size: int, mark: Array, marked: bool, x: Array) -> None:
-    """Do nothing: all unknowns are refined."""
+    """Do nothing: all unknowns are refined, and `x` contains them already."""

@@ -1,9 +1,11 @@
 """Normal equations of many problems in lanes: memory, measurements with derivatives, sums over groups of rows.
 
 A lane is a problem; one interpreter runs the tape of a kind over all lanes. A cell of the memory m (cells, B) contains
-one number of each of the B lanes. Addresses, such as those in `room`, are numbers of cells. `lanes` is the number of
-lanes in use, and r are the registers of the tapes. A *group* contains rows whose noise is correlated. A *packet*
-contains groups whose rows are evaluated together.
+one number of each of the B lanes. Addresses, such as those in `room`, `own`, `to` and x (the first cell of a vector),
+are numbers of cells. `lanes` is the number of lanes in use. The registers of the tapes are r, and `low` is the first
+column of a row in them. The tables are t, with lines such as `line`. The numbers of the problems are c (`common`,
+`place`). A *group* contains rows whose noise is correlated. A *packet* contains groups whose rows are evaluated
+together.
 
 All cells are in one array, because each array argument of a kernel costs as much time as dozens of multiplications.
 Kernels use integer indices instead of views: a view counts references, which takes longer than the arithmetic.
@@ -140,7 +142,7 @@ def cell_layout(t: Tables, c: Numbers, size: int) -> LaneCells:
 def load(
     m: Array, lane: int, item: int, source: Array, white: Array, prior: Array, observed: Array, present: Array
 ) -> None:
-    """Copy the numbers of problem `item` into a lane of the memory; the arrays are those of `Numbers`."""
+    """Copy the numbers of problem `item` into a lane of the memory; the arrays are fields of `Numbers`."""
     cell = _fill(m, 0, lane, source, item)
     cell = _fill(m, cell, lane, white, item)
     cell = _fill(m, cell, lane, prior, item)

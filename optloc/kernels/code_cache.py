@@ -63,7 +63,10 @@ def folder() -> Path | None:
 
 
 def _clear(place: Path) -> None:
-    """Remove folders for other compilers except the most recent ones; a process that still uses one compiles again."""
+    """Remove the folders next to `place` for other compilers, except the most recent ones.
+
+    A process that still uses a removed folder compiles again.
+    """
     others = [path for path in place.parent.glob(f"{PREFIX}*") if path != place and path.is_dir()]
     for path in sorted(others, key=_last_use, reverse=True)[_LEFT:]:
         shutil.rmtree(path, ignore_errors=True)

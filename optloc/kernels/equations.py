@@ -161,7 +161,8 @@ def _own(
 ) -> None:
     """Write the equations of the local unknowns of one epoch, and their coupling with the shared unknowns.
 
-    They are copied from the memory, where the equations begin at cell `to`.
+    They are copied from the memory, where the equations begin at cell `to`, to entries of `local`, `cross` and
+    `vector`.
     """
     width = n + size + 1
     for i in range(size):
@@ -179,9 +180,9 @@ def _own(
 def _whole(
     m: Array, to: int, n: int, width: int, begin: int, used: int, shared: Array, vector: Array, cost: Array
 ) -> None:
-    """Write the equations of the unknowns that all epochs share, and the cost, from the equations at cell `to`.
+    """Write the equations of the unknowns that all epochs share to `shared` and `vector`, and the cost to `cost`.
 
-    `width` is the number of unknowns plus one.
+    They are copied from the memory, where the equations begin at cell `to`; `width` is the number of unknowns plus one.
     """
     last = to + (width - 1) * width
     for b in range(used):

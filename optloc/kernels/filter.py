@@ -3,7 +3,7 @@
 States are ``x = mean + L y`` with ``L L' = P`` the predicted covariance, so that the prior is ``|y|^2``. The update is
 the minimum of the prior and the cost of the rows: ``(I + B' B) y = B' e``. B contains the whitened derivatives of the
 rows times L, and e the whitened residuals. For a state that is known exactly in some direction, L has a column of
-zeros.
+zeros. `item` is the number of the scan in `rows`, s is the workspace of one state of n components.
 """
 
 from __future__ import annotations
@@ -440,8 +440,8 @@ def _remember(rows: ScanRows, item: int, s: _Space, memory: Array, values: Array
     """Test whether errors of the stations repeat from scan to scan, and whether the innovations are too large.
 
     Both results are numbers of standard deviations, over about the last fifty scans. The scores for the errors of the
-    stations are ``a = D' S^-1 nu``. Their product with the scores b of the scan before has the mean zero. For a given b
-    its variance is ``(D b)' S^-1 (D b)``.
+    stations are ``a = D' S^-1 nu``: innovations nu, their covariance S, derivatives D. The product with the scores b of
+    the scan before has the mean zero and, for a given b, the variance ``(D b)' S^-1 (D b)``.
     """
     n, m, own = len(s.x), len(s.used), _of(len(rows.covariance), item)
     left, seen, back = np.zeros(m), np.zeros(m), np.zeros(n)

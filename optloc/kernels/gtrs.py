@@ -171,9 +171,10 @@ def _meet_lane(
     two: Array,
     lane: int,
 ) -> None:
-    """Write the points of `meet` for one lane.
+    """Write the points of `meet` for one lane, as `y` and `other`.
 
-    The eigenvalues are on the diagonal of A, the eigenvectors in the columns of `axes`.
+    The eigenvalues of the normal matrix are on the diagonal of A, the eigenvectors in the columns of `axes`; b is the
+    right side. `along` and `base` are scratch: direction and a point of the line of minimisers.
     """
     n, first = len(y), _open_axis(A, lane)
     if first < 0:
@@ -264,7 +265,7 @@ def _gradient(y: Array, on_cone: bool, across: Array, p: Array) -> None:
 
 @compiled
 def _value(y: Array, across: Array, on_cone: bool, out: Array) -> None:
-    """Write half of ``y'Cy + 2h'y`` to `out` (W,)."""
+    """Write half of the constraint, ``y'Cy + 2h'y``, to `out` (W,); `across` (n, W) is ``C y + h``."""
     n = len(y)
     for lane in range(LANES):
         # h is zero for the cone; for the paraboloid its last entry is minus a half.

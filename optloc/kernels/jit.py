@@ -146,8 +146,9 @@ class _Kernel(Compilable):
 def _take_as_variables(made: Any, function: Callable[..., Any]) -> None:
     """Make numba compile constants in calls as variables, except for arguments annotated with `Constant`.
 
-    Otherwise numba compiles a callee again for each constant argument, and its callees as well: of a thousand forms,
-    175 differed only by a constant. LLVM still uses the constants in code that it inlines.
+    `made` is numba's dispatcher of the function. Otherwise numba compiles a callee again for each constant argument,
+    and its callees as well: of a thousand forms, 175 differed only by a constant. LLVM still uses the constants in code
+    that it inlines.
     """
     from numba.core import types
 
@@ -244,7 +245,7 @@ def compile_mode() -> str:
 
 
 def may_use_code(kernel: Callable[..., Any], count: int) -> bool:
-    """Return whether to use machine code for a number of problems: it exists, or it may be compiled for them.
+    """Return whether to use machine code for `count` problems: it exists, or it may be compiled for them.
 
     Raises
     ------

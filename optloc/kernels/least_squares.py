@@ -203,7 +203,7 @@ def _iterate(
     folded: Folded | None,
     limits: Limits | None,
 ) -> Refined:
-    """Return the refinement by numpy with fixed weights; `face`, `folded` and `limits` are those of `refine`."""
+    """Return the refinement by numpy with fixed weights; `face`, `folded` and `limits`: see `refine`."""
     with np.errstate(all="ignore"):
         start = Equalities.of(problem, face).restore(start) if face else start
         start = start if limits is None else limits.clip(start)
@@ -287,7 +287,10 @@ _ROUNDINGS = 4.0
 
 
 def _blur(problem: Problem, count: int) -> Array:
-    """Return the rounding error (N,) of the whitened residuals; it is large for arrival times counted from long ago."""
+    """Return the rounding error (N,) of the whitened residuals of `count` vectors, in standard deviations.
+
+    It is large for arrival times counted from long ago.
+    """
     squares: Any = 0.0
     for _, _, part in windows(problem, count):
         sigma = np.sqrt(variances(part.noise, part.count))
@@ -383,7 +386,7 @@ _WEIGHED = 2**21
 def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: StopRules) -> Refined | None:
     """Return the refinement by machine code, or None if machine code does not support the problem.
 
-    The arguments are those of `refine`.
+    See `refine` for the arguments: starts (M, size), and the problem of each start.
     """
     most = _OF_RUNS if problem.layout.n_local and problem.epochs > 1 else _UNKNOWNS
     few = problem.layout.n_shared + problem.layout.n_local <= most

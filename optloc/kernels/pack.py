@@ -365,7 +365,7 @@ def fold(problem: Problem, found: Folding) -> Problem:
 
 
 def _fold_bias(bias: Bias, own: Array, found: Folding) -> Bias:
-    """Return a bias for the batch of epochs; `own` are its entries in the rows of one epoch."""
+    """Return a bias for the batch of epochs `found`; `own` are its entries in the rows of one epoch."""
     return replace(bias, row=found.local[bias.row[own]], member=bias.member[own], coefficient=bias.coefficient[own])
 
 

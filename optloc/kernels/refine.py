@@ -66,7 +66,7 @@ EMPTY = 2
 def new_answers(start: Array, kept: int | None = None) -> Answers:
     """Return arrays for the results of starts (M, p), which are copied.
 
-    They contain the equations of `kept` unknowns, by default of all.
+    They contain information and right side of the first `kept` unknowns, by default of all.
     """
     count, size = len(start), start.shape[1] if kept is None else kept
     return Answers(
@@ -174,7 +174,7 @@ def begin(c: Numbers, m: Array, room: LaneCells, tag: Array, used: int, item: Ar
 
 @compiled
 def move(m: Array, cells: int, tag: Array, to: int, lane: int) -> None:
-    """Copy the problem of one lane into another lane."""
+    """Copy the problem of one lane, memory and state, into another lane `to`."""
     if to != lane:
         for i in range(tag.shape[0]):
             tag[i, to] = tag[i, lane]

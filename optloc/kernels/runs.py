@@ -216,7 +216,7 @@ def _factor_shared(m: Array, room: LaneCells, n: int, matrix: Array) -> bool:
 
 @compiled
 def _solve_shared(m: Array, room: LaneCells, n: int, right: Array) -> None:
-    """Replace a vector (n,) by the solution of the shared system, which is factored."""
+    """Replace the vector `right` (n,) by the solution of the shared system, which `_factor_shared` has factored."""
     for i in range(n):
         m[room.step + i, 0] = right[i]
     forward(m, room.shared, n, room.shared_scale, room.step, 1)

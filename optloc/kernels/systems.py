@@ -184,7 +184,10 @@ def eliminate(m: Array, room: LaneCells, n: int, local: int, lanes: int) -> None
 
 @compiled
 def complete(m: Array, room: LaneCells, n: int, local: int, lanes: int) -> None:
-    """Write the step of the local unknowns after the step of the shared ones; the local system is factored."""
+    """Write the step of the local unknowns to `room.step`, after the step of the shared ones.
+
+    The local system is factored, and its coupling is in `room.half`.
+    """
     own = room.step + n
     for a in range(local):
         for b in range(lanes):
@@ -437,7 +440,7 @@ def cholesky(matrix: Array, size: int, least: float) -> bool:
 
 @compiled
 def substitute(lower: Array, right: Array) -> None:
-    """Replace a vector (n,) by the inverse of a lower triangular matrix times the vector."""
+    """Replace the vector `right` (n,) by the inverse of the lower triangular matrix `lower` times this vector."""
     for i in range(len(right)):
         for k in range(i):
             right[i] -= lower[i, k] * right[k]
@@ -446,7 +449,7 @@ def substitute(lower: Array, right: Array) -> None:
 
 @compiled
 def solve_factored(lower: Array, right: Array) -> None:
-    """Replace a vector (n,) by the solution of the system whose factor `cholesky` returned."""
+    """Replace the vector `right` (n,) by the solution of the system whose factor `cholesky` wrote to `lower`."""
     substitute(lower, right)
     for i in range(len(right) - 1, -1, -1):
         for k in range(i + 1, len(right)):

@@ -101,7 +101,10 @@ class Entries:
 
     @classmethod
     def feeds(cls, links: BlockLinks, trace: Traced, start: int) -> Entries:
-        """Return the entries of those inputs of a block that its function needs."""
+        """Return the entries of those inputs of a block that its function needs.
+
+        `start` is the number of the first row of the block in the problem.
+        """
         place, parts = {seed: i for i, (seed, _) in enumerate(trace.tape.inputs)}, []
         for feed in links.feeds:
             if feed.seed in place:

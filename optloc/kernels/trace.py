@@ -48,7 +48,7 @@ _NUMBER = {function.__name__: number for number, function in enumerate(_FUNCTION
 
 
 def operate(operation: int, left: Any, right: Any) -> Any:
-    """Return the result of an operation on numbers or arrays, computed by numpy."""
+    """Return the result of an operation (a number of `OPERATIONS`) on numbers or arrays, computed by numpy."""
     with np.errstate(all="ignore"):
         return _FUNCTIONS[operation](left) if operation in UNARY else _FUNCTIONS[operation](left, right)
 
@@ -86,13 +86,13 @@ class Recorder:
         return float(value) if operation == CONSTANT else None
 
     def apply(self, operation: int, left: Any, right: Any = None) -> Symbol:
-        """Return the symbol of an operation on symbols or numbers."""
+        """Record an operation (a number of `OPERATIONS`) on symbols or numbers, and return its symbol."""
         u = self.node(left)
         v = u if operation in UNARY else self.node(right)
         return Symbol(self, self._simplify(operation, u, v))
 
     def _number(self, key: tuple[int, Any, Any]) -> int:
-        """Return the number of a node, which is added if it is new."""
+        """Return the number of the node `key`, (operation, left, right), which is added if it is new."""
         if key not in self.known:
             self.known[key] = len(self.nodes)
             self.nodes.append(key)
@@ -244,7 +244,7 @@ class Symbol:
         raise TypeError("a measurement function must not branch on its arguments")
 
     def _with(self, operation: int, left: Any, right: Any) -> Any:
-        """Return the symbol of an operation with a symbol or a number."""
+        """Return the symbol of an operation with a symbol or a number; NotImplemented for other operands."""
         for one in (left, right):
             if not isinstance(one, Symbol | int | float | np.number):
                 return NotImplemented

@@ -1,9 +1,9 @@
 """Symmetric block tridiagonal systems of epochs that are coupled to the next epoch.
 
 The time to solve them is linear in the number k of epochs. Every epoch has a block of l unknowns. Regular systems are
-banded matrices, which LAPACK factors. Blocks of the inverse, and systems with singular blocks, use cyclic reduction:
-every other (odd) block is eliminated, and the even blocks are a chain of half the length. For positive definite
-matrices this is Cholesky's method in another order.
+banded matrices, which LAPACK factors. Blocks of the inverse, and systems with singular blocks, use cyclic reduction: it
+eliminates every other (odd) block. The even blocks are a chain of half the length. For positive definite matrices this
+is Cholesky's method in another order.
 
 B. L. Buzbee, G. H. Golub, C. W. Nielson, "On direct methods for solving Poisson's equations", SIAM J. Numer. Anal. 7
 (1970) 627-656.
@@ -58,7 +58,7 @@ def solve(block: Array, link: Array, right: Array) -> tuple[Array, Array]:
 def _banded(block: Array, link: Array, right: Array) -> Array | None:
     """Return the solution (k, l, p) of one chain by a banded factor, or None if the chain is not safely regular.
 
-    The arguments are those of `solve`, without batch axes.
+    See `solve` for the arguments, without batch axes.
     """
     from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
@@ -174,7 +174,7 @@ def _inverse_blocks_of_chain(
 
 
 def _solve_blocks(block: Array, right: Array) -> Array:
-    """Return the solutions of separate systems with matrices `block`, of least norm if a matrix is singular."""
+    """Return the solutions of separate systems ``block x = right``, of least norm if a matrix is singular."""
     solved, good = linalg.solve(block, right, _OPEN)
     if not good.all():
         root, _ = linalg.root(block[~good])

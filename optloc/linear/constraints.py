@@ -417,7 +417,7 @@ def levels(problem: Problem, face: Face, x: Array) -> tuple[Array, Array]:
 
 
 def restore(problem: Problem, face: Face, x: Array) -> Array:
-    """Return vectors (N, size) projected onto a face along the shortest way, by Newton steps.
+    """Return vectors x (N, size) projected onto a face along the shortest way, by Newton steps.
 
     Local unknowns do not move.
     """
@@ -484,10 +484,7 @@ def conjunction(problem: Problem) -> list[Band]:
 
 
 def face_of(problem: Problem, x: Array) -> Array:
-    """Return the number (N,) of the face in `faces` on which vectors x (N, size) are: the face with most levels.
-
-    A vector that satisfies no face with equality gets 0.
-    """
+    """Return the number (N,) in `faces` of the face with most levels on which vectors x (N, size) are; 0 if on none."""
     found = np.zeros(len(x), dtype=int)
     for number, face in enumerate(faces(problem)):
         if face:
@@ -515,7 +512,7 @@ def violation(problem: Problem, x: Array) -> Array:
 
 
 def _band_violation(band: Band, value: Array) -> Array:
-    """Return the violation (N,) of a band by values (N,), relative to its size; negative if the band is satisfied."""
+    """Return the violation (N,) of the worse bound, divided by one plus the absolute bound; negative if satisfied."""
     worst = np.full(len(value), -np.inf)
     for bound, sign in ((band.lower, 1.0), (band.upper, -1.0)):
         with np.errstate(invalid="ignore"):

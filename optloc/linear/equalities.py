@@ -1,7 +1,7 @@
 """Equality constraints of a run, for states that last for the run and for states of each epoch.
 
-M problems have k epochs; a vector has n shared unknowns and l local ones for each epoch, `size` in all. c is the number
-of equalities of a state.
+M problems have k epochs. A vector has `size` unknowns: n shared unknowns, and l local ones for each epoch. A state has
+c equalities.
 """
 
 from __future__ import annotations

@@ -167,7 +167,10 @@ def _links_of(problem: Problem, block: Rows, start: int) -> BlockLinks:
 
 
 def _adds(problem: Problem, block: Rows, start: int) -> Terms:
-    """Return the offsets, drifts and emission times of a block of rows, as linear terms."""
+    """Return the offsets, drifts and emission times of a block of rows, as linear terms.
+
+    `start` is the number of the first row of the block.
+    """
     parts = [_terms(problem, block, start, "adds")]
     for target in problem.emitting if MODELS[block.kind].emission else ():
         rows = np.flatnonzero(block.target == target)

@@ -197,7 +197,10 @@ def _keep_noise(noise: Noise, others: Array) -> list[Block]:
 
 
 def _reduced_rows(found: Ranges, shape: tuple[int, ...]) -> tuple[list[Rows], Array]:
-    """Return range, tdoa and range_sum rows of the statistic with batch axes `shape`, and their joint covariance."""
+    """Return range, tdoa and range_sum rows with the least-squares ranges, and their joint covariance.
+
+    `shape` contains the batch axes of the rows.
+    """
     free, reference = bool(found.free[0]), int(found.reference[0])
     nodes = [n for n in np.flatnonzero(found.inside[0]) if not (free and n == reference)]
     # r_i = c_i + t is a difference to the reference, r_i = c_i - t a sum with the reference
@@ -255,7 +258,11 @@ def _design(problem: Problem) -> tuple[Array, Array, Array]:
 
 @lru_cache(maxsize=_GRAPHS)
 def _graph(rows: bytes, count: int, stations: int) -> Graph:
-    """Return the graph of nodes from the bytes of D, whose columns are the nodes, stations first."""
+    """Return the graph of the nodes.
+
+    `rows` are the bytes of the present rows of D. `count` is the number q of nodes; the first `stations` nodes are
+    ranges. Bytes are hashable, so that graphs are cached.
+    """
     group, sign = _connect(np.frombuffer(rows).reshape(-1, count))
     names = np.unique(group[group >= 0])
     members = tuple(np.flatnonzero(group[:stations] == name) for name in names)

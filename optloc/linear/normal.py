@@ -381,7 +381,11 @@ def eliminated(equations: Normal) -> Normal:
 
 
 def _solve_local(equations: Normal, right: Array) -> tuple[Array, Array]:
-    """Return solutions (..., k, l, p) of the local systems, of least norm if they are singular, and ok (...)."""
+    """Return the solutions (..., k, l, p) of the local systems for right sides of this shape, and ok (...).
+
+    The solution has the least norm if a system is singular. `ok` is False if the only epoch leaves unknowns
+    undetermined.
+    """
     local, xp = equations.local, library(equations.local)
     if equations.link is not None:
         return chain.solve(_fix_unused(local), equations.link, right)

@@ -64,7 +64,7 @@ def residual(problem: Problem, x: Any, p: Any, z: Any) -> list[Any]:
 
 
 def _total(terms: Terms, row: int, x: Any) -> Any:
-    """Return the sum of the linear terms of a row."""
+    """Return the sum of the linear terms of a row at the vector x, as an expression."""
     return sum(float(terms.coefficient[i]) * x[int(terms.column[i])] for i in np.flatnonzero(terms.row == row))
 
 
@@ -113,7 +113,7 @@ def constrained(problem: Problem, x: Any, p: Any, length: Any) -> tuple[list[Any
 
 
 def _states(problem: Problem, target: int, x: Any) -> list[tuple[Any, ...]]:
-    """Return the state of a target as tuples of symbols: position, velocity, acceleration."""
+    """Return the state of a target in the vector x as tuples of symbols: position, velocity, acceleration."""
     names = state_names(target, len(problem.motions), problem.motions[target].order)
     starts = [problem.layout.find(name)[0].start for name in names]
     return [tuple(x[start + i] for i in range(problem.dimension)) for start in starts]
