@@ -90,6 +90,7 @@ def _solve(name: str, start: Array | None = None, ranges: Array = _RANGES, **con
     from formulations.nls import Program
 
     def residual(x: Any, p: Any, z: Any) -> list[Any]:
+        """Return measured minus predicted ranges."""
         return [z[i] - ca.sqrt((x[0] - s[0]) ** 2 + (x[1] - s[1]) ** 2) for i, s in enumerate(_STATION.tolist())]
 
     try:
@@ -121,10 +122,12 @@ def main(seconds: float, choices: list[str]) -> None:
 
     def say(word: str, name: str, fault: str) -> None:
         # solvers print to the same stream, perhaps without a line end
+        """Print one result line."""
         lines.write(f"\n{word} {name} {fault}\n")
         lines.flush()
 
     def stop(name: str) -> None:
+        """Print the failure of a solver that did not end in time, and end the process."""
         say(FAILED, name, f"it does not end within {seconds:g} s on a program of two unknowns")
         os._exit(0)
 

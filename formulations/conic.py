@@ -268,6 +268,7 @@ def keep(build: Callable[_Arguments, _Built]) -> Callable[_Arguments, _Built]:
     """
 
     def alone(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Built:
+        """Build while no other thread uses cvxpy."""
         with _CVXPY:
             return build(*args, **kwargs)
 
@@ -277,6 +278,7 @@ def keep(build: Callable[_Arguments, _Built]) -> Callable[_Arguments, _Built]:
 
     @wraps(build)
     def once(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Built:
+        """Return the cached result, and build it at the first call."""
         with lock:
             return cached(*args, **kwargs)  # type: ignore[arg-type]  # arguments are hashable
 

@@ -172,7 +172,7 @@ class Minorant:
 
 
 def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minorant:
-    r"""Return the touching quadratics of one fix.
+    r"""Return, for each direction, a quadratic that nowhere exceeds the squared angle errors and equals them at a fix.
 
     Parameters
     ----------

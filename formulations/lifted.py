@@ -153,10 +153,12 @@ def _program(count: int, dim: int, measured: int) -> Program:
     """Return a program with unknowns (x, r) and parameters: the stations, then the rows K, both row by row."""
 
     def residual(y: Any, p: Any, z: Any) -> list[Any]:
+        """Return ``z - K r``, with K from the parameters p."""
         at = count * dim
         return [z[k] - sum(p[at + count * k + i] * y[dim + i] for i in range(count)) for k in range(measured)]
 
     def equalities(y: Any, p: Any) -> list[Any]:
+        """Return ``r_i^2 - |x - s_i|^2``, which must be zero."""
         return [y[dim + i] ** 2 - sum((y[j] - p[dim * i + j]) ** 2 for j in range(dim)) for i in range(count)]
 
     return Program(dim + count, measured, count * (dim + measured), residual=residual, equalities=equalities)

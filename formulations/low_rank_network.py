@@ -183,7 +183,7 @@ class _NetworkFit:
     def distance(self, at: StationFactors, pulses: Pulses) -> Array:
         """Return distances (S, N, M), which divide the equations.
 
-        A distance is the mean of the distances from the arrival and from the fit; short distances are raised to a
+        A distance is the mean of two estimates, from the arrival time and from the fit. Short distances are raised to a
         minimum.
         """
         by_time = np.abs(self.z - at.b[:, None] - pulses.o[:, :, None])

@@ -151,6 +151,7 @@ def moment_problem(stations: int, dimension: int) -> Any:
     rule = cp.Parameter((stations - 1, dimension + 5), name="rule")
 
     def arrange(index: Index) -> Any:
+        """Return the moments with the given numbers as an expression of the same shape."""
         return cp.reshape(y[index.ravel()], index.shape, order="C")
 
     errors = arrange(own.table[0, 0])

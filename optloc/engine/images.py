@@ -226,8 +226,7 @@ def stop_hopeless(bow: float, room: EngineWorkspace, nearest: Array, every: bool
     alive = 0.0
     for lane in range(LANES):
         ball = _BALL * _BALL * scalar[HEIGHT, lane] * scalar[HEIGHT, lane]
-        # the gain is that of the damped step: within the ball, the damping changes the cost by no more than the last
-        # term
+        # the gain belongs to the damped step: within the ball, the damping changes the cost by at most the last term
         least = scalar[COST, lane] - scalar[GAIN, lane] - scalar[DAMPING, lane] * trace[lane] * ball
         far = np.sqrt(max(least, 0.0)) >= np.sqrt(scalar[FIX_COST, lane] + LISTED) + bow * ball / nearest[lane]
         near = spare[lane] < NEAR and scalar[COST, lane] - scalar[FIX_COST, lane] > RISEN * spare[lane]

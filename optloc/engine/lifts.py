@@ -179,6 +179,7 @@ def _tape_of(model: Model, d: int, turned: bool, paired: bool, known: bool) -> T
     recorder = Recorder()
 
     def point(first: int, axes: bool) -> Point:
+        """Return a point whose coordinates are the inputs from seed `first` on, with axes as inputs if requested."""
         own = tuple(tuple(recorder.input(_AXES + d * i + j) for j in range(d)) for i in range(d)) if axes else None
         return Point(tuple(recorder.input(first + i) for i in range(d)), None, own)
 

@@ -31,7 +31,15 @@ H, H_TRIAL, LOWER, FIX_H, MARGIN, REST = range(6)
 # Rows of `EngineWorkspace.axes`: BASE spans coordinates in inverse range, AXES are principal axes, EIGEN is the matrix
 # that these axes diagonalise.
 BASE, AXES, EIGEN = range(3)
-# Rows of `EngineWorkspace.scalar`.
+# Rows of `EngineWorkspace.scalar`, one number for each problem. COST, COST_TRIAL: cost at X and at TRIAL. LOOP: cost of
+# combinations of rows that no range changes. BLUR: rounding error of the whitened residuals. DAMPING, GROWTH:
+# Marquardt's factor, and its growth after a rejected step. GAIN: squared length of a step in standard deviations.
+# SOLVABLE: 1.0 if a system is regular. ALIVE: 1.0 while a refinement continues. GOOD: 1.0 if its result is valid so
+# far. STEPS: steps tried. SCALE: unit of length of squared-range rows, metres. SPREAD: greatest distance of a station
+# from their mean, metres. FIX_COST, FIX_GOOD: cost of the fix, and 1.0 if it is settled. HEIGHT: height of the fix
+# above the plane of the stations, metres. BEYOND: cost at infinity. SECOND: 1.0 if OTHER is valid. RADIUS: distance
+# from CENTRE to which positions are moved, metres; 0.0 for none. SPARE, HIGH, LOW and SHARE are scratch, mostly the
+# extremes and a factor of one kernel.
 COST, COST_TRIAL, LOOP, BLUR, DAMPING, GROWTH, GAIN, SOLVABLE, SPARE, ALIVE, GOOD, STEPS, SCALE, SPREAD = range(14)
 FIX_COST, FIX_GOOD, HEIGHT, HIGH, LOW, SHARE, BEYOND, SECOND, RADIUS = range(14, 23)
 

@@ -145,6 +145,7 @@ class Plan:
             answer = answer._replace(x=np.array(start))
 
         def work(first: int) -> int:
+            """Compute the problems from `first` on, and return their greatest number of steps."""
             part = slice(first, min(first + _CHUNK, count))
             loaded, written = load.take(part), Answer(*(array[part] for array in answer))
             return int(

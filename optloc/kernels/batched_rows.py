@@ -65,7 +65,7 @@ class LaneCells(NamedTuple):
     rows: int  # (rows of a packet, columns and residual)
     whitened: int  # (rows of a group, columns and residual)
     error: int  # (2 * largest prior,)
-    scale: int
+    scale: int  # scratch for the scale factor of a row
     trial: int  # (p,): vector at which the equations are computed
     best: int  # (p,)
     after: int  # (n + l + 1, n + l + 1): equations at `trial`, lower triangle, then vector and cost
@@ -77,7 +77,7 @@ class LaneCells(NamedTuple):
     local_scale: int  # (l,)
     half: int  # (n + 1, l): the local factor's inverse times coupling and vector
     state: int  # state of a refinement
-    cells: int
+    cells: int  # number of cells of a lane
     absent: int  # 1 if some rows are absent
 
 

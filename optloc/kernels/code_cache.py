@@ -99,6 +99,7 @@ class _CacheLocator:
         return self._path
 
     def get_source_stamp(self) -> str:
+        """Return an empty stamp of the source file, so that numba does not compare stamps."""
         return ""  # the name of the file contains the digest
 
     def get_disambiguator(self) -> str:
@@ -120,6 +121,8 @@ def _entries() -> tuple[Any, Any]:
 
     class CachedCallee(Impl):
         def rebuild(self, target_context: Any, payload: Any) -> Any:
+            """Return the compiled callee from stored code, read by the library for callees."""
+
             def read(stored: Any) -> Any:
                 return callee_library().read(target_context.codegen(), stored)
 

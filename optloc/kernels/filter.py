@@ -122,21 +122,21 @@ class _Space(NamedTuple):
     It contains the memory of one lane, matrices (n, n), rows (m, n + 1) with the residual last, and vectors.
     """
 
-    m: Array
-    r: Array
-    room: LaneCells
-    P: Array
-    root: Array
-    factor: Array
+    m: Array  # (cells, 1): memory of the lane
+    r: Array  # registers
+    room: LaneCells  # addresses in the memory
+    P: Array  # (n, n): predicted covariance
+    root: Array  # (n, n): its root L
+    factor: Array  # (n, n): factor of I + B' B
     rows: Array  # derivatives times root
     white: Array  # whitened `rows`
     W: Array  # (m, m): whitening matrix of the rows used
     used: Array  # (m,): weights, zero for rows that are left out
-    x: Array
-    y: Array
-    move: Array
-    slope: Array
-    at: Array
+    x: Array  # predicted mean
+    y: Array  # coordinates of the state, x = mean + L y
+    move: Array  # step of y
+    slope: Array  # right side of the step
+    at: Array  # scratch for a state
 
 
 @compiled

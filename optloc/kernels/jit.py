@@ -38,7 +38,10 @@ _LOADING = held_by_forks(Lock())
 
 @cache
 def _numba() -> Any:
-    """Return the module numba, or None if it is missing or disabled."""
+    """Return the module numba, or None if it is missing or disabled.
+
+    Compilations are reported from the first call on.
+    """
     try:
         import numba
     except ImportError:
@@ -158,6 +161,7 @@ def _take_as_variables(made: Any, function: Callable[..., Any]) -> None:
     template, fold = made.get_call_template, made._compiler.fold_argument_types  # noqa: SLF001
 
     def template_of_variables(args: Any, kws: Any) -> Any:
+        """Return numba's template of a call whose constants are variables."""
         args = fold(args, kws)[1]
         return template([a if n in kept else numba.unliteral(a) for n, a in zip(names, args, strict=True)], {})
 
@@ -182,9 +186,11 @@ def _listen(tell: Callable[[str, bool], None]) -> Callable[[], None]:
 
     class CompileReport(events.Listener):  # type: ignore[misc]
         def on_start(self, found: Any) -> None:
+            """Report the start of a compilation."""
             tell(name_of(found.data["dispatcher"].py_func), False)
 
         def on_end(self, found: Any) -> None:
+            """Report the end of a compilation."""
             tell(name_of(found.data["dispatcher"].py_func), True)
 
     listener = CompileReport()

@@ -402,6 +402,7 @@ def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: 
     parts = np.array_split(np.arange(len(start)), 1 + len(start) * problem.count * width // _WEIGHED)
 
     def work(part: Array) -> Refined | None:
+        """Return the refinement of the starts `part`."""
         return _refine_reweighted(problem.take(own[part]), start[part], rules)
 
     done = map_on_threads(work, parts) if len(parts) > 1 else [work(parts[0])]
@@ -430,6 +431,7 @@ def _refine_with_weights(
             getattr(done, name)[lost] = getattr(more, name)
 
     def make() -> Normal:
+        """Return the normal equations at the refined vectors."""
         if isinstance(found, PackedRuns):
             return sums_at(found, done.x, item, priors=True)
         return refine.equations(found, item, done)
@@ -455,6 +457,7 @@ def _join(parts: list[Refined]) -> Refined:
     """Return several refinements as one."""
 
     def make() -> Normal:
+        """Return the normal equations of all parts."""
         made = [part.equations for part in parts]
         return Normal(*(np.concatenate(same) for same in zip(*(one.parts for one in made), strict=True)))
 

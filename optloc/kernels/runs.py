@@ -484,6 +484,7 @@ def fixed_runs(
     )
 
     def work(i: int) -> None:
+        """Refine start number i."""
         refine_runs(runs.packed, item, runs.epochs, i, i + 1, rules, out, spread)
 
     map_on_threads(work, range(count))

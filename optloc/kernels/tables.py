@@ -224,13 +224,13 @@ class Tables(NamedTuple):
     group: int  # first row in the packet, rows, epoch; first column
     column: int  # unknowns of a group, ascending: shared ones, then local ones of its epoch
     factor: int  # first index of the factors of the terms in `real`
-    kinds: int
-    packets: int
-    groups: int
-    shared: int
-    local: int
-    epochs: int
-    registers: int
+    kinds: int  # number of kinds of rows
+    packets: int  # number of packets
+    groups: int  # number of groups
+    shared: int  # number of unknowns that all epochs share
+    local: int  # number of unknowns of each epoch
+    epochs: int  # number of epochs
+    registers: int  # greatest number of registers of a tape
     width: int  # greatest number of columns of a group, plus one for the residual
     rows: int  # greatest number of rows of a packet
     size: int  # greatest number of rows of a group
@@ -287,6 +287,7 @@ class Sources:
         )
 
         def place(array: Array | None) -> Array | None:
+            """Return the indices of the next array, or None if the problem does not have this array."""
             return None if array is None else next(places)
 
         s = problem.stations

@@ -214,33 +214,43 @@ class Symbol:
         return self.recorder.apply(_NUMBER[ufunc.__name__], *inputs)
 
     def __add__(self, other: Any) -> Any:
+        """Record ``self + other``."""
         return self._with(ADD, self, other)
 
     def __radd__(self, other: Any) -> Any:
+        """Record ``other + self``."""
         return self._with(ADD, other, self)
 
     def __sub__(self, other: Any) -> Any:
+        """Record ``self - other``."""
         return self._with(SUB, self, other)
 
     def __rsub__(self, other: Any) -> Any:
+        """Record ``other - self``."""
         return self._with(SUB, other, self)
 
     def __mul__(self, other: Any) -> Any:
+        """Record ``self * other``."""
         return self._with(MUL, self, other)
 
     def __rmul__(self, other: Any) -> Any:
+        """Record ``other * self``."""
         return self._with(MUL, other, self)
 
     def __truediv__(self, other: Any) -> Any:
+        """Record ``self / other``."""
         return self._with(DIV, self, other)
 
     def __rtruediv__(self, other: Any) -> Any:
+        """Record ``other / self``."""
         return self._with(DIV, other, self)
 
     def __neg__(self) -> Symbol:
+        """Record ``-self``."""
         return self.recorder.apply(NEG, self)
 
     def __bool__(self) -> bool:
+        """Raise TypeError: the value is not known yet, so that a function cannot branch on it."""
         raise TypeError("a measurement function must not branch on its arguments")
 
     def _with(self, operation: int, left: Any, right: Any) -> Any:
@@ -255,6 +265,7 @@ def _function(operation: int) -> Callable[..., Symbol]:
     """Return the function that records an operation."""
 
     def record(u: Any, v: Any = None) -> Symbol:
+        """Return the symbol of the operation on u, or on u and v."""
         owner = u if isinstance(u, Symbol) else v
         return owner.recorder.apply(operation, u, v)
 

@@ -341,10 +341,12 @@ def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point,
     d = problem.dimension
 
     def vector(seed: int) -> tuple[Any, ...]:
+        """Return the d components from `seed` on."""
         return tuple(inputs.get(seed + c, 0.0) for c in range(d))
 
     def station(place: int, rate: int, axes: int) -> Point:
         # Inputs are 16 numbers apart and axes 3: nine numbers of one set of axes fit before the next input.
+        """Return a station from the seeds of its position, rate and axes."""
         own = tuple(vector(axes + 3 * i) for i in range(d)) if axes in inputs else None
         if TURN in inputs:
             identity = tuple(tuple(float(i == j) for j in range(d)) for i in range(d))
@@ -352,6 +354,7 @@ def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point,
         return seen(vector(place), vector(rate) if model.velocity else None, own)
 
     def seen(place: tuple[Any, ...], rate: tuple[Any, ...] | None, axes: Any = None) -> Point:
+        """Return a point with the quantities that the model needs: ECEF position, medium, vertical."""
         medium = problem.medium if model.straight else None
         if not isinstance(medium, Atmosphere):
             return Point(place, rate, axes, to_ecef(problem, place) if model.ecef else None, medium=medium)
@@ -510,6 +513,7 @@ def _fold(layout: Layout) -> Any:
     n, length = layout.n_shared, layout.n_local
 
     def fold(column: Array) -> Array:
+        """Return the columns of the Jacobian for columns of the full vector."""
         return column if length == 0 else np.where(column < n, column, n + (column - n) % length)
 
     return fold
