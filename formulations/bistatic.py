@@ -215,7 +215,7 @@ def _fit_course(normals: Array, right: Array, powers: Array, weight: Array) -> t
     """Return the weighted least-squares course (N, order + 1, 3), and whether the system has full rank (N,).
 
     Each epoch has three rows: `normals` (N, k, 3, 3), right sides and weights (N, k, 3). `powers` (N, k, order + 1) are
-    powers of the time.
+    powers of the time; `weight` is one over the standard deviation.
     """
     count, order = len(right), powers.shape[-1]
     n = 3 * order

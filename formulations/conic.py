@@ -568,7 +568,7 @@ def _second_order(z: Array) -> Array:
 
 
 def _semidefinite(z: Array, size: int) -> Array:
-    """Return the projection of a scaled upper triangle z, stored column by column, on the semidefinite cone."""
+    """Return the projection of z, a scaled upper triangle by columns, on the cone of `size` x `size` matrices."""
     if not np.isfinite(z).all():
         return z
     column, row, scale = _triangle(size)
@@ -587,9 +587,9 @@ def _semidefinite(z: Array, size: int) -> Array:
 
 @lru_cache(_KEPT)
 def _triangle(size: int) -> tuple[Index, Index, Array]:
-    """Return columns and rows of a stored upper triangle, and the factor from a stored entry to the matrix entry.
+    """Return columns and rows of a stored upper triangle (`size` x `size`), and the factor of its stored entries.
 
-    The factor is one on the diagonal, and the root of a half elsewhere.
+    The factor gives the entries of the matrix: one on the diagonal, and the root of a half elsewhere.
     """
     column, row = np.tril_indices(size)
     return column, row, np.where(row == column, 1.0, np.sqrt(0.5))

@@ -299,7 +299,7 @@ def direction_problem(count: int) -> Any:
 
 @keep
 def _relaxation(count: int, backend: str) -> Relaxation:
-    """Return the relaxation, built once for each size and back end."""
+    """Return the relaxation for `count` directions, built once for each size and back end."""
     # the equalities depend on each other at a solution: with Clarabel's default of 1e-8 one solve in five stops early
     settings = tight(backend, 1e-9, static_regularization_constant=1e-7)
     return Relaxation(direction_problem(count), backend=backend, settings=settings)

@@ -100,7 +100,7 @@ def lifted_problem(count: int, dim: int) -> Any:
 
 @keep
 def _relaxation(count: int, dim: int, backend: str) -> Relaxation:
-    """Return the relaxation, built once for each size and back end."""
+    """Return the relaxation for `count` stations in `dim` dimensions, built once for each size and back end."""
     # a decade below the default of Clarabel, because the value that this baseline demonstrates is near zero
     return Relaxation(lifted_problem(count, dim), backend=backend, settings=tight(backend, 1e-9))
 

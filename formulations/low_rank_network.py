@@ -85,7 +85,7 @@ class Pulses:
 
 @dataclass(frozen=True, slots=True)
 class LowRank:
-    """A fit of small rank: stations, pulses and the weighted sum of squares (S,)."""
+    """Fits of small rank: stations and pulses of S fits, and `cost` (S,), the weighted sums of squares."""
 
     stations: StationFactors
     pulses: Pulses
@@ -158,7 +158,10 @@ class _NetworkFit:
     clocks: bool
 
     def run(self, at: StationFactors) -> LowRank:
-        """Return the fits from given starts."""
+        """Return the fits from S starts `at`.
+
+        The stages are plain steps, steps that divide by distances, and steps with fixed distances.
+        """
         count = at.alpha.shape[0]
         scale = np.broadcast_to(self.weight, (count, *self.z.shape))
         damping = np.full(count, _DAMPING)

@@ -247,7 +247,7 @@ def _common_at_level(u: Array, S: Array, scale: Array, level: float, backend: st
 
 @keep
 def _relaxation(kind: str, count: int, dim: int, backend: str) -> Relaxation:
-    """Return the cone program, built once for each kind, size and back end."""
+    """Return the cone program "ball" or "edge" for `count` cones in `dim` dimensions, built once for each back end."""
     settings = tight(backend, 1e-10)  # the sign of a margin is a proof: two decades below the default of Clarabel
     if kind == "edge":
         return Relaxation(edge_problem(count, dim), backend=backend, settings=settings)

@@ -100,7 +100,7 @@ def nuclear_problem(stations: int, pulses: int) -> Any:
 
 @keep
 def _relaxation(stations: int, pulses: int, backend: str) -> Relaxation:
-    """Return the relaxation, built once for each size and back end."""
+    """Return the relaxation for numbers of stations and pulses, built once for each size and back end."""
     return Relaxation(nuclear_problem(stations, pulses), backend=backend)
 
 

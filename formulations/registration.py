@@ -91,7 +91,7 @@ class RegistrationCourse:
 
 @dataclass(slots=True)
 class _Guess:
-    """The result of a pass: biases (N, q) and ranges of the reference (N, B)."""
+    """The result of a pass: `bias` (N, q), and the ranges `reference` (N, B) of the reference station."""
 
     bias: Array
     reference: Array

@@ -184,9 +184,13 @@ class RegistrationWindows:
     power : Array, shape (K, 1) or (K, 2)
         Powers of time that multiply the target's unknowns; time is relative to its middle, in half spans.
     unit : float
-        The fine unit, for biases and remainders.
-    origin, scale, clock
-        Origin, unit of length, and middle and half span of time.
+        The fine unit, for biases and remainders, in units of the extent.
+    origin : Array, shape (d,)
+        Mean of the stations, in the units of the caller.
+    scale : float
+        Extent of the stations, in the units of the caller.
+    clock : tuple of two float
+        Middle and half span of the times.
     """
 
     station: Array

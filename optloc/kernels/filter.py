@@ -74,7 +74,7 @@ class ScanRows(NamedTuple):
 
 
 class Move(NamedTuple):
-    """A prediction: transition (n, n), process noise (N or 1, n, n) and drive (N or 1, n)."""
+    """A prediction: transition F (n, n), process noise Q (N or 1, n, n) and drive (N or 1, n), a known change."""
 
     F: Array
     Q: Array
@@ -109,7 +109,7 @@ class Filtering(NamedTuple):
 
 
 class Filtered(NamedTuple):
-    """States after a scan, written: means (N, n), covariances (N, n, n), and numbers (N, VALUES) of each state."""
+    """States after a scan, written: `mean` (N, n), `cov` (N, n, n), and numbers `values` (N, VALUES) of each."""
 
     mean: Array
     cov: Array
@@ -271,7 +271,7 @@ def _of(count: int, i: int) -> int:
 
 @compiled
 def _take(rows: ScanRows, item: int, one: int, s: _Space) -> bool:
-    """Load the measurements and weights of a state; return whether a present row is not finite."""
+    """Load the measurements and weights of state number `one`; return whether a present row is not finite."""
     broken = False
     for i in range(len(s.used)):
         z = rows.z[_of(rows.z.shape[0], item), _of(rows.z.shape[1], one), i]
@@ -331,7 +331,7 @@ def _evaluate(rows: ScanRows, s: _Space, x: Array) -> None:
 
 @compiled
 def _gate(rows: ScanRows, item: int, how: Filtering, s: _Space, values: Array) -> None:
-    """Set the weights of rows whose innovation is outside the gate to zero, and count the rejected rows."""
+    """Set the weights of rows whose innovation is outside the gate to zero, and count the rejected rows in `values`."""
     n, own = len(s.x), _of(len(rows.covariance), item)
     for i in range(len(s.used)):
         if s.used[i] > 0.0:
@@ -501,7 +501,7 @@ def _write_rows(t: Tables, s: _Space, out: Array) -> None:
 
 @compiled
 def _size(rows: ScanRows, own: int, i: int) -> float:
-    """Return the standard deviation of the error of each station of row i: all its stations have the same."""
+    """Return the standard deviation of the error of each station of row i, from row `own` of the covariances."""
     return sqrt(_entry(rows, own, i, i) / (2.0 if rows.station[i, 1] >= 0 else 1.0))
 
 

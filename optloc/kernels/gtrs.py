@@ -220,7 +220,7 @@ def _meet_lane(
 
 @compiled
 def _normal(rows: Array, A: Array, b: Array, least: Array) -> None:
-    """Write the lower half of ``A = B'B``, ``b = B'g``, and the least valid pivot (W,), a share of A's diagonal."""
+    """Write the lower half of ``A = B'B``, ``b = B'g``, and the least valid pivot (W,), for `rows` [B | g]."""
     q, n = len(rows), len(b)
     for lane in range(LANES):
         least[lane] = 0.0
@@ -314,7 +314,7 @@ def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, fre
 def _residual_slope(rows: Array, y: Array, across: Array, multiplier: Array, slope: Array, left: Array) -> None:
     """Write the gradient ``B'(B y - g) + multiplier (C y + h)`` to `slope`; `left` (W,) is scratch.
 
-    Near the solution it has the accuracy of B, not of B'B.
+    `rows` are [B | g], `across` is ``C y + h``. Near the solution the result has the accuracy of B, not of B'B.
     """
     q, n = len(rows), len(y)
     for i in range(n):
@@ -333,10 +333,10 @@ def _residual_slope(rows: Array, y: Array, across: Array, multiplier: Array, slo
 
 @compiled
 def _step(y: Array, across: Array, p: Array, on_cone: bool, slope: Array, bend: Array, value: Array) -> None:
-    """Take one Newton step on the optimality conditions: slope and constraint become zero to first order.
+    """Take one Newton step of y on the optimality conditions: slope and constraint become zero to first order.
 
-    `slope` and `p` are solutions with the factored matrix. `bend` (W,) is the derivative of the constraint by the
-    multiplier.
+    `slope` and `p` are solutions with the factored matrix, `across` is ``C y + h``. `bend` (W,) is the derivative of
+    the constraint by the multiplier; `value` is scratch.
     """
     n = len(y)
     _value(y, across, on_cone, value)

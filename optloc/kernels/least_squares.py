@@ -162,7 +162,7 @@ def refine(
 def _refine_by_numpy(
     problem: Problem, start: Array, rules: StopRules, face: Face = (), limits: Limits | None = None
 ) -> Refined:
-    """Return the refinement by numpy, with weights computed at the start."""
+    """Return the refinement by numpy, with weights computed at the start; see `refine` for `face` and `limits`."""
     return _iterate(problem, start, _Weights.of(problem, start), rules, face, None, limits)
 
 
@@ -258,7 +258,8 @@ class _DescentState:
 class _ActiveProblems:
     """The problems of a refinement that have not ended, with their weights and constraints.
 
-    `blur` (N,) is the rounding error of the whitened residuals.
+    `problem` is the batch of these N problems. `blur` (N,) is the rounding error of their whitened residuals. `face`,
+    `folded` and `limits` are arguments of `refine`.
     """
 
     problem: Problem
@@ -413,7 +414,10 @@ def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: 
 def _refine_with_weights(
     problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: StopRules
 ) -> Refined | None:
-    """Return the refinement by machine code with the weights `noise`, or None if machine code is not supported."""
+    """Return the refinement by machine code with the weights `noise`, or None if machine code is not supported.
+
+    `start` (M, size) are the starts, `item` (M,) is the problem of each start.
+    """
     found = packed(problem, noise)
     if found is None:
         return None

@@ -370,7 +370,7 @@ def _fold_bias(bias: Bias, own: Array, found: Folding) -> Bias:
 
 
 def fold_whiteners(noise: tuple[Whitener, ...], found: Folding, count: int) -> tuple[Whitener, ...] | None:
-    """Return the whitening matrices of `count` runs for the batch of `fold`.
+    """Return the whitening matrices of `count` runs for the batch of `fold`; `found` are the common rows of epochs.
 
     The result is None if the groups of two epochs differ.
     """
@@ -406,7 +406,10 @@ def _fold_values(values: Array, own: Array, count: int) -> Array:
 
 
 def _fold_groups(row: Array, matrix: Array, found: Folding, count: int) -> tuple[Array, Array]:
-    """Return groups (g, r) and matrices (N or none, g or 1, r, r) for the batch of epochs; `count` is N."""
+    """Return groups (g, r) and matrices (N or none, g or 1, r, r) for the batch of epochs.
+
+    `found` are the common rows of the epochs, `count` is N.
+    """
     groups = found.groups(row)
     assert groups is not None
     local, own = groups

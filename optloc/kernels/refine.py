@@ -382,7 +382,10 @@ def refined(packed: Packed, item: Array, start: Array, rules: StopRules) -> tupl
 
 
 def equations(packed: Packed, item: Array, done: Answers) -> Normal:
-    """Return the normal equations at the refined vectors `done`; they are computed again if they were not stored."""
+    """Return the normal equations at the refined vectors `done`, of the problems `item` (M,).
+
+    They are computed again if they were not stored.
+    """
     n, matrix, vector = packed.tables.shared, done.matrix, done.vector
     if matrix.shape[-1] == 0:
         return normal_at(packed, done.x, item, priors=True)

@@ -461,7 +461,10 @@ def sum_runs(
 
 
 def refined_runs(runs: PackedRuns, item: Array, start: Array, rules: StopRules) -> tuple[Answers, Array]:
-    """Return the refined starts (M, size) of given runs (M,), and whether numpy must refine them instead (M,)."""
+    """Return the refined starts (M, size), and whether numpy must refine them instead (M,).
+
+    `item` (M,) is the run of each start.
+    """
     done, _ = fixed_runs(runs, item, start, rules, None)
     return done, np.asarray(done.status == LEFT_OPEN)
 
@@ -469,7 +472,7 @@ def refined_runs(runs: PackedRuns, item: Array, start: Array, rules: StopRules) 
 def fixed_runs(
     runs: PackedRuns, item: Array, start: Array, rules: StopRules, size: int | None
 ) -> tuple[Answers, Spread]:
-    """Return the refined starts (M, size) of given runs (M,), and their covariances.
+    """Return the refined starts (M, size), and their covariances; `item` (M,) is the run of each start.
 
     The covariances contain the first `size` local unknowns of each epoch. If `size` is None, they are empty.
     """
@@ -492,7 +495,10 @@ def fixed_runs(
 
 
 def sums_of_runs(runs: PackedRuns, x: Array, item: Array, *, priors: bool = False) -> Normal:
-    """Return the normal equations of runs at vectors x (M, size) of given runs (M,)."""
+    """Return the normal equations of runs at vectors x (M, size); `item` (M,) is the run of each vector.
+
+    If `priors` is True, Gaussian priors are added.
+    """
     t, count, k = runs.packed.tables, len(x), runs.epochs
     sums = Sums(
         np.empty((count, t.shared, t.shared)),

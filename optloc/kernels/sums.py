@@ -91,7 +91,7 @@ def packed(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | PackedRuns
 
 
 def sums_at(found: Packed | PackedRuns, x: Array, item: Array, *, priors: bool = False) -> Normal:
-    """Return the normal equations at vectors x (M, size), computed by machine code.
+    """Return the normal equations at vectors x (M, size), computed by machine code from the problems `found`.
 
     `item` (M,) is the problem of each vector.
     """

@@ -73,7 +73,7 @@ def factor(m: Array, matrix: int, n: int, scale: int, ok: int, least: float, lan
 
 @compiled
 def forward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
-    """Replace the vector (n,) at cell `right` by the inverse of the factor times the scaled vector."""
+    """Replace the vector (n,) at cell `right` by the inverse of the factor times the vector and its scale."""
     for i in range(n):
         for b in range(lanes):
             m[right + i, b] *= m[scale + i, b]
@@ -86,7 +86,7 @@ def forward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) ->
 
 @compiled
 def backward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
-    """Replace the vector (n,) at cell `right`, which `forward` returned, by the solution."""
+    """Replace the vector (n,) at cell `right`, which `forward` returned, by the solution, which is scaled."""
     for i in range(n - 1, -1, -1):
         for k in range(i + 1, n):
             for b in range(lanes):

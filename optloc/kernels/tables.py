@@ -238,7 +238,10 @@ class Tables(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CachedTables:
-    """Tables, and the number of each group among the groups of the whitening matrices: int array (groups,)."""
+    """Tables, and the number of each group among the groups of the whitening matrices.
+
+    `tables` are the indices. `number` (groups,) is the original number of each sorted group.
+    """
 
     tables: Tables
     number: Array
@@ -359,7 +362,7 @@ def _spanning(problem: Problem, groups: tuple[Array, ...]) -> bool:
 class _TracedRows:
     """A block of rows, its tape, and the number in `Sources` of each input of each row.
 
-    `inputs` maps the seed of an input to these numbers (m,).
+    `links` contains the rows, `trace` the tape. `inputs` maps the seed of an input to the numbers (m,).
     """
 
     links: BlockLinks
@@ -368,7 +371,7 @@ class _TracedRows:
 
 
 def _build_tables(problem: Problem, groups: RowGroups, found: list[_TracedRows], lookup: Array) -> CachedTables:
-    """Return the tables of traced blocks of rows; `lookup` is the result of `Sources.lookup`."""
+    """Return the tables of the traced blocks `found`; `lookup` is the result of `Sources.lookup`."""
     pairs = list(zip(found, problem.starts, strict=True))
     feeds = Entries.joined([Entries.feeds(kind.links, kind.trace, start) for kind, start in pairs])
     scales = Entries.joined([Entries.terms(kind.links.gains, start) for kind, start in pairs])
@@ -431,7 +434,7 @@ def _table(*columns: Array) -> Array:
 def _sources(found: list[_TracedRows], source_at: Array, order: Order, lookup: Array) -> Array:
     """Return the index of each input of each evaluated row, see `Sources.lookup`.
 
-    `source_at` is the first input of each evaluated row.
+    `found` are the blocks of rows. `source_at` is the first input of each evaluated row.
     """
     out, start = np.zeros(int(source_at[-1]), dtype=np.int64), 0
     for kind in found:

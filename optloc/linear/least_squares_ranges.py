@@ -197,9 +197,10 @@ def _keep_noise(noise: Noise, others: Array) -> list[Block]:
 
 
 def _reduced_rows(found: Ranges, shape: tuple[int, ...]) -> tuple[list[Rows], Array]:
-    """Return range, tdoa and range_sum rows with the least-squares ranges, and their joint covariance.
+    """Return range, tdoa and range_sum rows with the ranges in `found`, and their joint covariance.
 
-    `shape` contains the batch axes of the rows.
+    `shape` contains the batch axes of the rows. The kind depends on the sign of t: a range without t, a difference for
+    a plus, and a sum for a minus.
     """
     free, reference = bool(found.free[0]), int(found.reference[0])
     nodes = [n for n in np.flatnonzero(found.inside[0]) if not (free and n == reference)]
