@@ -472,7 +472,7 @@ class _Product:
 
     @classmethod
     def of(cls, matrix: Any) -> _Product:
-        """Return the product with a sparse matrix."""
+        """Return the products with a sparse matrix of scipy."""
         entries = matrix.tocoo()
         return cls(matrix.shape[0], entries.row.astype(np.int64), entries.col.astype(np.int64), entries.data)
 

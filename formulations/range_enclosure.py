@@ -179,7 +179,7 @@ def ball(ranged: Ranged, centre: Array, radius: float) -> EnclosingBox:
 def _left_inverse(system: Array, away: Array, root: Array) -> Array | None:
     """Return the left inverse of `system`, weighted for squared ranges, or None if the columns are not independent.
 
-    `away` (M - 1,) are distances from the stations, `root` is the Cholesky factor of the covariance of the ranges.
+    `away` (M - 1,) are distances from the stations, `root` is the Cholesky factor of the covariance of the errors w.
     """
     rows, columns = system.shape
     if rows < columns:

@@ -141,7 +141,10 @@ def _forms(curve: HeightCurve, surface: Ellipsoid, near: Array, guess: float) ->
 
 
 def _reach(curve: HeightCurve, station: Array, surface: Ellipsoid, guess: float) -> float:
-    """Return the greatest length of the lift of any point of the ellipsoid, which makes the bound rigorous."""
+    """Return the greatest length of the lift of any point of the ellipsoid, which makes the bound rigorous.
+
+    `guess` is the expected range, the unit of the lift. `station` (3,) is the first station.
+    """
     size = 1.0 / float(np.sqrt(np.linalg.eigvalsh(surface.shape)[0]))
     t = (float(np.linalg.norm(station - surface.centre)) + size) / guess + 1.0
     mu = (abs(float(curve.across[0] @ (surface.centre - curve.base[0]))) + size) / guess

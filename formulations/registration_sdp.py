@@ -328,7 +328,10 @@ def _relaxation(windows: int, stations: int, dimension: int, order: int, biases:
 
 
 def _parameters(run: RegistrationWindows) -> dict[str, Array]:
-    """Return the coefficients of the lifted equalities; the second kind is divided by the unit of the remainders."""
+    """Return the parameters of `registration_problem` by name, except the price.
+
+    The second kind of equalities is divided by the unit of the remainders.
+    """
     K, S, _ = run.station.shape
     power, first, other = run.power, run.station[:, 0], run.station[:, 1:]
     size = (run.station**2).sum(axis=-1)

@@ -500,9 +500,9 @@ def _reflect_lane(vector: Array, lane: int, out: Array) -> None:
 
 @compiled
 def _exchange(answer: Answer, i: int) -> None:
-    """Exchange fix and rival of problem i.
+    """Exchange fix and rival of problem i, because the rival is cheaper.
 
-    If the cost of the old fix is more than `LISTED` above the cost of the new one, it is no rival.
+    If the cost of the old fix is more than `LISTED` above the cost of the new fix, it is no rival.
     """
     x, rival, number = answer.x, answer.rival, answer.number
     for j in range(x.shape[1]):

@@ -473,8 +473,8 @@ def _turn_to_axes(block: RangeBlock, room: EngineWorkspace) -> None:
 def measure_infinity(block: RangeBlock, room: EngineWorkspace) -> None:
     """Write the least cost at infinity to BEYOND: exact if within `BEYOND_DOUBT` of FIX_COST, else a lower bound.
 
-    The kernel reads LOOP, FIX_COST and the results of `_see_far`. The least cost follows from a secular equation: the
-    direction, a function of a multiplier, has length one.
+    It is infinite unless `rows.level` is True. The kernel reads LOOP, FIX_COST and the results of `_see_far`. A secular
+    equation gives the least cost: the direction, a function of a multiplier, has length one.
     """
     scalar, vector = room.scalar, room.vector
     out = scalar[BEYOND]

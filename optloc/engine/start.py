@@ -1,7 +1,7 @@
 """The start of a fix: the exact minimiser of the squared ranges and the other linear rows.
 
 A block has W problems of s stations and d coordinates, one in each lane. The range to station i is ``r_i = c_i + s_i
-t``, with c_i from the measurements, the sign s_i and one unknown t.
+t``: c_i follows from the measurements, s_i is 1, -1 or 0, and t is one unknown.
 
 Names in capitals, such as X or GOOD, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """

@@ -335,8 +335,8 @@ def _residual_slope(rows: Array, y: Array, across: Array, multiplier: Array, slo
 def _step(y: Array, across: Array, p: Array, on_cone: bool, slope: Array, bend: Array, value: Array) -> None:
     """Take one Newton step of y on the optimality conditions: slope and constraint become zero to first order.
 
-    `slope` and `p` are solutions with the factored matrix, `across` is ``C y + h``. `bend` (W,) is the derivative of
-    the constraint by the multiplier; `value` is scratch.
+    `slope` and `p` are solutions with the factored matrix, `across` is ``C y + h``. `bend` (W,) is minus the derivative
+    of half the constraint by the multiplier; `value` is scratch.
     """
     n = len(y)
     _value(y, across, on_cone, value)

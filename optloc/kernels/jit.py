@@ -55,7 +55,10 @@ def _numba() -> Any:
 
 
 def enabled() -> bool:
-    """Return whether kernels run as machine code: numba is installed and NUMBA_DISABLE_JIT is not set."""
+    """Return whether kernels run as machine code.
+
+    They do if numba is installed, NUMBA_DISABLE_JIT is not set, and the code does not run inside `plain`.
+    """
     return not _PLAIN.get() and _numba() is not None
 
 

@@ -145,7 +145,11 @@ def step(m: Array, room: LaneCells, n: int, local: int, damping: int, ok: int, l
 def factor_local(
     m: Array, room: LaneCells, source: int, n: int, local: int, damping: int, ok: int, least: float, lanes: int
 ) -> None:
-    """Factor the damped system of the local unknowns of the equations at cell `source`, and prepare its coupling."""
+    """Factor the damped system of the local unknowns of the equations at cell `source`.
+
+    The coupling with the shared unknowns and the right side, multiplied by the inverse factor, are written to
+    `room.half`.
+    """
     line, half = n + local + 1, room.half
     for i in range(local):
         row, own = source + (n + i) * line, room.local + i * local

@@ -219,7 +219,7 @@ def _reduced_rows(found: Ranges, shape: tuple[int, ...]) -> tuple[list[Rows], Ar
 
 
 def _patterns(present: Array) -> tuple[Array, Array]:
-    """Return the distinct rows of a mask (N, m), and the number of the row of each problem."""
+    """Return the distinct rows of a mask (N, m), and for each problem (N,) the number of its row."""
     if present.all() or (present == present[:1]).all():
         return present[:1], np.zeros(len(present), dtype=int)
     patterns, pattern = np.unique(present, axis=0, return_inverse=True)
