@@ -121,8 +121,8 @@ def main(seconds: float, choices: list[str]) -> None:
     lines = os.fdopen(os.dup(1), "w", encoding="utf-8")
 
     def say(word: str, name: str, fault: str) -> None:
-        # solvers print to the same stream, perhaps without a line end
         """Print one result line."""
+        # solvers print to the same stream, perhaps without a line end
         lines.write(f"\n{word} {name} {fault}\n")
         lines.flush()
 

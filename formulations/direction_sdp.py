@@ -183,7 +183,7 @@ def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minor
     elevation : Array, shape (N,)
         Elevations predicted by the fix.
     cost : float
-        Total cost of the fix, the square of rho; the bound holds for points with at most this cost.
+        Total cost of the fix, the square of rho; the bound is valid for points with at most this cost.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-r"""A box that contains every point with small range residuals, so that a bound over the box holds for all space.
+r"""A box that contains every point with small range residuals, so that a bound over the box is valid for all space.
 
 Ranges :math:`r_i = |x - s_i|` are measured up to one unknown, :math:`r_i = \sigma_i r_1 + d_i + w_i`, with errors `w`
 of covariance `R`. Squared, and with :math:`a_i = s_i - s_1`, :math:`x' = x - s_1`, :math:`r_1^2 = |x'|^2`,

@@ -266,7 +266,7 @@ def project_covariance(model: EngineModel, room: EngineWorkspace) -> None:
         _keep_off(room, column, p)
         for j in range(i, p):
             for lane in range(LANES):
-                # the variance of a held coordinate is zero, which rounding may make slightly negative
+                # the variance of an exactly constrained coordinate is zero, which rounding may make slightly negative
                 cov[j, i, lane] = column[j, lane] if j > i else max(column[j, lane], 0.0)
 
 

@@ -31,7 +31,7 @@ _ROUNDING = 1e-13
 _SAME = 1e-14
 
 _S, _A, _B, _N, _FIRST, _ALONG, _BASE, _EDGE = 0, 3, 4, 5, 6, 7, 8, 9
-_RANGE = _N  # two rows also hold sign and offset of the ranges to the other stations
+_RANGE = _N  # two rows also contain sign and offset of the ranges to the other stations
 
 
 @compiled

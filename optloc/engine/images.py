@@ -67,7 +67,7 @@ _FREE = 1e-5
 # Greatest number of steps of a mirror image: in flat networks half of the rivals are reached in seven steps, nine of
 # ten in fifteen, the last in fifty.
 _MOST = 60
-# A point belongs to the fix if two conditions hold: its squared distance is below NEAR (squared standard deviations),
+# A point belongs to the fix under two conditions: its squared distance is below NEAR (squared standard deviations),
 # and its cost has risen by at least the share RISEN of the quadratic rise. Another minimum would be cheaper.
 NEAR, RISEN = 9.0, 0.5
 # Squared length of the undamped step, in standard deviations, below which a refinement has converged: 0.01 squared.

@@ -249,7 +249,7 @@ class EngineWorkspace(NamedTuple):
         Squared-range solutions, second solutions, and scratch of `optloc.kernels.gtrs.minimise`.
     vector, matrix, axes, scalar : array (13, p, W), (6, p, p, W), (3, d, d, W), (23, W)
         The constants of this module name the rows. Positions are relative to the origin, row ORIGIN. If RADIUS is not
-        zero, positions are held at this distance from CENTRE.
+        zero, positions are kept at this distance from CENTRE.
     face, push : array (2, k, d, W), (c, p, W)
         Gradients of the constrained quantities at rows X and TRIAL; for the c exact ones, their products with the
         inverse of the information.

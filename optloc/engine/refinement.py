@@ -49,7 +49,7 @@ def refine(model: EngineModel, rows: Any, room: EngineWorkspace, tolerance: floa
     Parameters
     ----------
     model : EngineModel
-        Contains the constraints that hold fixes.
+        Contains the constraints of the position.
     rows : named tuple
         Rows of the evaluator.
     room : EngineWorkspace

@@ -123,8 +123,8 @@ def refine(
     damped : bool
         If False, plain Taylor iteration: every step is accepted, even if it raises the cost.
     face : Face
-        Constraints that hold with equality, also in every epoch of a run. Steps follow their tangent space, and the
-        vectors are projected back onto them.
+        Levels that the estimate satisfies with equality, also in every epoch of a run. Steps follow their
+        tangent space, and the vectors are projected back onto them.
     folded : Folded, optional
         Restricts steps to a plane of symmetry of the problem, instead of a face.
     limits : Limits, optional

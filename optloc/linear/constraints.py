@@ -71,7 +71,7 @@ def height(
     target : int
         Number of the target.
     along : bool
-        Whether the constraint holds at every epoch, or only at the reference time.
+        Whether the constraint applies at every epoch, or only at the reference time.
     """
     low, high = (lower, upper) if exactly is None else (exactly, exactly)
     low, high = _metres(low, "height"), _metres(high, "height")
@@ -184,7 +184,7 @@ def _metres(value: Any, where: str) -> Array:
     return _float_array(in_si(value, "length", where, place=True))
 
 
-# Faces: sides that hold with equality together, and the projection of vectors onto them.
+# Faces: levels that are satisfied with equality together, and the projection of vectors onto them.
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,7 +306,7 @@ def is_held(problem: Problem, face: Face, x: Array, descent: Array) -> Array:
     problem : Problem
         N problems.
     face : Face
-        Constraints that hold with equality.
+        Levels that the vectors satisfy with equality.
     x : array (N, size)
         Vectors on the face.
     descent : array (N, n)
@@ -467,7 +467,7 @@ def conjunction(problem: Problem) -> list[Band]:
         corners = c.vertices
         edge = np.roll(corners, -1, axis=0) - corners
         turn = edge[:, 0] * np.roll(edge, -1, axis=0)[:, 1] - edge[:, 1] * np.roll(edge, -1, axis=0)[:, 0]
-        # For a concave polygon, not all edges need to hold: the region is not a conjunction.
+        # For a concave polygon, a point inside can violate an edge: the region is not a conjunction.
         if (turn >= 0.0).all() or (turn <= 0.0).all():
             sign = 1.0 if turn.sum() > 0.0 else -1.0
             for i in range(len(corners)):

@@ -18,7 +18,7 @@ from optloc.problem.problem import Problem
 
 
 def over_ground(problem: Problem) -> bool:
-    """Return whether the courses of a problem follow the Earth; this holds for all moving targets or for none."""
+    """Return whether the moving targets of a problem follow the curved Earth; either all of them do, or none."""
     return any(motion.over == "ground" for motion in problem.motions)
 
 

@@ -345,8 +345,8 @@ def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point,
         return tuple(inputs.get(seed + c, 0.0) for c in range(d))
 
     def station(place: int, rate: int, axes: int) -> Point:
-        # Inputs are 16 numbers apart and axes 3: nine numbers of one set of axes fit before the next input.
         """Return a station from the seeds of its position, rate and axes."""
+        # Inputs are 16 numbers apart and axes 3: nine numbers of one set of axes fit before the next input.
         own = tuple(vector(axes + 3 * i) for i in range(d)) if axes in inputs else None
         if TURN in inputs:
             identity = tuple(tuple(float(i == j) for j in range(d)) for i in range(d))

@@ -22,7 +22,7 @@ from optloc.problem.problem import Problem
 def one_position(problem: Problem) -> bool:
     """Return whether the only unknown state is one position.
 
-    This holds for a single unknown target, if it and the stations are at rest, or if there is only one epoch.
+    This is the case for a single unknown target, if it and the stations are at rest, or if there is only one epoch.
     """
     if len(problem.motions) != 1 or problem.motions[0].known is not None or problem.motions[0].span == "epoch":
         return False
