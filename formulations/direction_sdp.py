@@ -190,11 +190,9 @@ def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minor
     Minorant
         One quadratic for each direction.
 
-    Notes
-    -----
-    Let :math:`\hat v` (azimuth :math:`\hat A`, elevation :math:`\hat E`) be predicted by a fix, `v` any direction,
-    :math:`\eta = A_v - \hat A`, :math:`\epsilon = E_v - \hat E`, and :math:`\hat\delta`, :math:`\hat\varepsilon` the
-    fix's own errors against the measured angles, so that the cost of `v` is
+    Notes ----- Let :math:`\hat v` (azimuth :math:`\hat A`, elevation :math:`\hat E`) be the direction that a fix
+    predicts, and `v` any direction, with :math:`\eta = A_v - \hat A` and :math:`\epsilon = E_v - \hat E`. The errors of
+    the fix against the measured angles are :math:`\hat\delta` and :math:`\hat\varepsilon`, so that the cost of `v` is
 
     .. math:: f(v) = \frac{(\hat\delta + \eta)^2}{\sigma_A^2} + \frac{(\hat\varepsilon + \epsilon)^2}{\sigma_E^2} .
 
@@ -213,10 +211,10 @@ def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minor
     is at most a multiple of :math:`\eta^2` or :math:`\epsilon^2` (from :math:`|x - \sin x| \le |x|^3/6`, :math:`1 -
     \cos x \le x^2/2` and the mean value theorem for cos), and the three weights are :math:`1/\sigma^2` less these
     multiples. Hence :math:`q \le f` on the cap and :math:`q(\hat v) = f(\hat v)`. A point with total cost at most
-    :math:`\rho^2` has all its directions in their caps, so the least sum of `q` over any set that contains the best
-    point is at most the least sum of `f`.
+    :math:`\rho^2` has all its directions in their caps. So over any set that contains the best point, the least sum of
+    `q` is at most the least sum of `f`.
 
-    Near the zenith, or with caps so wide that a remainder exceeds a weight, the quadratic of this direction is zero,
+    Near the zenith, or with wide caps, a remainder may exceed a weight. Then the quadratic of this direction is zero,
     which is still a minorant. Derived here.
     """
     (dA, dE), (sA, sE), rho = error.T, sigma.T, np.sqrt(cost)

@@ -10,9 +10,9 @@ instance. A row of rates times :math:`r_a` has no quotient:
 
 .. math:: \varepsilon_m = r_a n_m = z_m r_a + (x - s_a) \cdot v_a + q_b r_a - A_m \cdot b\, r_a .
 
-With the unknown rates :math:`\beta = (b, q_b)` and the products :math:`w_{ji} = \beta_j r_i` that occur, all of this is
-linear in :math:`y = (1, x, \beta, r, w)`, and the weighted cost, rows of rates divided by ranges :math:`\rho_a` that
-are known from the pass before,
+With the unknown rates :math:`\beta = (b, q_b)` and the products :math:`w_{ji} = \beta_j r_i` that occur, all rows are
+linear in :math:`y = (1, x, \beta, r, w)`. Rows of rates are divided by ranges :math:`\rho_a`, which the previous pass
+gives. The weighted cost,
 
 .. math:: \min_x \; |W \,\mathrm{diag}(1/\rho)\, L\, y|^2,
 

@@ -5,9 +5,9 @@ r"""Low-rank network: arrivals of N pulses at M stations, all at unknown positio
 
 with :math:`u` any affine image of the stations, :math:`\alpha_i = |a_i|^2` and :math:`\beta_j = |y_j|^2 - o_j^2` up to
 an exchange between :math:`u` and :math:`v`. For given :math:`\theta_i = (\alpha_i, u_i, b_i)` each pulse is a linear
-least squares problem in :math:`(\beta_j, v_j, o_j)` over its own rows, so that entries may be missing and the
-non-linear problem has :math:`M (d + 1)` unknowns however many pulses there are: it is solved by variable projection
-(Levenberg and Marquardt on :math:`\theta`, Kaufman's approximation of the derivative of a projector).
+least-squares problem in :math:`(\beta_j, v_j, o_j)` over its own rows, so that entries may be missing. The nonlinear
+problem has :math:`M (d + 1)` unknowns for any number of pulses. It is solved by variable projection (Levenberg and
+Marquardt on :math:`\theta`, Kaufman's approximation of the derivative of a projector).
 
 An error n of an arrival changes its equation by about :math:`2 |a_i - y_j| n`. So each equation is divided by this
 distance, as estimated in every step. A share of the spread replaces distances near zero.

@@ -9,8 +9,8 @@ A fit of small rank (:mod:`formulations.low_rank_network`) gives :math:`\alpha_i
    \beta_j + o_j^2 = \tfrac14 v_j^\top K v_j + \tfrac12 v_j^\top K h + c'
 
 are each linear: in (H, h, c) for enough stations, in (K, K h, c') for enough pulses, and exact without noise. Noise can
-make H or K indefinite along the thinnest axis; its eigenvalues are then kept above a share of the largest, of which
-several are tried.
+make H or K indefinite along the thinnest axis. Eigenvalues below a share of the largest are then raised to this share;
+several shares are tried.
 
 Sources: the rank condition is that of M. Pollefeys and D. Nister, "Direct computation of sound and microphone locations
 from time-difference-of-arrival data", Proc. ICASSP 2008; the upgrade from stations is in M. Crocco, A. Del Bue and V.

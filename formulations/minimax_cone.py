@@ -9,10 +9,10 @@ if :math:`|T_i (p - S_i)| + r / \cos\theta_i \le \tan(\theta_i) u_i^\top (p - S_
 
 .. math:: \max_{p,\, r \le 1} \; r \quad\text{subject to these N cones},
 
-decides whether the cones meet (:math:`r \ge 0`), gives the centre of the largest inscribed ball, and otherwise, from
-its dual, multipliers that prove that the cones do not meet. With :math:`\theta_i = t \sigma_i` the set grows with t
-(the worst scaled angle is quasi-convex). Bisection on t, accelerated by the attained angles, finds the global minimax
-fix.
+decides whether the cones meet (:math:`r \ge 0`). If they meet, it gives the centre of the largest inscribed ball.
+Otherwise its dual gives multipliers that prove that the cones do not meet. With :math:`\theta_i = t \sigma_i` the set
+grows with t (the worst scaled angle is quasi-convex). Bisection on t, accelerated by the attained angles, finds the
+global minimax fix.
 
 Sources: M. S. Lobo, L. Vandenberghe, S. Boyd and H. Lebret, "Applications of second-order cone programming", Linear
 Algebra Appl. 284 (1998); F. Kahl and R. Hartley, "Multiple-view geometry under the L-infinity norm", IEEE Trans.

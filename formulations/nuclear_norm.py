@@ -1,7 +1,7 @@
 r"""Nuclear norm of a network, the convex start: **a baseline of studies, never a default**.
 
-Arrivals :math:`z_{ij} = |a_i - y_j| + o_j` of N pulses at M stations, squared and centred over both, are affine in the
-times of emission, and of rank d at the true ones:
+The arrivals of N pulses at M stations are :math:`z_{ij} = |a_i - y_j| + o_j`. Squared and centred over both, they are
+affine in the times of emission o, and of rank d at the true times:
 
 .. math:: G(o) = Q_M^\top (Z \circ Z - 2 Z \, \mathrm{diag}\, o) \, Q_N = -2 \, Q_M^\top A Y^\top Q_N,
 
@@ -10,9 +10,9 @@ sum of the singular values, its convex envelope on matrices of bounded norm, and
 
 .. math:: \min_o \; \|G(o)\|_* - \langle W, G(o) \rangle \quad\text{subject to}\quad o_j \le \min_i z_{ij}.
 
-*First pass*, :math:`W = 0`: the nuclear norm. It is **not tight**: distances that are too small make all of `G` small,
-so that the least nuclear norm is between the true times and the times at the nearest stations. Without the bounds on
-`o` the solution is beyond them.
+*First pass*, :math:`W = 0`: the nuclear norm. It is **not tight**: distances that are too small make all of `G` small.
+So the least nuclear norm is between the true times and the times at the nearest stations. Without the bounds on `o` the
+solution is beyond them.
 
 *Further passes*, :math:`W = U_d V_d^\top` of the pass before: the truncated nuclear norm, the sum of the singular
 values beyond the first d, decreased by linearising its concave part. Without noise it is zero at the true times. If the

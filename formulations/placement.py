@@ -13,8 +13,9 @@ on the eigenvector.
 *Semidefinite relaxation* (0 <= w <= 1): :math:`\begin{pmatrix} M_p & e \\ e^\top & t \end{pmatrix} \succeq 0` gives
 :math:`t \ge e^\top M_p^{-1} e`, and :math:`M_p \succeq C^\top S_p C` gives :math:`P_p \preceq S_p^{-1}`.
 
-*Outer approximation*: tangents :math:`t_p \ge f_p(u) + \nabla f_p(u)^\top (w - u)` at every integer point that a mixed
-integer programme finds, and half way between it and the best one, until its dual bound meets the best point.
+*Outer approximation*: tangents :math:`t_p \ge f_p(u) + \nabla f_p(u)^\top (w - u)` are added at every integer point
+that a mixed integer programme finds, and half way between this point and the best point. This ends when the dual bound
+of the programme reaches the value of the best point.
 
 *Continuous places*: the same criterion over the positions of the sites, each in a convex region, as a nonlinear
 programme; a local optimum.

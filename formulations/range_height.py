@@ -8,17 +8,17 @@ own plane,
 
 .. math:: x(t, \mu) = b + p\,t + n\,\mu, \qquad \mu^2 = q(t) = q_0 + q_1 t + q_2 t^2, \qquad r_i = \rho_i t + e_i,
 
-in which `n` is the unit normal of the plane of the stations and `t` is :math:`r_1`, shifted and scaled so that `p` is
-at most a unit long and `b` near the stations (nearly collinear stations make both huge otherwise). Two known ranges
-leave a circle about the line of their stations, which has the same form, `t` and :math:`\mu` being cosine and sine.
-On the conic the ellipsoid reads :math:`E(t) + L(t)\,\mu + \alpha\,\mu^2 = 0`. With :math:`Q = E + \alpha q` the first
-coordinate is a root of
+in which `n` is the unit normal of the plane of the stations. The parameter `t` is :math:`r_1`, shifted and scaled: `p`
+is at most a unit long and `b` is near the stations. Otherwise both would be huge for nearly collinear stations. Two
+known ranges leave a circle about the line of their stations, which has the same form, `t` and :math:`\mu` being cosine
+and sine. On the conic the ellipsoid reads :math:`E(t) + L(t)\,\mu + \alpha\,\mu^2 = 0`. With :math:`Q = E + \alpha q`
+the first coordinate is a root of
 
 .. math:: Q(t)^2 - L(t)^2\, q(t) = 0,
 
 at most four real ones. Squaring also admits the problem with flipped signs, whose points have a negative range; they
-are dropped. Each root starts a Newton iteration on the two conics from both signs of :math:`\mu`, which restores the
-digits that squaring has lost, and needs no special case for :math:`L = 0`.
+are dropped. Each root starts a Newton iteration on the two conics from both signs of :math:`\mu`. The iteration
+restores the digits that squaring has lost, and needs no special case for :math:`L = 0`.
 
 Points on the far side of the ellipsoid are not visible. The polar plane of an outside point `s`, :math:`(x - c)^\top A
 (s - c) = 1`, touches the ellipsoid where the tangents from `s` do: it cuts off exactly the part that is seen from `s`.

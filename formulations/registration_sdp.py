@@ -17,10 +17,10 @@ The lift :math:`Y = y y^\top` is relaxed to :math:`Y \succeq 0` and solved with 
 
 The lift is never formed. With the biases in the lift the cost is a sum over the windows, and so are the definitions: of
 `Y` only the blocks of :math:`u_k = (1, p, v, \delta, r_1(k), f_i(k))` occur, which have the block of :math:`(1, p, v,
-\delta)` in common. If all blocks are semidefinite and agree in their common part, they are the blocks of a semidefinite
-matrix, because the graph of this pattern is chordal. The best moments of the biases give :math:`f^\top M f` again. So
-`K` blocks of a dozen rows are the same relaxation as the lift of all windows, whose time grows with the sixth power of
-them.
+\delta)` in common. The graph of this pattern is chordal. Therefore, if all blocks are semidefinite and agree in their
+common part, they are blocks of a semidefinite matrix. The best moments of the biases give :math:`f^\top M f` again. So
+`K` blocks of a dozen rows are the same relaxation as the lift of all windows. The time of that lift would grow with the
+sixth power of the number of windows.
 
 Small unknowns are lifted in small units: the lift contains the remainders, not the ranges :math:`r_i`. Compared with
 the squares of ranges, the remainders would be rounding for an interior-point method.
@@ -29,9 +29,9 @@ Both the price and the prior are needed. A misfit `m` of the second equality can
 :math:`2 \operatorname{cov}(r_1, f) = m`, for which :math:`\operatorname{var}(r_1) \operatorname{var}(f) \ge m^2 / 4`
 suffices. Without the price, :math:`\operatorname{var}(r_1)`, that is the trace, grows without bound and every target
 has cost zero in the limit; with it misfits cost about :math:`\sqrt{\eta \sum M_{ff} m^2}`. Without the prior, `M` is
-zero for remainders common to all windows, so that these misfits cost nothing again and the price moves the target into
-the array. The relaxation is not tight (at the best price its misfit is about a twentieth of the misfit by noise): it
-gives starts, not bounds.
+zero for remainders common to all windows. These misfits would cost nothing again, and the price would move the target
+into the array. The relaxation is not tight (at the best price its misfit is about a twentieth of the misfit by noise):
+it gives starts, not bounds.
 
 The best price depends on the unknown distance. A price that is too high moves the target into the array; with a price
 that is too low, the slack moves it far away. So the problem is solved for several prices, and the solutions are ranked

@@ -8,11 +8,11 @@ and
 
 .. math:: k(t) = T(t)^{-1/2} - (\kappa + \sigma t)^{-1/2}
 
-is concave in every interval. Newton's iteration on `k`, started near a pole where `k <= 0`, therefore climbs
+is concave in every interval. Newton's iteration on `k` starts near a pole, where `k <= 0`. It therefore climbs
 monotonically to the first root on that side of the pole, or reaches `k' <= 0`, which proves that no root exists. Every
-interval contains at most two roots, one at each end. So the two sides of all poles, and for ``sigma > 0`` the zero of
-the right side, list all real roots without a polynomial and without a bracket. Each root is stored as the distance from
-its pole: roots that fall onto a pole (the "hard case", ``c_j`` near 0) keep their full relative accuracy.
+interval contains at most two roots, one at each end. So starts on both sides of all poles, and for ``sigma > 0`` at the
+zero of the right side, find all real roots. No polynomial and no bracket is needed. Each root is stored as the distance
+from its pole: roots that fall onto a pole (the "hard case", ``c_j`` near 0) keep their full relative accuracy.
 
 Sources: J. J. More and D. C. Sorensen, "Computing a trust region step", SIAM J. Sci. Stat. Comput. 4 (1983), section 3
 (the concave form on the last interval); the use on every interval is the same inequality.
