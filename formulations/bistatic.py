@@ -195,8 +195,9 @@ def course(
         normals = np.concatenate([e[:, :, :2], (e[:, :, 2] - A[:, None] / L[..., None])[:, :, None, :]], axis=2)
         normals = np.where(present[..., None], normals, 0.0)
         right = np.where(present, [0.0, 0.0, 1.0] * ((L * L - d * d) / (2.0 * L))[..., None], 0.0)
-        # An angle error shortens u'p by half its square, which is not small compared with a good path. Added is the
-        # root of the second moment of half the sum of two squared normal errors, (3 s1^4 + 3 s2^4 + 2 s1^2 s2^2) / 4.
+        # An angle error shortens u'p by half its square, which is not small compared with the error of a precise path.
+        # The added term is the root of the second moment of half the sum of two squared normal errors. This moment is
+        # (3 s1^4 + 3 s2^4 + 2 s1^2 s2^2) / 4 for deviations s1 and s2.
         square = np.where(present[..., :2], deviation[..., :2], 0.0) ** 2
         bend = 0.5 * np.sqrt(3.0 * (square**2).sum(axis=-1) + 2.0 * square.prod(axis=-1))
         far = across = 0.5 * L

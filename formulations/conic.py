@@ -220,8 +220,8 @@ class Relaxation:
         return ConicAnswer(point, primal, -np.inf, status, good and status == cvxpy.OPTIMAL, iterations, message)
 
 
-# Statuses of Clarabel with a solution: its tolerances are met, or its reduced ones (5e-5 of the gap, 1e-4 of
-# feasibility), which it also checks if it stops at a limit or makes no progress.
+# Statuses of Clarabel with a solution: its tolerances are met, or its reduced tolerances (5e-5 of the gap, 1e-4 of
+# feasibility). It also checks them if it stops at a limit or makes no progress.
 _MET = ("Solved", "AlmostSolved")
 # For a second attempt if the factorisation lost its digits: ten times the default of 1e-8. Relaxations of Doppler
 # shifts of satellites then meet the full tolerances, with a third more iterations.

@@ -30,7 +30,7 @@ import numpy as np
 from formulations.algebra import Array, Mask
 
 # Greatest numbers of steps: before equations are divided by distances, while they are divided, and with fixed
-# distances. Distances at a random start are wrong: for 12 x 20 networks in flat halls 60 % of the starts end at the
+# distances. Distances at a random start are wrong. For 12 x 20 networks in flat halls, 60 % of the starts end at the
 # best fit, but only 5 % if all steps divide. The last steps minimise one fixed function.
 _PLAIN, _WEIGHED, _FROZEN = 30, 55, 5
 # Relative change of the costs of all starts that ends a stage, and the number of successive steps with this change.

@@ -163,8 +163,8 @@ class Program:
         faster = _compile(self._name, solver, options) if compiled else None
         self.compiled = faster is not None
         self._solver = solver if faster is None else faster
-        # CasADi releases the interpreter lock while it solves, and the solver has one memory, which simultaneous
-        # threads would corrupt, and one report, of its last solve
+        # CasADi releases the interpreter lock while it solves. The solver has one memory, which simultaneous threads
+        # would corrupt, and one report of its last solve.
         self.lock = threading.Lock()
         _LOCKS.programs.add(self)
 

@@ -44,8 +44,8 @@ _SLOTS = 4  # roots of a quartic
 _THIN = 1e-7
 _AXIAL = 1e-12  # squared sine of the angle between a direction and the axis below which they count as parallel
 _LEAD = 1e-14  # leading coefficient of the quartic, relative to the largest, that is rounding: a root at infinity
-# Greatest relative residual of the two conics at a start of the iteration: eigenvalues of the companion matrix are
-# accurate to 1e-8 at a double root, and a pair slightly off the real axis is off by the root of the perturbation.
+# Greatest relative residual of the two conics at a start of the iteration. Eigenvalues of the companion matrix are
+# accurate to 1e-8 at a double root. A pair slightly off the real axis is wrong by the root of the perturbation.
 _NEAR = 1e-3
 _NEWTON = 30  # steps; quadratic convergence at simple roots; a bit per step at double roots, accurate to 1e-8
 _RESTS = 1e-14  # relative step at which a slot has converged

@@ -39,8 +39,8 @@ from formulations.algebra import Array
 from formulations.squared_range import paraboloid, stationary
 
 # Number of passes of stage 0, from random runs of 30 epochs, five stations and errors of 1e-3 of their spread. A fixed
-# target two spreads away needs one pass; of one 30 spreads away the 90 % error falls from 7.3 to 0.4 by the second, and
-# of a moving one from 31 to 19 by the fourth.
+# target two spreads away needs one pass. For a fixed target 30 spreads away, the 90 % error falls from 7.3 to 0.4 by
+# the second pass. For a moving target it falls from 31 to 19 by the fourth pass.
 _PASSES = 4
 # Number of passes of stage 1 in the same runs: the second reduces the 90 % error of far fixed targets by a quarter;
 # later passes change little.

@@ -56,8 +56,8 @@ from numpy.typing import ArrayLike
 from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio
 
-# Two prices per decade. In random plane arrays the best price (median of twelve) is 30 for targets within one extent, 3
-# at two extents, 0.3 at three, 0.1 at five and 0.03 at ten.
+# Two prices per decade. In random plane arrays the best price (median of twelve) depends on the distance of the target:
+# 30 within one extent, 3 at two extents, 0.3 at three, 0.1 at five and 0.03 at ten.
 PRICES = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)
 """Prices eta of the squared distance from the array's centre, in units of its mean squared extent."""
 

@@ -144,9 +144,9 @@ def _start(equation: Secular, pole: Array, weight: Array, sign: float) -> tuple[
     if not grows.any():
         return np.sqrt(weight / safe), positive
     rate = np.where(grows, slope, 1.0)
-    # The other poles only add to the left side. If this pole alone exceeds twice each of the two terms of the
-    # right side, the first root has not been reached. If the level is negative, the
-    # root lies beyond the zero of the right side, by b say, and (away + b)^2 <= 4 max(away, b)^2 gives the quarters.
+    # The other poles only add to the left side. If this pole alone exceeds twice each of the two terms of the right
+    # side, the first root has not been reached. If the level is negative, the root is beyond the zero of the right
+    # side, at the distance b. Then (away + b)^2 <= 4 max(away, b)^2 gives the factors of a quarter.
     cube = np.where(grows, np.cbrt(0.25 * weight / rate), np.inf)
     above = np.minimum(np.sqrt(0.5 * weight / safe), cube)
     away = np.where(positive, 1.0, -level / rate)

@@ -130,8 +130,8 @@ def azimuths_beside(problem: Problem, rows: Rows) -> Array | None:
 
 # The same rows for machine code: one tape for each block of rows, and the source of each input of the tape.
 
-# Sources of an input: a constant of the structure, a measurement, a coordinate of a station, a least-squares range, or
-# a coordinate of the position at which the row is evaluated.
+# Sources of an input: a constant of the structure, a measurement, a coordinate of a station, or a least-squares range.
+# The last source is a coordinate of the position at which the row is evaluated.
 NUMBER, SEEN, STATION, OFFSET, POINT = range(5)
 
 

@@ -489,7 +489,7 @@ def face_of(problem: Problem, x: Array) -> Array:
     for number, face in enumerate(faces(problem)):
         if face:
             values, _ = levels(problem, face, x)
-            # Faces are sorted by number of levels, so that the last one that fits has the most.
+            # Faces are sorted by number of levels, so that the last face that fits has the most levels.
             found[(np.abs(values) <= 10.0 * TOLERANCE * (1.0 + np.abs(x).max(1, keepdims=True))).all(1)] = number
     return found
 

@@ -267,7 +267,7 @@ def _graph(rows: bytes, count: int, stations: int) -> Graph:
     group, sign = _connect(np.frombuffer(rows).reshape(-1, count))
     names = np.unique(group[group >= 0])
     members = tuple(np.flatnonzero(group[:stations] == name) for name in names)
-    # the group with most stations; if equal, the first one, so that the same rows always give the same group
+    # The group with most stations; of equal groups the first, so that the same rows always give the same group.
     main = max(range(len(names)), key=lambda i: (len(members[i]), -i)) if len(names) else -1
     inside = (group == names[main])[:stations] if len(names) else np.zeros(stations, dtype=bool)
     reference = int(np.flatnonzero(inside)[0]) if inside.any() else 0
