@@ -321,7 +321,7 @@ class PlacementRegion:
         return np.concatenate([plan, [self.low - up, up - self.high]])
 
     def nearest(self, place: Array, ground: PlacementGround | None) -> Array:
-        """Return the place in the region that is nearest in the plan, at the nearest height."""
+        """Return the place (d,) in the region, metres, that is nearest in the plan, at the nearest height."""
         flat = place[:2].copy()
         if (self.edges @ flat > self.offsets).any():
             from scipy.optimize import LinearConstraint, minimize

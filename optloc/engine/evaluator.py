@@ -5,8 +5,8 @@ Each function of this module is a placeholder for a kernel of the same name in a
 kind. `evaluated_by` replaces the placeholders and compiles a kernel for one evaluator, so that the choice costs no time
 while the machine code runs.
 
-A block has W problems, one in each lane. `rows` are the rows of the evaluator, after `keep` with their memory. `room`
-is the workspace of the block; names in capitals, such as X or SOLVABLE, are rows of its arrays, see
+A block has W problems, one in each lane. `rows` are the rows of the evaluator; the function `keep` adds their memory.
+`room` is the workspace of the block; names in capitals, such as X or SOLVABLE, are rows of its arrays, see
 `optloc.engine.memory.EngineWorkspace`.
 """
 

@@ -182,7 +182,7 @@ def compiling(tell: Callable[[str, bool], None]) -> Iterator[None]:
 
 
 def _listen(tell: Callable[[str, bool], None]) -> Callable[[], None]:
-    """Register `tell(name, done)` for compilations, and return the function that removes it."""
+    """Register a listener `tell(name, done)` for compilations, and return the function that removes it."""
     from numba.core import event
 
     events: Any = event  # without types

@@ -78,9 +78,9 @@ def _evaluate(
 ) -> None:
     """Write the equations of a run at its vector x (n + k l,) to `out`.
 
-    Each lane evaluates one epoch. The equations of the shared unknowns are summed; those of the local unknowns are
-    stored for the elimination. `item` is the number of the run, `epochs` is k. If `priors` is True, Gaussian priors are
-    added.
+    Each lane evaluates one epoch. The equations of the shared unknowns are summed. The equations of the local unknowns
+    are stored for the elimination. `item` is the number of the run, `epochs` is k. If `priors` is True, Gaussian priors
+    are added.
     """
     t, c = packed
     n, local, lanes = t.shared, t.local, m.shape[1]

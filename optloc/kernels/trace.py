@@ -361,14 +361,14 @@ def evaluate(tape: Tape, inputs: dict[int, Any]) -> list[Any]:
 
     Tests compare the compiled interpreter with this function.
     """
-    own: list[Any] = [0.0] * tape.registers
+    values: list[Any] = [0.0] * tape.registers
     for seed, register in tape.inputs:
-        own[register] = inputs[seed]
+        values[register] = inputs[seed]
     for register, value in tape.constants:
-        own[register] = value
+        values[register] = value
     for operation, target, left, right in tape.code.tolist():
-        own[target] = operate(operation, own[left], own[right])
-    return [own[register] for register in tape.outputs]
+        values[target] = operate(operation, values[left], values[right])
+    return [values[register] for register in tape.outputs]
 
 
 @dataclass(frozen=True, slots=True)

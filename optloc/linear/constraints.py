@@ -299,7 +299,7 @@ def is_corner(problem: Problem, face: Face) -> bool:
 
 
 def is_held(problem: Problem, face: Face, x: Array, descent: Array) -> Array:
-    """Return (N,) whether each minimum along a face (N, size) is a constrained minimum: the cost grows inwards.
+    """Return whether each minimum along a face (N,) is a constrained minimum: the cost increases into the region.
 
     Parameters
     ----------

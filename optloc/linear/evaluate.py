@@ -58,7 +58,7 @@ class Feed:
     def table(self, count: int) -> tuple[Array, Array]:
         """Return column and factor, each (count,), for all rows of the block.
 
-        The factor is zero for rows without it.
+        The factor is zero for rows without this contribution.
         """
         # Column zero with factor zero for the other rows: a gather needs a valid column.
         column, gain = np.zeros(count, dtype=np.int64), np.zeros(count)
