@@ -1,8 +1,8 @@
 r"""Linear algebra of small matrices in batches, for most problems of this package.
 
-Every product is a fixed chain of elementwise operations: an item that is singular or not finite changes no bit of its
-neighbours, and problems of three or four unknowns cost no call per matrix. Two layouts occur. Geometry keeps the batch
-in front and the vector on the last axis. The squared-range solvers keep the *batch on the last axis*, so that every
+Every product is a fixed chain of elementwise operations. So an item that is singular or not finite changes no bit of
+its neighbours, and no function is called for each matrix. There are two layouts. Geometry has the batch on the first
+axes and the vector on the last axis. The squared-range solvers have the *batch on the last axis*, so that every
 operation of a small matrix runs along contiguous memory.
 
 Sources: textbook formulas; the bordered system is the one of a Newton step on the optimality conditions, J. Nocedal
@@ -29,7 +29,7 @@ _CORRECTION = 1e-2
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return the inner products along the last axis.
+    """Return the inner products of vectors along the last axis.
 
     Parameters
     ----------
@@ -63,7 +63,9 @@ def flatten(value: ArrayLike, last: tuple[int, ...], lead: tuple[int, ...]) -> A
 
 
 def span(when: Array, heard: Mask) -> tuple[Array, Array]:
-    """Return the middle and the half length of the observed times, so that powers of scaled times are of order one.
+    """Return the middle and the half length of the observed times; polynomials use times relative to them.
+
+    Scaled powers of time are then of order one.
 
     Parameters
     ----------
@@ -79,9 +81,9 @@ def span(when: Array, heard: Mask) -> tuple[Array, Array]:
     """
     first = np.min(np.where(heard, when, np.inf), axis=-1, keepdims=True)
     last = np.max(np.where(heard, when, -np.inf), axis=-1, keepdims=True)
-    some = last >= first
-    half = np.where(some, 0.5 * (last - first), 0.0)
-    return np.where(some, 0.5 * (first + last), 0.0), np.where(half > 0.0, half, 1.0)
+    any_time = last >= first
+    half = np.where(any_time, 0.5 * (last - first), 0.0)
+    return np.where(any_time, 0.5 * (first + last), 0.0), np.where(half > 0.0, half, 1.0)
 
 
 def uncentre(c: Array, middle: Array, half: Array) -> Array:
@@ -110,7 +112,7 @@ def uncentre(c: Array, middle: Array, half: Array) -> Array:
 
 
 def normal(B: Array, g: Array) -> tuple[Array, Array]:
-    """Return ``B'B`` and ``B'g``.
+    """Return the normal equations of rows: the matrix ``B'B`` and the right side ``B'g``.
 
     Parameters
     ----------
@@ -199,6 +201,8 @@ def eigen(S: Array) -> tuple[Array, Array]:
 def bordered(D: Array, q: Array, corner: float | Array, right: Array, last: Array) -> Array:
     """Return the solution v of ``[diag D, q; q', corner] (v, .) = (right, last)``, in which one entry of D may vanish.
 
+    Newton steps on a constrained minimum have this form. Only v is returned, not the last unknown.
+
     Parameters
     ----------
     D, q, right : Array, shape (n, K, N)
@@ -217,13 +221,13 @@ def bordered(D: Array, q: Array, corner: float | Array, right: Array, last: Arra
     """
     # Elimination divides by the entries of D; the entry with the largest q^2 / |D| is eliminated by the border instead.
     pivot = np.argmax(q * q / np.abs(D), axis=0)[None]
-    own, edge = np.take_along_axis(D, pivot, axis=0)[0], np.take_along_axis(q, pivot, axis=0)[0]
-    share = q * own / D
-    np.put_along_axis(share, pivot, edge[None], axis=0)
-    multiplier = ((share * right).sum(axis=0) - last * own) / ((share * q).sum(axis=0) - corner * own)
+    pivot_entry, pivot_border = np.take_along_axis(D, pivot, axis=0)[0], np.take_along_axis(q, pivot, axis=0)[0]
+    share = q * pivot_entry / D
+    np.put_along_axis(share, pivot, pivot_border[None], axis=0)
+    multiplier = ((share * right).sum(axis=0) - last * pivot_entry) / ((share * q).sum(axis=0) - corner * pivot_entry)
     out = (right - multiplier * q) / D
     np.put_along_axis(out, pivot, 0.0, axis=0)
-    rest = (last - corner * multiplier - (q * out).sum(axis=0)) / edge
+    rest = (last - corner * multiplier - (q * out).sum(axis=0)) / pivot_border
     np.put_along_axis(out, pivot, rest[None], axis=0)
     return np.asarray(out)
 
@@ -241,5 +245,5 @@ def correct(y: Array, move: Array) -> Array:
     Array, shape (n, K, N)
         ``y + move`` or ``y``.
     """
-    good = np.abs(move).max(axis=0) <= _CORRECTION * np.abs(y).max(axis=0)
-    return np.where(good, y + move, y)
+    short = np.abs(move).max(axis=0) <= _CORRECTION * np.abs(y).max(axis=0)
+    return np.where(short, y + move, y)

@@ -91,7 +91,7 @@ _ENDINGS: ContextVar[list[Ending] | None] = ContextVar("endings", default=None)
 
 
 def choice_for(kind: Kind) -> Choice | None:
-    """Return the choice that is valid for a kind of program, None for the default of the formulation."""
+    """Return the choice that is valid for a kind of program in this thread; None for the default of the formulation."""
     choice = _CHOICE.get()
     return choice if choice is not None and choice.kind == kind else None
 
@@ -132,7 +132,7 @@ def recording() -> Iterator[list[Ending]]:
 
 
 def failures() -> tuple[Ending, ...]:
-    """Return the failed solves in the list of the innermost `recording`."""
+    """Return the endings of failed solves in the list of the innermost `recording`; () outside of `recording`."""
     return tuple(ending for ending in _ENDINGS.get() or () if not ending.found)
 
 

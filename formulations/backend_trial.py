@@ -30,8 +30,11 @@ _RANGES = np.sqrt(((_PLACE - _STATION) ** 2).sum(1))
 _NEAR = 1e-2
 
 
-def _conic(name: str) -> str:
-    """Return the failure of a conic solver, or "" if it works."""
+def _conic_failure(name: str) -> str:
+    """Return the failure of a conic solver, or "" if it works.
+
+    The solver must solve a program with a known position, and must not report a common point of cones that do not meet.
+    """
     from formulations.minimax_cone import common
     from formulations.squared_range import paraboloid
     from formulations.squared_range_conic import hull, shor
@@ -52,8 +55,11 @@ def _conic(name: str) -> str:
     return ""
 
 
-def _nonlinear(name: str) -> str:
-    """Return the failure of a nonlinear solver, or "" if it works."""
+def _nonlinear_failure(name: str) -> str:
+    """Return the failure of a nonlinear solver, or "" if it works.
+
+    The solver must solve programs with a known position, and must not report success for programs without a solution.
+    """
     free, held = _solve(name), _solve(name, inequalities=lambda x, p: [0.5 - x[0]])
     if isinstance(free, str) or isinstance(held, str):
         return str(free if isinstance(free, str) else held)
@@ -75,12 +81,16 @@ def _nonlinear(name: str) -> str:
 
 
 def _solve(name: str, start: Array | None = None, ranges: Array = _RANGES, **constraints: Callable[..., Any]) -> Any:
-    """Return the solution of a solver, or the message of its failure."""
+    """Return the solution of the nonlinear solver `name` for the position (2,), or the message of its failure.
+
+    `constraints` are the equalities and inequalities of `formulations.nls.Program`. `ranges` (3,) are the measurements.
+    """
     import casadi as ca
 
     from formulations.nls import Program
 
     def residual(x: Any, p: Any, z: Any) -> list[Any]:
+        """Return measured minus predicted ranges."""
         return [z[i] - ca.sqrt((x[0] - s[0]) ** 2 + (x[1] - s[1]) ** 2) for i, s in enumerate(_STATION.tolist())]
 
     try:
@@ -90,10 +100,10 @@ def _solve(name: str, start: Array | None = None, ranges: Array = _RANGES, **con
         return str(trouble).partition("\n")[0]
 
 
-def _tried(kind: str, name: str) -> str:
+def _failure_of(kind: str, name: str) -> str:
     """Return the failure of a solver of a kind, "conic" or "nonlinear", or "" if it works."""
     try:
-        return _conic(name) if kind == "conic" else _nonlinear(name)
+        return _conic_failure(name) if kind == "conic" else _nonlinear_failure(name)
     except Exception as trouble:  # noqa: BLE001  (any exception of a solver is its failure)
         return f"{type(trouble).__name__}: {trouble}".partition("\n")[0]
 
@@ -111,11 +121,13 @@ def main(seconds: float, choices: list[str]) -> None:
     lines = os.fdopen(os.dup(1), "w", encoding="utf-8")
 
     def say(word: str, name: str, fault: str) -> None:
+        """Print one result line."""
         # solvers print to the same stream, perhaps without a line end
         lines.write(f"\n{word} {name} {fault}\n")
         lines.flush()
 
     def stop(name: str) -> None:
+        """Print the failure of a solver that did not end in time, and end the process."""
         say(FAILED, name, f"it does not end within {seconds:g} s on a program of two unknowns")
         os._exit(0)
 
@@ -124,7 +136,7 @@ def main(seconds: float, choices: list[str]) -> None:
         timer = Timer(seconds, stop, (name,))
         timer.daemon = True
         timer.start()
-        fault = _tried(kind, name)
+        fault = _failure_of(kind, name)
         timer.cancel()
         say(FAILED if fault else PASSED, name, fault)
 

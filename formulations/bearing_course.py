@@ -5,13 +5,15 @@ A target at :math:`p(t) = \sum_j c_j t^j`, seen at time t from S with azimuth A 
 .. math:: g^\top \Bigl(\sum_j c_j t^j - S\Bigr) = 0, \quad g_A = (\sin A, -\cos A, 0), \quad
    g_E = (\sin E \cos A, \sin E \sin A, -\cos E),
 
-with errors :math:`\rho \sin n_A` and, to first order, :math:`D n_E` (horizontal and slant range). With rows
-:math:`G_{kj} = t_k^j g_k`, right sides :math:`b = g^\top S` and weights W:
+with errors :math:`\rho \sin n_A` and, to first order, :math:`D n_E`. Here :math:`n_A` and :math:`n_E` are the errors of
+the angles, :math:`\rho` is the horizontal range and D the slant range. With rows :math:`G_{kj} = t_k^j g_k`, right
+sides :math:`b = g^\top S` and weights W:
 
 - *plain*: :math:`\min |W_0 (G c - b)|^2`, :math:`W_0 = 1/\sigma`;
-- *weighted*: the same with :math:`1/(\rho \sigma_A)`, :math:`1/(D \sigma_E)` on the course before;
-- *instrumental*: :math:`Z^\top W^2 (G c - b) = 0`, `Z` being `G` at the angles predicted by the weighted course. A run
-  has many rays, and the noise in `G` is what biases the first two, more than it scatters them; `Z` does not share it.
+- *weighted*: the same with the weights :math:`1/(\rho \sigma_A)`, :math:`1/(D \sigma_E)` at the previous course;
+- *instrumental*: :math:`Z^\top W^2 (G c - b) = 0`, with the instruments `Z`: the rows `G` at the angles that the
+  weighted course predicts. The noise in `G` biases the first two courses. In a run of many rays, this bias is larger
+  than the scatter. `Z` does not contain the noise.
 
 No epoch needs enough rows for a separate fix: one station that manoeuvres may be enough.
 
@@ -58,7 +60,13 @@ class BearingCourses:
 
 @dataclass(frozen=True, slots=True)
 class _CourseRun:
-    """The data of a fit: stations (N, m, d), axes, powers of the times (N, m, order + 1), rows and right sides."""
+    """The data of a fit of N courses to m bearings each, in d dimensions.
+
+    `station` (N, m, d) are the positions, `axes` the axes of the stations (None: the axes of the frame). `powers` (N,
+    m, order + 1) are the powers of the scaled times. `normal` (N, rows, d) are the vectors g, `right` (N, rows) the
+    right sides. `both` is True if elevations follow the azimuths, so that there are 2 m rows. `least` (N, 1) is the
+    shortest range in a weight.
+    """
 
     station: Array
     axes: Array | None
@@ -69,16 +77,16 @@ class _CourseRun:
     least: Array
 
     def design(self, normal: Array) -> Array:
-        """Return the rows G, shape (N, rows, n), made of normals (N, rows, d)."""
+        """Return the rows G (N, rows, n) of the n course coefficients, made of normals (N, rows, d)."""
         powers = np.concatenate([self.powers, self.powers], axis=1) if self.both else self.powers
         return (powers[..., :, None] * normal[..., None, :]).reshape(*normal.shape[:2], -1)
 
     def line(self, c: Array) -> Array:
-        """Return the lines of sight (N, m, d) to a course, in the frame of the stations."""
+        """Return the lines of sight (N, m, d) to a course c (N, order + 1, d), in the frame of the stations."""
         return np.asarray(self.powers @ c - self.station)
 
     def own(self, c: Array) -> Array:
-        """Return the lines of sight (N, m, d) to a course, in the axes of each station."""
+        """Return the lines of sight (N, m, d) to a course c, in the axes of each station."""
         return self.line(c) if self.axes is None else np.einsum("nmij,nmj->nmi", self.axes, self.line(c))
 
 
@@ -137,14 +145,14 @@ def sight_courses(
         middle, half = span(when, use)
         powers = ((when - middle) / half)[..., None] ** np.arange(order + 1.0)
         seen = rays(A, E if both else None, axes)
-        run = _run(S, axes, powers, seen, both)
+        run = _course_run(S, axes, powers, seen, both)
         G = run.design(run.normal)
-        c = plain = _balance(G, G, run.right, W, order)
+        c = plain = _weighted_solution(G, G, run.right, W, order)
         for _ in range(passes):
-            c = _balance(G, G, run.right, W / lengths(run.own(c), run.least), order)
+            c = _weighted_solution(G, G, run.right, W / lengths(run.own(c), run.least), order)
         own = run.own(c)
         instruments = run.design(look(own, axes).normals)
-        final = _balance(instruments, G, run.right, W / lengths(own, run.least), order)
+        final = _weighted_solution(instruments, G, run.right, W / lengths(own, run.least), order)
         # a bearing and its opposite give the same row, so the side of the target is checked here
         front = dot(run.line(final), seen.ahead) > 0.0
         ok = np.asarray(np.isfinite(final).all(axis=(-2, -1)))
@@ -152,8 +160,8 @@ def sight_courses(
     return BearingCourses(three[0], three[1], three[2], ok, ok & (front | ~use).all(axis=-1))
 
 
-def _run(S: Array, axes: Array | None, powers: Array, seen: BearingRays, both: bool) -> _CourseRun:
-    """Return the data of a fit, with the least range in a weight."""
+def _course_run(S: Array, axes: Array | None, powers: Array, seen: BearingRays, both: bool) -> _CourseRun:
+    """Return the data of a fit, see `_CourseRun`; `seen` are the directions of sight."""
     normal = seen.normals
     right = dot(normal, np.concatenate([S, S], axis=1) if both else S)
     size = np.sqrt(dot(S, S)).max(axis=-1, keepdims=True)
@@ -161,8 +169,12 @@ def _run(S: Array, axes: Array | None, powers: Array, seen: BearingRays, both: b
     return _CourseRun(S, axes, powers, normal, right, both, np.maximum(_NEAR * size, 1e-300))
 
 
-def _balance(Z: Array, G: Array, b: Array, W: Array, order: int) -> Array:
-    """Return the solution (N, order + 1, d) of ``Z' W^2 (G c - b) = 0``; NaN if it is not unique."""
+def _weighted_solution(Z: Array, G: Array, b: Array, W: Array, order: int) -> Array:
+    """Return the solution c (N, order + 1, d) of ``Z' W^2 (G c - b) = 0``; NaN if it is not unique.
+
+    Z (N, rows, n) are the instruments, G the rows, b the right sides, W (N, rows) the weights. With Z = G it is
+    weighted least squares.
+    """
     n = G.shape[-1]
     # triangularised, not squared: an orthonormal base of the instruments' columns replaces Z' W
     share = np.where(W > 0.0, W / W.max(axis=-1, keepdims=True), 0.0)[..., None]

@@ -4,14 +4,15 @@ A station S with azimuth A and elevation E (in its own axes) sees p in two plane
 
 .. math:: g_A = (\sin A, -\cos A, 0), \quad g_E = (\sin E \cos A, \sin E \sin A, -\cos E), \qquad g^\top (p - S) = 0,
 
-with errors :math:`\rho \sin n_A` and, to first order, :math:`D n_E` (horizontal and slant range); in the plane only
-the first row. With rows `G`, right sides :math:`b = g^\top S` and weights `W`:
+with errors :math:`\rho \sin n_A` and, to first order, :math:`D n_E`. Here :math:`n_A` and :math:`n_E` are the errors of
+the angles, :math:`\rho` is the horizontal range and D the slant range. In the plane there is only the first row. With
+rows `G`, right sides :math:`b = g^\top S` and weights `W`:
 
 - *plain*: :math:`\min |W_0 (G p - b)|^2`, :math:`W_0 = 1/\sigma`;
-- *weighted*: the same with :math:`1/(\rho \sigma_A)`, :math:`1/(D \sigma_E)` at the fix before;
-- *instrumental*: :math:`Z^\top W^2 (G p - b) = 0`, `Z` being `G` at the angles predicted by the weighted fix. The
-  noise in `G` is what biases the first two (with many rays towards the stations, by about :math:`-(G^\top G)^{-1}
-  \sum \sigma^2 (\rho u_h + D u)`); `Z` does not share it.
+- *weighted*: the same with the weights :math:`1/(\rho \sigma_A)`, :math:`1/(D \sigma_E)` at the previous fix;
+- *instrumental*: :math:`Z^\top W^2 (G p - b) = 0`, with the instruments `Z`: the rows `G` at the angles that the
+  weighted fix predicts. The noise in `G` biases the first two fixes: with many rays, towards the stations by about
+  :math:`-(G^\top G)^{-1} \sum \sigma^2 (\rho u_h + D u)`. `Z` does not contain the noise.
 
 Source: K. Dogancay, "Bias compensation for the bearings-only pseudolinear target track estimator", IEEE Trans. Signal
 Process. 54 (2006), and "3D pseudolinear target motion analysis from angle measurements", IEEE Trans. Signal Process.
@@ -176,11 +177,11 @@ def sight(
         G, W = seen.normals, np.concatenate([wA, wE], axis=-1) if E is not None else wA
         own = np.concatenate([S, S], axis=-2) if E is not None else S
         b = dot(G, own)
-        point = plain = _balance(G, G, b, W)
+        point = plain = _weighted_solution(G, G, b, W)
         for _ in range(passes):
-            point = _balance(G, G, b, W / lengths(_local(point, S, turn), least))
-        line = _local(point, S, turn)
-        final = _balance(look(line, turn).normals, G, b, W / lengths(line, least))
+            point = _weighted_solution(G, G, b, W / lengths(_lines_in_axes(point, S, turn), least))
+        line = _lines_in_axes(point, S, turn)
+        final = _weighted_solution(look(line, turn).normals, G, b, W / lengths(line, least))
         # an azimuth and its opposite give the same row, so the side of the target is checked here
         front = dot(final[..., None, :] - S, seen.ahead) > 0.0
     ok = np.asarray(np.isfinite(final).all(axis=-1))
@@ -209,7 +210,7 @@ def predict(point: Array, station: Array, axes: ArrayLike | None = None) -> Arra
     -----
     Plain geometry.
     """
-    line = _local(point, station, None if axes is None else np.asarray(axes, dtype=np.float64))
+    line = _lines_in_axes(point, station, None if axes is None else np.asarray(axes, dtype=np.float64))
     flat = np.hypot(line[..., 0], line[..., 1])
     return np.stack([np.arctan2(line[..., 1], line[..., 0]), np.arctan2(line[..., 2], flat)], axis=-1)
 
@@ -284,14 +285,20 @@ def lengths(line: Array, least: Array) -> Array:
     return flat if line.shape[-1] == 2 else np.concatenate([flat, np.hypot(flat, line[..., 2])], axis=-1)
 
 
-def _local(point: Array, S: Array, turn: Array | None) -> Array:
-    """Return the lines of sight to a point, in the axes of each station."""
+def _lines_in_axes(point: Array, S: Array, turn: Array | None) -> Array:
+    """Return the lines of sight (..., N, d) from stations S to a point, in the axes of each station.
+
+    `turn` (..., N, d, d) are the axes; None: the axes of the frame.
+    """
     line = point[..., None, :] - S
     return line if turn is None else np.einsum("...ij,...j->...i", turn, line)
 
 
-def _balance(Z: Array, G: Array, b: Array, W: Array) -> Array:
-    """Return the solution of ``Z' W^2 (G p - b) = 0``, with one step of refinement; NaN if it is not unique."""
+def _weighted_solution(Z: Array, G: Array, b: Array, W: Array) -> Array:
+    """Return the solution p (..., d) of ``Z' W^2 (G p - b) = 0``, with one step of refinement; NaN if it is not unique.
+
+    Z are the instruments, G the rows, b the right sides, W the weights. With Z = G it is weighted least squares.
+    """
     left = Z * np.where(W > 0.0, W / W.max(axis=-1, keepdims=True), 0.0)[..., None] ** 2
     inverse = _inverse(np.einsum("...ki,...kj->...ij", left, G))
     point = np.zeros(inverse.shape[:-1])
@@ -303,7 +310,7 @@ def _balance(Z: Array, G: Array, b: Array, W: Array) -> Array:
 
 
 def _inverse(M: Array) -> Array:
-    """Return the inverse of 2 x 2 or 3 x 3 matrices by cofactors; NaN if singular."""
+    """Return the inverse of matrices (..., 2, 2) or (..., 3, 3) by cofactors; NaN if singular."""
     if M.shape[-1] == 2:
         first, second = M[..., 0, :], M[..., 1, :]
         columns = np.stack(

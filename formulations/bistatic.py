@@ -5,16 +5,16 @@ With :math:`d = |A|`, unit direction u and excess path :math:`l = r + |r u - A| 
 .. math:: r = \frac{l^2 + 2 d l}{2\,[\,d - u^\top A + l\,]}, \qquad
    \frac{\partial l}{\partial r} = 1 + \frac{r - u^\top A}{|r u - A|} \ge 0.
 
-Between the receiver and the illuminator l vanishes and with it the slope: the quotient is 0/0 there.
+Between the receiver and the illuminator, l and the slope are zero, so that the quotient is 0/0.
 
 A target :math:`p(t) = \sum_k c_k t^k` meets, exactly and linearly in c,
 
 .. math:: e_1^\top p = 0, \quad e_2^\top p = 0, \quad (u - A/L)^\top p = \frac{L^2 - d^2}{2 L}, \qquad L = l + d,
 
 with :math:`e_1, e_2` normal to u; for angle errors :math:`\sigma_1, \sigma_2` and path error :math:`\sigma_l` the rows
-have the deviations :math:`r \sigma_1`, :math:`r \sigma_2` and, to first order, :math:`\sigma_l |p - A| / L`. The second
-order, :math:`r \delta^2 / 2` for an angle error :math:`\delta`, must be added to the last: a path weighted too
-well turns the errors of u in its row into information about the direction.
+have the deviations :math:`r \sigma_1`, :math:`r \sigma_2` and, to first order, :math:`\sigma_l |p - A| / L`. An angle
+error :math:`\delta` changes the last row by :math:`r \delta^2 / 2` in second order, which must be added to its
+deviation. Otherwise a precise path would turn the errors of u in its row into wrong information about the direction.
 
 Source: M. I. Skolnik, "An analysis of bistatic radar", IRE Trans. Aerosp. Navig. Electron. ANE-8 (1961) (the ellipse);
 the linear rows are its polar equation.
@@ -187,32 +187,37 @@ def course(
     with np.errstate(all="ignore"):
         d = np.sqrt(dot(A, A))[:, None]
         L = path + d
-        heard = np.isfinite(L + when + e.sum(axis=(-2, -1))) & (L > 0.0)
-        present = heard[..., None] & (deviation > 0.0) & np.isfinite(deviation)
-        heard &= present.any(axis=-1)
-        middle, spread = span(when, heard)
-        powers = np.where(heard, (when - middle) / spread, 0.0)[..., None] ** np.arange(order + 1.0)
+        usable = np.isfinite(L + when + e.sum(axis=(-2, -1))) & (L > 0.0)
+        present = usable[..., None] & (deviation > 0.0) & np.isfinite(deviation)
+        usable &= present.any(axis=-1)
+        middle, spread = span(when, usable)
+        powers = np.where(usable, (when - middle) / spread, 0.0)[..., None] ** np.arange(order + 1.0)
         normals = np.concatenate([e[:, :, :2], (e[:, :, 2] - A[:, None] / L[..., None])[:, :, None, :]], axis=2)
         normals = np.where(present[..., None], normals, 0.0)
         right = np.where(present, [0.0, 0.0, 1.0] * ((L * L - d * d) / (2.0 * L))[..., None], 0.0)
-        # An angle error shortens u'p by half its square, which is not small compared with a good path. Added is the
-        # root of the second moment of half the sum of two squared normal errors, (3 s1^4 + 3 s2^4 + 2 s1^2 s2^2) / 4.
+        # An angle error shortens u'p by half its square, which is not small compared with the error of a precise path.
+        # The added term is the root of the second moment of half the sum of two squared normal errors. This moment is
+        # (3 s1^4 + 3 s2^4 + 2 s1^2 s2^2) / 4 for deviations s1 and s2.
         square = np.where(present[..., :2], deviation[..., :2], 0.0) ** 2
         bend = 0.5 * np.sqrt(3.0 * (square**2).sum(axis=-1) + 2.0 * square.prod(axis=-1))
         far = across = 0.5 * L
         for _ in range(_PASSES):
             path_row = np.hypot(across / L * deviation[..., 2], far * bend)
             scale = np.stack([far * deviation[..., 0], far * deviation[..., 1], path_row], axis=-1)
-            c, ok = _fit(normals, right, powers, np.where(present, 1.0 / scale, 0.0))
+            c, ok = _fit_course(normals, right, powers, np.where(present, 1.0 / scale, 0.0))
             p = np.einsum("nkj,nji->nki", powers, c)
             far, across = np.sqrt(dot(p, p)), np.sqrt(dot(p - A[:, None], p - A[:, None]))
-        ok &= ((dot(p, e[:, :, 2]) > 0.0) | ~heard).all(axis=-1)
+        ok &= ((dot(p, e[:, :, 2]) > 0.0) | ~usable).all(axis=-1)
         c = np.where(ok[:, None, None], uncentre(c, middle, spread), np.nan)
     return BistaticCourse(c.reshape(*lead, order + 1, 3), ok.reshape(lead))
 
 
-def _fit(normals: Array, right: Array, powers: Array, weight: Array) -> tuple[Array, Mask]:
-    """Return the weighted least-squares solution (N, order + 1, 3), and whether the system has full rank."""
+def _fit_course(normals: Array, right: Array, powers: Array, weight: Array) -> tuple[Array, Mask]:
+    """Return the weighted least-squares course (N, order + 1, 3), and whether the system has full rank (N,).
+
+    Each epoch has three rows: `normals` (N, k, 3, 3), right sides and weights (N, k, 3). `powers` (N, k, order + 1) are
+    powers of the time; `weight` is one over the standard deviation.
+    """
     count, order = len(right), powers.shape[-1]
     n = 3 * order
     B = powers[:, :, None, :, None] * (normals * weight[..., None])[:, :, :, None]

@@ -119,7 +119,7 @@ class Relaxation:
 
     @property
     def _data(self) -> Data | None:
-        """Return the data of this thread."""
+        """Return the numbers of this thread, copied at its first use; None if the back end is not Clarabel."""
         if self._shared is None:
             return None
         if not hasattr(self._own, "data"):
@@ -151,14 +151,14 @@ class Relaxation:
         backend, settings = (self.backend, self.settings) if choice is None else (choice.name, dict(choice.settings))
         if data is None or backend != "CLARABEL":
             with _CVXPY:
-                answer = self._elsewhere(values, backend, settings)
+                answer = self._solve_by_cvxpy(values, backend, settings)
         else:
-            answer = self._directly(data, values, {**self.settings, **settings}, bound=bound, reach=reach)
+            answer = self._solve_by_clarabel(data, values, {**self.settings, **settings}, bound=bound, reach=reach)
         count(backend, answer.iterations)
         record(Ending(backend, answer.status, answer.message, bool(np.isfinite(answer.primal))))
         return answer
 
-    def _directly(
+    def _solve_by_clarabel(
         self,
         data: Data,
         values: Mapping[str, Array],
@@ -188,12 +188,13 @@ class Relaxation:
         primal = 0.5 * quadratic + float(data.q @ at) + data.d
         return ConicAnswer(data.recover(at), primal, low, status, status == "Solved", int(solution.iterations))
 
-    def _elsewhere(self, values: Mapping[str, Array], backend: str, settings: Mapping[str, Any]) -> ConicAnswer:
+    def _solve_by_cvxpy(self, values: Mapping[str, Array], backend: str, settings: Mapping[str, Any]) -> ConicAnswer:
+        """Return the solution by another back end through cvxpy; it has no lower bound."""
         import cvxpy
 
         for name, value in values.items():
             self.parameters[name].value = value
-        _forget(self.problem)
+        _clear_values(self.problem)
         status, message = cvxpy.settings.SOLVER_ERROR, ""
         try:
             with warnings.catch_warnings():
@@ -219,8 +220,8 @@ class Relaxation:
         return ConicAnswer(point, primal, -np.inf, status, good and status == cvxpy.OPTIMAL, iterations, message)
 
 
-# Statuses of Clarabel with a solution: its tolerances are met, or its reduced ones (5e-5 of the gap, 1e-4 of
-# feasibility), which it also checks if it stops at a limit or makes no progress.
+# Statuses of Clarabel with a solution: its tolerances are met, or its reduced tolerances (5e-5 of the gap, 1e-4 of
+# feasibility). It also checks them if it stops at a limit or makes no progress.
 _MET = ("Solved", "AlmostSolved")
 # For a second attempt if the factorisation lost its digits: ten times the default of 1e-8. Relaxations of Doppler
 # shifts of satellites then meet the full tolerances, with a third more iterations.
@@ -230,7 +231,7 @@ _REGULAR = {"static_regularization_constant": 1e-7}
 _REDUCED = ("ECOS", "QOCO")
 
 
-def _forget(problem: Any) -> None:
+def _clear_values(problem: Any) -> None:
     """Remove the values of the previous solve from a cvxpy problem, because a failed solve does not overwrite them."""
     for variable in problem.variables():
         variable.save_value(None)
@@ -240,6 +241,7 @@ def _forget(problem: Any) -> None:
 
 
 def _solver(data: Data, settings: Mapping[str, Any]) -> Any:
+    """Return a Clarabel solver for the data, with settings that keep the dual point valid for the bound."""
     import clarabel
 
     own = clarabel.DefaultSettings()
@@ -266,6 +268,7 @@ def keep(build: Callable[_Arguments, _Built]) -> Callable[_Arguments, _Built]:
     """
 
     def alone(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Built:
+        """Build while no other thread uses cvxpy."""
         with _CVXPY:
             return build(*args, **kwargs)
 
@@ -275,6 +278,7 @@ def keep(build: Callable[_Arguments, _Built]) -> Callable[_Arguments, _Built]:
 
     @wraps(build)
     def once(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Built:
+        """Return the cached result, and build it at the first call."""
         with lock:
             return cached(*args, **kwargs)  # type: ignore[arg-type]  # arguments are hashable
 
@@ -409,7 +413,7 @@ class Data:
             self.P.data[:] = self._quadratic(self.vector)[self._upper]
 
     def twin(self) -> Data:
-        """Return the same problem with separate arrays, for another thread."""
+        """Return the same problem with separate arrays, for another thread; the affine maps are shared."""
         other = copy(self)
         other.vector, other.A = self.vector.copy(), self.A.copy()
         other.P = self.P.copy()
@@ -418,18 +422,7 @@ class Data:
         return other
 
     def square(self, x: Array) -> Array:
-        """Return ``Px`` from the stored upper triangle.
-
-        Parameters
-        ----------
-        x : Array, shape (n,)
-            A point.
-
-        Returns
-        -------
-        Array, shape (n,)
-            The product.
-        """
+        """Return the product ``P x`` (n,) from the stored upper triangle."""
         if self._quadratic is None:
             return np.zeros_like(x)
         return self.below(x) + self.above(x, self._ridge)
@@ -461,24 +454,16 @@ class Data:
         return self.d - 0.5 * float(x @ product) - float(self.b @ z) - reach * float(np.sqrt(rest @ rest))
 
     def recover(self, x: Array) -> dict[str, Array]:
-        """Return the values of the variables by name at a point of the solver.
-
-        Parameters
-        ----------
-        x : Array, shape (n,)
-            The point.
-
-        Returns
-        -------
-        dict[str, Array]
-            One array for each variable.
-        """
+        """Return the values of the variables by name at a point x (n,) of the solver, one array for each variable."""
         return {name: (matrix @ x).reshape(shape, order="F") for name, matrix, shape in self._recover}
 
 
 @dataclass(frozen=True, slots=True)
 class _Product:
-    """Products with a sparse matrix; with tens of entries, products of scipy take longer than the solver."""
+    """Products of a sparse matrix with vectors; with tens of entries, products of scipy take longer than the solver.
+
+    Entry i is `data[i]`, in row `row[i]` and column `source[i]`; `size` is the number of rows.
+    """
 
     size: int
     row: Index
@@ -487,7 +472,7 @@ class _Product:
 
     @classmethod
     def of(cls, matrix: Any) -> _Product:
-        """Return the product with a sparse matrix."""
+        """Return the products with a sparse matrix of scipy."""
         entries = matrix.tocoo()
         return cls(matrix.shape[0], entries.row.astype(np.int64), entries.col.astype(np.int64), entries.data)
 
@@ -499,12 +484,16 @@ class _Product:
         return cls(size, column, matrix.indices.astype(np.int64), matrix.data)
 
     def __call__(self, x: Array, share: Array | float = 1.0) -> Array:
+        """Return the product with x, with each entry of the matrix multiplied by `share`."""
         total = np.bincount(self.row, weights=self.data * x[self.source] * share, minlength=self.size)
         return np.asarray(total, dtype=np.float64)
 
 
 def _affine(reduced: Any) -> tuple[_Product, tuple[Index, Index, tuple[int, int]]]:
-    """Return the map from the parameter vector to the stored entries, and their compressed-column pattern."""
+    """Return the map from the parameter vector to the stored entries of a matrix, and their compressed-column pattern.
+
+    The pattern is row indices, column starts, and shape.
+    """
     reduced.cache()
     if reduced.problem_data_index is None:
         raise ValueError("the problem has no constraint")
@@ -512,7 +501,10 @@ def _affine(reduced: Any) -> tuple[_Product, tuple[Index, Index, tuple[int, int]
 
 
 def _recovery(problem: Any, chain: Any, inverse: Any, name: int, n: int) -> list[tuple[str, Array, tuple[int, ...]]]:
-    """Return matrices from the solver's x to each variable, computed by undoing the reductions on unit vectors."""
+    """Return, for each variable, its name, the matrix that maps the solver's x (n,) to it, and its shape.
+
+    cvxpy's reductions (`chain`, with the data `inverse`) are undone on unit vectors. `name` is the id of x.
+    """
     from cvxpy.reductions.solution import Solution
 
     columns: dict[int, list[Array]] = {variable.id: [] for variable in problem.variables()}
@@ -565,7 +557,7 @@ def dual_point(z: Array, dims: Any) -> Array:
 
 
 def _second_order(z: Array) -> Array:
-    """Return the projection on ``z_0 >= |z_1..|``."""
+    """Return the projection of z on the second-order cone ``z_0 >= |(z_1, z_2, ...)|``."""
     size = float(np.linalg.norm(z[1:]))
     if size <= z[0]:
         return z
@@ -576,7 +568,7 @@ def _second_order(z: Array) -> Array:
 
 
 def _semidefinite(z: Array, size: int) -> Array:
-    """Return the projection of a scaled upper triangle, stored column by column, on the semidefinite cone."""
+    """Return the projection of z, a scaled upper triangle by columns, on the cone of `size` x `size` matrices."""
     if not np.isfinite(z).all():
         return z
     column, row, scale = _triangle(size)
@@ -595,6 +587,9 @@ def _semidefinite(z: Array, size: int) -> Array:
 
 @lru_cache(_KEPT)
 def _triangle(size: int) -> tuple[Index, Index, Array]:
-    """Return columns and rows of a stored upper triangle, and the inverse scale of its off-diagonal entries."""
+    """Return columns and rows of a stored upper triangle (`size` x `size`), and the factor of its stored entries.
+
+    The factor gives the entries of the matrix: one on the diagonal, and the root of a half elsewhere.
+    """
     column, row = np.tril_indices(size)
     return column, row, np.where(row == column, 1.0, np.sqrt(0.5))

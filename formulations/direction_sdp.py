@@ -1,15 +1,15 @@
 r"""Bearings as unknown unit directions: a semidefinite relaxation, and a lower bound of the angular ML cost.
 
-Station i at :math:`S_i` measured azimuth and elevation, that is a unit vector :math:`u_i` with tangents
-:math:`a_i`, :math:`e_i`. The unknowns are the unit directions :math:`v_i` themselves,
+Station i at :math:`S_i` measured azimuth and elevation, which are a unit vector :math:`u_i` with tangents :math:`a_i`,
+:math:`e_i`. The unknowns are the unit directions :math:`v_i` themselves,
 
 .. math:: \min \sum_i q_i(v_i) \quad\text{subject to}\quad |v_i| = 1, \quad v_i^\top [S_j - S_i]_\times v_j = 0,
    \quad (S_j - S_i)^\top (v_i - v_j) \ge 0,
 
 the last two for every pair: two lines of sight lie in one plane, and they do not diverge (without this linear
-inequality, rays that meet behind the stations would be accepted). All is quadratic in `v`; with :math:`v_i =
-F_i^\top (e_1 + \sigma w_i)`, the rows of :math:`F_i` being a reference direction and its tangents, the lift :math:`Y
-= (1, w)(1, w)^\top` of size 3N + 1 is relaxed to :math:`Y \succeq 0`.
+inequality, rays that meet behind the stations would be accepted). The problem is quadratic in `v`; with :math:`v_i =
+F_i^\top (e_1 + \sigma w_i)`, the rows of :math:`F_i` being a reference direction and its tangents, the lift :math:`Y =
+(1, w)(1, w)^\top` of size 3N + 1 is relaxed to :math:`Y \succeq 0`.
 
 *Chordal* (a start without a guess): :math:`q_i = (u_i - v_i)^\top W_i (u_i - v_i)`, :math:`W_i = a_i a_i^\top /
 (\sigma_A \cos E)^2 + e_i e_i^\top / \sigma_E^2 + w_r u_i u_i^\top`. Its bound bounds the chordal cost only: on the
@@ -172,7 +172,7 @@ class Minorant:
 
 
 def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minorant:
-    r"""Return the touching quadratics of one fix.
+    r"""Return, for each direction, a quadratic that nowhere exceeds the squared angle errors and equals them at a fix.
 
     Parameters
     ----------
@@ -183,18 +183,16 @@ def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minor
     elevation : Array, shape (N,)
         Elevations predicted by the fix.
     cost : float
-        Total cost of the fix, the square of rho; the bound holds for points with at most this cost.
+        Total cost of the fix, the square of rho; the bound is valid for points with at most this cost.
 
     Returns
     -------
     Minorant
         One quadratic for each direction.
 
-    Notes
-    -----
-    Let :math:`\hat v` (azimuth :math:`\hat A`, elevation :math:`\hat E`) be predicted by a fix, `v` any direction,
-    :math:`\eta = A_v - \hat A`, :math:`\epsilon = E_v - \hat E`, and :math:`\hat\delta`, :math:`\hat\varepsilon` the
-    fix's own errors against the measured angles, so that the cost of `v` is
+    Notes ----- Let :math:`\hat v` (azimuth :math:`\hat A`, elevation :math:`\hat E`) be the direction that a fix
+    predicts, and `v` any direction, with :math:`\eta = A_v - \hat A` and :math:`\epsilon = E_v - \hat E`. The errors of
+    the fix against the measured angles are :math:`\hat\delta` and :math:`\hat\varepsilon`, so that the cost of `v` is
 
     .. math:: f(v) = \frac{(\hat\delta + \eta)^2}{\sigma_A^2} + \frac{(\hat\varepsilon + \epsilon)^2}{\sigma_E^2} .
 
@@ -211,13 +209,13 @@ def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minor
        w_0 |v - \hat v|^2
 
     is at most a multiple of :math:`\eta^2` or :math:`\epsilon^2` (from :math:`|x - \sin x| \le |x|^3/6`, :math:`1 -
-    \cos x \le x^2/2` and the mean value theorem for cos), and the three weights are what is left of :math:`1/\sigma^2`.
-    Hence :math:`q \le f` on the cap and :math:`q(\hat v) = f(\hat v)`. A point with total cost at most :math:`\rho^2`
-    has all its directions in their caps, so the least sum of `q` over any set that holds the best point is at most the
-    least sum of `f`.
+    \cos x \le x^2/2` and the mean value theorem for cos), and the three weights are :math:`1/\sigma^2` less these
+    multiples. Hence :math:`q \le f` on the cap and :math:`q(\hat v) = f(\hat v)`. A point with total cost at most
+    :math:`\rho^2` has all its directions in their caps. So over any set that contains the best point, the least sum of
+    `q` is at most the least sum of `f`.
 
-    Near the zenith, or with caps so wide that a remainder eats a weight, that direction's quadratic is zero: still a
-    minorant. Derived here.
+    Near the zenith, or with wide caps, a remainder may exceed a weight. Then the quadratic of this direction is zero,
+    which is still a minorant. Derived here.
     """
     (dA, dE), (sA, sE), rho = error.T, sigma.T, np.sqrt(cost)
     # the cap: its elevations, the largest cosine and sine among them, and the largest eta and epsilon
@@ -299,7 +297,7 @@ def direction_problem(count: int) -> Any:
 
 @keep
 def _relaxation(count: int, backend: str) -> Relaxation:
-    """Return the relaxation, built once for each size and back end."""
+    """Return the relaxation for `count` directions, built once for each size and back end."""
     # the equalities depend on each other at a solution: with Clarabel's default of 1e-8 one solve in five stops early
     settings = tight(backend, 1e-9, static_regularization_constant=1e-7)
     return Relaxation(direction_problem(count), backend=backend, settings=settings)
@@ -307,7 +305,11 @@ def _relaxation(count: int, backend: str) -> Relaxation:
 
 @dataclass(frozen=True, slots=True)
 class _Cost:
-    """Coefficients in ``v - v^``, and the largest sum of ``|v - v^|^2`` of any relevant point."""
+    """A quadratic cost of N directions: ``constant + 2 linear'w + sum square w^2`` with w the change from a reference.
+
+    `linear` and `square` have the shape (N, 3). `reach` is the largest sum of ``|v - v^|^2`` of any relevant point,
+    with the reference directions v^.
+    """
 
     constant: float
     linear: Array
@@ -316,14 +318,20 @@ class _Cost:
 
 
 def _frames(angle: Array, axes: ArrayLike | None) -> Array:
-    """Return the frames (N, 3, 3) of directions: direction, tangent of azimuth, tangent of elevation."""
+    """Return the frames (N, 3, 3) of directions `angle` (N, 2), radians.
+
+    The rows are the direction, the tangent of azimuth, and the tangent of elevation.
+    """
     seen = rays(angle[:, 0], angle[:, 1], axes)
     assert seen.upward is not None
     return np.stack([seen.ahead, seen.across, seen.upward], axis=1)
 
 
 def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
-    """Return the solution of the relaxation for a quadratic cost."""
+    """Return the solution of the relaxation for a quadratic cost in the frames (N, 3, 3) of the reference directions.
+
+    S (N, 3) are the stations.
+    """
     count = len(S)
     # w in units in which the largest tangent weight is one; otherwise the lift of errors of a milliradian would vanish
     size = float(cost.square[:, 1:].max()) or 1.0

@@ -4,15 +4,15 @@ A node is a station at one epoch: place :math:`s_i`, velocity :math:`v_i`. Range
 
 .. math:: r_i = |x - s_i|, \qquad r_i\, q_i = -(x - s_i) \cdot v_i,
 
-and the rows say :math:`z_m = q_a - q_b + A_m \cdot b + n_m` (without `b` if one station measures the Doppler shift) or
-:math:`z_l = R_l \cdot r + A_l \cdot b + n_l` with unknowns `b`, an offset of the emitter's frequency for instance. A
-row of rates times :math:`r_a` has no quotient left:
+and the rows are :math:`z_m = q_a - q_b + A_m \cdot b + n_m` (without :math:`q_b` if one station measures the Doppler
+shift) or :math:`z_l = R_l \cdot r + A_l \cdot b + n_l` with unknowns `b`, an offset of the emitter's frequency for
+instance. A row of rates times :math:`r_a` has no quotient:
 
 .. math:: \varepsilon_m = r_a n_m = z_m r_a + (x - s_a) \cdot v_a + q_b r_a - A_m \cdot b\, r_a .
 
-With the unknown rates :math:`\beta = (b, q_b)` and the products :math:`w_{ji} = \beta_j r_i` that occur, all of this is
-linear in :math:`y = (1, x, \beta, r, w)`, and the weighted cost, rows of rates divided by ranges :math:`\rho_a` that
-are known from the pass before,
+With the unknown rates :math:`\beta = (b, q_b)` and the products :math:`w_{ji} = \beta_j r_i` that occur, all rows are
+linear in :math:`y = (1, x, \beta, r, w)`. Rows of rates are divided by ranges :math:`\rho_a`, which the previous pass
+gives. The weighted cost,
 
 .. math:: \min_x \; |W \,\mathrm{diag}(1/\rho)\, L\, y|^2,
 
@@ -100,7 +100,7 @@ class Shape:
 
     @property
     def places(self) -> tuple[int, int, int, int]:
-        """Return the first indices of beta, r and w in y, and the length of y."""
+        """Return four indices of y: the first of beta, the first of r, the first of w, and its length."""
         beta = 1 + self.dimension
         r = beta + self.unknowns + len(self.second)
         return beta, r, r + self.nodes, r + self.nodes + len(self.product)
@@ -195,7 +195,7 @@ class DopplerScene:
         rate = float(np.sqrt((speed**2).sum(axis=1).max())) or 1.0
         of_rate = np.asarray(rates.any(axis=1))
         size = np.where(of_rate, rate, length)
-        first, second, sign = _ends(rates, speed)
+        first, second, sign = _nodes_of_rows(rates, speed)
         scaled = design / size[:, None]
         unit = 1.0 / np.maximum(np.abs(scaled).max(axis=0, initial=0.0), np.finfo(float).tiny)
         scaled = scaled * unit
@@ -212,7 +212,11 @@ class DopplerScene:
         return cls(shape, place, speed, rows, first, whiten, own, origin, length, rate, unit, unit * mean)
 
     def parameters(self, far: Array, reach: float) -> tuple[dict[str, Array], float]:
-        """Return the parameters of the programme for the ranges of the previous pass, and the unit of its cost."""
+        """Return the parameters of the programme by name, and the unit of its cost.
+
+        `far` (m,) are the ranges of the previous pass, which divide the rows; `reach` is the greatest distance of the
+        source.
+        """
         form = self.whiten @ (self.rows / far[:, None])
         gram = form.T @ form
         size = float(np.abs(gram).max()) or 1.0
@@ -240,7 +244,7 @@ class DopplerScene:
         return values, size
 
     def longest(self, reach: float) -> float:
-        """Return the greatest length of Y for any source within the reach."""
+        """Return the greatest length of Y for any source within the reach; the bound from the dual needs it."""
         far = reach if self.surface is None else float(np.linalg.eigvalsh(self.surface.shape)[0]) ** -0.5
         r = far + np.sqrt((self.place**2).sum(axis=1))
         slow = np.sqrt((self.speed**2).sum(axis=1))
@@ -330,7 +334,7 @@ def doppler(
     S, V, values, W, R, Q = (np.asarray(part, dtype=np.float64) for part in (place, speed, z, whiten, ranges, rates))
     A = np.zeros((len(values), 0)) if design is None else np.asarray(design, dtype=np.float64)
     if not all(np.isfinite(part).all() for part in (S, V, values, W, A)):
-        return _nothing(S.shape[1], A.shape, None)
+        return _no_start(S.shape[1], A.shape, None)
     scene = DopplerScene.of(S, V, values, W, R, Q, A, surface)
     relaxation, far = _relaxation(scene.shape, backend), np.ones(len(values))
     for _ in range(_PASSES):
@@ -338,7 +342,7 @@ def doppler(
         answer = relaxation.solve(given, reach=scene.longest(reach))
         lift = answer.values["lift"]
         if not np.isfinite(lift).all():
-            return _nothing(S.shape[1], A.shape, answer)
+            return _no_start(S.shape[1], A.shape, answer)
         weighted, point = far, lift[0, 1 : 1 + S.shape[1]]
         apart = np.sqrt(((point - scene.place) ** 2).sum(axis=1))
         far = np.where(scene.pivot < 0, 1.0, np.maximum(apart[scene.pivot], _NEAREST))
@@ -346,7 +350,10 @@ def doppler(
 
 
 def _read_off(scene: DopplerScene, far: Array, size: float, answer: ConicAnswer) -> DopplerStart:
-    """Return the start in the units of the caller from a solution of the relaxation."""
+    """Return the start in the units of the caller from a solution of the relaxation.
+
+    `far` (m,) are the ranges that divided the rows, scaled; `size` is the unit of the cost.
+    """
     lift, d = answer.values["lift"], scene.shape.dimension
     point, beta = lift[0, 1 : 1 + d], scene.shape.places[0]
     spread, axes = np.linalg.eigh(lift[1 : 1 + d, 1 : 1 + d] - np.outer(point, point))
@@ -367,15 +374,18 @@ def _read_off(scene: DopplerScene, far: Array, size: float, answer: ConicAnswer)
     )
 
 
-def _nothing(dimension: int, design: tuple[int, ...], answer: ConicAnswer | None) -> DopplerStart:
-    """Return a start of NaN."""
+def _no_start(dimension: int, design: tuple[int, ...], answer: ConicAnswer | None) -> DopplerStart:
+    """Return a start of NaN, for `design` of the shape (rows, unknowns)."""
     rows, unknowns = design
     point, none = np.full((1 + 2 * dimension, dimension), np.nan), np.full(unknowns, np.nan)
     return DopplerStart(point, none, np.full(rows, np.nan), np.nan, -np.inf, np.nan, answer)
 
 
-def _ends(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
-    """Return the node whose range multiplies a row, the node whose rate is an unknown, -1 for none, and the sign."""
+def _nodes_of_rows(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
+    """Return three arrays (m,): the node whose range multiplies a row, the node whose rate is an unknown, and the sign.
+
+    A node is -1 if there is none. The sign is the coefficient of the first node.
+    """
     if (np.abs(rates).sum(axis=1) > 2.0).any() or (np.abs(rates.sum(axis=1)) > 1.0).any():
         raise ValueError("a row of rates must be one rate, or the difference of two")
     # a rate that is always zero needs no unknown; a rate that many rows share should be only one unknown
@@ -392,7 +402,11 @@ def _ends(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
 
 
 def _shape(nodes: tuple[int, ...], first: Array, second: Array, design: Array, rate: Mask, surface: bool) -> Shape:
-    """Return the structure of the programme for the given rows."""
+    """Return the structure of the programme.
+
+    `nodes` is the shape (M, d) of the nodes. `first` and `second` are the results of `_nodes_of_rows`. `design` (m, p)
+    are the coefficients of b. `rate` marks rows of rates, `surface` is True for a source on an ellipsoid.
+    """
     known = design.shape[1]
     others = tuple(int(node) for node in np.unique(second[second >= 0]))
     of = {node: known + i for i, node in enumerate(others)}
@@ -406,7 +420,10 @@ def _shape(nodes: tuple[int, ...], first: Array, second: Array, design: Array, r
 def _forms(
     shape: Shape, place: Array, speed: Array, z: Array, ranges: Array, first: Array, second: Array, design: Array
 ) -> Array:
-    """Return the rows as linear forms in y: measured minus predicted values."""
+    """Return the rows (m, length of y) as linear forms in y: measured values z minus predicted values.
+
+    The form of a row of rates is multiplied by the range of its node `first`.
+    """
     beta, r, w, size = shape.places
     at = {pair: w + k for k, pair in enumerate(shape.product)}
     of = {node: j for j, node in shape.rate_of.items()}
@@ -440,7 +457,7 @@ def lifted_size(dimension: int, ranges: Array, rates: Array, design: Array) -> i
     int
         The length; beyond `SIZE` the programme takes seconds.
     """
-    first, second, _ = _ends(rates, np.ones((rates.shape[1], 1)))
+    first, second, _ = _nodes_of_rows(rates, np.ones((rates.shape[1], 1)))
     rate = np.asarray(rates.any(axis=1))
     return _shape((rates.shape[1], dimension), first, second, design, rate, False).places[-1]
 

@@ -100,7 +100,7 @@ def lifted_problem(count: int, dim: int) -> Any:
 
 @keep
 def _relaxation(count: int, dim: int, backend: str) -> Relaxation:
-    """Return the relaxation, built once for each size and back end."""
+    """Return the relaxation for `count` stations in `dim` dimensions, built once for each size and back end."""
     # a decade below the default of Clarabel, because the value that this baseline demonstrates is near zero
     return Relaxation(lifted_problem(count, dim), backend=backend, settings=tight(backend, 1e-9))
 
@@ -153,10 +153,12 @@ def _program(count: int, dim: int, measured: int) -> Program:
     """Return a program with unknowns (x, r) and parameters: the stations, then the rows K, both row by row."""
 
     def residual(y: Any, p: Any, z: Any) -> list[Any]:
+        """Return ``z - K r``, with K from the parameters p."""
         at = count * dim
         return [z[k] - sum(p[at + count * k + i] * y[dim + i] for i in range(count)) for k in range(measured)]
 
     def equalities(y: Any, p: Any) -> list[Any]:
+        """Return ``r_i^2 - |x - s_i|^2``, which must be zero."""
         return [y[dim + i] ** 2 - sum((y[j] - p[dim * i + j]) ** 2 for j in range(dim)) for i in range(count)]
 
     return Program(dim + count, measured, count * (dim + measured), residual=residual, equalities=equalities)

@@ -5,9 +5,9 @@ r"""Low-rank network: arrivals of N pulses at M stations, all at unknown positio
 
 with :math:`u` any affine image of the stations, :math:`\alpha_i = |a_i|^2` and :math:`\beta_j = |y_j|^2 - o_j^2` up to
 an exchange between :math:`u` and :math:`v`. For given :math:`\theta_i = (\alpha_i, u_i, b_i)` each pulse is a linear
-least squares problem in :math:`(\beta_j, v_j, o_j)` over its own rows, so that entries may be missing and the
-non-linear problem has :math:`M (d + 1)` unknowns however many pulses there are: it is solved by variable projection
-(Levenberg and Marquardt on :math:`\theta`, Kaufman's approximation of the derivative of a projector).
+least-squares problem in :math:`(\beta_j, v_j, o_j)` over its own rows, so that entries may be missing. The nonlinear
+problem has :math:`M (d + 1)` unknowns for any number of pulses. It is solved by variable projection (Levenberg and
+Marquardt on :math:`\theta`, Kaufman's approximation of the derivative of a projector).
 
 An error n of an arrival changes its equation by about :math:`2 |a_i - y_j| n`. So each equation is divided by this
 distance, as estimated in every step. A share of the spread replaces distances near zero.
@@ -30,7 +30,7 @@ import numpy as np
 from formulations.algebra import Array, Mask
 
 # Greatest numbers of steps: before equations are divided by distances, while they are divided, and with fixed
-# distances. Distances at a random start are wrong: for 12 x 20 networks in flat halls 60 % of the starts end at the
+# distances. Distances at a random start are wrong. For 12 x 20 networks in flat halls, 60 % of the starts end at the
 # best fit, but only 5 % if all steps divide. The last steps minimise one fixed function.
 _PLAIN, _WEIGHED, _FROZEN = 30, 55, 5
 # Relative change of the costs of all starts that ends a stage, and the number of successive steps with this change.
@@ -85,14 +85,14 @@ class Pulses:
 
 @dataclass(frozen=True, slots=True)
 class LowRank:
-    """A fit of small rank: stations, pulses and the weighted sum of squares (S,)."""
+    """Fits of small rank: stations and pulses of S fits, and `cost` (S,), the weighted sums of squares."""
 
     stations: StationFactors
     pulses: Pulses
     cost: Array
 
     def take(self, which: Any) -> LowRank:
-        """Return the selected fits."""
+        """Return the selected fits; `which` is an index, a mask or a slice."""
         s, p = self.stations, self.pulses
         return LowRank(
             StationFactors(s.alpha[which], s.u[which], s.b[which]),
@@ -142,12 +142,15 @@ def fit_low_rank(z: Array, weight: Array, emission: Array, start: StationFactors
     LowRank
         S fits, in the order of the starts.
     """
-    return _Fit(z, weight, emission, clocks).run(start)
+    return _NetworkFit(z, weight, emission, clocks).run(start)
 
 
 @dataclass(frozen=True, slots=True)
-class _Fit:
-    """The data of a fit; each method is a part of one step for all starts at once."""
+class _NetworkFit:
+    """The data of a fit; each method is a part of one step for all S starts at once.
+
+    The fields are arguments of `fit_low_rank`: `z` and `weight` (N, M), `emission` (N,), `clocks`.
+    """
 
     z: Array
     weight: Array
@@ -155,7 +158,10 @@ class _Fit:
     clocks: bool
 
     def run(self, at: StationFactors) -> LowRank:
-        """Return the fits from given starts."""
+        """Return the fits from S starts `at`.
+
+        The stages are plain steps, steps that divide by distances, and steps with fixed distances.
+        """
         count = at.alpha.shape[0]
         scale = np.broadcast_to(self.weight, (count, *self.z.shape))
         damping = np.full(count, _DAMPING)
@@ -170,7 +176,7 @@ class _Fit:
                 trial = self.moved(at, here, damping)
                 there = self.project(trial, scale)
                 good = there.cost < here.cost
-                at, here = _chosen(good, trial, at), here.replaced(good, there)
+                at, here = _choose_stations(good, trial, at), here.replaced(good, there)
                 damping = np.clip(np.where(good, damping * _EASE, damping * _STIFFEN), _LEAST, _MOST)
                 calm = calm + 1 if (np.abs(here.cost - before) <= _SETTLED * before).all() else 0
                 if calm == _CALM:
@@ -178,13 +184,20 @@ class _Fit:
         return LowRank(at, here.pulses, here.cost)
 
     def distance(self, at: StationFactors, pulses: Pulses) -> Array:
-        """Return distances (S, N, M): the mean of the distances from the arrival and from the fit, above a minimum."""
+        """Return distances (S, N, M), which divide the equations.
+
+        A distance is the mean of two estimates, from the arrival time and from the fit. Short distances are raised to a
+        minimum.
+        """
         by_time = np.abs(self.z - at.b[:, None] - pulses.o[:, :, None])
         square = at.alpha[:, None] + (pulses.beta + pulses.o**2)[:, :, None] + pulses.v @ np.swapaxes(at.u, 1, 2)
         return np.maximum(0.5 * (by_time + np.sqrt(np.maximum(square, 0.0))), _NEAR)
 
     def project(self, at: StationFactors, scale: Array) -> _Projected:
-        """Return the residuals that remain for the best pulses."""
+        """Return the residuals that remain for the best pulses, at stations `at`.
+
+        `scale` (S, N, M) multiplies the equations.
+        """
         shifted = self.z - at.b[:, None]
         u = np.broadcast_to(at.u[:, None], (*scale.shape, at.u.shape[-1]))
         ones = np.ones((*scale.shape, 1))
@@ -195,13 +208,16 @@ class _Fit:
         target = scale * (shifted**2 - at.alpha[:, None])
         part = np.einsum("snik,sni->snk", q, target)
         residual = target - np.einsum("snik,snk->sni", q, part)
-        found = _back(r, part)
+        found = _back_substitute(r, part)
         d = at.u.shape[-1]
         pulses = Pulses(found[..., 0], found[..., 1 : 1 + d], found[..., 1 + d])
         return _Projected(pulses, q, residual, scale, np.sum(residual**2, axis=(1, 2)))
 
     def moved(self, at: StationFactors, here: _Projected, damping: Array) -> StationFactors:
-        """Return stations after one damped step of Gauss and Newton."""
+        """Return stations after one damped step of Gauss and Newton from `at`, whose projection is `here`.
+
+        `damping` (S,) is Marquardt's factor of each start.
+        """
         count, n, m = here.scale.shape
         d = at.u.shape[-1]
         columns = [np.ones((count, n, m, 1)), np.broadcast_to(here.pulses.v[:, :, None], (count, n, m, d))]
@@ -225,7 +241,11 @@ class _Fit:
 
 @dataclass(frozen=True, slots=True)
 class _Projected:
-    """The pulses that fit best, an orthonormal basis of their columns, the residuals, and the sum of their squares."""
+    """The result of a projection: the pulses that fit best, and the residuals.
+
+    `q` (S, N, M, d + 2) is an orthonormal basis of the columns of the pulses. `residual` (S, N, M) are the scaled
+    residuals, `cost` (S,) the sums of their squares. `scale` (S, N, M) multiplied the equations.
+    """
 
     pulses: Pulses
     q: Array
@@ -251,7 +271,7 @@ def _where(mask: Mask, one: Array, other: Array) -> Array:
     return np.where(mask.reshape(-1, *[1] * (one.ndim - 1)), one, other)
 
 
-def _chosen(mask: Mask, one: StationFactors, other: StationFactors) -> StationFactors:
+def _choose_stations(mask: Mask, one: StationFactors, other: StationFactors) -> StationFactors:
     """Return stations of `one` where the mask (S,) is True, else of `other`."""
     return StationFactors(
         _where(mask, one.alpha, other.alpha), _where(mask, one.u, other.u), _where(mask, one.b, other.b)
@@ -289,8 +309,8 @@ def orthonormal(a: Array) -> tuple[Array, Array]:
     return q, r
 
 
-def _back(r: Array, part: Array) -> Array:
-    """Return the solution of an upper triangular system; zero where its pivot is infinite."""
+def _back_substitute(r: Array, part: Array) -> Array:
+    """Return the solution of the upper triangular system ``r x = part``; zero where its pivot is infinite."""
     out = np.zeros_like(part)
     for i in range(part.shape[-1] - 1, -1, -1):
         known = part[..., i] - np.einsum("...k,...k->...", r[..., i, i + 1 :], out[..., i + 1 :])

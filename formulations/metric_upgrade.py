@@ -9,8 +9,8 @@ A fit of small rank (:mod:`formulations.low_rank_network`) gives :math:`\alpha_i
    \beta_j + o_j^2 = \tfrac14 v_j^\top K v_j + \tfrac12 v_j^\top K h + c'
 
 are each linear: in (H, h, c) for enough stations, in (K, K h, c') for enough pulses, and exact without noise. Noise can
-make H or K indefinite along the thinnest axis; its eigenvalues are then kept above a share of the largest, of which
-several are tried.
+make H or K indefinite along the thinnest axis. Eigenvalues below a share of the largest are then raised to this share;
+several shares are tried.
 
 Sources: the rank condition is that of M. Pollefeys and D. Nister, "Direct computation of sound and microphone locations
 from time-difference-of-arrival data", Proc. ICASSP 2008; the upgrade from stations is in M. Crocco, A. Del Bue and V.
@@ -55,8 +55,8 @@ def upgrade(fit: LowRank) -> tuple[Array, Array, Array]:
     """
     found: list[tuple[Array, Array, int]] = []
     for s in range(len(fit.cost)):
-        u, v, alpha, square = _white(fit, s)
-        for H, h in _sides(u, v, alpha, square):
+        u, v, alpha, square = _whitened_fit(fit, s)
+        for H, h in _candidates_of_sides(u, v, alpha, square):
             T = np.linalg.cholesky(H)
             found.append((u @ T, -0.5 * np.linalg.solve(T, (v + h).T).T, s))
     d = fit.stations.u.shape[-1]
@@ -69,8 +69,11 @@ def upgrade(fit: LowRank) -> tuple[Array, Array, Array]:
     )
 
 
-def _white(fit: LowRank, s: int) -> tuple[Array, Array, Array, Array]:
-    """Return centred and white stations, the pulses for these stations, and their squares."""
+def _whitened_fit(fit: LowRank, s: int) -> tuple[Array, Array, Array, Array]:
+    """Return the data of fit number s with centred and white stations u (M, d).
+
+    The results are u, the pulses v (N, d) for these stations, alpha (M,), and beta + o^2 (N,).
+    """
     u, v = fit.stations.u[s], fit.pulses.v[s]
     middle = u.mean(axis=0)
     centred = u - middle
@@ -80,25 +83,28 @@ def _white(fit: LowRank, s: int) -> tuple[Array, Array, Array, Array]:
     return np.linalg.solve(root, centred.T).T, v @ root, fit.stations.alpha[s], beta + fit.pulses.o[s] ** 2
 
 
-def _sides(u: Array, v: Array, alpha: Array, square: Array) -> list[tuple[Array, Array]]:
-    """Return the candidates (H, h), with H (d, d) and h (d,), from each side with enough points."""
+def _candidates_of_sides(u: Array, v: Array, alpha: Array, square: Array) -> list[tuple[Array, Array]]:
+    """Return the candidates (H, h), with H (d, d) and h (d,), from each side with enough points.
+
+    `alpha` (M,) and `square` (N,) are the values of the two quadrics, for the stations u and the pulses v.
+    """
     d, out = u.shape[1], []
     if len(u) >= unknowns(d):
         H, h = _quadric(u, alpha)
-        out += [(positive, h) for positive in _positive(H)]
+        out += [(positive, h) for positive in _with_floors(H)]
     if len(v) >= unknowns(d):
         # 4 K and 2 K h of a quadric in v; pulses may be far away, so they have another unit of length
         length = np.sqrt(np.mean(v * v))
         K, Kh = _quadric(v / length, square)
         K, Kh = 4.0 * K / length**2, 2.0 * Kh / length
-        for positive in _positive(K):
+        for positive in _with_floors(K):
             inverse = np.asarray(np.linalg.inv(positive), dtype=float)
             out.append((0.5 * (inverse + inverse.T), inverse @ Kh))
     return out
 
 
 def _quadric(x: Array, value: Array) -> tuple[Array, Array]:
-    """Return Q (d, d) and q (d,) of the fit ``x'Qx + x'q + constant`` to values."""
+    """Return Q (d, d) and q (d,) of the fit ``x'Qx + x'q + constant`` to values (n,) at points x (n, d)."""
     d = x.shape[1]
     i, k = np.triu_indices(d)
     columns = np.concatenate([x[:, i] * x[:, k] * np.where(i == k, 1.0, 2.0), x, np.ones((len(x), 1))], axis=1)
@@ -108,8 +114,11 @@ def _quadric(x: Array, value: Array) -> tuple[Array, Array]:
     return Q, found[len(i) : len(i) + d]
 
 
-def _positive(Q: Array) -> list[Array]:
-    """Return matrices with eigenvalues raised to each floor; only one matrix if no eigenvalue is below a floor."""
+def _with_floors(Q: Array) -> list[Array]:
+    """Return matrices with eigenvalues raised to each floor of `_FLOORS`.
+
+    The list has one matrix if no eigenvalue is below a floor, and none if Q is zero or not finite.
+    """
     width, axes = np.linalg.eigh(Q)
     largest = np.abs(width).max()
     if not np.isfinite(largest) or largest <= 0.0:

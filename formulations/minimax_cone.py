@@ -4,15 +4,15 @@ The angle between p - S_i and the measured unit direction :math:`u_i` is at most
 
 .. math:: |T_i (p - S_i)| \le \tan(\theta_i) \, u_i^\top (p - S_i), \qquad T_i^\top T_i = I - u_i u_i^\top,
 
-a second-order cone that no point behind the station satisfies. A ball of radius r about p lies in it exactly if
-:math:`|T_i (p - S_i)| + r / \cos\theta_i \le \tan(\theta_i) u_i^\top (p - S_i)`, so one problem,
+a second-order cone that no point behind the station satisfies. A ball of radius r about p is inside this cone exactly
+if :math:`|T_i (p - S_i)| + r / \cos\theta_i \le \tan(\theta_i) u_i^\top (p - S_i)`, so one problem,
 
 .. math:: \max_{p,\, r \le 1} \; r \quad\text{subject to these N cones},
 
-decides whether the cones meet (:math:`r \ge 0`), gives the centre of the largest inscribed ball, and otherwise, from
-its dual, multipliers that prove that the cones do not meet. With :math:`\theta_i = t \sigma_i` the set grows with t
-(the worst scaled angle is quasi-convex). Bisection on t, accelerated by the attained angles, finds the global minimax
-fix.
+decides whether the cones meet (:math:`r \ge 0`). If they meet, it gives the centre of the largest inscribed ball.
+Otherwise its dual gives multipliers that prove that the cones do not meet. With :math:`\theta_i = t \sigma_i` the set
+grows with t (the worst scaled angle is quasi-convex). Bisection on t, accelerated by the attained angles, finds the
+global minimax fix.
 
 Sources: M. S. Lobo, L. Vandenberghe, S. Boyd and H. Lebret, "Applications of second-order cone programming", Linear
 Algebra Appl. 284 (1998); F. Kahl and R. Hartley, "Multiple-view geometry under the L-infinity norm", IEEE Trans.
@@ -192,7 +192,7 @@ def minimax(
     u, S, scale = (np.asarray(part, dtype=np.float64) for part in (direction, station, sigma))
     # the widest cones first: if they do not meet, no point is in front of all stations
     level, low = _WIDEST / float(scale[np.isfinite(scale)].min()), 0.0
-    found = _at(u, S, scale, level, backend)
+    found = _common_at_level(u, S, scale, level, backend)
     if not found.meet:
         nowhere = level if found.meet is False else 0.0
         return Minimax(np.full(u.shape[1], np.nan), np.inf, nowhere, found.meet, 1)
@@ -200,7 +200,7 @@ def minimax(
     level = float((angles(point, u, S) / scale).max())
     while level - low > tolerance * level and level > _EXACT and solves < most:
         middle = 0.5 * (low + level)
-        found, solves = _at(u, S, scale, middle, backend), solves + 1
+        found, solves = _common_at_level(u, S, scale, middle, backend), solves + 1
         if found.meet:
             # the angles at the found point are below the requested level: faster than bisection alone
             point, level = found.point, float((angles(found.point, u, S) / scale).max())
@@ -236,8 +236,8 @@ def angles(point: Array, direction: Array, station: Array) -> Array:
     return np.asarray(2.0 * np.arctan2(away, along))
 
 
-def _at(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
-    """Return the common points of cones whose half-angles are `level` times their scale."""
+def _common_at_level(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
+    """Return the common points of cones whose half-angles are `level` times `scale` (N,), at most `_WIDEST`."""
     theta = np.where(np.isfinite(scale), np.minimum(level * scale, _WIDEST), np.inf)
     return common(u, S, theta, backend=backend)
 
@@ -247,7 +247,7 @@ def _at(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
 
 @keep
 def _relaxation(kind: str, count: int, dim: int, backend: str) -> Relaxation:
-    """Return the cone program, built once for each kind, size and back end."""
+    """Return the cone program "ball" or "edge" for `count` cones in `dim` dimensions, built once for each back end."""
     settings = tight(backend, 1e-10)  # the sign of a margin is a proof: two decades below the default of Clarabel
     if kind == "edge":
         return Relaxation(edge_problem(count, dim), backend=backend, settings=settings)
@@ -305,7 +305,10 @@ def edge_problem(count: int, dim: int) -> Any:
 
 
 def _cones(point: Any, radius: Any, count: int, dim: int) -> list[Any]:
-    """Return the constraints of the cones, with new parameters."""
+    """Return the constraints of the cones, with new parameters.
+
+    If `radius` is not None, a ball of this radius about the point must be inside the cones.
+    """
     import cvxpy as cp
 
     rows = dim - 1
@@ -320,7 +323,8 @@ def _cones(point: Any, radius: Any, count: int, dim: int) -> list[Any]:
 def _cone_data(u: Array, S: Array, theta: Array, *, ball: bool) -> dict[str, Array]:
     """Return the parameters of both problems at half-angles (N,) below pi/2; an infinite angle drops its cone.
 
-    Each cone is multiplied by the cosine of its half-angle, so that wide cones have small numbers.
+    `ball` is True for the problem with a ball. Each cone is multiplied by the cosine of its half-angle, so that wide
+    cones have small numbers.
     """
     _count, dim = u.shape
     held = np.isfinite(theta)

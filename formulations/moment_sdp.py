@@ -151,6 +151,7 @@ def moment_problem(stations: int, dimension: int) -> Any:
     rule = cp.Parameter((stations - 1, dimension + 5), name="rule")
 
     def arrange(index: Index) -> Any:
+        """Return the moments with the given numbers as an expression of the same shape."""
         return cp.reshape(y[index.ravel()], index.shape, order="C")
 
     errors = arrange(own.table[0, 0])
@@ -212,7 +213,11 @@ def moment_bound(ranged: Ranged, box: EnclosingBox, cost: float, *, backend: str
 
 
 def _forms(ranged: Ranged, box: EnclosingBox, unit: Array) -> tuple[Array, Array, Array]:
-    """Return the quadratic form of the first equality, coefficients of the others, and the cost in (1, t, w)."""
+    """Return the coefficients of the relaxation: first equality, other equalities, and cost.
+
+    The first equality is a matrix in (1, s, t), the cost a matrix in (1, t, omega). The others are rows (M - 1, d + 5)
+    of ``1, s, t, w_i, t w_i, w_i^2``. `unit` (M - 1,) are the units of the errors w.
+    """
     from_first, other = box.centre - ranged.station[0], ranged.station[1:] - ranged.station[0]
     middle, half = 0.5 * (box.low + box.high), 0.5 * (box.high - box.low)
     side, d, D = ranged.side, ranged.excess, len(from_first)
@@ -238,7 +243,10 @@ def _forms(ranged: Ranged, box: EnclosingBox, unit: Array) -> tuple[Array, Array
 
 
 def _cost(ranged: Ranged, change: Array) -> Array:
-    """Return the matrix of the cost after a change of the variables (1, r_1, w)."""
+    """Return the matrix of the cost after a change of the variables (1, r_1, w).
+
+    `change` maps (1, t, omega) to (1, r_1, w).
+    """
     if ranged.free:
         return np.asarray(change[2:].T @ np.linalg.solve(ranged.spread, change[2:]))
     # The measurement minus the middle of the box is small. It is subtracted before squaring, because squares of ranges

@@ -3,9 +3,9 @@ r"""Weighted nonlinear least squares with bounds, equalities and inequalities, a
 .. math:: \min_x \; |W\, e(x, p, z)|^2 + (x - m)^\top M (x - m) \quad\text{subject to}\quad
    l \le x \le u, \quad c(x, p) = 0, \quad d(x, p) \ge 0,
 
-with :math:`e = z - h(x, p)` unless another residual is given (angles must wrap). The functions h, c, d are injected
-and differentiated exactly by CasADi; data, weights, prior, bounds and start are arguments of the solve, so that a
-program is compiled once per structure. Threads may share a program: they take turns.
+with :math:`e = z - h(x, p)` unless another residual is given (residuals of angles must be wrapped). The functions h, c,
+d are arguments of the program; CasADi differentiates them exactly. Data, weights, prior, bounds and start are arguments
+of the solve, so that a program is compiled once per structure. Threads may share a program: they take turns.
 
 Sources: A. Waechter and L. T. Biegler, "On the implementation of an interior-point filter line-search algorithm for
 large-scale nonlinear programming", Math. Program. 106 (2006); J. A. E. Andersson et al., "CasADi", Math. Program.
@@ -163,8 +163,8 @@ class Program:
         faster = _compile(self._name, solver, options) if compiled else None
         self.compiled = faster is not None
         self._solver = solver if faster is None else faster
-        # CasADi releases the interpreter lock while it solves, and the solver has one memory, which simultaneous
-        # threads would corrupt, and one report, of its last solve
+        # CasADi releases the interpreter lock while it solves. The solver has one memory, which simultaneous threads
+        # would corrupt, and one report of its last solve.
         self.lock = threading.Lock()
         _LOCKS.programs.add(self)
 
@@ -249,9 +249,10 @@ class Program:
         )
 
     def _contradiction(self, x: Any, data: Array, status: str) -> str:
-        """Return why a point is not a solution although the solver reports success; "" if there is no contradiction.
+        """Return the reason why a point is not a solution although the solver reports success; "" if there is none.
 
-        Some solvers report success at their time limit, or at a start without a gradient.
+        Some solvers report success at their time limit, or at a start without a gradient. `data` are the parameters of
+        the solve, `status` is the status in the solver's words.
         """
         if "limit" in status.lower():
             return "it stopped at a limit"
@@ -285,7 +286,10 @@ hold_in_forks(_LOCKS)
 
 
 def _options(choice: Choice | None, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a CasADi solver; the options of IPOPT are in a separate table."""
+    """Return the options of a CasADi solver: options that suppress output, then settings of the choice or `settings`.
+
+    The options of IPOPT are in a separate table.
+    """
     name = "ipopt" if choice is None else choice.name
     own = dict(settings if choice is None else choice.settings)
     silent = _SILENCE.get(name, {})
@@ -295,7 +299,7 @@ def _options(choice: Choice | None, settings: Mapping[str, Any]) -> dict[str, An
 
 
 def _column(expressions: Any, count: int | None = None) -> Any:
-    """Return expressions as one CasADi column."""
+    """Return expressions as one CasADi column; raise ValueError if there are not `count` of them."""
     import casadi as ca
 
     listed = isinstance(expressions, Sequence)

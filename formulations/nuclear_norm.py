@@ -1,7 +1,7 @@
 r"""Nuclear norm of a network, the convex start: **a baseline of studies, never a default**.
 
-Arrivals :math:`z_{ij} = |a_i - y_j| + o_j` of N pulses at M stations, squared and centred over both, are affine in the
-times of emission, and of rank d at the true ones:
+The arrivals of N pulses at M stations are :math:`z_{ij} = |a_i - y_j| + o_j`. Squared and centred over both, they are
+affine in the times of emission o, and of rank d at the true times:
 
 .. math:: G(o) = Q_M^\top (Z \circ Z - 2 Z \, \mathrm{diag}\, o) \, Q_N = -2 \, Q_M^\top A Y^\top Q_N,
 
@@ -10,13 +10,13 @@ sum of the singular values, its convex envelope on matrices of bounded norm, and
 
 .. math:: \min_o \; \|G(o)\|_* - \langle W, G(o) \rangle \quad\text{subject to}\quad o_j \le \min_i z_{ij}.
 
-*First pass*, :math:`W = 0`: the nuclear norm. It is **not tight**: distances that are too small make all of `G` small,
-so that the least nuclear norm is between the true times and the times at the nearest stations. Without the bounds on
-`o` the solution is beyond them.
+*First pass*, :math:`W = 0`: the nuclear norm. It is **not tight**: distances that are too small make all of `G` small.
+So the least nuclear norm is between the true times and the times at the nearest stations. Without the bounds on `o` the
+solution is beyond them.
 
 *Further passes*, :math:`W = U_d V_d^\top` of the pass before: the truncated nuclear norm, the sum of the singular
-values beyond the first d, decreased by linearising what is concave in it. It is zero at the true times without noise,
-and where the passes arrive there, they are exact; a local method from one start.
+values beyond the first d, decreased by linearising its concave part. Without noise it is zero at the true times. If the
+passes end there, they are exact. They are a local method from one start.
 
 Times of emission make the network affine by one singular value decomposition, and :mod:`formulations.metric_upgrade`
 gives the positions. Stations without a common clock are not supported: their term :math:`b \, o^\top` is not affine.
@@ -94,18 +94,18 @@ def nuclear_problem(stations: int, pulses: int) -> Any:
     squares = cp.Parameter((stations - 1, pulses - 1), name="squares")
     factor = cp.Parameter((stations - 1, pulses), name="factor")
     slope, most = cp.Parameter(pulses, name="slope"), cp.Parameter(pulses, name="most")
-    G = squares - 2 * factor @ cp.diag(offset) @ _across(pulses)
+    G = squares - 2 * factor @ cp.diag(offset) @ _centring_columns(pulses)
     return cp.Problem(cp.Minimize(cp.normNuc(G) - slope @ offset), [offset <= most])
 
 
 @keep
 def _relaxation(stations: int, pulses: int, backend: str) -> Relaxation:
-    """Return the relaxation, built once for each size and back end."""
+    """Return the relaxation for numbers of stations and pulses, built once for each size and back end."""
     return Relaxation(nuclear_problem(stations, pulses), backend=backend)
 
 
-def _across(n: int) -> Array:
-    """Return n - 1 orthonormal columns that are orthogonal to ones (Helmert's)."""
+def _centring_columns(n: int) -> Array:
+    """Return a matrix (n, n - 1) of orthonormal columns that are orthogonal to ones (Helmert's)."""
     row, k = np.arange(n)[:, None], np.arange(1, n)
     return np.asarray(np.where(row < k, 1.0, np.where(row == k, -k, 0.0)) / np.sqrt(k * (k + 1)))
 
@@ -136,7 +136,7 @@ def nuclear_offsets(z: ArrayLike, d: int, *, passes: int = 20, backend: str = "C
     """
     Z = np.asarray(z, dtype=np.float64).T
     m, n = Z.shape
-    left, right = _across(m), _across(n)
+    left, right = _centring_columns(m), _centring_columns(n)
     squares, factor = left.T @ (Z * Z) @ right, left.T @ Z
     relaxation = _relaxation(m, n, backend)
     slope, before, bound = np.zeros(n), np.full(n, np.inf), -np.inf

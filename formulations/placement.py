@@ -13,8 +13,9 @@ on the eigenvector.
 *Semidefinite relaxation* (0 <= w <= 1): :math:`\begin{pmatrix} M_p & e \\ e^\top & t \end{pmatrix} \succeq 0` gives
 :math:`t \ge e^\top M_p^{-1} e`, and :math:`M_p \succeq C^\top S_p C` gives :math:`P_p \preceq S_p^{-1}`.
 
-*Outer approximation*: tangents :math:`t_p \ge f_p(u) + \nabla f_p(u)^\top (w - u)` at every integer point that a mixed
-integer programme finds, and half way between it and the best one, until its dual bound meets the best point.
+*Outer approximation*: tangents :math:`t_p \ge f_p(u) + \nabla f_p(u)^\top (w - u)` are added at every integer point
+that a mixed integer programme finds, and half way between this point and the best point. This ends when the dual bound
+of the programme reaches the value of the best point.
 
 *Continuous places*: the same criterion over the positions of the sites, each in a convex region, as a nonlinear
 programme; a local optimum.
@@ -78,7 +79,10 @@ def covariances(design: Design, w: Array) -> Array:
 
 
 def of_places(covariance: Array, criterion: Criterion) -> Array:
-    """Return the criterion f (...) of covariances (..., d, d), m^2."""
+    """Return the criterion f (...) of covariances (..., d, d) in m^2.
+
+    The unit is m^2 for A and E; D is the logarithm of a determinant.
+    """
     if criterion == "A":
         return np.asarray(np.trace(covariance, axis1=-2, axis2=-1))
     if criterion == "D":
@@ -101,7 +105,7 @@ def value(design: Design, w: Array, criterion: Criterion, *, worst: bool = False
 
 
 def gradients(design: Design, w: Array, criterion: Criterion) -> tuple[Array, Array]:
-    """Return f (P,) and its gradients (P, n) at weights (n,); a subgradient for a repeated eigenvalue."""
+    """Return f (P,) and its gradients (P, n) by the weights w (n,); a subgradient for a repeated eigenvalue."""
     information = design.prior + np.einsum("prmn,n,prkn->pmk", design.rows, np.asarray(w, float), design.rows)
     inverse = np.linalg.inv(information)
     d = design.dimension
@@ -121,6 +125,9 @@ def semidefinite(
     design: Design, rules: Array, limits: Array, criterion: Criterion, *, worst: bool = False
 ) -> tuple[float, Array]:
     """Return the least value over 0 <= w <= 1, rules @ w <= limits, and w (n,), by Clarabel's interior-point method.
+
+    The value is a lower bound for all sets of sites. `rules` (R, n) and `limits` (R,) are the linear rules; `worst`
+    minimises the maximum over places instead of their mean.
 
     Raises
     ------
@@ -276,13 +283,13 @@ class PlacementGround:
     height: Array
 
     def function(self) -> Any:
-        """Return the height as a function of CasADi, from (2,) to a number."""
+        """Return the height as a function of CasADi, from plan coordinates (2,), metres, to metres."""
         import casadi as ca
 
         return ca.interpolant("ground", "bspline", [self.x, self.y], self.height.ravel(order="F"))
 
     def at(self, points: Array) -> Array:
-        """Return the heights (q,) at points (q, 2)."""
+        """Return the heights (q,), metres, at points (q, 2); points beyond the grid get the height at its edge."""
         spline = self.function()
         low, high = [self.x[0], self.y[0]], [self.x[-1], self.y[-1]]
         return np.array([float(spline(np.clip(point, low, high))) for point in points])
@@ -306,7 +313,7 @@ class PlacementRegion:
     high: float = 0.0
 
     def excess(self, place: Array, ground: PlacementGround | None) -> Array:
-        """Return the violation of each rule by a place (d,); no value is positive inside the region."""
+        """Return the violation of each rule by a place (d,), metres; no value is positive inside the region."""
         plan = self.edges @ place[:2] - self.offsets
         if len(place) == 2:
             return np.asarray(plan)
@@ -314,7 +321,7 @@ class PlacementRegion:
         return np.concatenate([plan, [self.low - up, up - self.high]])
 
     def nearest(self, place: Array, ground: PlacementGround | None) -> Array:
-        """Return the place in the region that is nearest in the plan, at the nearest height."""
+        """Return the place (d,) in the region, metres, that is nearest in the plan, at the nearest height."""
         flat = place[:2].copy()
         if (self.edges @ flat > self.offsets).any():
             from scipy.optimize import LinearConstraint, minimize
@@ -394,9 +401,9 @@ def refine(
 
 
 def _symbolic(ca: Any, matrix: Any, d: int, criterion: Criterion) -> Any:
-    """Return the criterion of the covariance of a symbolic information matrix.
+    """Return the criterion of the covariance of a symbolic information matrix; `ca` is the module casadi.
 
-    For E, a root of the trace of a power.
+    For E, the result is a root of the trace of a power, which is smooth.
     """
     covariance = ca.inv(matrix)[:d, :d]
     if criterion == "A":

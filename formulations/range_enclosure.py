@@ -1,4 +1,4 @@
-r"""A box that contains every point with small range residuals, so that a bound over the box holds for all space.
+r"""A box that contains every point with small range residuals, so that a bound over the box is valid for all space.
 
 Ranges :math:`r_i = |x - s_i|` are measured up to one unknown, :math:`r_i = \sigma_i r_1 + d_i + w_i`, with errors `w`
 of covariance `R`. Squared, and with :math:`a_i = s_i - s_1`, :math:`x' = x - s_1`, :math:`r_1^2 = |x'|^2`,
@@ -62,12 +62,12 @@ class Ranged:
 
     @property
     def excess(self) -> Array:
-        """Return the vector d, shape (M - 1,)."""
+        """Return the vector d, shape (M - 1,): known differences of the ranges from the range of the reference."""
         return self.offset[1:] if self.free else self.offset[1:] - self.offset[0]
 
     @property
     def spread(self) -> Array:
-        """Return the covariance R of w, shape (M - 1, M - 1)."""
+        """Return the covariance R of the errors w, shape (M - 1, M - 1)."""
         inner = self.covariance[1:, 1:]
         if self.free:
             return inner
@@ -143,7 +143,7 @@ def enclosure(ranged: Ranged, point: Array, cost: float) -> EnclosingBox | None:
     away = np.maximum(np.linalg.norm(point - ranged.station[1:], axis=1), _NEAR)
     root: Array = np.asarray(np.linalg.cholesky(ranged.spread), dtype=np.float64)
     left = _left_inverse(system, away, root)
-    error = _Error(rho, root, side, d, np.array(np.diag(ranged.spread)))
+    error = _ErrorBounds(rho, root, side, d, np.array(np.diag(ranged.spread)))
     if not ranged.free:
         # the reference is measured: it is an unknown in an interval, not a column of the system
         slack = rho * float(np.sqrt(ranged.covariance[0, 0]))
@@ -177,7 +177,10 @@ def ball(ranged: Ranged, centre: Array, radius: float) -> EnclosingBox:
 
 
 def _left_inverse(system: Array, away: Array, root: Array) -> Array | None:
-    """Return the left inverse weighted for squared ranges, or None if the columns are not independent."""
+    """Return the left inverse of `system`, weighted for squared ranges, or None if the columns are not independent.
+
+    `away` (M - 1,) are distances from the stations, `root` is the Cholesky factor of the covariance of the errors w.
+    """
     rows, columns = system.shape
     if rows < columns:
         return None
@@ -192,8 +195,12 @@ def _left_inverse(system: Array, away: Array, root: Array) -> Array | None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Error:
-    """Bounds of the effect of range errors on linear functions of the squared equations."""
+class _ErrorBounds:
+    """Bounds of the effect of range errors w on linear functions of the squared equations, for a cost of at most rho^2.
+
+    `root` is the Cholesky factor of the covariance R of w, `variance` its diagonal. `side` are the signs, `excess` is
+    the vector d of the ranges.
+    """
 
     rho: float
     root: Array
@@ -204,36 +211,39 @@ class _Error:
     def reference(self, row: Array, middle: float) -> tuple[float, float] | None:
         """Return the interval of r_1 from its row of the left inverse, or None if the errors are too large."""
         # r_1 <= middle + rest + slope r_1: if the slope reaches one, the errors grow with the range without bound
-        slope = self._along(row * self.side)
-        rest = self._along(row * self.excess) + self._square(row)
+        slope = self._linear_bound(row * self.side)
+        rest = self._linear_bound(row * self.excess) + self._square_bound(row)
         if slope >= 1.0 or middle + rest < 0.0:
             return None
         return max(0.0, (middle - rest) / (1.0 + slope)), (middle + rest) / (1.0 - slope)
 
     def position(self, row: Array, low: float, high: float) -> float:
-        """Return a bound of the effect of the errors on a coordinate."""
-        middle, half = 0.5 * (low + high), 0.5 * (high - low)
-        both = self._along(row * (self.excess + self.side * middle)) + half * self._along(row * self.side)
-        return both + self._square(row)
+        """Return a bound of the effect of the errors on a coordinate, for reference ranges from `low` to `high`.
 
-    def _along(self, row: Array) -> float:
+        `row` (M - 1,) is the row of the left inverse for this coordinate.
+        """
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        both = self._linear_bound(row * (self.excess + self.side * middle)) + half * self._linear_bound(row * self.side)
+        return both + self._square_bound(row)
+
+    def _linear_bound(self, row: Array) -> float:
         """Return a bound of twice ``row' w`` for errors w with a cost of at most rho^2."""
         return 2.0 * self.rho * float(np.linalg.norm(self.root.T @ row))
 
-    def _square(self, row: Array) -> float:
+    def _square_bound(self, row: Array) -> float:
         """Return a bound of ``row' w^2`` for errors w with a cost of at most rho^2."""
         return self.rho**2 * float(np.abs(row) @ self.variance)
 
 
 def _box(
-    ranged: Ranged, point: Array, left: Array, right: Array, error: _Error, reach: tuple[float, float]
+    ranged: Ranged, point: Array, left: Array, right: Array, error: _ErrorBounds, reach: tuple[float, float]
 ) -> EnclosingBox:
-    """Return the box of ``x' = left (right - phi)`` in principal axes.
+    """Return the box of ``x' = left (right - phi)`` in principal axes; `reach` is the interval of the reference range.
 
     A measured reference range is an extra unknown.
     """
     low, high = reach
-    axes = _principal(ranged, point)
+    axes = _principal_axes(ranged, point)
     rows = np.linalg.inv(axes) @ left
     half = np.array([error.position(row, low, high) for row in rows])
     if not ranged.free:
@@ -241,8 +251,8 @@ def _box(
     return EnclosingBox(ranged.station[0] + left @ right, axes * (half * _ROUND), low / _ROUND, high * _ROUND)
 
 
-def _principal(ranged: Ranged, point: Array) -> Array:
-    """Return the principal axes of the errors of a fix as columns, each one standard deviation long."""
+def _principal_axes(ranged: Ranged, point: Array) -> Array:
+    """Return the principal axes (d, d) of the errors of a fix at `point`, in columns of one standard deviation."""
     apart = point - ranged.station
     # at a station the direction is undefined: the row is left out, which avoids a division by zero
     unit = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)

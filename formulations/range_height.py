@@ -8,17 +8,17 @@ own plane,
 
 .. math:: x(t, \mu) = b + p\,t + n\,\mu, \qquad \mu^2 = q(t) = q_0 + q_1 t + q_2 t^2, \qquad r_i = \rho_i t + e_i,
 
-in which `n` is the unit normal of the plane of the stations and `t` is :math:`r_1`, shifted and scaled so that `p` is
-at most a unit long and `b` near the stations (nearly collinear stations make both huge otherwise). Two known ranges
-leave a circle about the line of their stations, which has the same form, `t` and :math:`\mu` being cosine and sine.
-On the conic the ellipsoid reads :math:`E(t) + L(t)\,\mu + \alpha\,\mu^2 = 0`. With :math:`Q = E + \alpha q` the first
-coordinate is a root of
+in which `n` is the unit normal of the plane of the stations. The parameter `t` is :math:`r_1`, shifted and scaled: `p`
+is at most a unit long and `b` is near the stations. Otherwise both would be huge for nearly collinear stations. Two
+known ranges leave a circle about the line of their stations, which has the same form, `t` and :math:`\mu` being cosine
+and sine. On the conic the ellipsoid reads :math:`E(t) + L(t)\,\mu + \alpha\,\mu^2 = 0`. With :math:`Q = E + \alpha q`
+the first coordinate is a root of
 
 .. math:: Q(t)^2 - L(t)^2\, q(t) = 0,
 
 at most four real ones. Squaring also admits the problem with flipped signs, whose points have a negative range; they
-are dropped. Each root starts a Newton iteration on the two conics from both signs of :math:`\mu`, which gives back the
-digits the squares lost and needs no rule for :math:`L = 0`.
+are dropped. Each root starts a Newton iteration on the two conics from both signs of :math:`\mu`. The iteration
+restores the digits that squaring has lost, and needs no special case for :math:`L = 0`.
 
 Points on the far side of the ellipsoid are not visible. The polar plane of an outside point `s`, :math:`(x - c)^\top A
 (s - c) = 1`, touches the ellipsoid where the tangents from `s` do: it cuts off exactly the part that is seen from `s`.
@@ -44,8 +44,8 @@ _SLOTS = 4  # roots of a quartic
 _THIN = 1e-7
 _AXIAL = 1e-12  # squared sine of the angle between a direction and the axis below which they count as parallel
 _LEAD = 1e-14  # leading coefficient of the quartic, relative to the largest, that is rounding: a root at infinity
-# Greatest relative residual of the two conics at a start of the iteration: eigenvalues of the companion matrix are
-# accurate to 1e-8 at a double root, and a pair slightly off the real axis is off by the root of the perturbation.
+# Greatest relative residual of the two conics at a start of the iteration. Eigenvalues of the companion matrix are
+# accurate to 1e-8 at a double root. A pair slightly off the real axis is wrong by the root of the perturbation.
 _NEAR = 1e-3
 _NEWTON = 30  # steps; quadratic convergence at simple roots; a bit per step at double roots, accurate to 1e-8
 _RESTS = 1e-14  # relative step at which a slot has converged
@@ -195,7 +195,7 @@ def locate(
         flatten(surface.centre, (3,), lead),
     )
     curve = three_stations(flat, flatten(sign, (3,), lead), flatten(offset, (3,), lead))
-    return _reshape(_meet(curve, flat, A, centre, positive=positive), lead)
+    return _reshape(_curve_points(curve, flat, A, centre, positive=positive), lead)
 
 
 def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> HeightCandidates:
@@ -229,17 +229,20 @@ def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> Heig
     )
     known = flatten(ranges, (2,), lead)
     curve = two_stations(flat, known, centre)
-    return _reshape(_meet(curve, flat, A, centre, positive=True), lead)
+    return _reshape(_curve_points(curve, flat, A, centre, positive=True), lead)
 
 
 def _reshape(found: HeightCandidates, lead: tuple[int, ...]) -> HeightCandidates:
-    """Return candidates with the batch axis reshaped to `lead`."""
+    """Return candidates (N, ...) with the batch axis reshaped to `lead`, the shape of the caller's batch."""
     x, ranges = (v.reshape(*lead, *v.shape[1:]) for v in (found.x, found.ranges))
     return HeightCandidates(x, ranges, found.valid.reshape(*lead, _SLOTS))
 
 
-def _meet(curve: HeightCurve, stations: Array, A: Array, centre: Array, *, positive: bool) -> HeightCandidates:
-    """Return all common points of N curves and their ellipsoids."""
+def _curve_points(curve: HeightCurve, stations: Array, A: Array, centre: Array, *, positive: bool) -> HeightCandidates:
+    """Return all common points of N curves and their ellipsoids; shapes A (N, 3, 3), centres (N, 3).
+
+    If `positive` is True, points with a negative range to one of the `stations` are dropped.
+    """
     with np.errstate(all="ignore"):
         E, L, alpha = curve.on_ellipsoid(A, centre)
         t, mu = _starts(curve.square, E, L, alpha)
@@ -420,7 +423,7 @@ def two_stations(stations: Array, ranges: Array, towards: Array) -> HeightCurve:
 
 
 def _perpendicular(axis: Array, hint: Array) -> Array:
-    """Return the unit vector normal to the axis, towards the hint if the hint is off the axis."""
+    """Return unit vectors (N, 3) normal to the axes (N, 3), towards the hint (N, 3) if the hint is off the axis."""
     least = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
     off = hint - axis * dot(axis, hint)[:, None]
     weak = dot(off, off) <= _AXIAL * dot(hint, hint)
@@ -476,7 +479,10 @@ def _roots(c: Array) -> Array:
 
 
 def _starts(square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Array]:
-    """Return starts near every real intersection, two slots for each root; NaN without a start."""
+    """Return starts (t, mu), each (N, 8), near every real intersection, two slots for each root.
+
+    t is NaN if a slot has no start. See `quartic` for the arguments.
+    """
     roots = _roots(quartic(square, E, L, alpha))
     t = np.tile(roots.real, 2)
     # a pair slightly off the real axis may be a double root
@@ -488,7 +494,11 @@ def _starts(square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Arr
 
 
 def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Array]:
-    """Return the results of Newton's iteration on the two conics; residuals reveal slots that did not converge."""
+    """Return the results (t, mu) of Newton's iteration on the two conics, from starts (N, K).
+
+    Slots that did not converge are not marked; the caller finds them by their residuals. See `quartic` for the
+    coefficients.
+    """
     go = np.isfinite(t)
     for _ in range(_NEWTON):
         one = mu * mu - _value(square, t)
@@ -509,5 +519,5 @@ def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array
 
 
 def _value(c: Array, t: Array) -> Array:
-    """Return the values of polynomials at t; coefficients are constant first."""
+    """Return the values of quadratic polynomials c (N, 3) at t (N, K); coefficients are constant first."""
     return np.asarray(c[:, :1] + t * (c[:, 1:2] + t * c[:, 2:]))

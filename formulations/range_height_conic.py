@@ -122,7 +122,11 @@ def lift(
 
 
 def _forms(curve: HeightCurve, surface: Ellipsoid, near: Array, guess: float) -> tuple[dict[str, Array], Array]:
-    """Return quadratic forms in (1, t, mu), relative to the guess and in its unit, and the inverse transformation."""
+    """Return the quadratic forms (3, 3) by name, and the map from scaled variables to (1, t, mu).
+
+    The scaled variables are relative to `guess`, the expected range r_1, and in its unit. `near` (3,) is the point of
+    the objective.
+    """
     E, L, alpha = (v[0] for v in curve.on_ellipsoid(surface.shape[None], surface.centre[None]))
     q, rate, offset = curve.square[0], curve.rate[0, 0], curve.offset[0, 0]
     on_surface = 0.5 * np.array([[2.0 * E[0], E[1], L[0]], [E[1], 2.0 * E[2], L[1]], [L[0], L[1], 2.0 * alpha]])
@@ -137,7 +141,10 @@ def _forms(curve: HeightCurve, surface: Ellipsoid, near: Array, guess: float) ->
 
 
 def _reach(curve: HeightCurve, station: Array, surface: Ellipsoid, guess: float) -> float:
-    """Return the greatest length of the lift of any point of the ellipsoid, which makes the bound rigorous."""
+    """Return the greatest length of the lift of any point of the ellipsoid, which makes the bound rigorous.
+
+    `guess` is the expected range, the unit of the lift. `station` (3,) is the first station.
+    """
     size = 1.0 / float(np.sqrt(np.linalg.eigvalsh(surface.shape)[0]))
     t = (float(np.linalg.norm(station - surface.centre)) + size) / guess + 1.0
     mu = (abs(float(curve.across[0] @ (surface.centre - curve.base[0]))) + size) / guess

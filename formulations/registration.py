@@ -25,7 +25,7 @@ stations and target are of order one to a hundred.
 
 Sources: Y. T. Chan and K. C. Ho, "A simple and efficient estimator for hyperbolic location", IEEE Trans. Signal
 Process. 42 (1994), for the lifted rows; A. Beck, P. Stoica, J. Li, IEEE Trans. Signal Process. 56 (2008), for the exact
-constraint. Biases, free reference ranges over time and branches are this package's own.
+constraint. Biases, free reference ranges over time and branches were derived for this package.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from formulations.algebra import Array
 from formulations.squared_range import paraboloid, stationary
 
 # Number of passes of stage 0, from random runs of 30 epochs, five stations and errors of 1e-3 of their spread. A fixed
-# target two spreads away needs one pass; of one 30 spreads away the 90 % error falls from 7.3 to 0.4 by the second, and
-# of a moving one from 31 to 19 by the fourth.
+# target two spreads away needs one pass. For a fixed target 30 spreads away, the 90 % error falls from 7.3 to 0.4 by
+# the second pass. For a moving target it falls from 31 to 19 by the fourth pass.
 _PASSES = 4
 # Number of passes of stage 1 in the same runs: the second reduces the 90 % error of far fixed targets by a quarter;
 # later passes change little.
@@ -59,7 +59,7 @@ _NEAREST = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class RegistrationCourse:
-    """Range offsets of a batch of N problems at B times.
+    """Range offsets of a batch of N problems at B times, with S stations besides the reference, and q biases.
 
     Parameters
     ----------
@@ -91,14 +91,16 @@ class RegistrationCourse:
 
 @dataclass(slots=True)
 class _Guess:
-    """The result of a pass: biases (N, q) and ranges of the reference (N, B)."""
+    """The result of a pass: `bias` (N, q), and the ranges `reference` (N, B) of the reference station."""
 
     bias: Array
     reference: Array
 
 
 def candidates(course: RegistrationCourse, order: int = 0) -> tuple[Array, Array]:
-    """Return starts of a registration.
+    """Return starts of a registration: courses of the target and biases, without an initial guess.
+
+    A local method refines all C candidates, because only their costs show which of them leads to the best minimum.
 
     Parameters
     ----------
@@ -110,26 +112,30 @@ def candidates(course: RegistrationCourse, order: int = 0) -> tuple[Array, Array
     Returns
     -------
     state : Array, shape (N, C, order + 1, d)
-        Candidates; NaN for an empty place.
+        Candidates: position, velocity and acceleration at time zero. First the stationary points of stage 1 (one point
+        for a moving target), then one course on each side of the plane of the stations; NaN for an empty place.
     bias : Array, shape (N, q)
-        Biases for these candidates.
+        Biases for these candidates, the same for all C.
     """
     with np.errstate(all="ignore"):
         guess = _free_ranges(course, order)
         state = np.full((len(course.offset), 1, order + 1, course.station.shape[-1]), np.nan)
         for _ in range(_LIFTED_PASSES):
             state, guess = _tie_ranges(course, guess, order)
-        branches = _branches(course, state[:, 0], guess.reference)
+        branches = _plane_branches(course, state[:, 0], guess.reference)
     return np.concatenate([state, branches], axis=1), guess.bias
 
 
 def _powers(course: RegistrationCourse, count: int) -> Array:
-    """Return the powers t^j / j! (B, count)."""
+    """Return the factors t^j / j! (B, count) of position, velocity and higher derivatives, for j below `count`."""
     return np.stack([course.time**j / factorial(j) for j in range(count)], axis=-1)
 
 
 def _rows(course: RegistrationCourse, guess: _Guess) -> tuple[Array, Array, Array, Array]:
-    """Return ranges r, and the rows divided by r: columns of x, columns of r_0, right side; each (N, B, S, ...)."""
+    """Return ranges r, and the rows divided by r: columns of x, columns of r_0, right side; each (N, B, S, ...).
+
+    The ranges follow from the biases and reference ranges of `guess`.
+    """
     m = course.offset - (course.bias @ guess.bias[:, None, :, None])[..., 0]
     r = np.maximum(m + course.sign * guess.reference[..., None], _NEAREST)
     first, others = course.station[..., :1, :], course.station[..., 1:, :]
@@ -171,7 +177,11 @@ def _free_ranges(course: RegistrationCourse, order: int) -> _Guess:
 
 
 def _least_squares(rows: Array, course: RegistrationCourse, bias: Array | None, cut: float) -> Array:
-    """Return the least-squares solution (N, n) of rows [A | b] (N, B, S, n + 1); undetermined directions stay zero."""
+    """Return the least-squares solution (N, n) of rows [A | b] (N, B, S, n + 1); undetermined directions stay zero.
+
+    If `bias` (N, q) is given, the last q unknowns are changes of the biases, and get their prior. `cut` is the share of
+    the largest eigenvalue that counts as zero.
+    """
     flat = rows.reshape(len(rows), -1, rows.shape[-1])
     gram = np.swapaxes(flat, -1, -2) @ flat
     matrix, vector = gram[..., :-1, :-1].copy(), gram[..., :-1, -1].copy()
@@ -183,7 +193,11 @@ def _least_squares(rows: Array, course: RegistrationCourse, bias: Array | None, 
 
 
 def _solve(matrix: Array, vector: Array, cut: float) -> Array:
-    """Return the solution (N, n) of scaled normal equations, zero in directions with (almost) no information."""
+    """Return the solution (N, n) of normal equations scaled to a unit diagonal; NaN if the input is not finite.
+
+    It is zero along eigenvectors whose eigenvalue is at most `cut` times the largest: these directions have (almost) no
+    information.
+    """
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     scaled = matrix * scale[..., :, None] * scale[..., None, :]
@@ -196,7 +210,7 @@ def _solve(matrix: Array, vector: Array, cut: float) -> Array:
 
 
 def _smooth(course: RegistrationCourse, reference: Array, order: int) -> Array:
-    """Return reference ranges whose squares fit a course: r^2 - |s|^2 = lifts(t) - 2 s' x(t)."""
+    """Return reference ranges (N, B) whose squares fit a course: r^2 - |s|^2 = lifts(t) - 2 s' x(t)."""
     first = course.station[..., 0, :]
     lifts = _powers(course, 2 * order + 1)
     along = _course_columns(course, first[..., None, :], order)[..., 0, :]
@@ -209,7 +223,10 @@ def _smooth(course: RegistrationCourse, reference: Array, order: int) -> Array:
 
 
 def _tie_ranges(course: RegistrationCourse, guess: _Guess, order: int) -> tuple[Array, _Guess]:
-    """Return the candidates of stage 1 (N, C, order + 1, d), and biases and reference ranges of the best candidate."""
+    """Return the candidates of stage 1 (N, C, order + 1, d), and biases and reference ranges of the best candidate.
+
+    The reference ranges are tied to the course: near `guess` they are linear in their squares.
+    """
     q, d, n = course.bias.shape[-1], course.station.shape[-1], (order + 1) * course.station.shape[-1]
     _, place, gain, right = _rows(course, guess)
     # rows in (bias, course, lifts): the tangent parabola at the guess replaces the reference range
@@ -238,7 +255,7 @@ def _tie_ranges(course: RegistrationCourse, guess: _Guess, order: int) -> tuple[
 def _add_prior(rows: Array, course: RegistrationCourse, bias: Array) -> Array:
     """Return rows (N, R, q + n + 1), with the rows of the prior of the biases appended.
 
-    Biases are the first columns.
+    The first q columns are changes of the biases from `bias` (N, q); the last column is the right side.
     """
     q = bias.shape[1]
     prior = np.zeros((len(rows), q, rows.shape[-1]))
@@ -269,15 +286,21 @@ def _solve_constrained(rows: Array, q: int, d: int) -> tuple[Array, Array]:
 
 
 def _reference(course: RegistrationCourse, theta: Array, lifts: Array, order: int) -> Array:
-    """Return the squared ranges (N, B) of the reference station."""
+    """Return the squared ranges (N, B) of the reference station to courses `theta` (N, (order + 1) d).
+
+    `lifts` are the coefficients of |x(t)|^2. The results may be negative for solutions that violate the constraint.
+    """
     first = course.station[..., 0, :]
     along = _course_columns(course, first[..., None, :], order)[..., 0, :]
     inner = (along @ theta[..., None])[..., 0]
     return np.asarray(lifts @ _powers(course, 2 * order + 1).T - 2.0 * inner + (first**2).sum(-1))
 
 
-def _branches(course: RegistrationCourse, state: Array, reference: Array) -> Array:
-    """Return two courses (N, 2, order + 1, d), one on each side of the plane in which the stations spread most."""
+def _plane_branches(course: RegistrationCourse, state: Array, reference: Array) -> Array:
+    """Return two courses (N, 2, order + 1, d), one on each side of the plane in which the stations spread most.
+
+    The distance from the plane follows from the reference ranges (N, B); the part of `state` along the plane stays.
+    """
     first = course.station[..., 0, :]
     # the normal is the direction in which the stations spread least; the reference range gives the distance from the
     # plane

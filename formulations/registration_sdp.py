@@ -17,21 +17,21 @@ The lift :math:`Y = y y^\top` is relaxed to :math:`Y \succeq 0` and solved with 
 
 The lift is never formed. With the biases in the lift the cost is a sum over the windows, and so are the definitions: of
 `Y` only the blocks of :math:`u_k = (1, p, v, \delta, r_1(k), f_i(k))` occur, which have the block of :math:`(1, p, v,
-\delta)` in common. If all blocks are semidefinite and agree in their common part, they are the blocks of a semidefinite
-matrix, because the graph of this pattern is chordal. The best moments of the biases give :math:`f^\top M f` again. So
-`K` blocks of a dozen rows are the same relaxation as the lift of all windows, whose time grows with the sixth power of
-them.
+\delta)` in common. The graph of this pattern is chordal. Therefore, if all blocks are semidefinite and agree in their
+common part, they are blocks of a semidefinite matrix. The best moments of the biases give :math:`f^\top M f` again. So
+`K` blocks of a dozen rows are the same relaxation as the lift of all windows. The time of that lift would grow with the
+sixth power of the number of windows.
 
-Small unknowns are lifted in small units: the lift contains the remainders, not the
-ranges :math:`r_i`, compared with whose squares they would be rounding for an interior-point method.
+Small unknowns are lifted in small units: the lift contains the remainders, not the ranges :math:`r_i`. Compared with
+the squares of ranges, the remainders would be rounding for an interior-point method.
 
 Both the price and the prior are needed. A misfit `m` of the second equality can be absorbed in the moments alone,
 :math:`2 \operatorname{cov}(r_1, f) = m`, for which :math:`\operatorname{var}(r_1) \operatorname{var}(f) \ge m^2 / 4`
 suffices. Without the price, :math:`\operatorname{var}(r_1)`, that is the trace, grows without bound and every target
 has cost zero in the limit; with it misfits cost about :math:`\sqrt{\eta \sum M_{ff} m^2}`. Without the prior, `M` is
-zero for remainders common to all windows, so that these misfits cost nothing again and the price moves the target into
-the array. The relaxation is not tight (at the best price its misfit is about a twentieth of the misfit by noise): it
-gives starts, not bounds.
+zero for remainders common to all windows. These misfits would cost nothing again, and the price would move the target
+into the array. The relaxation is not tight (at the best price its misfit is about a twentieth of the misfit by noise):
+it gives starts, not bounds.
 
 The best price depends on the unknown distance. A price that is too high moves the target into the array; with a price
 that is too low, the slack moves it far away. So the problem is solved for several prices, and the solutions are ranked
@@ -56,8 +56,8 @@ from numpy.typing import ArrayLike
 from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio
 
-# Two prices per decade. In random plane arrays the best price (median of twelve) is 30 for targets within one extent, 3
-# at two extents, 0.3 at three, 0.1 at five and 0.03 at ten.
+# Two prices per decade. In random plane arrays the best price (median of twelve) depends on the distance of the target:
+# 30 within one extent, 3 at two extents, 0.3 at three, 0.1 at five and 0.03 at ten.
 PRICES = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)
 """Prices eta of the squared distance from the array's centre, in units of its mean squared extent."""
 
@@ -184,9 +184,13 @@ class RegistrationWindows:
     power : Array, shape (K, 1) or (K, 2)
         Powers of time that multiply the target's unknowns; time is relative to its middle, in half spans.
     unit : float
-        The fine unit, for biases and remainders.
-    origin, scale, clock
-        Origin, unit of length, and middle and half span of time.
+        The fine unit, for biases and remainders, in units of the extent.
+    origin : Array, shape (d,)
+        Mean of the stations, in the units of the caller.
+    scale : float
+        Extent of the stations, in the units of the caller.
+    clock : tuple of two float
+        Middle and half span of the times.
     """
 
     station: Array
@@ -247,7 +251,7 @@ class RegistrationWindows:
         return float(np.einsum("ki,kij,kj", rest, self.gram, rest) + self.prior @ shift**2), shift
 
     def place(self, target: Array) -> Array:
-        """Return position at time zero, and velocity of a moving target, (1 or 2, d) as given."""
+        """Return the target (1 or 2, d) in the units of the caller: position at time zero, and velocity if it moves."""
         found = self.scale * target.reshape(-1, len(self.origin))
         if len(found) == 2:  # back from time relative to its middle, in half spans
             found[1] /= self.clock[1]
@@ -324,7 +328,10 @@ def _relaxation(windows: int, stations: int, dimension: int, order: int, biases:
 
 
 def _parameters(run: RegistrationWindows) -> dict[str, Array]:
-    """Return the coefficients of the lifted equalities; the second kind is divided by the unit of the remainders."""
+    """Return the parameters of `registration_problem` by name, except the price.
+
+    The second kind of equalities is divided by the unit of the remainders.
+    """
     K, S, _ = run.station.shape
     power, first, other = run.power, run.station[:, 0], run.station[:, 1:]
     size = (run.station**2).sum(axis=-1)
@@ -346,7 +353,10 @@ def _parameters(run: RegistrationWindows) -> dict[str, Array]:
 
 
 def _read_off(run: RegistrationWindows, weight: Array, price: float, answer: ConicAnswer) -> RegistrationStart:
-    """Return the start in the units of the caller from a solution of the relaxation."""
+    """Return the start in the units of the caller from a solution of the relaxation.
+
+    `weight` (n, n) is the form of the mean of |p_k|^2 over the windows, which `price` multiplies.
+    """
     shared, inside = answer.values["shared"], slice(1, 1 + len(weight))
     target = shared[0, inside]
     cost, shift = run.cost(target)
@@ -365,6 +375,6 @@ def _read_off(run: RegistrationWindows, weight: Array, price: float, answer: Con
 
 
 def _block(answer: ConicAnswer, window: int) -> Array:
-    """Return the block of a window from a solution of the relaxation."""
+    """Return the block of a window from a solution of the relaxation: the lift of (1, p, v, delta, r_1, f)."""
     across = answer.values[f"across {window}"]
     return np.block([[answer.values["shared"], across], [across.T, answer.values[f"own {window}"]]])

@@ -2,17 +2,17 @@ r"""The secular equation of least squares with one quadratic constraint.
 
 .. math:: \sum_j \frac{c_j^2}{(t - p_j)^2} = \kappa + \sigma t, \qquad \sigma \ge 0,
 
-with poles :math:`p_1 \le \dots \le p_d`. Put :math:`T(t)` for the left side. By Cauchy's inequality
-:math:`3 T'^2 \le 2 T T''`, so :math:`T^{-1/2}` is concave between two poles, :math:`(\kappa + \sigma t)^{-1/2}` is
-convex where it exists, and
+with poles :math:`p_1 \le \dots \le p_d`. :math:`T(t)` is the left side. By Cauchy's inequality :math:`3 T'^2 \le 2 T
+T''`, so :math:`T^{-1/2}` is concave between two poles, :math:`(\kappa + \sigma t)^{-1/2}` is convex where it exists,
+and
 
 .. math:: k(t) = T(t)^{-1/2} - (\kappa + \sigma t)^{-1/2}
 
-is concave in every interval. Newton's iteration on `k`, started near a pole where `k <= 0`, therefore climbs
+is concave in every interval. Newton's iteration on `k` starts near a pole, where `k <= 0`. It therefore climbs
 monotonically to the first root on that side of the pole, or reaches `k' <= 0`, which proves that no root exists. Every
-interval holds at most two roots, one per end, so the two sides of all poles, and for ``sigma > 0`` the zero of the
-right side, list all real roots without a polynomial and without a bracket. Each root is stored as the distance from its
-pole: roots that fall onto a pole (the "hard case", ``c_j`` near 0) keep their full relative accuracy.
+interval contains at most two roots, one at each end. So starts on both sides of all poles, and for ``sigma > 0`` at the
+zero of the right side, find all real roots. No polynomial and no bracket is needed. Each root is stored as the distance
+from its pole: roots that fall onto a pole (the "hard case", ``c_j`` near 0) keep their full relative accuracy.
 
 Sources: J. J. More and D. C. Sorensen, "Computing a trust region step", SIAM J. Sci. Stat. Comput. 4 (1983), section 3
 (the concave form on the last interval); the use on every interval is the same inequality.
@@ -131,7 +131,10 @@ def everything(equation: Secular) -> Roots:
 
 
 def _start(equation: Secular, pole: Array, weight: Array, sign: float) -> tuple[Array, Mask]:
-    """Return distances from the poles that are not beyond the first root, and whether a root is possible."""
+    """Return distances from the poles that are not beyond the first root, and whether a root is possible.
+
+    `pole` and `weight` (K, N) belong to the slots; `sign` is 1 for roots above the poles, -1 for roots below them.
+    """
     level, slope = equation.level + equation.slope * pole, equation.slope
     positive = level > 0.0
     safe = np.where(positive, level, 1.0)
@@ -141,9 +144,9 @@ def _start(equation: Secular, pole: Array, weight: Array, sign: float) -> tuple[
     if not grows.any():
         return np.sqrt(weight / safe), positive
     rate = np.where(grows, slope, 1.0)
-    # The other poles only add to the left side. If this pole alone exceeds twice each of the two terms of the
-    # right side, the first root has not been reached. If the level is negative, the
-    # root lies beyond the zero of the right side, by b say, and (away + b)^2 <= 4 max(away, b)^2 gives the quarters.
+    # The other poles only add to the left side. If this pole alone exceeds twice each of the two terms of the right
+    # side, the first root has not been reached. If the level is negative, the root is beyond the zero of the right
+    # side, at the distance b. Then (away + b)^2 <= 4 max(away, b)^2 gives the factors of a quarter.
     cube = np.where(grows, np.cbrt(0.25 * weight / rate), np.inf)
     above = np.minimum(np.sqrt(0.5 * weight / safe), cube)
     away = np.where(positive, 1.0, -level / rate)
@@ -152,7 +155,11 @@ def _start(equation: Secular, pole: Array, weight: Array, sign: float) -> tuple[
 
 
 def _climb(equation: Secular, origin: Array, gap: Array, sign: Array, start: Array, free: Mask) -> Roots:
-    """Return the results of Newton's monotone iteration; ``gap[k, i]`` is the distance of origin i from pole k."""
+    """Return the roots after Newton's monotone iteration from distances `start` (K, N) of the origins.
+
+    `gap[k, i]` is the distance of origin i from pole k. `sign` is 1 for slots above their origin, -1 below. `free`
+    marks slots in which a root is possible.
+    """
     weight = equation.weight[:, None]
     level = equation.level + equation.slope * origin
     slope = equation.slope * sign

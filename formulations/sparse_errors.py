@@ -217,12 +217,12 @@ def sparse_fit(
 
 
 def group_sizes(values: Array, groups: Groups, count: int) -> Array:
-    """Return the Euclidean length of the values of each group.
+    """Return the Euclidean length of the values of each group: the size of its gross error.
 
     Parameters
     ----------
     values, groups : Array and int array, shape (m,)
-        A value and the group of each row.
+        A value and the number of the group of each row.
     count : int
         Number of groups G.
 

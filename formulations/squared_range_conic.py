@@ -115,7 +115,7 @@ def hull_problem(quadric: Quadric) -> Any:
 
 @keep
 def _relaxation(kind: str, quadric: Quadric, backend: str) -> Relaxation:
-    """Return the relaxation, built once for each quadric and back end."""
+    """Return the relaxation of the given kind, "shor" or "hull", built once for each quadric and back end."""
     problem = shor_problem(quadric) if kind == "shor" else hull_problem(quadric)
     # In 200 random problems in space, the greatest error of the point is 1e-3 at Clarabel's default of 1e-8. It is 1e-4
     # here, after two more iterations; at 1e-11 one solve in seven stops early.
@@ -232,7 +232,7 @@ def mixed_points(lift: Array, quadric: Quadric) -> Array:
 
 
 def _form(u: Array, v: Array, quadric: Quadric) -> float:
-    """Return the bilinear form of the constraint for points (y, 1) times any number."""
+    """Return the bilinear form of the constraint for two vectors (n + 1,), points (y, 1) times any number."""
     linear = quadric.linear @ (u[:-1] * v[-1] + v[:-1] * u[-1])
     return float(np.sum(quadric.square * u[:-1] * v[:-1]) + linear)
 
@@ -272,7 +272,10 @@ def crossings(factor: Array, y: Array, quadric: Quadric) -> Array:
 
 
 def _triangle(B: Array, g: Array) -> tuple[Array, float]:
-    """Return the square triangular factor of ``[B, -g]`` divided by its size, as rows are large if noise is small."""
+    """Return the triangular factor (n + 1, n + 1) of ``[B, -g]`` divided by its size, and this size.
+
+    Whitened rows are large if the noise is small; the solver needs numbers of order one.
+    """
     rows = np.concatenate([B, -g[:, None]], axis=1)
     n = rows.shape[1]
     factor = np.zeros((n, n))

@@ -1,9 +1,12 @@
-"""The admitted positions: surfaces that hold fixes exactly, bounds, and lines of sight.
+"""The admitted positions: exact surfaces, bounds, and lines of sight that the Earth does not block.
 
-Every constrained quantity is a tape with its gradient. A refinement steps along the exact surfaces, and its positions
-are projected back onto them. Bounds and lines of sight are checked after the refinement.
+Every constrained quantity is a tape: elementary operations that compute its value and its gradient. A refinement steps
+along the exact surfaces, and its positions are projected back onto them. Bounds and lines of sight are checked after
+the refinement.
 
-Names in capitals, such as X or MOVE, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+A block has W problems, one in each lane; the lane is the last axis of the arrays. A problem has d coordinates, p
+unknowns and c exact constraints. `room` is the workspace of the block. Names in capitals, such as X or MOVE, are rows
+of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations
@@ -54,7 +57,10 @@ _ON = 1e-15
 
 @compiled
 def _measure(a: Admission, room: EngineWorkspace, shift: int, last: int) -> None:
-    """Write the first `last` quantities at row X, or at TRIAL if `shift` is 1, and their gradients."""
+    """Write the first `last` constrained quantities to `room.side`, and their gradients to `room.face`.
+
+    They are computed at row X, or at row TRIAL if `shift` is 1.
+    """
     d, r, x, origin, table = room.d, room.registers, room.vector[X + shift], room.vector[ORIGIN], a.tapes.table
     for k in range(last):
         for i in range(table[k, INPUT], table[k + 1, INPUT]):
@@ -73,7 +79,10 @@ def _measure(a: Admission, room: EngineWorkspace, shift: int, last: int) -> None
 
 @compiled
 def restore(model: EngineModel, room: EngineWorkspace, shift: int) -> None:
-    """Project row X, or TRIAL if `shift` is 1, onto the exact surfaces, along the shortest way."""
+    """Project row X, or TRIAL if `shift` is 1, onto the exact surfaces, along the shortest way.
+
+    If RADIUS is positive, the position is moved to the sphere of this radius about CENTRE instead.
+    """
     a, d = model.admission, room.d
     if room.scalar[RADIUS, 0] > 0.0:
         _restore_radius(room, shift)
@@ -117,7 +126,11 @@ def _restore_radius(room: EngineWorkspace, shift: int) -> None:
 
 @compiled
 def _square(left: Array, right: Array, room: EngineWorkspace, d: int) -> None:
-    """Write the factor of the products (c, c, W) of gradients (c, d, W) and vectors (c, d, W) to `room.small`."""
+    """Write the Cholesky factor (c, c, W) of the matrix ``left right^T`` to `room.small`, its pivots to `room.pivot`.
+
+    `left` and `right` have the shape (c, d, W): gradients of the exact constraints, and vectors. The matrix must be
+    symmetric.
+    """
     small, pivot, diagonal = room.small, room.pivot[0], room.pivot[1]
     for k in range(len(small[0])):
         for m in range(k + 1):
@@ -135,9 +148,9 @@ def _square(left: Array, right: Array, room: EngineWorkspace, d: int) -> None:
 def evaluate(model: EngineModel, rows: Any, room: EngineWorkspace, shift: int) -> None:
     """Write information, right side and cost at row X, or at TRIAL if `shift` is 1.
 
-    On exact surfaces, the information across the surface is enlarged to the size of the information along it. The steps
-    that `project_step` leaves do not depend on this term. The matrix becomes regular if the rows leave a direction
-    undetermined.
+    On exact surfaces, the information across the surface is enlarged to the size of the information along it. The
+    matrix then becomes regular if the rows leave a direction undetermined. The steps that `project_step` leaves do not
+    depend on this term.
     """
     equations(rows, room, shift)
     a, d, matrix, spare = model.admission, room.d, room.matrix[H + shift], room.scalar[SPARE]
@@ -164,7 +177,7 @@ def evaluate(model: EngineModel, rows: Any, room: EngineWorkspace, shift: int) -
 
 @compiled
 def _point_out(room: EngineWorkspace, shift: int, out: Array) -> None:
-    """Write the direction (d, W) away from CENTRE, not normalised."""
+    """Write the vector (d, W) from CENTRE to row X, or to TRIAL if `shift` is 1, to `out`, metres."""
     for j in range(room.d):
         for lane in range(LANES):
             out[j, lane] = room.vector[X + shift, j, lane] - room.vector[CENTRE, j, lane]
@@ -172,7 +185,11 @@ def _point_out(room: EngineWorkspace, shift: int, out: Array) -> None:
 
 @compiled
 def coarsen(model: EngineModel, room: EngineWorkspace) -> None:
-    """Raise the rounding error of the residuals to the error that projection onto a surface around the Earth causes."""
+    """Raise BLUR, the rounding error of the residuals, if a surface around the Earth constrains the position.
+
+    The projection onto the surface then rounds coordinates as large as the Earth's radius. The unit of BLUR is one
+    standard deviation.
+    """
     a, blur = model.admission, room.scalar[BLUR]
     if a.exact == 0 or not a.earth:
         return
@@ -185,7 +202,11 @@ def coarsen(model: EngineModel, room: EngineWorkspace) -> None:
 
 @compiled
 def project_step(model: EngineModel, room: EngineWorkspace) -> None:
-    """Remove the part of the step MOVE that leaves the exact surfaces; LOWER contains the factor of the information."""
+    """Remove the part of the step MOVE that leaves the exact surfaces.
+
+    LOWER and INVERSE must contain the factor of the information. The remaining step minimises the linearised cost along
+    the surfaces.
+    """
     a, d, move = model.admission, room.d, room.vector[MOVE]
     if a.exact == 0:
         return
@@ -200,7 +221,7 @@ def project_step(model: EngineModel, room: EngineWorkspace) -> None:
 
 @compiled
 def _keep_off(room: EngineWorkspace, move: Array, p: int) -> None:
-    """Subtract the combination of `room.push` from a vector (p, W) that makes the vector tangent to the surfaces."""
+    """Subtract a combination of the vectors `room.push` from `move` (p, W): the result is tangent to the surfaces."""
     face, push, part, d = room.face[0], room.push, room.part, room.d
     _square(face, push, room, d)
     for k in range(len(push)):
@@ -218,7 +239,10 @@ def _keep_off(room: EngineWorkspace, move: Array, p: int) -> None:
 
 @compiled
 def project_covariance(model: EngineModel, room: EngineWorkspace) -> None:
-    """Replace the covariance in the lower half of H_TRIAL by the covariance along the exact surfaces."""
+    """Replace the covariance in the lower half of H_TRIAL by the covariance along the exact surfaces.
+
+    The variance across a surface becomes zero. LOWER, MOVE and `room.push` are overwritten.
+    """
     a, d, cov, column = model.admission, room.d, room.matrix[H_TRIAL], room.vector[MOVE]
     if a.exact == 0:
         return
@@ -242,13 +266,16 @@ def project_covariance(model: EngineModel, room: EngineWorkspace) -> None:
         _keep_off(room, column, p)
         for j in range(i, p):
             for lane in range(LANES):
-                # the variance of a held coordinate is zero, which rounding may make slightly negative
+                # the variance of an exactly constrained coordinate is zero, which rounding may make slightly negative
                 cov[j, i, lane] = column[j, lane] if j > i else max(column[j, lane], 0.0)
 
 
 @compiled
 def find_multipliers(model: EngineModel, room: EngineWorkspace) -> None:
-    """Write the Lagrange multipliers (c, W) of the exact constraints at row X to `room.part`."""
+    """Write the Lagrange multipliers (c, W) of the exact constraints at row X to `room.part`.
+
+    The gradient of the cost plus the sum of multipliers times constraint gradients is zero.
+    """
     a, d, part, face = model.admission, room.d, room.part, room.face[0]
     if a.exact == 0:
         return
@@ -265,7 +292,10 @@ def find_multipliers(model: EngineModel, room: EngineWorkspace) -> None:
 
 @compiled
 def check_constraints(model: EngineModel, room: EngineWorkspace, out: Array) -> None:
-    """Write 0.0 to `out` (W,) if row X violates a constraint, or if the Earth hides it from a station with a row."""
+    """Write 0.0 to `out` (W,) for lanes whose row X is not admitted; the other lanes keep their values.
+
+    A position is not admitted if it violates a constraint, or if the Earth hides it from a station with a row.
+    """
     a = model.admission
     sides = room.side.shape[1]
     if sides:
@@ -293,7 +323,10 @@ side of the Earth count as hidden."""
 
 @compiled
 def _is_hidden(model: EngineModel, room: EngineWorkspace, lane: int) -> bool:
-    """Return whether the Earth hides row X of a lane from a station with a row (as `optloc.solvers.inequalities`)."""
+    """Return whether the Earth hides row X of a lane from a station with a row (as `optloc.solvers.inequalities`).
+
+    Stations on the ground with rows other than angles do not count while the target is below satellites.
+    """
     a, origin, base = model.admission, room.vector[ORIGIN], room.axes[BASE]
     high = 0.0
     for i in range(3):
@@ -374,7 +407,10 @@ _SPACE = 3
 
 
 def levels_of(problem: Problem) -> Array:
-    """Return the bounds (N or 1, k, 2) of the constraints of problems, in the order of `admission_of`."""
+    """Return the lower and upper bounds (N or 1, k, 2) of the k constraints, in the order of `admission_of`.
+
+    Exact constraints come first. The first axis is 1 if all problems share the bounds.
+    """
     bands = [band for band in problem.constraints if isinstance(band, Band)]
     bands.sort(key=lambda band: not is_exact(band))
     if not bands:
@@ -385,7 +421,11 @@ def levels_of(problem: Problem) -> Array:
 
 
 def _trace(problem: Problem, band: Band) -> tuple[Tape, tuple[int, ...]] | None:
-    """Return the tape of a constrained quantity with its derivatives, and the coordinates of these derivatives."""
+    """Return the tape of a constrained quantity, and the coordinates that its derivatives refer to.
+
+    The outputs of the tape are the value and the derivatives that are not zero. The result is None if the quantity has
+    no tape, for instance because it depends on a velocity.
+    """
     recorder, d = Recorder(), problem.dimension
     state = tuple(Jet(recorder.input(i), {i: 1.0}) for i in range(d))
     try:

@@ -1,7 +1,9 @@
 """Candidates for starts if squared ranges have too few rows, for example the cheapest of many positions.
 
 A few candidates are refined, and the cheapest two at different minima are used. The second one replaces the mirror
-image of the fix. Names in capitals, such as X or FIX, are rows of the arrays of
+image of the fix. `spot` contains the candidates of a block of W problems: d coordinates and the cost of each.
+
+`room` is the workspace of the block. Names in capitals, such as X or FIX, are rows of the arrays of
 `optloc.engine.memory.EngineWorkspace`.
 """
 
@@ -82,7 +84,10 @@ def refine_candidates(model: EngineModel, rows: Any, room: EngineWorkspace, spot
 
 @compiled
 def _keep(room: EngineWorkspace, spot: Array) -> None:
-    """Write the refined candidate and its cost to `spot` (d + 1, W), and store the best candidate so far in FIX."""
+    """Write row X, a refined candidate, and its cost to `spot` (d + 1, W), and store the best candidate so far in FIX.
+
+    The cost is infinite for lanes that are not good.
+    """
     vector, scalar, d = room.vector, room.scalar, room.d
     for lane in range(LANES):
         good = scalar[GOOD, lane] != 0.0
@@ -102,8 +107,9 @@ def _keep(room: EngineWorkspace, spot: Array) -> None:
 def _choose(model: EngineModel, room: EngineWorkspace, spot: Array) -> None:
     """Write the best candidate to row X, and the cheapest candidate at another minimum to row OTHER.
 
-    A lane is not good if a third minimum is a rival too. It is not good either if the best candidate fits poorly, since
-    a position between the candidates may be a better minimum.
+    SECOND becomes 1.0 if this other candidate is a rival of the best one. GOOD becomes 0.0 for three reasons: no
+    candidate is admitted, a third minimum is a rival too, or the best candidate fits poorly. In the last case a
+    position between the candidates may be a better minimum.
     """
     vector, scalar, d = room.vector, room.scalar, room.d
     for lane in range(LANES):
@@ -127,7 +133,10 @@ def _choose(model: EngineModel, room: EngineWorkspace, spot: Array) -> None:
 
 @compiled
 def _is_apart(room: EngineWorkspace, spot: Array, row: int, lane: int) -> bool:
-    """Return whether a candidate is more than three standard deviations of FIX from the given row of `vector`."""
+    """Return whether a candidate is more than three standard deviations from a row of `room.vector`, in one lane.
+
+    `row` is FIX or OTHER. FIX gives the standard deviations.
+    """
     apart = 0.0
     for i in range(room.d):
         for j in range(room.d):
@@ -149,7 +158,8 @@ RINGS = len(_RADII)
 def look_around(model: EngineModel, rows: Any, room: EngineWorkspace, spot: Array, rings: int) -> None:
     """Write the cheapest position of each sector about the stations, and its cost, to `spot`, see `refine_candidates`.
 
-    The `rings` nearest rings are used. Each position is first projected onto the exact surfaces.
+    `rings` is the number of distances that are tried, from the nearest. Each position is first projected onto the exact
+    surfaces.
     """
     vector, scalar, d = room.vector, room.scalar, room.d
     each = len(model.ahead) // CANDIDATES
@@ -179,7 +189,7 @@ _FAN = {2: 4, 3: 12}
 
 
 def directions(d: int) -> Array:
-    """Return unit vectors (n, d), sorted by sector and spread as evenly as possible."""
+    """Return unit vectors (n, d), sorted by sector and spread as evenly as possible, for d = 2 or 3 coordinates."""
     count = CANDIDATES * _FAN[d]
     number = np.arange(count) + 0.5
     if d == 2:

@@ -1,4 +1,9 @@
-"""The arrays of a plan, from the structure of one problem."""
+"""The arrays of a plan, from the structure of one problem.
+
+`one` is a problem without batch axes. `found` are its least-squares ranges as linear maps of the measurements, known up
+to one common unknown t; None if the rows give no ranges. Letters: m rows, s station positions with rows, k epochs, d
+coordinates.
+"""
 
 from __future__ import annotations
 
@@ -45,9 +50,18 @@ _LEVEL = 1e-9
 
 
 class PlanArrays(NamedTuple):
-    """The stations of a plan (epoch and number, (2, s)), its maps to a start, and a function that returns its rows.
+    """The arrays of a plan, and a function that returns the rows of problems.
 
-    `ranged` is True if all rows are sums of ranges.
+    Parameters
+    ----------
+    node : int64 array (2, s)
+        Epoch and station number of each station position that has rows.
+    model : EngineModel
+        Maps from measurements to a start.
+    rows : callable
+        Returns the rows for the evaluator, from a problem or a flat batch.
+    ranged : bool
+        Whether all rows are sums of ranges.
     """
 
     node: Array
@@ -59,7 +73,8 @@ class PlanArrays(NamedTuple):
 def draw_ranges(one: Problem, admission: Admission) -> PlanArrays | None:
     """Return the arrays of a plan whose rows are sums of ranges.
 
-    The result is None if rows for a start are missing, or if no row links some stations.
+    `admission` contains the constraints of the position. The result is None if rows for a start are missing, or if no
+    row links some stations.
     """
     offset = None
     if one.stations.unknown_for:  # errors along the lines to the target are noise
@@ -69,8 +84,8 @@ def draw_ranges(one: Problem, admission: Admission) -> PlanArrays | None:
     # If no row links two stations, their ranges are not related.
     if found is None or len(found.groups[0]) != 1:
         return None
-    node = _nodes(one, found)
-    model = _model(one, found, node, admission)
+    node = _station_nodes(one, found)
+    model = _start_maps(one, found, node, admission)
     if model is None or _start_of(one, found, admission, 0) != BY_SQUARES:
         return None
     turned, made = _range_rows(with_station_noise(one), node[1])
@@ -82,10 +97,14 @@ def draw_ranges(one: Problem, admission: Admission) -> PlanArrays | None:
 
 
 def draw_tapes(one: Problem, admission: Admission, dof: int) -> PlanArrays | None:
-    """Return the arrays of a plan whose rows are tapes, or None if the rows have no tapes or no start."""
+    """Return the arrays of a plan whose rows are tapes, or None if the rows have no tapes or no start.
+
+    `admission` contains the constraints of the position. `dof` is the number of degrees of freedom; it sets the cost
+    above which a candidate fits poorly.
+    """
     found = _find_ranges(one)
-    node = _nodes(one, found)
-    model = _model(one, found, node, admission)
+    node = _station_nodes(one, found)
+    model = _start_maps(one, found, node, admission)
     if model is None:
         return None
     places = {(int(station), int(epoch)): i for i, (epoch, station) in enumerate(node.T)}
@@ -103,7 +122,10 @@ def draw_tapes(one: Problem, admission: Admission, dof: int) -> PlanArrays | Non
 
 
 def _find_ranges(one: Problem) -> Ranges | None:
-    """Return the least-squares ranges of one problem as linear maps: the ranges of unit vectors of measurements."""
+    """Return the least-squares ranges of one problem as linear maps, or None if the rows give no ranges.
+
+    Item i of the result contains the ranges for the measurements that are one in row i and zero in all other rows.
+    """
     return ranges(with_station_noise(_unit_measurements(problem_at_rest(one.flat()))))
 
 
@@ -115,9 +137,10 @@ _THREE = 3
 
 
 def _start_of(one: Problem, found: Ranges | None, admission: Admission, lifted: int) -> int | None:
-    """Return the way in which fixes start, see `EngineModel.start`; None if the rows give no start.
+    """Return BY_SQUARES, BY_HEIGHT or BY_PLACES, see `EngineModel.start`; None if the rows give no start.
 
-    Squared ranges need one linear row for each coordinate; the quadric determines the last unknown.
+    Squared ranges need one linear row for each coordinate; the quadric determines the last unknown. `lifted` is the
+    number of linear rows of other kinds.
     """
     known = 0 if found is None else int(found.inside[0].sum())
     if lifted + known == 0:
@@ -133,7 +156,10 @@ def _start_of(one: Problem, found: Ranges | None, admission: Admission, lifted: 
 
 
 def _height_of(one: Problem) -> int | None:
-    """Return the source of the height of the target, see `EngineModel.height`; None if the height is not known."""
+    """Return the source of the height of the target, see `EngineModel.height`; None if the height is not known.
+
+    The source is the number of an exact constraint, or -1 minus the number of a row.
+    """
     held = [band for band in one.constraints if is_exact(band)]
     for i, band in enumerate(held):
         if isinstance(band, Band) and band.kind == "height":
@@ -152,10 +178,13 @@ def _unit_measurements(problem: Problem) -> Problem:
     return replace(problem, rows=rows, stations=replace(problem.stations, velocity=None, axes=None))
 
 
-def _nodes(one: Problem, found: Ranges | None) -> Array:
-    """Return epoch and number (2, s) of the stations that have rows, first those whose ranges are known."""
+def _station_nodes(one: Problem, found: Ranges | None) -> Array:
+    """Return epoch and number (2, s) of the stations that have rows, first those whose ranges are known.
+
+    The epoch is 0 if stations do not move.
+    """
     moving = one.stations.position.shape[-3] > 1
-    known = _known(found)
+    known = _stations_with_ranges(found)
     first = [] if found is None else list(zip(found.epoch[known].tolist(), found.station[known].tolist(), strict=True))
     others = {
         (int(rows.epoch[i]) if moving else 0, int(end[i]))
@@ -166,14 +195,17 @@ def _nodes(one: Problem, found: Ranges | None) -> Array:
     return np.array([*first, *sorted(others - {*first})], dtype=np.int64).reshape(-1, 2).T
 
 
-def _known(found: Ranges | None) -> Array:
-    """Return the numbers of the stations whose ranges are known."""
+def _stations_with_ranges(found: Ranges | None) -> Array:
+    """Return the numbers of the stations in `found` whose ranges the rows determine, at least up to t."""
     return np.zeros(0, dtype=np.int64) if found is None else np.flatnonzero(found.inside[0])
 
 
-def _model(one: Problem, found: Ranges | None, node: Array, admission: Admission) -> EngineModel | None:
-    """Return the maps from measurements of one problem to a start by squares; None if the noise is singular."""
-    count, s, flat, known = one.count, node.shape[1], one.flat(), _known(found)
+def _start_maps(one: Problem, found: Ranges | None, node: Array, admission: Admission) -> EngineModel | None:
+    """Return the maps from measurements of one problem to a start by squares; None if the noise is singular.
+
+    `node` (2, s) is the result of `_station_nodes`; `admission` contains the constraints of the position.
+    """
+    count, s, flat, known = one.count, node.shape[1], one.flat(), _stations_with_ranges(found)
     white = np.eye(s)
     if found is not None:
         white[: len(known), : len(known)] = whitening(found.covariance[0, known[:, None], known])
@@ -199,21 +231,28 @@ def _model(one: Problem, found: Ranges | None, node: Array, admission: Admission
 
 
 def _observed_stations(one: Problem, node: Array) -> tuple[Array, Array]:
-    """Return two arrays (s,): 1.0 for stations that have a row, and 1.0 for stations that have an angle."""
+    """Return two arrays (s,): 1.0 for stations that have a row, and 1.0 for stations that have an angle; else 0.0.
+
+    They are the rows HEARD and SEEN of `EngineModel.station`.
+    """
     moving = one.stations.position.shape[-3] > 1
-    heard, seen = np.zeros(node.shape[1]), np.zeros(node.shape[1])
+    has_row, has_angle = np.zeros(node.shape[1]), np.zeros(node.shape[1])
     for rows in one.rows:
         model = MODELS[rows.kind]
         for index in (rows.a, rows.b)[: model.stations]:
             for i in np.flatnonzero(rows.weight > 0.0):
-                own = (node[1] == index[i]) & (node[0] == (rows.epoch[i] if moving else 0))
-                heard[own] = 1.0
-                seen[own] = 1.0 if model.quantity == "angle" else seen[own]
-    return heard, seen
+                same = (node[1] == index[i]) & (node[0] == (rows.epoch[i] if moving else 0))
+                has_row[same] = 1.0
+                has_angle[same] = 1.0 if model.quantity == "angle" else has_angle[same]
+    return has_row, has_angle
 
 
 def _anchors(one: Problem) -> tuple[Array, Array]:
-    """Return the row that the emission time of each row (m,) and of each epoch (k,) is relative to, or -1."""
+    """Return the reference rows of the emission times: of each row (m,), and of each epoch (k,); -1 without one.
+
+    The reference of an epoch is its first row with an emission time. The second array is empty if epochs have no
+    unknowns.
+    """
     anchor, start = np.full(one.count, -1), np.full(one.epochs if one.layout.n_local else 0, -1)
     for rows, first in zip(one.rows, one.starts, strict=True):
         if MODELS[rows.kind].emission:
@@ -225,7 +264,11 @@ def _anchors(one: Problem) -> tuple[Array, Array]:
 
 
 def _range_rows(one: Problem, station: Array) -> tuple[Array, RangeRows]:
-    """Return the maps to whitened rows, emission times and loops; and the rows over the ranges to `station` (s,)."""
+    """Return linear maps (v, m) of the measurements, and the rows over the ranges to the stations `station` (s,).
+
+    The maps give the whitened rows, then the emission times, then the loops. A loop is a combination of rows that no
+    range changes; its cost is the misfit of the measurements with each other.
+    """
     design, emitted = _design(one, station)
     alone = whiten_rows(whiten(one.noise, one.weight), np.eye(one.count))
     times = alone @ emitted
@@ -253,7 +296,10 @@ def _range_rows(one: Problem, station: Array) -> tuple[Array, RangeRows]:
 
 
 def _design(one: Problem, station: Array) -> tuple[Array, Array]:
-    """Return the coefficients of the ranges (m, s) and of the emission times (m, k) in the rows."""
+    """Return the coefficients of the ranges (m, s) and of the emission times (m, k) in the rows.
+
+    `station` (s,) contains the station numbers.
+    """
     design, emitted = np.zeros((one.count, len(station))), np.zeros((one.count, len(_anchors(one)[1])))
     place = {int(s): i for i, s in enumerate(station)}
     for rows, first in zip(one.rows, one.starts, strict=True):
@@ -268,7 +314,11 @@ def _design(one: Problem, station: Array) -> tuple[Array, Array]:
 
 
 def _tape_rows(correction: Array, base: Array, lifts: Lifts, bounded: bool, problem: Problem) -> TapeRows | None:
-    """Return the rows of problems as tapes, or None if a row has no tape."""
+    """Return the rows of problems as tapes, or None if a row has no tape.
+
+    `base` (p,) are the starts of the other unknowns, `bounded` is the result of `_is_bounded`. The other arguments are
+    the fields of `TapeRows`.
+    """
     bare = problem.with_rows(z=np.zeros(problem.count))
     found = pack(bare, whiten(with_station_noise(bare).noise, bare.weight))
     scaled = any(form_of(bias).enters == "scales" for bias in problem.biases)

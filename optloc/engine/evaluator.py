@@ -2,10 +2,12 @@
 
 Each function of this module is a placeholder for a kernel of the same name in a module of rows, an *evaluator*:
 `optloc.engine.ranges` for rows that are sums of ranges without other unknowns, `optloc.engine.tapes` for rows of every
-kind. `evaluated_by` replaces the placeholders and compiles a kernel for one evaluator, so that the choice costs no
-time while the machine code runs.
+kind. `evaluated_by` replaces the placeholders and compiles a kernel for one evaluator, so that the choice costs no time
+while the machine code runs.
 
-Names in capitals, such as X or SOLVABLE, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+A block has W problems, one in each lane. `rows` are the rows of the evaluator; the function `keep` adds their memory.
+`room` is the workspace of the block; names in capitals, such as X or SOLVABLE, are rows of its arrays, see
+`optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations
@@ -38,19 +40,28 @@ def count_lifted(rows: Any) -> int:
 
 @compiled
 def keep(model: EngineModel, rows: Any, stations: int, d: int, size: int) -> Any:
-    """Return the rows together with the memory that the evaluator needs for a block of problems."""
+    """Return the rows together with the memory that the evaluator needs for a block of problems.
+
+    `stations` and `d` are the numbers of stations and coordinates, `size` is the length of a parameter vector.
+    """
     raise NotImplementedError
 
 
 @compiled
 def load(rows: Any, z: Array, room: EngineWorkspace, anew: bool) -> None:
-    """Load the measurements z (N, m) of a block; `anew` is True if the positions of its stations have changed."""
+    """Load the measurements z (N, m) of a block; `anew` is True if the positions of its stations have changed.
+
+    `room.item` contains the number of the problem of each lane.
+    """
     raise NotImplementedError
 
 
 @compiled
 def minimise_start(model: EngineModel, rows: Any, room: EngineWorkspace, first: bool) -> None:
-    """Write the minimiser of the weighted squared-range rows to `room.y`, and to SOLVABLE whether it is unique."""
+    """Write the minimiser of the weighted squared-range rows to `room.y`, and to SOLVABLE whether it is unique.
+
+    `first` is True in the first of two passes, before ranges are known for the weights.
+    """
     raise NotImplementedError
 
 
@@ -151,7 +162,7 @@ def evaluated_by(kernel: _Kernel, rows: ModuleType, mark: str, **constants: Any)
     kernel : callable
         Kernel that calls kernels of this module, directly or through other kernels.
     rows : module
-        Evaluator: it defines a kernel of each name in `_INTERFACE`.
+        Evaluator: it defines a kernel for each name in `_INTERFACE`.
     mark : str
         Suffix that distinguishes the names of the machine code.
     constants : object

@@ -1,11 +1,19 @@
 """Fixes of N problems in one compiled call: start, refinement, covariance, shape of the cost and rival minima.
 
-The problems are computed in blocks of LANES problems, one problem in each lane. Only a few problems need more work:
-more steps, a mirror image whose refinement goes on, or a second measurement of the shape. These problems are collected
-and computed later in full blocks, so that no block waits for one of its lanes.
+The problems are computed in blocks of LANES problems; a lane is the place of one problem in a block. Only a few
+problems need more work: more steps, a mirror image whose refinement goes on, or a second measurement of the shape.
+These problems are collected and computed later in full blocks, so that no block waits for one of its lanes.
 
-A *rival* is another minimum whose cost is at most `LISTED` above the cost of the fix. Names in capitals, such as X or
-GOOD, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+A *rival* is another minimum whose cost is at most `LISTED` above the cost of the fix. Arguments that many kernels
+share:
+
+- `room` is the workspace of the block. Names in capitals, such as X or GOOD, are rows of the arrays of
+  `optloc.engine.memory.EngineWorkspace`.
+- `size` is the number of different problems in the block; the last problem fills the other lanes.
+- `look` (N,) marks fixes whose shape must be measured again.
+- `hidden` (N,) are the numbers of the problems whose mirror image needs more steps; `images` is their count.
+- `course` (3, N) contains damping, growth and steps of these mirror images.
+- `given` is True if the starts come from elsewhere, see `fixes`.
 """
 
 from __future__ import annotations
@@ -164,9 +172,10 @@ def fixes(
 
 @compiled
 def _take(item: Array, order: Array | None, first: int, count: int) -> int:
-    """Write the problem number of each lane to `item`, and return the number of problems in the block.
+    """Write the number of the problem of each lane to `item` (W,), and return the number of problems in the block.
 
-    The problems are those from `first` on, in the given order or as stored. The last problem fills up the block.
+    The problems are those from `first` on, of `count`, in the given order or as stored. The last problem fills the
+    other lanes.
     """
     size = min(LANES, count - first)
     for lane in range(LANES):
@@ -177,7 +186,10 @@ def _take(item: Array, order: Array | None, first: int, count: int) -> int:
 
 @compiled
 def _see(model: EngineModel, rows: Any, z: Array, station: Array, room: EngineWorkspace, begins: bool) -> None:
-    """Load measurements, bounds and stations of a block; shared stations are loaded only at the begin of a call."""
+    """Load measurements, bounds and stations of a block; shared stations are loaded only if `begins` is True.
+
+    `begins` is True in the first block of a call. `station` (N or 1, s, d) are positions, metres.
+    """
     scalar, vector, anew = room.scalar, room.vector, len(station) > 1 or begins
     level = model.admission.level
     for k in range(level.shape[1]):
@@ -213,7 +225,10 @@ def _refine(
     limit: int,
     answer: Answer,
 ) -> int:
-    """Refine the unknowns of a block, write them to the answer, and return the greatest number of steps."""
+    """Refine the unknowns of a block, write them to the answer, and return the greatest number of steps.
+
+    `limit` is the greatest number of steps tried.
+    """
     refine(model, rows, room, tolerance, limit)
     _write_fixes(model, rows, z, room, size, answer)
     steps = 0
@@ -253,7 +268,7 @@ def _write_fixes(model: EngineModel, rows: Any, z: Array, room: EngineWorkspace,
 
 @compiled
 def _place(vector: Array, item: Array, x: Array, mark: Array, marked: bool, size: int) -> None:
-    """Write the refined positions of the first `size` lanes to x (N, size), metres.
+    """Write the refined positions of the first `size` lanes to x (N, p), metres; `item` are the problems of the lanes.
 
     If `marked` is True, only the lanes with a nonzero `mark` are written.
     """
@@ -355,7 +370,7 @@ def _measure_closely(
 
 @compiled
 def _look_beyond(model: EngineModel, rows: Any, room: EngineWorkspace, size: int, answer: Answer) -> None:
-    """Write the least cost at infinity of the fixes whose kappa exceeds STRAIGHT."""
+    """Write the least cost at infinity of the fixes whose kappa exceeds STRAIGHT: far positions may fit as well."""
     number = answer.number
     search_infinity(model, rows, room)
     for lane in range(size):
@@ -379,7 +394,7 @@ def _pursue(
     images: int,
     course: Array,
 ) -> None:
-    """Refine the mirror images that need more steps in full blocks, until all refinements have ended."""
+    """Refine the mirror images listed in `hidden` in full blocks, until all refinements have ended."""
     scalar, item = room.scalar, room.item
     while images:
         waiting = images
@@ -415,7 +430,10 @@ def _end_images(
     images: int,
     course: Array,
 ) -> int:
-    """Write the rivals that mirror images have reached, and return the number of mirror images that need more steps."""
+    """Write the rivals that mirror images have reached, and return the new number of mirror images in `hidden`.
+
+    If a rival is cheaper than the fix, the two are exchanged.
+    """
     scalar, item = room.scalar, room.item
     before = images
     for lane in range(size):
@@ -453,7 +471,7 @@ def _end_images(
 
 @compiled
 def _is_likelier(room: EngineWorkspace, lane: int) -> bool:
-    """Return whether, of two minima of equal cost, row X is likelier than row FIX.
+    """Return whether, of two minima of equal cost, row X is likelier than row FIX, in one lane.
 
     The minimum nearer to the centre of the stations is likelier. If the logarithms of both distances differ by rounding
     only, the minimum with the greater last coordinate is likelier.
@@ -482,9 +500,9 @@ def _reflect_lane(vector: Array, lane: int, out: Array) -> None:
 
 @compiled
 def _exchange(answer: Answer, i: int) -> None:
-    """Exchange fix and rival of problem i.
+    """Exchange fix and rival of problem i, because the rival is cheaper.
 
-    If the cost of the old fix is more than `LISTED` above the cost of the new one, it is no rival.
+    If the cost of the old fix is more than `LISTED` above the cost of the new fix, it is no rival.
     """
     x, rival, number = answer.x, answer.rival, answer.number
     for j in range(x.shape[1]):
@@ -497,7 +515,7 @@ def _exchange(answer: Answer, i: int) -> None:
 def _look_again(
     model: EngineModel, rows: Any, z: Array, room: EngineWorkspace, size: int, answer: Answer, look: Array
 ) -> None:
-    """Write covariance and shape again for the fixes in row X."""
+    """Write covariance and shape again for the fixes in row X that are marked in `look`."""
     evaluate(model, rows, room, 0)
     for lane in range(LANES):
         room.scalar[ALIVE, lane] = 0.0
@@ -507,7 +525,7 @@ def _look_again(
 
 @compiled
 def _resume(model: EngineModel, x: Array, room: EngineWorkspace) -> None:
-    """Set row X to the positions x (N, d), metres, reached so far, projected onto the exact surfaces."""
+    """Set row X to the unknowns x (N, p) reached so far, metres, projected onto the exact surfaces."""
     item, vector = room.item, room.vector
     for j in range(vector.shape[1]):
         for lane in range(LANES):

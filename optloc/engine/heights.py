@@ -1,6 +1,8 @@
 """The points where ranges known up to one unknown meet the ellipsoid of a known height: a quartic, one lane at a time.
 
-`formulations.range_height` explains the mathematics.
+`formulations.range_height` explains the mathematics. A lane is one problem of a block. `w` is the scratch of one lane;
+the constants _S to _EDGE name its rows. `spot` (CANDIDATES, d + 1, W) receives the points, metres. `room` is the
+workspace of the block, see `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ _ROUNDING = 1e-13
 _SAME = 1e-14
 
 _S, _A, _B, _N, _FIRST, _ALONG, _BASE, _EDGE = 0, 3, 4, 5, 6, 7, 8, 9
-_RANGE = _N  # two rows also hold sign and offset of the ranges to the other stations
+_RANGE = _N  # two rows also contain sign and offset of the ranges to the other stations
 
 
 @compiled
@@ -57,7 +59,7 @@ def meet_ellipsoid(model: EngineModel, room: EngineWorkspace, w: Array, spot: Ar
 
 @compiled
 def _place_stations(model: EngineModel, room: EngineWorkspace, w: Array, lane: int) -> None:
-    """Write the first three stations, Earth-centred and in Earth radii, to the first rows of `w`."""
+    """Write the first three stations of a lane, Earth-centred and in Earth radii, to the rows _S to _S + 2 of `w`."""
     globe, origin = model.admission.globe, room.vector[ORIGIN]
     for s in range(3):
         for i in range(3):
@@ -75,7 +77,7 @@ def _dot(w: Array, a: int, b: int) -> float:
 
 @compiled
 def _cross(w: Array, a: int, b: int, out: int) -> None:
-    """Write the vector product of two rows of `w` to a third row."""
+    """Write the vector product of the rows `a` and `b` of `w` to the row `out`."""
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         w[out, i] = w[a, j] * w[b, k] - w[a, k] * w[b, j]
@@ -85,8 +87,10 @@ def _cross(w: Array, a: int, b: int, out: int) -> None:
 def _meet(model: EngineModel, room: EngineWorkspace, w: Array, height: float, lane: int, spot: Array) -> None:
     """Write the candidates of one lane to `spot`; `height` is in Earth radii.
 
-    On the plane curve ``base + along t + n mu`` with ``mu^2 = q(t)`` all ranges are satisfied. The ellipsoid requires
-    ``E(t) + L(t) mu + alpha mu^2 = 0``. So t is a root of ``(E + alpha q)^2 - L^2 q``.
+    On the plane curve ``base + along t + n mu`` with ``mu^2 = q(t)`` all ranges are satisfied. The parameter t is the
+    range to the first station, shifted and scaled; n is the unit normal of the plane of the stations. The ellipsoid
+    requires ``E(t) + L(t) mu + alpha mu^2 = 0``: E is quadratic, L is linear in t. So t is a root of ``(E + alpha q)^2
+    - L^2 q``.
     """
     turn, gap = model.station[SIGN, 0], room.value[0, lane] / WGS84_A
     for s in range(2):
@@ -127,7 +131,10 @@ def _meet(model: EngineModel, room: EngineWorkspace, w: Array, height: float, la
 
 @compiled
 def _form(w: Array, a: int, b: int, height: float) -> float:
-    """Return the bilinear form of the ellipsoid at `height` (Earth radii) for two rows of `w`."""
+    """Return the bilinear form of the ellipsoid at `height` (Earth radii) for the rows `a` and `b` of `w`.
+
+    A point x is on the ellipsoid if the form of x with itself is one.
+    """
     wide, high = 1.0 / (1.0 + height), 1.0 / (1.0 - WGS84_F + height)
     return float((w[a, 0] * w[b, 0] + w[a, 1] * w[b, 1]) * wide * wide + w[a, 2] * w[b, 2] * high * high)
 
@@ -136,7 +143,10 @@ def _form(w: Array, a: int, b: int, height: float) -> float:
 def _cut(
     room: EngineWorkspace, model: EngineModel, w: Array, height: float, lane: int, spot: Array, curve: Any
 ) -> None:
-    """Write the points of a curve on the ellipsoid to `spot`."""
+    """Write the points of a curve on the ellipsoid to `spot`, for one lane.
+
+    `curve` has the coefficients q0, q1, q2 of q(t), and scale and shift of t, see `_meet`. `height` is in Earth radii.
+    """
     q0, q1, q2, scale, shift = curve
     alpha = _form(w, _N, _N, height)
     e0, e1 = _form(w, _BASE, _BASE, height) - 1.0 + alpha * q0, 2.0 * _form(w, _BASE, _ALONG, height) + alpha * q1
@@ -169,7 +179,10 @@ def _cut(
 def _put(
     room: EngineWorkspace, model: EngineModel, w: Array, t: float, across: float, lane: int, spot: Array, count: int
 ) -> int:
-    """Write a point of the curve as the next candidate unless it exists already; return 1 if it was written, else 0."""
+    """Write a point of the curve as candidate number `count`, unless it exists already; return 1 if written, else 0.
+
+    The point is ``base + along t + n across``, see `_meet`.
+    """
     globe, origin, point = model.admission.globe, room.vector[ORIGIN], w[_FIRST]
     for i in range(3):
         point[i] = w[_BASE, i] + w[_ALONG, i] * t + w[_N, i] * across

@@ -1,7 +1,10 @@
 """The refined mirror image of a fix in the best plane of the stations: the second minimum of flat networks.
 
-A refinement ends early if it cannot lead to a rival of the fix, see `stop_hopeless`. Names in capitals, such as X or
-GOOD, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+A block has W problems, one in each lane. A refinement ends early if it cannot lead to a rival of the fix, see
+`stop_hopeless`. ALIVE is 1.0 for lanes whose refinement continues; GOOD is 1.0 for lanes that may reach a rival.
+
+`room` is the workspace of the block. Names in capitals, such as X or GOOD, are rows of the arrays of
+`optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations
@@ -64,7 +67,7 @@ _FREE = 1e-5
 # Greatest number of steps of a mirror image: in flat networks half of the rivals are reached in seven steps, nine of
 # ten in fifteen, the last in fifty.
 _MOST = 60
-# A point belongs to the fix if two conditions hold: its squared distance is below NEAR (squared standard deviations),
+# A point belongs to the fix under two conditions: its squared distance is below NEAR (squared standard deviations),
 # and its cost has risen by at least the share RISEN of the quadratic rise. Another minimum would be cheaper.
 NEAR, RISEN = 9.0, 0.5
 # Squared length of the undamped step, in standard deviations, below which a refinement has converged: 0.01 squared.
@@ -138,23 +141,26 @@ def reflect(model: EngineModel, room: EngineWorkspace) -> None:
 def refine_images(
     model: EngineModel, rows: Any, room: EngineWorkspace, tolerance: float, fewest: int, every: bool
 ) -> None:
-    """Refine the unknowns of active lanes, until fewer than `fewest` lanes are active.
+    """Refine the mirror images in row X, until fewer than `fewest` lanes are active.
+
+    The result decides whether the fix has a rival. The caller collects the lanes that remain active and continues them
+    in a full block.
 
     Parameters
     ----------
     model : EngineModel
-        Contains the constraints that hold fixes.
+        Contains the constraints of the position.
     rows : named tuple
         Rows of the evaluator.
     room : EngineWorkspace
-        In: unknowns, damping, steps, and the results of `keep_fix`. Out: lanes that converged are good and not ALIVE;
-        lanes that were abandoned are not good.
+        In: unknowns in row X, damping, steps, and the results of `keep_fix`. Out: lanes that converged have GOOD = 1
+        and ALIVE = 0; lanes that were abandoned have GOOD = 0 and ALIVE = 0; the others have ALIVE = 1.
     tolerance : float
-        Tolerance of `optloc.engine.refinement.refine`.
+        Tolerance of `optloc.engine.refinement.refine`: length of the last step in standard deviations.
     fewest : int
         Least number of active lanes to continue.
     every : bool
-        As for `stop_hopeless`.
+        Whether to refine also images whose bound excludes a rival, see `stop_hopeless`.
     """
     nearest = room.scalar[SHARE]
     evaluate(model, rows, room, 0)
@@ -174,7 +180,10 @@ def refine_images(
 
 @compiled
 def _note_nearest(rows: Any, room: EngineWorkspace, nearest: Array, every: bool) -> None:
-    """Write the range (W,) to the nearest station, metres, for lanes whose last step was kept, or for every lane."""
+    """Write the range (W,) to the nearest station, metres, to `nearest`.
+
+    Only lanes whose last step was kept are written, or every lane if `every` is True.
+    """
     kept, least = room.scalar[SPARE], room.scalar[LOW]
     note_nearest(rows, room, least)
     for lane in range(LANES):
@@ -217,8 +226,7 @@ def stop_hopeless(bow: float, room: EngineWorkspace, nearest: Array, every: bool
     alive = 0.0
     for lane in range(LANES):
         ball = _BALL * _BALL * scalar[HEIGHT, lane] * scalar[HEIGHT, lane]
-        # the gain is that of the damped step: within the ball, the damping changes the cost by no more than the last
-        # term
+        # the gain belongs to the damped step: within the ball, the damping changes the cost by at most the last term
         least = scalar[COST, lane] - scalar[GAIN, lane] - scalar[DAMPING, lane] * trace[lane] * ball
         far = np.sqrt(max(least, 0.0)) >= np.sqrt(scalar[FIX_COST, lane] + LISTED) + bow * ball / nearest[lane]
         near = spare[lane] < NEAR and scalar[COST, lane] - scalar[FIX_COST, lane] > RISEN * spare[lane]
@@ -232,7 +240,7 @@ def stop_hopeless(bow: float, room: EngineWorkspace, nearest: Array, every: bool
 
 @compiled
 def confirm_rivals(model: EngineModel, rows: Any, room: EngineWorkspace) -> float:
-    """Clear GOOD for lanes that did not reach a rival, and return the number of the others.
+    """Clear GOOD for lanes that did not reach a rival, and return the number of lanes that did.
 
     The end of a damped refinement need not be a minimum. Therefore the undamped step must be short, and the curvature
     of the cost must be positive, including the second derivatives of the ranges.
@@ -265,7 +273,7 @@ def confirm_rivals(model: EngineModel, rows: Any, room: EngineWorkspace) -> floa
 
 @compiled
 def _require_rest(model: EngineModel, room: EngineWorkspace) -> None:
-    """Clear GOOD for lanes whose undamped step is not short."""
+    """Clear GOOD for lanes whose undamped step from row X is 0.01 standard deviations or longer: X is no minimum."""
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     d, move, length = vector.shape[1], vector[MOVE], scalar[SPARE]
     _require_positive(vector, matrix, scalar[GOOD], matrix[H])
@@ -285,7 +293,10 @@ def _require_rest(model: EngineModel, room: EngineWorkspace) -> None:
 
 @compiled
 def _require_positive(vector: Array, matrix: Array, good: Array, curvature: Array) -> None:
-    """Clear GOOD for lanes whose curvature is not positive definite; write the factor to LOWER and INVERSE."""
+    """Clear GOOD for lanes whose `curvature` (p, p, W) is not positive definite.
+
+    The Cholesky factor is written to LOWER, one over its pivots to INVERSE.
+    """
     d, diagonal, inverse = vector.shape[1], vector[DIAGONAL], vector[INVERSE]
     for i in range(d):
         for lane in range(LANES):

@@ -41,7 +41,8 @@ _TOLERANCE, _STEPS = 1e-2, 12
 def search_sphere(model: EngineModel, rows: Any, room: EngineWorkspace, spot: Array) -> None:
     """Write the least cost at infinity to BEYOND; row X and its information do not change.
 
-    The search refines the direction of the fix, and the cheapest direction of each sector.
+    The search refines the direction of the fix, and the cheapest direction of each sector. `spot` is scratch for
+    candidates, see `optloc.engine.candidates.refine_candidates`.
     """
     scalar, vector, d = room.scalar, room.vector, room.d
     keep_fix(room)
@@ -66,7 +67,7 @@ def search_sphere(model: EngineModel, rows: Any, room: EngineWorkspace, spot: Ar
 
 @compiled
 def _bring_back(room: EngineWorkspace) -> None:
-    """Copy row FIX and its information to row X."""
+    """Copy row FIX and its information to row X: the state before the search."""
     vector, matrix = room.vector, room.matrix
     for i in range(vector.shape[1]):
         for lane in range(LANES):

@@ -1,8 +1,11 @@
 """Rows of angles and gain ratios that are linear in the position and one more coordinate.
 
 The coordinates are ``y = ((x - origin) / scale, last)``. The last coordinate is the range to a reference station, or
-the squared distance from the origin. The start of a fix solves these rows together with the squared ranges. Each row
-has one elementwise formula, which serves arrays and is recorded as a tape for machine code.
+the squared distance from the origin. The start of a fix solves these linear rows together with the squared ranges. Each
+row has one elementwise formula, which serves arrays and is recorded as a tape for machine code.
+
+Letters: m is the measured value of a row, a and b are its stations, d is the number of coordinates. `known` and `found`
+are ranges ``offset + sign t`` from other rows, with the last coordinate t.
 """
 
 from __future__ import annotations
@@ -54,8 +57,9 @@ class KnownLift(NamedTuple):
 def pair_elevation(m: Any, azimuth: Any, a: Point) -> LiftEntry:
     """Return the linear row of an elevation E with its azimuth A: ``[sin E cos A, sin E sin A, -cos E] . (x - s) = 0``.
 
-    The vector in brackets is in the axes of the station. It is the normal of the cone of elevation E at the measured
-    azimuth A, and is perpendicular to the line of sight. The error of the row is the range times the error of E.
+    Here `m` is the elevation, radians, and `a` is the station at s. The vector in brackets is in the axes of the
+    station. It is the normal of the cone of elevation E at the measured azimuth A, and is perpendicular to the line of
+    sight. The error of the row is the range times the error of E.
     """
     xp = namespace(m)
     own = (xp.sin(m) * xp.cos(azimuth), xp.sin(m) * xp.sin(azimuth), -1.0 * xp.cos(m))
@@ -126,8 +130,8 @@ def azimuths_beside(problem: Problem, rows: Rows) -> Array | None:
 
 # The same rows for machine code: one tape for each block of rows, and the source of each input of the tape.
 
-# Sources of an input: a constant of the structure, a measurement, a coordinate of a station, a least-squares range, or
-# a coordinate of the position at which the row is evaluated.
+# Sources of an input: a constant of the structure, a measurement, a coordinate of a station, or a least-squares range.
+# The last source is a coordinate of the position at which the row is evaluated.
 NUMBER, SEEN, STATION, OFFSET, POINT = range(5)
 
 
@@ -167,10 +171,15 @@ _TAPES = Cache["Tape | None"](64)
 
 
 def _tape_of(model: Model, d: int, turned: bool, paired: bool, known: bool) -> Tape | None:
-    """Return the tape of the rows of a kind (coefficients, right side, factor), or None if they are not linear."""
+    """Return the tape of the rows of a kind (coefficients, right side, factor), or None if they are not linear.
+
+    `turned` is True if stations have axes, `paired` if the rows are elevations with azimuths, `known` if ranges are
+    known.
+    """
     recorder = Recorder()
 
     def point(first: int, axes: bool) -> Point:
+        """Return a point whose coordinates are the inputs from seed `first` on, with axes as inputs if requested."""
         own = tuple(tuple(recorder.input(_AXES + d * i + j) for j in range(d)) for i in range(d)) if axes else None
         return Point(tuple(recorder.input(first + i) for i in range(d)), None, own)
 
@@ -193,7 +202,11 @@ def _tape_of(model: Model, d: int, turned: bool, paired: bool, known: bool) -> T
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """The rows of one kind: the tape, the sources of the inputs of each row, and the sigmas of the measurements."""
+    """The rows of one kind as one tape.
+
+    `tape` computes each row. `source` contains, for each row and input, the source and the index in it. `sigma`
+    contains the standard deviation of each measurement.
+    """
 
     tape: Tape
     source: list[list[tuple[int, int]]]
@@ -202,7 +215,11 @@ class _Block:
 
 @dataclass(slots=True)
 class _LiftedProblem:
-    """One problem, its least-squares ranges, the index of each station, and the constants collected so far."""
+    """One problem and the data from which its linear rows are made.
+
+    `found` are its least-squares ranges. `node` maps (station, epoch) to the index of a station. `on_cone` is True if
+    the last coordinate is a range. `number` collects the constants of the rows.
+    """
 
     problem: Problem
     found: Ranges | None
@@ -211,7 +228,10 @@ class _LiftedProblem:
     number: list[float]
 
     def block(self, rows: Rows, start: int) -> _Block | None:
-        """Return the block of the rows of one kind, or None if the rows are not linear."""
+        """Return the block of the rows of one kind, or None if the rows are not linear.
+
+        `start` is the number of the first of these rows in the problem.
+        """
         problem, model = self.problem, MODELS[rows.kind]
         beside = azimuths_beside(problem, rows) if rows.kind == "elevation" else None
         present, whole = rows.weight > 0.0, problem.weight > 0.0
@@ -225,20 +245,26 @@ class _LiftedProblem:
             return None
         out, sigma = _Block(made, [], []), np.sqrt(variances(problem.noise, problem.count))
         for i in np.flatnonzero(present).tolist():
-            own = [self._source(seed, rows, i, start, beside) for seed, _ in made.inputs]
-            if not all(which >= 0 for _, which in own):
+            sources = [self._source_of_input(seed, rows, i, start, beside) for seed, _ in made.inputs]
+            if not all(which >= 0 for _, which in sources):
                 return None  # a range is unknown
-            out.source.append(own)
+            out.source.append(sources)
             # a row of weight w counts as a row of variance sigma^2 / w
             out.sigma.append(float(sigma[start + i] / np.sqrt(rows.weight[i])))
         return out
 
-    def _source(self, seed: int, rows: Rows, i: int, start: int, beside: Array | None) -> tuple[int, int]:
-        """Return source and index of an input of the tape of a row; the index is -1 if the input does not exist."""
+    def _source_of_input(self, seed: int, rows: Rows, i: int, start: int, beside: Array | None) -> tuple[int, int]:
+        """Return source and index of an input of the tape of row i; the index is -1 if the input does not exist.
+
+        `seed` is the number of the input, see `_M` and the constants after it. `start` is the number of the first row
+        of the kind. `beside` contains the rows of the azimuths that belong to elevations, or is None.
+        """
         if seed in (_M, _AZIMUTH):
             return SEEN, int(start + i if beside is None or seed == _M else beside[i])
         if seed >= _T:
-            return (POINT, seed - _T) if seed < _AXES else (NUMBER, self._keep(self._axis(rows, i, seed - _AXES)))
+            return (
+                (POINT, seed - _T) if seed < _AXES else (NUMBER, self._add_constant(self._axis(rows, i, seed - _AXES)))
+            )
         second = seed >= _B if seed >= _A else seed in (_KNOWN_B, _SIGN_B)
         epoch = int(rows.epoch[i]) if self.problem.stations.position.shape[-3] > 1 else 0
         station = int((rows.b if second else rows.a)[i])
@@ -251,15 +277,15 @@ class _LiftedProblem:
             return OFFSET, -1
         if seed in (_KNOWN_A, _KNOWN_B):
             return OFFSET, place
-        return NUMBER, self._keep(float(self.found.sign[0, known.argmax()]) if self.on_cone else 0.0)
+        return NUMBER, self._add_constant(float(self.found.sign[0, known.argmax()]) if self.on_cone else 0.0)
 
     def _axis(self, rows: Rows, i: int, cell: int) -> float:
-        """Return a component of the axes of the station of a row; `cell` numbers the components row by row."""
+        """Return a component of the axes of the station of row i; `cell` numbers the d * d components row by row."""
         axes, d = self.problem.stations.axes, self.problem.dimension
         assert axes is not None
         return float(axes[int(rows.epoch[i]) if len(axes) > 1 else 0, rows.a[i], cell // d, cell % d])
 
-    def _keep(self, value: float) -> int:
+    def _add_constant(self, value: float) -> int:
         """Append a constant of the structure, and return its index."""
         self.number.append(value)
         return len(self.number) - 1
@@ -287,10 +313,10 @@ def lift(problem: Problem, found: Ranges | None, node: dict[tuple[int, int], int
     ]
     blocks = [block for block in lifted if block is not None and block.source]
     d, tapes = problem.dimension, [block.tape for block in blocks]
-    every = [own for block in blocks for own in block.source]
+    every = [sources for block in blocks for sources in block.source]
     source = np.zeros((len(every), max(map(len, every), default=0), 2), dtype=np.int64)
-    for row, own in zip(source, every, strict=True):
-        row[: len(own)] = own
+    for row, sources in zip(source, every, strict=True):
+        row[: len(sources)] = sources
     return Lifts(
         found is None and all((one.outputs[d], 0.0) in one.constants for one in tapes),
         tape_table(tapes, [one.outputs for one in tapes]),

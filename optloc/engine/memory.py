@@ -1,7 +1,8 @@
 """The data that all problems of a plan share, the workspace of a block of problems, and the arrays of the answers.
 
 A block has W = LANES problems, one in each lane; the last axis of every array of a block is the lane. The integer
-constants name rows of these arrays.
+constants name rows of these arrays. Letters: m rows, s stations, d coordinates, p refined unknowns, k constraints, c of
+them exact.
 """
 
 from __future__ import annotations
@@ -30,7 +31,15 @@ H, H_TRIAL, LOWER, FIX_H, MARGIN, REST = range(6)
 # Rows of `EngineWorkspace.axes`: BASE spans coordinates in inverse range, AXES are principal axes, EIGEN is the matrix
 # that these axes diagonalise.
 BASE, AXES, EIGEN = range(3)
-# Rows of `EngineWorkspace.scalar`.
+# Rows of `EngineWorkspace.scalar`, one number for each problem. COST, COST_TRIAL: cost at X and at TRIAL. LOOP: cost of
+# combinations of rows that no range changes. BLUR: rounding error of the whitened residuals. DAMPING, GROWTH:
+# Marquardt's factor, and its growth after a rejected step. GAIN: squared length of a step in standard deviations.
+# SOLVABLE: 1.0 if a system is regular. ALIVE: 1.0 while a refinement continues. GOOD: 1.0 if its result is valid so
+# far. STEPS: steps tried. SCALE: unit of length of squared-range rows, metres. SPREAD: greatest distance of a station
+# from their mean, metres. FIX_COST, FIX_GOOD: cost of the fix, and 1.0 if it is settled. HEIGHT: height of the fix
+# above the plane of the stations, metres. BEYOND: cost at infinity. SECOND: 1.0 if OTHER is valid. RADIUS: distance
+# from CENTRE to which positions are moved, metres; 0.0 for none. SPARE, HIGH, LOW and SHARE are scratch, mostly the
+# extremes and a factor of one kernel.
 COST, COST_TRIAL, LOOP, BLUR, DAMPING, GROWTH, GAIN, SOLVABLE, SPARE, ALIVE, GOOD, STEPS, SCALE, SPREAD = range(14)
 FIX_COST, FIX_GOOD, HEIGHT, HIGH, LOW, SHARE, BEYOND, SECOND, RADIUS = range(14, 23)
 
@@ -121,7 +130,12 @@ class EngineModel(NamedTuple):
 
 
 class EngineResult(NamedTuple):
-    """One row of `Answer.number`; `Answer` has the columns under the same names."""
+    """The numbers of one fix: one row of `Answer.number`. `Answer` has the columns under the same names.
+
+    `cost` and `rival_cost` are chi-square values of fix and rival. `settled` is 1.0 if the fix is valid, else 0.0.
+    `infinity` is the least cost at infinity. `kappa` and `kappa_far` measure the deviation from a Gaussian, in metres
+    and in inverse range.
+    """
 
     cost: float
     rival_cost: float
@@ -200,17 +214,17 @@ class Answer(NamedTuple):
 
     @property
     def multiplier(self) -> Array:
-        """Multipliers (N, k) of the exact constraints."""
+        """Lagrange multipliers (N, k) of the exact constraints; zero for bounds."""
         return self.side[..., MULTIPLIER]
 
     @property
     def quantity(self) -> Array:
-        """Values (N, k) of the constrained quantities."""
+        """Values (N, k) of the constrained quantities at the fix, in the unit of each constraint."""
         return self.side[..., VALUE]
 
     @property
     def normal(self) -> Array:
-        """Gradients (N, k, d) of the constrained quantities."""
+        """Gradients (N, k, d) of the constrained quantities at the fix."""
         return self.side[..., GRADIENT:]
 
 
@@ -235,7 +249,7 @@ class EngineWorkspace(NamedTuple):
         Squared-range solutions, second solutions, and scratch of `optloc.kernels.gtrs.minimise`.
     vector, matrix, axes, scalar : array (13, p, W), (6, p, p, W), (3, d, d, W), (23, W)
         The constants of this module name the rows. Positions are relative to the origin, row ORIGIN. If RADIUS is not
-        zero, positions are held at this distance from CENTRE.
+        zero, positions are kept at this distance from CENTRE.
     face, push : array (2, k, d, W), (c, p, W)
         Gradients of the constrained quantities at rows X and TRIAL; for the c exact ones, their products with the
         inverse of the information.
@@ -272,7 +286,11 @@ class EngineWorkspace(NamedTuple):
 
 @compiled
 def make_room(model: EngineModel, stations: int, d: int, unknowns: int, others: int) -> EngineWorkspace:
-    """Return the workspace of a block, for numbers of stations, coordinates, unknowns and other linear rows."""
+    """Return the workspace of a block.
+
+    The arguments after `model` are numbers of stations, of coordinates, of refined unknowns, and of linear rows of
+    other kinds than ranges.
+    """
     s, p, m = stations, unknowns, model.row.shape[1]
     c, k = model.admission.exact, model.admission.level.shape[1]
     return EngineWorkspace(

@@ -3,6 +3,9 @@
 A plan is made once and cached; measurements and station positions are arguments of a run. A plan serves one target at
 rest, with rows of every kind and with other unknowns. The problems of a batch may differ in measurements, and in
 positions and velocities of stations.
+
+Letters: N problems, m rows, s station positions with rows, d coordinates. A *narrow block* of machine code computes one
+problem at a time, a *wide block* many.
 """
 
 from __future__ import annotations
@@ -97,7 +100,7 @@ class Plan:
         return Load(model, self.rows(problem), self._places(problem))
 
     def _places(self, problem: Problem) -> Array:
-        """Return the positions (N or 1, s, d) of the stations with rows, metres."""
+        """Return the positions (N or 1, s, d) of the stations with rows, metres; 1 if all problems share them."""
         position = problem.stations.position
         flat = position.reshape(-1, *position.shape[-3:])
         # Usually all stations have rows, and their positions need no copy.
@@ -106,16 +109,10 @@ class Plan:
         return flat[:, self.node[0], self.node[1]]
 
     def kernel(self, count: int, *, often: bool = False) -> Callable[..., int]:
-        """Return the machine code for a number of problems: narrow blocks for few problems, else wide blocks.
+        """Return the machine code for `count` problems: narrow blocks for few problems, else wide blocks.
 
-        Few problems use wide blocks too if only wide blocks are loaded.
-
-        Parameters
-        ----------
-        count : int
-            Number of problems of one call.
-        often : bool
-            Whether such calls are frequent, so that the best machine code is worth loading.
+        Few problems use wide blocks too if only wide blocks are loaded. `often` is True if such calls are frequent, so
+        that the best machine code is worth loading.
         """
         few, many, most = _BY_RANGES if self.ranged else _BY_TAPES
         narrow = count <= most and (is_in_use(few) or ((often or not is_in_use(many)) and may_use_code(few, count)))
@@ -148,9 +145,21 @@ class Plan:
             answer = answer._replace(x=np.array(start))
 
         def work(first: int) -> int:
+            """Compute the problems from `first` on, and return their greatest number of steps."""
             part = slice(first, min(first + _CHUNK, count))
-            own, some = load.take(part), Answer(*(array[part] for array in answer))
-            return int(kernel(own.model, own.rows, _owned(z[part]), _owned(own.place), TOLERANCE, LIMIT, given, some))
+            loaded, written = load.take(part), Answer(*(array[part] for array in answer))
+            return int(
+                kernel(
+                    loaded.model,
+                    loaded.rows,
+                    _contiguous(z[part]),
+                    _contiguous(loaded.place),
+                    TOLERANCE,
+                    LIMIT,
+                    given,
+                    written,
+                )
+            )
 
         return answer, max(map_on_threads(work, range(0, count, _CHUNK), threads), default=0)
 
@@ -173,7 +182,7 @@ class Load(NamedTuple):
     place: Array
 
     def take(self, part: slice | Array) -> Load:
-        """Return the data of the selected problems."""
+        """Return the data of the problems that `part` selects; data that all problems share stay as they are."""
         model, rows, place = self
         level = model.admission.level
         if len(level) > 1:
@@ -197,7 +206,21 @@ _BY_TAPES = (fix_one_by_tapes, fix_tapes, 4)
 
 
 def blank_answer(count: int, d: int, size: int, shared: int, sides: int) -> Answer:
-    """Return empty arrays for answers: numbers of problems, coordinates, unknowns, shared unknowns, constraints."""
+    """Return arrays for the answers to `count` problems; the kernels write their values later.
+
+    Parameters
+    ----------
+    count : int
+        Number N of problems.
+    d : int
+        Number of coordinates of a position.
+    size : int
+        Number of all unknowns of a problem.
+    shared : int
+        Number of unknowns that all epochs share; only these have a covariance.
+    sides : int
+        Number of constrained quantities.
+    """
     return Answer(
         np.empty((count, size)),
         np.empty((count, shared, shared)),
@@ -207,7 +230,7 @@ def blank_answer(count: int, d: int, size: int, shared: int, sides: int) -> Answ
     )
 
 
-def _owned(values: Array) -> Array:
+def _contiguous(values: Array) -> Array:
     """Return values as the array type that machine code takes: float, C order, writable."""
     return np.require(values, dtype=float, requirements=["C", "W"])
 
@@ -219,7 +242,7 @@ _KEPT = Cache["Plan | None"](256)
 
 
 def plan_of(problem: Problem) -> Plan | None:
-    """Return the cached plan of problems, or None if their structure has no plan.
+    """Return the cached plan of problems, or None if their structure has no plan or machine code is disabled.
 
     Parameters
     ----------
@@ -228,7 +251,7 @@ def plan_of(problem: Problem) -> Plan | None:
     """
     if not (is_planned(problem) and enabled()):
         return None
-    return _KEPT.find(key_of(problem), lambda: _make(problem))
+    return _KEPT.find(key_of(problem), lambda: _make_plan(problem))
 
 
 def key_of(problem: Problem) -> tuple[Hashable, ...]:
@@ -286,7 +309,10 @@ def _is_ranged(problem: Problem) -> bool:
 
 
 def _is_taped(problem: Problem) -> bool:
-    """Return whether the rows have tapes, and the unknowns of epochs are few."""
+    """Return whether the rows can have tapes, and the unknowns are few enough for lanes.
+
+    A medium, walks, or unknowns of several epochs exclude tapes.
+    """
     layout = problem.layout
     several = layout.n_local > 0 and problem.epochs > 1
     return problem.medium is None and not several and layout.size <= _UNKNOWNS and not walks(problem)
@@ -295,9 +321,13 @@ def _is_taped(problem: Problem) -> bool:
 # How a plan is made.
 
 
-def _make(problem: Problem) -> Plan | None:
-    """Return the plan of problems, or None if they have no degrees of freedom, no tapes or no start."""
-    one = _bare(problem)
+def _make_plan(problem: Problem) -> Plan | None:
+    """Return the plan of problems, or None if a plan is impossible.
+
+    Reasons are negative degrees of freedom, a position that is not first among the unknowns, constraints or rows
+    without tapes, or rows without a start.
+    """
+    one = _without_measurements(problem)
     dof = int(degrees_of_freedom(one.flat())[0])
     if dof < 0 or problem.layout.find("position")[0].start:
         return None
@@ -318,8 +348,8 @@ def _make(problem: Problem) -> Plan | None:
     )
 
 
-def _bare(problem: Problem) -> Problem:
-    """Return one problem of a batch, without measurements."""
+def _without_measurements(problem: Problem) -> Problem:
+    """Return one problem of a batch with zero measurements and without levels of constraints, as a plan needs it."""
     stations = problem.stations
     place = stations.position.reshape(-1, *stations.position.shape[-3:])[0]
     rates = stations.velocity

@@ -1,4 +1,10 @@
-"""Rows that are sums of ranges, with emission times as the only other unknowns: a linear map of ranges, and loops."""
+"""Rows that are sums of ranges, with emission times as the only other unknowns: a linear map of ranges, and loops.
+
+A block has W problems, one in each lane; s stations, d coordinates, q whitened rows, e emission times. K (q, s) maps
+ranges to rows; u (q, W) are whitened measurements. `loop` (W,) is the cost of the loops, `place` (s, d, W) are the
+stations. `left` and `spare` are scratch. `room` is the `EngineWorkspace` of the block: capitals, such as COST, name
+rows of its arrays.
+"""
 
 from __future__ import annotations
 
@@ -113,7 +119,7 @@ def count_lifted(rows: RangeRows) -> int:
 
 @compiled
 def keep(model: EngineModel, rows: RangeRows, stations: int, d: int, size: int) -> RangeBlock:
-    """Return the rows with the memory for a block of problems."""
+    """Return the rows with the memory for a block of problems with `stations` stations and d coordinates."""
     q = len(rows.K)
     return RangeBlock(
         rows,
@@ -128,7 +134,7 @@ def keep(model: EngineModel, rows: RangeRows, stations: int, d: int, size: int) 
 
 @compiled
 def load(block: RangeBlock, z: Array, room: EngineWorkspace, anew: bool) -> None:
-    """Write the cost of the loops; for new stations also the map from directions at infinity."""
+    """Write the cost of the loops to LOOP; if `anew` is True, also the map from directions at infinity."""
     first, loop = len(room.place) + len(block.rows.K) + len(block.rows.start), room.scalar[LOOP]
     for lane in range(LANES):
         loop[lane] = 0.0
@@ -187,15 +193,15 @@ def costs(block: RangeBlock, room: EngineWorkspace) -> None:
 def bow_of(block: RangeBlock, room: EngineWorkspace) -> float:
     """Return a bound b of the curvature of all residuals, 1/metres: over a step D at range r they differ by b D^2 / r.
 
-    A range exceeds its linear prediction by 0 to ``D^2 / 2 r``, and all residuals together theirs by at most
-    ``norm(K) sqrt(s) D^2 / 2 r``. If a common error of all ranges has no effect, half of this bound is valid.
+    A range exceeds its linear prediction by 0 to ``D^2 / 2 r``, and all residuals together theirs by at most ``norm(K)
+    sqrt(s) D^2 / 2 r``. If a common error of all ranges has no effect, half of this bound is valid.
     """
     return float(block.rows.norm * np.sqrt(len(block.r)) * (0.25 if block.rows.level else 0.5))
 
 
 @compiled
 def note_nearest(block: RangeBlock, room: EngineWorkspace, least: Array) -> None:
-    """Write the range (W,) to the nearest station, metres."""
+    """Write the range to the nearest station, metres, to `least` (W,)."""
     r = block.r
     for lane in range(LANES):
         least[lane] = np.inf
@@ -212,7 +218,7 @@ def search_infinity(model: EngineModel, block: RangeBlock, room: EngineWorkspace
 
 @compiled
 def finish(block: RangeBlock, z: Array, room: EngineWorkspace, size: int, mark: Array, marked: bool, x: Array) -> None:
-    """Write emission times and station errors at row X to the parameter vectors x (N, size), metres."""
+    """Write emission times and station errors at row X to x (N, p), metres: `size` lanes, or those with a `mark`."""
     if not len(block.rows.start) and not len(block.rows.wander):
         return
     ranges(room.place, room.vector[X], block.r, block.unit, room.scalar[SPARE])
@@ -226,7 +232,7 @@ def finish(block: RangeBlock, z: Array, room: EngineWorkspace, size: int, mark: 
 
 @compiled
 def _emit(block: RangeBlock, z: Array, room: EngineWorkspace, size: int, mark: Array, marked: bool, x: Array) -> None:
-    """Write the emission times, metres: their linear map less the share of the ranges, plus their reference."""
+    """Write emission times to x (N, p), metres: their linear map less the share of the ranges, plus their reference."""
     item, r, sent, start, d = room.item, block.r, block.sent, block.rows.start, room.d
     first = len(room.place) + len(block.rows.K)
     for j in range(len(start)):
@@ -245,7 +251,7 @@ def _emit(block: RangeBlock, z: Array, room: EngineWorkspace, size: int, mark: A
 
 @compiled
 def _write_residuals(block: RangeBlock, room: EngineWorkspace) -> None:
-    """Write the whitened residuals of the ranges in `block.r`."""
+    """Write the whitened residuals (q, W) ``u - K r`` of the ranges in `block.r` to `block.residual`."""
     K, residual, r, s = block.rows.K, block.residual, block.r, len(room.place)
     for k in range(len(K)):
         for lane in range(LANES):
@@ -261,7 +267,7 @@ def _write_residuals(block: RangeBlock, room: EngineWorkspace) -> None:
 def _shift(
     block: RangeBlock, room: EngineWorkspace, station: int, size: int, mark: Array, marked: bool, x: Array
 ) -> None:
-    """Write the position error of a station, metres: along the line to the target, proportional to its residual."""
+    """Write the error of a station to x (N, p), metres: along the line of sight, its variance times half the slope."""
     K, residual, unit, first = block.rows.K, block.residual, block.unit, block.rows.offset[station]
     for lane in range(size):
         if not marked or mark[lane] != 0.0:
@@ -313,7 +319,7 @@ def _equations(
 
 @compiled
 def _row(share: Array, seen: Array, r: Array, unit: Array, row: Array, left: Array) -> None:
-    """Write one whitened row (d, W) of the Jacobian, and its residual (W,): `seen` less the weighted ranges."""
+    """Write a whitened row (d, W) of the Jacobian, and its residual (W,): `seen` less the ranges times `share` (s,)."""
     s, d = unit.shape[:2]
     for lane in range(LANES):
         left[lane] = seen[lane]
@@ -420,7 +426,7 @@ _UNIT = 1e-12
 
 @compiled
 def _see_far(block: RangeBlock, room: EngineWorkspace) -> None:
-    """Write the map from directions at infinity to whitened residuals, and its squared singular values."""
+    """Write the map (q, d, W) from directions at infinity to whitened residuals, and its squared singular values."""
     s, d = room.place.shape[:2]
     flat = block.flat
     for k in range(len(flat)):
@@ -437,7 +443,7 @@ def _see_far(block: RangeBlock, room: EngineWorkspace) -> None:
 
 @compiled
 def _turn_to_axes(block: RangeBlock, room: EngineWorkspace) -> None:
-    """Rotate the map from directions to the principal axes of its square."""
+    """Rotate the map F from directions to the principal axes of F^T F, and write its eigenvalues to `block.stiff`."""
     flat, stiff, row = block.flat, block.stiff, room.vector[MOVE]
     work, axes, d = room.axes[EIGEN], room.axes[AXES], room.d
     for i in range(d):
@@ -467,12 +473,8 @@ def _turn_to_axes(block: RangeBlock, room: EngineWorkspace) -> None:
 def measure_infinity(block: RangeBlock, room: EngineWorkspace) -> None:
     """Write the least cost at infinity to BEYOND: exact if within `BEYOND_DOUBT` of FIX_COST, else a lower bound.
 
-    Parameters
-    ----------
-    block : RangeBlock
-        Rows and memory.
-    room : EngineWorkspace
-        In: LOOP, FIX_COST and the results of `_see_far`. Scratch rows are overwritten.
+    It is infinite unless `rows.level` is True. The kernel reads LOOP, FIX_COST and the results of `_see_far`. A secular
+    equation gives the least cost: the direction, a function of a multiplier, has length one.
     """
     scalar, vector = room.scalar, room.vector
     out = scalar[BEYOND]
@@ -509,10 +511,10 @@ def measure_infinity(block: RangeBlock, room: EngineWorkspace) -> None:
 def _begin(
     u: Array, block: RangeBlock, room: EngineWorkspace, g: Array, gap: Array, total: Array, least: Array, more: Array
 ) -> None:
-    """Write g, gaps of the eigenvalues, the cost without ranges, the least eigenvalue, and the first multiplier.
+    """Write gradient g, gaps of the eigenvalues, cost without ranges, least eigenvalue, and the first multiplier.
 
-    Multipliers are relative to minus the least eigenvalue, where no digits cancel. The first is the largest for which
-    one component alone has length one: the direction is not shorter there, and Newton's steps converge from this side.
+    Multipliers (`more`) are relative to minus the least eigenvalue, where no digits cancel. The first is the largest
+    for which one component alone has length one: Newton's steps converge from this side.
     """
     q, d = len(u), len(g)
     for lane in range(LANES):
@@ -537,10 +539,7 @@ def _begin(
 def _step(
     scalar: Array, g: Array, gap: Array, total: Array, least: Array, more: Array, low: Array, todo: Array
 ) -> bool:
-    """Write the lower bounds at the multipliers, take Newton steps if the bound is low.
-
-    Return whether any was taken.
-    """
+    """Write lower bounds of the cost to `low` (W,), and step multipliers of low bounds; return whether any moved."""
     d, square, cube = len(g), scalar[SPARE], todo
     for lane in range(LANES):
         low[lane], square[lane], cube[lane] = total[lane] + least[lane] - more[lane], 0.0, 0.0
@@ -585,7 +584,7 @@ def _lengthen(y: Array, gap: Array, spare: Array) -> None:
 
 @compiled
 def _weigh(u: Array, block: RangeBlock, room: EngineWorkspace, y: Array, left: Array, cost: Array) -> None:
-    """Write the cost (W,) of emitters at infinity in directions y (d, W), more accurate than the bound."""
+    """Write the cost (W,) of emitters at infinity in directions y (d, W), more accurate than the bound of `_step`."""
     for lane in range(LANES):
         cost[lane] = room.scalar[LOOP, lane]
     for k in range(len(u)):

@@ -1,6 +1,7 @@
 """Damped Gauss-Newton refinement of many problems in lanes, with the rules of `optloc.kernels.least_squares`.
 
-Names in capitals, such as X or ALIVE, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+A lane is the place of one problem in a block. `room` is the workspace of the block. Names in capitals, such as X or
+ALIVE, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def refine(model: EngineModel, rows: Any, room: EngineWorkspace, tolerance: floa
     Parameters
     ----------
     model : EngineModel
-        Contains the constraints that hold fixes.
+        Contains the constraints of the position.
     rows : named tuple
         Rows of the evaluator.
     room : EngineWorkspace
@@ -82,7 +83,11 @@ def refine(model: EngineModel, rows: Any, room: EngineWorkspace, tolerance: floa
 
 @compiled
 def propose(model: EngineModel, room: EngineWorkspace) -> None:
-    """Write the damped step, its squared length in standard deviations to GAIN, and to SOLVABLE whether it exists."""
+    """Write the damped step to MOVE and its end to TRIAL.
+
+    GAIN becomes the squared length of the step in standard deviations. SOLVABLE becomes 1.0 if the damped matrix is
+    regular, else 0.0.
+    """
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     d = vector.shape[1]
     diagonal, inverse, move, right, damping = (
@@ -116,7 +121,10 @@ def propose(model: EngineModel, room: EngineWorkspace) -> None:
 
 @compiled
 def decide(room: EngineWorkspace, tolerance: float) -> bool:
-    """Keep steps that lower the cost, update the damping, end converged lanes; return whether any lane is ALIVE."""
+    """Keep steps that lower the cost, update the damping, end converged lanes; return whether any lane is ALIVE.
+
+    SPARE becomes 1.0 for the lanes whose step was kept.
+    """
     vector, matrix, scalar, face = room.vector, room.matrix, room.scalar, room.face
     d = vector.shape[1]
     # Converged lanes run through the same rule without effect: their step counts as unsolvable.

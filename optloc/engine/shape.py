@@ -1,9 +1,11 @@
-"""The shape of the likelihood around a fix: how far it differs from a Gaussian.
+"""The shape of the likelihood around a fix: its difference from a Gaussian.
 
 `kappa` is the greatest absolute logarithm of the cost rise at three sigma over the quadratic rise, in all probed
-directions. It is 0 for a Gaussian. It is measured in metres, and in inverse range about the mean of the stations.
+directions. It is 0 for a Gaussian. It is measured in metres, and in inverse range about the mean of the stations. The
+*rise* of the cost is its value at a probe less its value at the fix.
 
-Names in capitals, such as X or MOVE, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+A block has W problems, one in each lane. `room` is the workspace of the block. Names in capitals, such as X or MOVE,
+are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations
@@ -60,12 +62,12 @@ _HORIZON = 1e-6
 def measure_shape(
     model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool, turned: bool, out: Array
 ) -> None:
-    """Write kappa of the fixes in row X.
+    """Write kappa of the fixes in row X to `out`.
 
     Parameters
     ----------
     model : EngineModel
-        Contains the constraints that hold fixes.
+        Contains the constraints of the position.
     rows : named tuple
         Rows of the evaluator.
     room : EngineWorkspace
@@ -139,7 +141,10 @@ def _even(eigen: Array, i: int, j: int, lane: int) -> float:
 
 @compiled
 def _turn(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) -> None:
-    """Probe along the diagonals between two axes, and keep the rises of the lanes with equal eigenvalues."""
+    """Probe along the diagonals between two axes, and record the rises of the lanes with equal eigenvalues.
+
+    With equal eigenvalues the axes are arbitrary, so that the axes alone may miss the direction of the greatest kappa.
+    """
     vector, axes, scalar = room.vector, room.axes, room.scalar
     d, share = room.d, scalar[SHARE]
     even = room.vector[ROW, 0]
@@ -170,8 +175,9 @@ def _turn(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) -
 def _span(vector: Array, base: Array, r: Array) -> None:
     """Write the derivatives of positions by (p, w) at the fix, ``[r B, -r u0]``, to the columns of `base` (d, d, W).
 
-    (p, w) are the coordinates in inverse range; r and u0 are range and direction of the fix from the centre. B is
-    from T. Duff et al., "Building an orthonormal basis, revisited", J. Computer Graphics Techniques 6 (2017).
+    (p, w) are the coordinates in inverse range: direction and inverse range, relative to the fix. r and u0 are range
+    and direction of the fix from the centre. B is from T. Duff et al., "Building an orthonormal basis, revisited", J.
+    Computer Graphics Techniques 6 (2017).
     """
     d = len(base)
     for lane in range(LANES):
@@ -200,8 +206,8 @@ def _span(vector: Array, base: Array, r: Array) -> None:
 def _axes(room: EngineWorkspace, inverse: bool, held: bool, spare: Array) -> None:
     """Write the principal axes of the position's information, each one sigma long, to AXES.
 
-    If `inverse` is True, the information is expressed in inverse range. If `held` is True, the axes come from the
-    covariance.
+    If `inverse` is True, the information is expressed in inverse range. If `held` is True, exact surfaces constrain the
+    fix, and the axes come from the covariance. `spare` (W,) is scratch.
     """
     d, base, work, axes = room.d, room.axes[BASE], room.axes[EIGEN], room.axes[AXES]
     source = room.matrix[H_TRIAL if held else MARGIN if room.vector.shape[1] > d else H]
@@ -234,7 +240,7 @@ def _axes(room: EngineWorkspace, inverse: bool, held: bool, spare: Array) -> Non
 
 @compiled
 def _drop_exact(variance: Array, most: Array) -> None:
-    """Set variances on a diagonal (d, d, W) to zero if they are rounding relative to the largest."""
+    """Set variances on a diagonal (d, d, W) to zero if they are rounding relative to the largest, `most` (W,)."""
     d = len(variance)
     for lane in range(LANES):
         most[lane] = 0.0
@@ -249,7 +255,7 @@ def _drop_exact(variance: Array, most: Array) -> None:
 
 @compiled
 def _probe(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) -> None:
-    """Write the cost after a step MOVE from the fix, and one over the rise of a quadratic cost there to SHARE.
+    """Write the cost after a step MOVE from the fix to COST_TRIAL, and one over the quadratic rise there to SHARE.
 
     In inverse range, a step beyond `_HORIZON` is shortened.
     """
@@ -289,7 +295,7 @@ def _probe(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) 
 
 @compiled
 def _spare_still(room: EngineWorkspace, axis: int) -> None:
-    """Set the rise of the cost to that of a Gaussian along axes of length zero, where a surface holds the fix."""
+    """Set the rise of the cost to the quadratic rise along axes of length zero, where a surface fixes the position."""
     scalar = room.scalar
     for lane in range(LANES):
         if room.axes[EIGEN, axis, axis, lane] == 0.0:
@@ -298,7 +304,7 @@ def _spare_still(room: EngineWorkspace, axis: int) -> None:
 
 @compiled
 def _note(scalar: Array, high: Array, low: Array) -> None:
-    """Update the greatest and the least rise of the cost (W,), relative to a quadratic cost."""
+    """Update the greatest (`high`) and the least (`low`) rise of the cost (W,), relative to a quadratic cost."""
     for lane in range(LANES):
         rise = (scalar[COST_TRIAL, lane] - scalar[COST, lane]) * scalar[SHARE, lane]
         # NaN means far from quadratic, and every comparison with NaN is false

@@ -1,5 +1,8 @@
 """The start of a fix: the exact minimiser of the squared ranges and the other linear rows.
 
+A block has W problems of s stations and d coordinates, one in each lane. The range to station i is ``r_i = c_i + s_i
+t``: c_i follows from the measurements, s_i is 1, -1 or 0, and t is one unknown.
+
 Names in capitals, such as X or GOOD, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
@@ -290,9 +293,10 @@ def weigh_rows(
 
 @compiled
 def _accept(y: Array, settled: Array, good: Array, scale: Array, x: Array) -> None:
-    """Write the positions of squared-range solutions to x (d, W), metres, and clear `good` of invalid ones.
+    """Write the positions of squared-range solutions `y` (d + 1, W) to x (d, W), metres; clear `good` of invalid ones.
 
-    A solution is invalid if it is not settled, or if its last coordinate is negative (behind the stations).
+    A solution is invalid if `settled` (W,) is 0.0, or if its last coordinate is negative (behind the stations). `scale`
+    (W,) is the unit of `y`, metres.
     """
     d = len(y) - 1
     for lane in range(LANES):

@@ -1,7 +1,10 @@
 """Rows of every kind as tapes of h(x) and its derivatives, with all other unknowns.
 
-This evaluator serves all problems that `optloc.engine.ranges` does not. It refines all unknowns together. Names in
-capitals, such as X or COST, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+A tape is a list of elementary operations. This evaluator implements `optloc.engine.evaluator` for all problems that
+`optloc.engine.ranges` does not serve. It refines all p unknowns together, the first d of which are the position.
+
+A block has W problems, one in each lane. `room` is the workspace of the block. Names in capitals, such as X or COST,
+are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations
@@ -111,7 +114,7 @@ class TapeBlock(NamedTuple):
 
 @compiled
 def count_unknowns(rows: TapeRows, d: int, size: int) -> int:
-    """Return the number of all unknowns."""
+    """Return the number of all unknowns, `size`: they are refined together."""
     return size
 
 
@@ -123,7 +126,7 @@ def count_lifted(rows: TapeRows) -> int:
 
 @compiled
 def keep(model: EngineModel, rows: TapeRows, stations: int, d: int, size: int) -> TapeBlock:
-    """Return the rows with the memory for a block of problems."""
+    """Return the rows with the memory for a block of problems with `size` unknowns and `d` coordinates."""
     at = cell_layout(rows.tables, rows.numbers, size)
     m, r = memory(rows.tables, at, LANES)
     if rows.lifts.tapes.registers > len(r):
@@ -134,7 +137,7 @@ def keep(model: EngineModel, rows: TapeRows, stations: int, d: int, size: int) -
 
 @compiled
 def load(block: TapeBlock, z: Array, room: EngineWorkspace, anew: bool) -> None:
-    """Copy the numbers and measurements z (N, m) of a block into its lanes."""
+    """Copy the numbers and measurements z (N, m) of a block into its lanes, and write their rounding error to BLUR."""
     c, at, m = block.rows.numbers, block.at, block.m
     for lane in range(LANES):
         i = room.item[lane]
@@ -146,7 +149,10 @@ def load(block: TapeBlock, z: Array, room: EngineWorkspace, anew: bool) -> None:
 
 @compiled
 def minimise_start(model: EngineModel, block: TapeBlock, room: EngineWorkspace, first: bool) -> None:
-    """Write the minimiser of the weighted squared-range rows and of the other linear rows."""
+    """Write the minimiser of the weighted squared-range rows and of the other linear rows to `room.y`.
+
+    SOLVABLE becomes 1.0 if it is unique, else 0.0. `first` is True in the first of two passes.
+    """
     _lift(block, room, first)
     if block.rows.lifts.flat:
         _minimise_flat(room)
@@ -156,7 +162,10 @@ def minimise_start(model: EngineModel, block: TapeBlock, room: EngineWorkspace, 
 
 @compiled
 def _lift(block: TapeBlock, room: EngineWorkspace, first: bool) -> None:
-    """Write the linear rows after the range rows, weighted by their errors at the last minimiser."""
+    """Write the linear rows after the range rows of `room.rows`, weighted by their errors at the last minimiser.
+
+    In the first pass (`first`), all targets count as one scale away.
+    """
     lifts, r = block.rows.lifts, block.r
     s, scale, spare = len(room.place), room.scalar[SCALE], room.scalar[SPARE]
     together = max(1, r.shape[1] // LANES)
@@ -175,7 +184,10 @@ def _lift(block: TapeBlock, room: EngineWorkspace, first: bool) -> None:
 
 @compiled
 def _enter(lifts: Lifts, b: int, room: EngineWorkspace, r: Array, row: int, low: int, inverse: Array) -> None:
-    """Write the inputs of one row of block b into their registers; `inverse` (W,) is one over the scale, 1/metres."""
+    """Write the inputs of linear row `row` of block b into their registers r.
+
+    `low` is the first column of this row in the registers. `inverse` (W,) is one over the scale, 1/metres.
+    """
     table = lifts.tapes.table
     begin = table[b, INPUT]
     for i in range(table[b + 1, INPUT] - begin):
@@ -196,9 +208,10 @@ def _enter(lifts: Lifts, b: int, room: EngineWorkspace, r: Array, row: int, low:
 
 @compiled
 def _weigh(table: Array, b: int, sigma: float, r: Array, low: int, first: bool, out: Array) -> None:
-    """Write one row (d + 2, W) divided by its error.
+    """Write one linear row (d + 2, W) divided by its error to `out`.
 
-    For the first start, the error of each row is the error at a distance of one scale.
+    `sigma` is the standard deviation of the measurement, `low` the first column of the row in the registers r. If
+    `first` is True, the error of each row is the error at a distance of one scale.
     """
     begin, last = table[b, OUTPUT], len(out)
     for j in range(last):
@@ -209,9 +222,9 @@ def _weigh(table: Array, b: int, sigma: float, r: Array, low: int, first: bool, 
 
 @compiled
 def _minimise_flat(room: EngineWorkspace) -> None:
-    """Write the least-squares position of rows that do not contain the last coordinate.
+    """Write the least-squares position of rows that do not contain the last coordinate to `room.y`.
 
-    The quadric would determine a last coordinate that no row depends on.
+    SOLVABLE becomes 1.0 if the rows determine it. The quadric would determine a last coordinate that no row depends on.
     """
     rows, y, d, vector, work = room.rows, room.y, room.d, room.vector, room.axes[0]
     diagonal, inverse, solvable = vector[DIAGONAL][:d], vector[MOVE][:d], room.scalar[SOLVABLE]
@@ -247,7 +260,7 @@ _MOST = 1e13
 
 @compiled
 def scout(model: EngineModel, block: TapeBlock, room: EngineWorkspace) -> None:
-    """Write the best candidates to rows X and OTHER."""
+    """Write the best candidates to rows X and OTHER, for starts by a height or by many positions."""
     for k in range(room.d, room.vector.shape[1]):
         for lane in range(LANES):
             room.vector[X, k, lane] = block.rows.base[k]
@@ -260,7 +273,10 @@ def scout(model: EngineModel, block: TapeBlock, room: EngineWorkspace) -> None:
 
 @compiled
 def complete(block: TapeBlock, room: EngineWorkspace) -> None:
-    """Write the unknowns other than the position that minimise the linearised cost; exact for rows linear in them."""
+    """Write the unknowns other than the position that minimise the linearised cost to row X.
+
+    They are exact if the rows are linear in these unknowns.
+    """
     vector, d, p = room.vector, room.d, room.vector.shape[1]
     if p == d:
         return
@@ -392,4 +408,4 @@ def search_infinity(model: EngineModel, block: TapeBlock, room: EngineWorkspace)
 
 @compiled
 def finish(block: TapeBlock, z: Array, room: EngineWorkspace, size: int, mark: Array, marked: bool, x: Array) -> None:
-    """Do nothing: all unknowns are refined."""
+    """Do nothing: all unknowns are refined, and `x` contains them already."""

@@ -1,9 +1,14 @@
 """Normal equations of many problems in lanes: memory, measurements with derivatives, sums over groups of rows.
 
-A lane is a problem; one interpreter runs the tape of a kind over all lanes. A cell of the memory contains one number of
-every lane. All cells are in one array, because each array argument of a kernel costs as much time as dozens of
-multiplications. Kernels use integer indices instead of views: a view counts references, which takes longer than the
-arithmetic.
+A lane is a problem; one interpreter runs the tape of a kind over all lanes. A cell of the memory m (cells, B) contains
+one number of each of the B lanes. Addresses, such as those in `room`, `own`, `to` and x (the first cell of a vector),
+are numbers of cells. `lanes` is the number of lanes in use. The registers of the tapes are r, and `low` is the first
+column of a row in them. The tables are t, with lines such as `line`. The numbers of the problems are c (`common`,
+`place`). A *group* contains rows whose noise is correlated. A *packet* contains groups whose rows are evaluated
+together.
+
+All cells are in one array, because each array argument of a kernel costs as much time as dozens of multiplications.
+Kernels use integer indices instead of views: a view counts references, which takes longer than the arithmetic.
 """
 
 from __future__ import annotations
@@ -60,7 +65,7 @@ class LaneCells(NamedTuple):
     rows: int  # (rows of a packet, columns and residual)
     whitened: int  # (rows of a group, columns and residual)
     error: int  # (2 * largest prior,)
-    scale: int
+    scale: int  # scratch for the scale factor of a row
     trial: int  # (p,): vector at which the equations are computed
     best: int  # (p,)
     after: int  # (n + l + 1, n + l + 1): equations at `trial`, lower triangle, then vector and cost
@@ -72,7 +77,7 @@ class LaneCells(NamedTuple):
     local_scale: int  # (l,)
     half: int  # (n + 1, l): the local factor's inverse times coupling and vector
     state: int  # state of a refinement
-    cells: int
+    cells: int  # number of cells of a lane
     absent: int  # 1 if some rows are absent
 
 
@@ -137,7 +142,7 @@ def cell_layout(t: Tables, c: Numbers, size: int) -> LaneCells:
 def load(
     m: Array, lane: int, item: int, source: Array, white: Array, prior: Array, observed: Array, present: Array
 ) -> None:
-    """Copy the numbers of a problem into a lane of the memory (cells, B); the arrays are those of `Numbers`."""
+    """Copy the numbers of problem `item` into a lane of the memory; the arrays are fields of `Numbers`."""
     cell = _fill(m, 0, lane, source, item)
     cell = _fill(m, cell, lane, white, item)
     cell = _fill(m, cell, lane, prior, item)
@@ -147,7 +152,7 @@ def load(
 
 @compiled
 def rounding_of_residuals(sigma: Array, size: Array, m: Array, room: LaneCells, lane: int, item: int) -> float:
-    """Return the rounding error of the whitened residuals; it is large for arrival times counted from long ago."""
+    """Return the rounding error of a lane's whitened residuals; it is large for arrival times from long ago."""
     row, squares = item if sigma.shape[0] > 1 else 0, 0.0
     for i in range(sigma.shape[1]):
         if not room.absent or m[room.present + i, lane] != 0.0:
@@ -182,7 +187,7 @@ def blocks(packed: Packed, size: int, count: int) -> int:
 
 @compiled
 def memory(t: Tables, room: LaneCells, lanes: Constant) -> tuple[Array, Array]:
-    """Return cells (cells, lanes) and registers for a number of lanes."""
+    """Return cells (cells, lanes) and registers (registers, LENGTH or more) for a number of lanes."""
     return np.zeros((room.cells, lanes)), np.empty((t.registers, max(LENGTH, lanes)))
 
 
@@ -289,10 +294,7 @@ def write_derivatives(
 def _inputs(
     t: Tables, common: Array, m: Array, own: int, r: Array, begin: int, row: int, end: int, x: int, lanes: Constant
 ) -> None:
-    """Write the inputs of the rows of one kind into their registers.
-
-    `begin` is their first line in the table of inputs.
-    """
+    """Write the inputs of rows of a kind to registers; `begin` is their first line in the table of inputs."""
     index = t.table
     for one in range(row, end):
         low, source = (one - row) * lanes, index[t.row + one, ROW_SOURCE]
@@ -313,7 +315,7 @@ def _inputs(
 
 @compiled
 def _derivatives(t: Tables, m: Array, r: Array, begin: int, line: int, low: int, to: int, lanes: Constant) -> None:
-    """Write the derivatives of h of one row by the unknowns that change its inputs."""
+    """Write the derivatives of h of one row by the unknowns of its group to the cells from `to` on."""
     index = t.table
     source = index[line, ROW_SOURCE]
     for j in range(index[line, ROW_WIDTH]):
@@ -332,7 +334,7 @@ def _derivatives(t: Tables, m: Array, r: Array, begin: int, line: int, low: int,
 def _measurement(
     t: Tables, m: Array, r: Array, place: int, line: int, low: int, to: int, x: int, scale: int, lanes: Constant
 ) -> None:
-    """Write the value of one row after its derivatives, and apply scales and offsets to both."""
+    """Write the value of one row after its derivatives (from cell `to` on), and apply scales and offsets to both."""
     index = t.table
     value, end = to + index[line, ROW_WIDTH], index[line + 1, ROW_ADDEND]
     first, last = index[line, ROW_SCALE], index[line + 1, ROW_SCALE]
@@ -364,7 +366,7 @@ def _measurement(
 
 @compiled
 def _residual(m: Array, value: int, observed: int, periodic: int, lanes: Constant) -> None:
-    """Replace values by residuals; angles are wrapped."""
+    """Replace the values in cell `value` by residuals, measured minus predicted; angles are wrapped to (-pi, pi]."""
     for b in range(lanes):
         m[value, b] = m[observed, b] - m[value, b]
     if periodic:
@@ -376,7 +378,7 @@ def _residual(m: Array, value: int, observed: int, periodic: int, lanes: Constan
 
 @compiled
 def _mask(m: Array, value: int, present: int, lanes: Constant) -> None:
-    """Set the residuals of absent rows to zero."""
+    """Set the residuals in cell `value` to zero where the row is absent."""
     for b in range(lanes):
         m[value, b] = m[value, b] if m[present, b] != 0.0 else 0.0
 
@@ -414,7 +416,7 @@ def write_equations(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, 
 
 @compiled
 def write_cost(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, lanes: Constant) -> None:
-    """Write the cost at `room.trial` to the last cell of `room.after`."""
+    """Write the cost at `room.trial`, with all priors, to the last cell of `room.after`."""
     total = room.after + (t.shared + t.local + 1) ** 2 - 1
     for b in range(lanes):
         m[total, b] = 0.0
@@ -518,7 +520,7 @@ def _whiten(
     to: int,
     lanes: Constant,
 ) -> None:
-    """Write `size` rows from cell `first` on, whitened, to cell `to`."""
+    """Write `size` rows of `columns` cells, from cell `first` on, times the whitening matrix, to cell `to`."""
     for i in range(size):
         for s in range(columns):
             cell = to + i * width + s
@@ -550,7 +552,7 @@ def _square(
     last: int,
     lanes: Constant,
 ) -> None:
-    """Add the products of the columns of whitened rows; the last column is the residual."""
+    """Add the products of the columns of `size` whitened rows to the equations at `to`; the residual is last."""
     for i in range(columns):
         line = to + (index[column + i, FIRST] if i < columns - 1 else last) * (last + 1)
         for j in range(i + 1):

@@ -5,7 +5,8 @@ calls, from any file: after an edit or an upgrade of one of them, numba would ru
 not used. The name of the folder of machine code depends on the versions of the compilers and on the processor. The
 folder of an installed distribution (`optloc.kernels.manifest`) is read first.
 
-Callees are stored too if this saves time: in a checkout, and while `optloc compile` compiles everything.
+A *callee* is a kernel that only other kernels call. Callees are stored too if this saves time: in a checkout, and while
+`optloc compile` compiles everything.
 """
 
 from __future__ import annotations
@@ -62,13 +63,16 @@ def folder() -> Path | None:
 
 
 def _clear(place: Path) -> None:
-    """Remove folders for other compilers except the most recent ones; a process that still uses one compiles again."""
+    """Remove the folders next to `place` for other compilers, except the most recent ones.
+
+    A process that still uses a removed folder compiles again.
+    """
     others = [path for path in place.parent.glob(f"{PREFIX}*") if path != place and path.is_dir()]
-    for path in sorted(others, key=_used, reverse=True)[_LEFT:]:
+    for path in sorted(others, key=_last_use, reverse=True)[_LEFT:]:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def _used(path: Path) -> float:
+def _last_use(path: Path) -> float:
     """Return the time at which a folder was last used, seconds; 0 if it no longer exists."""
     try:
         return path.stat().st_mtime
@@ -77,22 +81,29 @@ def _used(path: Path) -> float:
 
 
 class _CacheLocator:
-    """The location of the machine code of a function, with the interface of a cache locator of numba."""
+    """The location of the machine code of a function, with the interface of a cache locator of numba.
+
+    `place` is the folder, `digest` the digest of the function's call graph.
+    """
 
     def __init__(self, function: Callable[..., Any], place: Path, digest: str) -> None:
         self._py_file = str(Path(function.__code__.co_filename).resolve())
         self._path, self._digest = str(place), digest
 
     def ensure_cache_path(self) -> None:
+        """Create the folder."""
         Path(self._path).mkdir(parents=True, exist_ok=True)
 
     def get_cache_path(self) -> str:
+        """Return the folder."""
         return self._path
 
     def get_source_stamp(self) -> str:
+        """Return an empty stamp of the source file, so that numba does not compare stamps."""
         return ""  # the name of the file contains the digest
 
     def get_disambiguator(self) -> str:
+        """Return the part of the file name that distinguishes versions of the function."""
         return self._digest
 
 
@@ -110,6 +121,8 @@ def _entries() -> tuple[Any, Any]:
 
     class CachedCallee(Impl):
         def rebuild(self, target_context: Any, payload: Any) -> Any:
+            """Return the compiled callee from stored code, read by the library for callees."""
+
             def read(stored: Any) -> Any:
                 return callee_library().read(target_context.codegen(), stored)
 
@@ -124,7 +137,7 @@ def _entries() -> tuple[Any, Any]:
 
 
 def _fields(kind: Any) -> tuple[Any, ...]:
-    """Return the fields of a numba type and of the types inside it; () for a type without fields."""
+    """Return the names of the fields of a numba type, nested for the types inside it; () for a type without fields."""
     from numba.core import types
 
     numba: Any = types  # half typed
@@ -135,7 +148,10 @@ def _fields(kind: Any) -> tuple[Any, ...]:
 
 @cache
 def _cache_type() -> Any:
-    """Return the class of numba's function cache with our folder and file names; damaged entries are ignored."""
+    """Return a subclass of numba's function cache, with our folder and file names, that ignores damaged entries.
+
+    The class is defined in a function, so that numba is imported only if it is needed.
+    """
     from numba.core import caching
 
     numba: Any = caching  # half typed
@@ -192,7 +208,10 @@ def _cache_type() -> Any:
 
 
 def code_cache_of(kernel: Compilable, *, callee: bool) -> Any:
-    """Return a cache for the machine code of a kernel, for numba's dispatcher; None without a folder."""
+    """Return a cache for the machine code of a kernel, for numba's dispatcher; None without a folder.
+
+    `callee` is True for the form that other kernels call, False for the form that Python calls.
+    """
     place = _callees() if callee else folder_in_use()
     return None if place is None else _cache_type()(kernel, place, callee=callee)
 
@@ -203,7 +222,7 @@ def folder_in_use() -> Path | None:
 
 
 def _callees() -> Path | None:
-    """Return the folder for code that only kernels call, or None if no later compilation will use it."""
+    """Return the folder for callees, or None if no later compilation will use it."""
     named = os.environ.get(CALLEES)
     if named:
         return Path(named)
@@ -222,7 +241,10 @@ def is_cached(kernel: Compilable) -> bool:
 
 
 def files_of(kernel: Compilable, *places: Path | None) -> list[Path]:
-    """Return the files with the machine code of a kernel, from the first folder that contains it; [] if none does."""
+    """Return the files with the machine code of a kernel, from the first of the folders `places` that contains it.
+
+    The list is empty if no folder contains it.
+    """
     index = f"{file_prefix_of(name_of(kernel.function), digest_of(kernel))}.nbi"
     found = next((place for place in places if place is not None and (place / index).exists()), None)
     return [] if found is None else [found / index, *found.glob(index.replace(".nbi", ".*.nbc"))]
@@ -241,9 +263,12 @@ def file_prefix_of(name: str, digest: str) -> str:
 
 
 def _leave_last(place: Path, name: str, base: str) -> None:
-    """Remove the files of other digests of a function, except the newest."""
+    """Remove the files of old versions of the function `name`, except the newest `_LEFT` - 1.
+
+    `base` is the file name of the present version, which stays.
+    """
     others = [path for path in place.glob(f"{file_prefix_of(name, '*')}.nbi") if path.stem != base]
-    for path in sorted(others, key=_used, reverse=True)[_LEFT - 1 :]:
+    for path in sorted(others, key=_last_use, reverse=True)[_LEFT - 1 :]:
         for file in (path, *place.glob(f"{path.stem}.*.nbc")):
             file.unlink(missing_ok=True)
 
@@ -277,8 +302,11 @@ def start_background_compiler() -> None:
         _LOG.warning("cannot start the process that compiles machine code: %s", error)
 
 
-def _holds(file: IO[bytes], *, wait: bool) -> bool:
-    """Return whether a file could be locked until it is closed; True if the system or file system has no locks."""
+def _lock_file(file: IO[bytes], *, wait: bool) -> bool:
+    """Lock a file until it is closed, and return whether this succeeded.
+
+    If `wait` is True, the function waits for the lock. The result is True if the system or file system has no locks.
+    """
     try:
         import fcntl
 
@@ -298,7 +326,7 @@ def sole_compiler() -> Iterator[bool]:
         yield False
         return
     with (place / "all.lock").open("ab") as file:
-        yield _holds(file, wait=False)
+        yield _lock_file(file, wait=False)
 
 
 @contextmanager
@@ -317,5 +345,5 @@ def locked(kernel: Compilable) -> Iterator[None]:
         except OSError:  # the folder was removed, so it is created again
             yield
             return
-        _holds(file, wait=True)
+        _lock_file(file, wait=True)
         yield

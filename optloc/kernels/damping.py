@@ -36,7 +36,11 @@ _FALL, _QUICK_FALL, _AGREED = 1.0 / 3.0, 0.1, 0.9
 
 
 class StopRules(NamedTuple):
-    """The conditions that end a refinement; see `optloc.kernels.least_squares.refine`, which has the same defaults."""
+    """The conditions that end a refinement; see `optloc.kernels.least_squares.refine`, which has the same defaults.
+
+    `tolerance` is the length of the last step in standard deviations, `limit` the greatest number of steps. If `damped`
+    is False, every step is accepted.
+    """
 
     tolerance: float = 1e-7
     limit: int = 60
@@ -118,7 +122,10 @@ def judge_lane(
     tolerance: float,
     damped: bool,
 ) -> tuple[bool, bool, bool, float, float]:
-    """Return the fields of `Judged` for one step of one fix: `judge` as machine code, with identical rounding."""
+    """Return the five fields of `Judged` for one step of one fix: `judge` as machine code, with identical rounding.
+
+    The order is better, small, stuck, damping, growth; see `judge` for the arguments.
+    """
     achieved, floor = cost - after, _ROUNDING * (1.0 + cost)
     rounding = floor + 2.0 * blur * np.sqrt(1.0 + cost)
     better = solvable and np.isfinite(after) and (achieved >= -rounding or not damped)

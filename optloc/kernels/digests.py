@@ -41,14 +41,14 @@ class Compilable:
 def digest_of(kernel: Compilable) -> str:
     """Return the digest of a kernel's call graph; kernels that call each other have the same digest."""
     own = sorted(
-        f"{one.function.__module__}.{one.function.__qualname__} {one.taken_in} {_own(one.function)[0]}"
+        f"{one.function.__module__}.{one.function.__qualname__} {one.taken_in} {_digest_and_callees(one.function)[0]}"
         for one in closure(kernel)
     )
     return sha256("\n".join(own).encode()).hexdigest()[:_DIGITS]
 
 
 def closure(kernel: Compilable) -> set[Compilable]:
-    """Return a kernel and all kernels that it calls, directly or indirectly."""
+    """Return a set: the kernel and all kernels that it calls, directly or indirectly."""
     found, left = {kernel}, [kernel]
     while left:
         new = set(callees(left.pop())) - found
@@ -59,7 +59,7 @@ def closure(kernel: Compilable) -> set[Compilable]:
 
 def callees(kernel: Compilable) -> tuple[Compilable, ...]:
     """Return the compiled functions whose names a kernel uses."""
-    return _own(kernel.function)[1]
+    return _digest_and_callees(kernel.function)[1]
 
 
 def callers(kernels: Iterable[Compilable], known: Iterable[Compilable]) -> set[Compilable]:
@@ -73,8 +73,11 @@ def callers(kernels: Iterable[Compilable], known: Iterable[Compilable]) -> set[C
 
 
 @cache
-def _own(function: Callable[..., Any]) -> tuple[str, tuple[Compilable, ...]]:
-    """Return the digest of a function without its callees, and its callees."""
+def _digest_and_callees(function: Callable[..., Any]) -> tuple[str, tuple[Compilable, ...]]:
+    """Return the digest of a function without its callees, and its callees.
+
+    The result is cached, because many call graphs contain the same function.
+    """
     texts, called = list[str](), list[Compilable]()
     for text, callee in _parts(function, set()):
         texts.append(text)
@@ -84,7 +87,10 @@ def _own(function: Callable[..., Any]) -> tuple[str, tuple[Compilable, ...]]:
 
 
 def _parts(function: Callable[..., Any], seen: set[FunctionType]) -> Iterator[tuple[str, Compilable | None]]:
-    """Yield (text, callee) for each part of a function; callee is None unless the text is the name of a kernel."""
+    """Yield (text, callee) for each part of a function that changes its machine code.
+
+    `callee` is None unless the text is the name of a kernel. `seen` contains the functions that were visited already.
+    """
     assert isinstance(function, FunctionType)
     if function in seen:
         return
@@ -103,9 +109,9 @@ def _parts(function: Callable[..., Any], seen: set[FunctionType]) -> Iterator[tu
 
 
 def _value(name: str, value: Any, names: list[str], seen: set[FunctionType]) -> Iterator[tuple[str, Compilable | None]]:
-    """Yield (text, callee) for a value whose name a function uses.
+    """Yield (text, callee) for a value whose name a function uses; see `_parts`.
 
-    For a module, the attributes that the function may use are included.
+    `names` are all names in the function: for a module, its attributes with these names are included.
     """
     if isinstance(value, Compilable):
         yield f"{name} calls {value.function.__module__}.{value.function.__qualname__}", value
@@ -140,6 +146,7 @@ def _record(kind: Any) -> str:
 
 
 def _is_library(module: str) -> bool:
+    """Return whether a module belongs to numpy, numba or the standard library, whose versions are covered elsewhere."""
     return module.partition(".")[0] in _LIBRARIES
 
 
@@ -153,7 +160,10 @@ def _names(code: CodeType) -> set[str]:
 
 
 def _text(value: Any, documentation: str | None = None) -> str:
-    """Return a text that two values share only if they compile to the same machine code."""
+    """Return a text that two values share only if they compile to the same machine code.
+
+    `documentation` is the docstring of a function whose code is the value; the text does not contain it.
+    """
     if isinstance(value, CodeType):
         # The docstring is the first constant; some Python versions put None there if there is no docstring.
         constants = value.co_consts[value.co_consts[:1] in ((documentation,), (None,)) :]

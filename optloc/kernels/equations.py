@@ -1,6 +1,9 @@
 """Normal equations of many problems in one call.
 
-The equations are summed over the epochs of a run; the unknowns of each epoch keep separate blocks.
+The equations are summed over the epochs of a run; the unknowns of each epoch keep separate blocks. Letters: n shared
+unknowns, `local` (or `size`) local unknowns of an epoch, B lanes. `m` is the memory (cells, B), `room` its addresses, r
+are registers, see `optloc.kernels.batched_rows`. `used` is the number of lanes in use; lane b contains vector `begin` +
+b.
 """
 
 from __future__ import annotations
@@ -33,7 +36,11 @@ _SHARE = 64
 
 
 class Sums(NamedTuple):
-    """The arrays of `optloc.linear.normal.Normal` for M vectors."""
+    """The arrays of `optloc.linear.normal.Normal` for M vectors, with k epochs, n shared and l local unknowns.
+
+    `shared` (M, n, n), `local` (M, k, l, l), `cross` (M, k, n, l), `shared_vector` (M, n), `local_vector` (M, k, l) and
+    `cost` (M,).
+    """
 
     shared: Array
     local: Array
@@ -44,7 +51,7 @@ class Sums(NamedTuple):
 
 
 def chunks(count: int) -> list[tuple[int, int]]:
-    """Return ranges (first, last) of start numbers, one for each thread that pays off."""
+    """Return ranges (first, last) of the numbers of `count` starts, one range for each thread that saves time."""
     # Ranges of equal length: starts take about the same time, and each range has its own memory.
     parts = max(1, min(thread_count(), count // _SHARE))
     ends = np.linspace(0, count, parts + 1).round().astype(int).tolist()
@@ -82,7 +89,10 @@ def normal_at(packed: Packed, x: Array, item: Array, *, priors: bool = False) ->
 
 @compiled
 def normal_block(packed: Packed, x: Array, item: Array, first: int, last: int, priors: bool, out: Sums) -> None:
-    """Write the normal equations at the vectors first <= i < last."""
+    """Write the normal equations at the vectors first <= i < last of x (M, size) to `out`.
+
+    `item` (M,) is the problem of each vector.
+    """
     t, c = packed
     size = x.shape[1]
     lanes, room = blocks(packed, size, last - first), cell_layout(t, c, size)
@@ -119,9 +129,9 @@ def _epochs(
     cross: Array,
     vector: Array,
 ) -> None:
-    """Write the equations of the local unknowns of each epoch.
+    """Write the equations of the local unknowns of each epoch to `local`, `cross` and `vector`.
 
-    The equations of the shared unknowns are summed in `room.after`.
+    The equations of the shared unknowns are summed in `room.after`. The arrays are fields of `Sums`.
     """
     group, packet, last = 0, 0, t.shared + t.local
     clear(m, room.now, (last + 1) ** 2, used)
@@ -149,7 +159,11 @@ def _epochs(
 def _own(
     m: Array, to: int, n: int, size: int, begin: int, epoch: int, used: int, local: Array, cross: Array, vector: Array
 ) -> None:
-    """Write the equations of the local unknowns of one epoch, and their coupling with the shared unknowns."""
+    """Write the equations of the local unknowns of one epoch, and their coupling with the shared unknowns.
+
+    They are copied from the memory, where the equations begin at cell `to`, to entries of `local`, `cross` and
+    `vector`.
+    """
     width = n + size + 1
     for i in range(size):
         line = to + (n + i) * width
@@ -166,7 +180,10 @@ def _own(
 def _whole(
     m: Array, to: int, n: int, width: int, begin: int, used: int, shared: Array, vector: Array, cost: Array
 ) -> None:
-    """Write the equations of the unknowns that all epochs share, and the cost."""
+    """Write the equations of the unknowns that all epochs share to `shared` and `vector`, and the cost to `cost`.
+
+    They are copied from the memory, where the equations begin at cell `to`; `width` is the number of unknowns plus one.
+    """
     last = to + (width - 1) * width
     for b in range(used):
         cost[begin + b] = m[last + width - 1, b]

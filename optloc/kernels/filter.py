@@ -3,7 +3,7 @@
 States are ``x = mean + L y`` with ``L L' = P`` the predicted covariance, so that the prior is ``|y|^2``. The update is
 the minimum of the prior and the cost of the rows: ``(I + B' B) y = B' e``. B contains the whitened derivatives of the
 rows times L, and e the whitened residuals. For a state that is known exactly in some direction, L has a column of
-zeros.
+zeros. `item` is the number of the scan in `rows`, s is the workspace of one state of n components.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class ScanRows(NamedTuple):
 
 
 class Move(NamedTuple):
-    """A prediction: transition (n, n), process noise (N or 1, n, n) and drive (N or 1, n)."""
+    """A prediction: transition F (n, n), process noise Q (N or 1, n, n) and drive (N or 1, n), a known change."""
 
     F: Array
     Q: Array
@@ -109,7 +109,7 @@ class Filtering(NamedTuple):
 
 
 class Filtered(NamedTuple):
-    """States after a scan, written: means (N, n), covariances (N, n, n), and numbers (N, VALUES) of each state."""
+    """States after a scan, written: `mean` (N, n), `cov` (N, n, n), and numbers `values` (N, VALUES) of each."""
 
     mean: Array
     cov: Array
@@ -122,21 +122,21 @@ class _Space(NamedTuple):
     It contains the memory of one lane, matrices (n, n), rows (m, n + 1) with the residual last, and vectors.
     """
 
-    m: Array
-    r: Array
-    room: LaneCells
-    P: Array
-    root: Array
-    factor: Array
+    m: Array  # (cells, 1): memory of the lane
+    r: Array  # registers
+    room: LaneCells  # addresses in the memory
+    P: Array  # (n, n): predicted covariance
+    root: Array  # (n, n): its root L
+    factor: Array  # (n, n): factor of I + B' B
     rows: Array  # derivatives times root
     white: Array  # whitened `rows`
     W: Array  # (m, m): whitening matrix of the rows used
     used: Array  # (m,): weights, zero for rows that are left out
-    x: Array
-    y: Array
-    move: Array
-    slope: Array
-    at: Array
+    x: Array  # predicted mean
+    y: Array  # coordinates of the state, x = mean + L y
+    move: Array  # step of y
+    slope: Array  # right side of the step
+    at: Array  # scratch for a state
 
 
 @compiled
@@ -222,7 +222,7 @@ def _predict(move: Move, one: int, mean: Array, cov: Array, s: _Space) -> None:
 
 @compiled
 def _update(rows: ScanRows, item: int, one: int, how: Filtering, s: _Space, memory: Array, out: Filtered) -> float:
-    """Write a state after the scan, and return its status."""
+    """Write state number `one` after the scan to `out`, and return its status; GENERAL if nothing was written."""
     n, values, mean, cov = len(s.x), out.values[one], out.mean[one], out.cov[one]
     broken = _take(rows, item, one, s)
     if not _root(s.P, s.root):
@@ -271,7 +271,7 @@ def _of(count: int, i: int) -> int:
 
 @compiled
 def _take(rows: ScanRows, item: int, one: int, s: _Space) -> bool:
-    """Load the measurements and weights of a state; return whether a present row is not finite."""
+    """Load the measurements and weights of state number `one`; return whether a present row is not finite."""
     broken = False
     for i in range(len(s.used)):
         z = rows.z[_of(rows.z.shape[0], item), _of(rows.z.shape[1], one), i]
@@ -284,7 +284,7 @@ def _take(rows: ScanRows, item: int, one: int, s: _Space) -> bool:
 
 @compiled
 def _root(cov: Array, root: Array) -> bool:
-    """Write the lower triangular root of a covariance, and return whether the covariance is positive semidefinite."""
+    """Write the lower triangular root L of a covariance to `root`; return False if it is not semidefinite."""
     n, most = len(cov), 0.0
     for i in range(n):
         most = max(most, cov[i, i])
@@ -310,7 +310,7 @@ def _root(cov: Array, root: Array) -> bool:
 
 @compiled
 def _evaluate(rows: ScanRows, s: _Space, x: Array) -> None:
-    """Write residuals and derivatives times root of the used rows at a state."""
+    """Write residuals, and derivatives times L, of the used rows at a state x (n,) to `s.rows`."""
     t, n = rows.tables, len(x)
     for i in range(n):
         s.m[s.room.trial + i, 0] = x[i]
@@ -331,7 +331,7 @@ def _evaluate(rows: ScanRows, s: _Space, x: Array) -> None:
 
 @compiled
 def _gate(rows: ScanRows, item: int, how: Filtering, s: _Space, values: Array) -> None:
-    """Leave out the rows whose innovation is outside the gate, and count the rejected rows."""
+    """Set the weights of rows whose innovation is outside the gate to zero, and count the rejected rows in `values`."""
     n, own = len(s.x), _of(len(rows.covariance), item)
     for i in range(len(s.used)):
         if s.used[i] > 0.0:
@@ -384,7 +384,7 @@ def _whitener(rows: ScanRows, item: int, s: _Space) -> tuple[float, float]:
 
 @compiled
 def _entry(rows: ScanRows, own: int, i: int, j: int) -> float:
-    """Return entry (i, j) of the covariance of the rows."""
+    """Return entry (i, j) of the covariance of the rows; `own` is the row of the scan in `rows.covariance`."""
     m = rows.z.shape[2]
     if rows.covariance.shape[1] == m:
         return float(rows.covariance[own, i]) if i == j else 0.0
@@ -440,8 +440,8 @@ def _remember(rows: ScanRows, item: int, s: _Space, memory: Array, values: Array
     """Test whether errors of the stations repeat from scan to scan, and whether the innovations are too large.
 
     Both results are numbers of standard deviations, over about the last fifty scans. The scores for the errors of the
-    stations are ``a = D' S^-1 nu``. Their product with the scores b of the scan before has the mean zero. For a given b
-    its variance is ``(D b)' S^-1 (D b)``.
+    stations are ``a = D' S^-1 nu``: innovations nu, their covariance S, derivatives D. The product with the scores b of
+    the scan before has the mean zero and, for a given b, the variance ``(D b)' S^-1 (D b)``.
     """
     n, m, own = len(s.x), len(s.used), _of(len(rows.covariance), item)
     left, seen, back = np.zeros(m), np.zeros(m), np.zeros(n)
@@ -487,7 +487,7 @@ def _remember(rows: ScanRows, item: int, s: _Space, memory: Array, values: Array
 
 @compiled
 def _write_rows(t: Tables, s: _Space, out: Array) -> None:
-    """Write derivatives, residual and weight of each row at the prediction; zeros for rows that are left out."""
+    """Add derivatives, residual and weight of each used row to `out`, which has n + 2 zeros for each of the m rows."""
     n = len(s.x)
     begin = t.table[t.group, GROUP_COLUMN]
     columns = t.table[t.group + 1, GROUP_COLUMN] - begin
@@ -501,7 +501,7 @@ def _write_rows(t: Tables, s: _Space, out: Array) -> None:
 
 @compiled
 def _size(rows: ScanRows, own: int, i: int) -> float:
-    """Return the standard deviation of the error of each station of a row: all its stations have the same."""
+    """Return the standard deviation of the error of each station of row i, from row `own` of the covariances."""
     return sqrt(_entry(rows, own, i, i) / (2.0 if rows.station[i, 1] >= 0 else 1.0))
 
 
@@ -570,7 +570,7 @@ def _modify(rows: ScanRows, s: _Space, cov: Array) -> None:
 
 @compiled
 def _place(s: _Space, share: float, out: Array) -> None:
-    """Write the state at the given share of y."""
+    """Write the state ``mean + share * L y`` to `out`, with the predicted mean."""
     for i in range(len(s.x)):
         out[i] = s.x[i]
         for k in range(i + 1):
@@ -590,7 +590,7 @@ def _covariance(s: _Space, out: Array) -> None:
 
 @compiled
 def _square(A: Array, out: Array) -> None:
-    """Write ``A A'``."""
+    """Write the matrix ``A A'`` to `out`."""
     for i in range(A.shape[0]):
         for j in range(i + 1):
             value = 0.0

@@ -1,9 +1,13 @@
 """Squared-range least squares in lanes: Newton's method on the multiplier for many problems side by side.
 
 Minimise ``|B y - g|^2`` over the cone ``y = (x, r)``, ``|x|^2 = r^2``, or the paraboloid ``y = (x, w)``, ``|x|^2 = w``.
-The last axis of every array counts W = LANES problems, so that one instruction serves several of them. Problems whose
-normal matrix is not definite, or whose iteration does not converge, are flagged. They need the eigenvalues of a matrix
-pencil, which other code computes for a batch of a few hard problems.
+Both constraints are ``y'Cy + 2h'y = 0``: C is the unit matrix except for its last entry, -1 (cone) or 0. h is zero
+except for its last entry, 0 (cone) or -1/2.
+
+The last axis of every array counts W = LANES problems, so that one instruction serves several of them. A lane is one
+problem. Problems whose normal matrix is not definite, or whose iteration does not converge, are flagged. They need the
+eigenvalues of a matrix pencil, which other code computes for a batch of a few hard problems. Letters: n unknowns y, q
+rows, ``A = B'B``, ``b = B'g``.
 
 Source: J. J. More, "Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993), theorem 3.2.
 """
@@ -167,9 +171,10 @@ def _meet_lane(
     two: Array,
     lane: int,
 ) -> None:
-    """Write the points of `meet` for one lane.
+    """Write the points of `meet` for one lane, as `y` and `other`.
 
-    The eigenvalues are on the diagonal of A, the eigenvectors in the columns of `axes`.
+    The eigenvalues of the normal matrix are on the diagonal of A, the eigenvectors in the columns of `axes`; b is the
+    right side. `along` and `base` are scratch: direction and a point of the line of minimisers.
     """
     n, first = len(y), _open_axis(A, lane)
     if first < 0:
@@ -215,7 +220,7 @@ def _meet_lane(
 
 @compiled
 def _normal(rows: Array, A: Array, b: Array, least: Array) -> None:
-    """Write the lower half of ``B'B``, ``B'g``, and the least valid pivot (W,)."""
+    """Write the lower half of ``A = B'B``, ``b = B'g``, and the least valid pivot (W,), for `rows` [B | g]."""
     q, n = len(rows), len(b)
     for lane in range(LANES):
         least[lane] = 0.0
@@ -237,7 +242,7 @@ def _normal(rows: Array, A: Array, b: Array, least: Array) -> None:
 
 @compiled
 def _shift(A: Array, b: Array, multiplier: Array, on_cone: bool, diagonal: Array, right: Array) -> None:
-    """Write the diagonal of ``A + multiplier C`` and the right side ``b - multiplier h``."""
+    """Write the diagonal (n, W) of ``A + multiplier C`` and the right side (n, W) ``b - multiplier h``."""
     n = len(b)
     sign, shift = (-1.0, 0.0) if on_cone else (0.0, 0.5)
     for i in range(n):
@@ -249,7 +254,7 @@ def _shift(A: Array, b: Array, multiplier: Array, on_cone: bool, diagonal: Array
 
 @compiled
 def _gradient(y: Array, on_cone: bool, across: Array, p: Array) -> None:
-    """Write ``C y + h`` to `across` and to `p`."""
+    """Write half the gradient of the constraint, ``C y + h`` (n, W), to `across` and to `p`."""
     n = len(y)
     for i in range(n - 1):
         for lane in range(LANES):
@@ -260,7 +265,7 @@ def _gradient(y: Array, on_cone: bool, across: Array, p: Array) -> None:
 
 @compiled
 def _value(y: Array, across: Array, on_cone: bool, out: Array) -> None:
-    """Write half of ``y'Cy + 2h'y`` to `out` (W,)."""
+    """Write half of the constraint, ``y'Cy + 2h'y``, to `out` (W,); `across` (n, W) is ``C y + h``."""
     n = len(y)
     for lane in range(LANES):
         # h is zero for the cone; for the paraboloid its last entry is minus a half.
@@ -274,7 +279,9 @@ def _value(y: Array, across: Array, on_cone: bool, out: Array) -> None:
 def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, free: Array) -> bool:
     """Update the multipliers of the lanes that have not converged, and return whether there are any.
 
-    The update is Newton's step; a step out of the definite interval is halved.
+    The update is Newton's step; a step out of the interval where the matrix is definite is halved. `across` is ``C y +
+    h``, `p` is the solution for this right side. `spare` contains the scalars of each lane, named by the constants from
+    MULTIPLIER on. `free` is scratch.
     """
     n = len(y)
     multiplier, todo, value = spare[MULTIPLIER], spare[TODO], spare[VALUE]
@@ -305,7 +312,10 @@ def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, fre
 
 @compiled
 def _residual_slope(rows: Array, y: Array, across: Array, multiplier: Array, slope: Array, left: Array) -> None:
-    """Write ``B'(B y - g) + multiplier (C y + h)``; near the solution it has the accuracy of B, not of B'B."""
+    """Write the gradient ``B'(B y - g) + multiplier (C y + h)`` to `slope`; `left` (W,) is scratch.
+
+    `rows` are [B | g], `across` is ``C y + h``. Near the solution the result has the accuracy of B, not of B'B.
+    """
     q, n = len(rows), len(y)
     for i in range(n):
         for lane in range(LANES):
@@ -323,7 +333,11 @@ def _residual_slope(rows: Array, y: Array, across: Array, multiplier: Array, slo
 
 @compiled
 def _step(y: Array, across: Array, p: Array, on_cone: bool, slope: Array, bend: Array, value: Array) -> None:
-    """Take one Newton step on the optimality conditions: slope and constraint become zero to first order."""
+    """Take one Newton step of y on the optimality conditions: slope and constraint become zero to first order.
+
+    `slope` and `p` are solutions with the factored matrix, `across` is ``C y + h``. `bend` (W,) is minus the derivative
+    of half the constraint by the multiplier; `value` is scratch.
+    """
     n = len(y)
     _value(y, across, on_cone, value)
     for i in range(n):

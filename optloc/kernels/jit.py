@@ -38,7 +38,10 @@ _LOADING = held_by_forks(Lock())
 
 @cache
 def _numba() -> Any:
-    """Return the module numba, or None if it is missing or disabled."""
+    """Return the module numba, or None if it is missing or disabled.
+
+    Compilations are reported from the first call on.
+    """
     try:
         import numba
     except ImportError:
@@ -52,7 +55,10 @@ def _numba() -> Any:
 
 
 def enabled() -> bool:
-    """Return whether kernels run as machine code: numba is installed and NUMBA_DISABLE_JIT is not set."""
+    """Return whether kernels run as machine code.
+
+    They do if numba is installed, NUMBA_DISABLE_JIT is not set, and the code does not run inside `plain`.
+    """
     return not _PLAIN.get() and _numba() is not None
 
 
@@ -70,7 +76,10 @@ _KERNELS: list[_Kernel] = []
 
 
 class _Kernel(Compilable):
-    """A function of scalars and arrays in three forms: plain, compiled for Python, and compiled for calling kernels."""
+    """A function of scalars and arrays in three forms: plain, compiled for Python, and compiled for calling kernels.
+
+    `taken_in` is True if every caller inlines the function. `ready` is True if this process has used the machine code.
+    """
 
     def __init__(self, function: Callable[..., Any], *, taken_in: bool) -> None:
         super().__init__(function, taken_in=taken_in)
@@ -91,7 +100,10 @@ class _Kernel(Compilable):
         return self._form(callee=False)
 
     def _form(self, *, callee: bool) -> Any:
-        """Return a compiled form, shared by all threads: numba infers types again for each new form."""
+        """Return a compiled form, shared by all threads: numba infers types again for each new form.
+
+        `callee` is True for the form that other kernels call, False for the form that Python calls.
+        """
         made = self._forms.get(callee)  # a local name, because another thread may discard the form meanwhile
         if made is None:
             with _LOCK:
@@ -118,6 +130,7 @@ class _Kernel(Compilable):
         return getattr(self._form(callee=True), name)
 
     def __call__(self, *args: Any) -> Any:
+        """Run the machine code, or the plain function if machine code is disabled."""
         if not enabled():
             return self.function(*args)
         if not self.ready:
@@ -139,8 +152,9 @@ class _Kernel(Compilable):
 def _take_as_variables(made: Any, function: Callable[..., Any]) -> None:
     """Make numba compile constants in calls as variables, except for arguments annotated with `Constant`.
 
-    Otherwise numba compiles a callee again for each constant argument, and its callees as well: of a thousand forms,
-    175 differed only by a constant. LLVM still uses the constants in code that it inlines.
+    `made` is numba's dispatcher of the function. Otherwise numba compiles a callee again for each constant argument,
+    and its callees as well: of a thousand forms, 175 differed only by a constant. LLVM still uses the constants in code
+    that it inlines.
     """
     from numba.core import types
 
@@ -150,6 +164,7 @@ def _take_as_variables(made: Any, function: Callable[..., Any]) -> None:
     template, fold = made.get_call_template, made._compiler.fold_argument_types  # noqa: SLF001
 
     def template_of_variables(args: Any, kws: Any) -> Any:
+        """Return numba's template of a call whose constants are variables."""
         args = fold(args, kws)[1]
         return template([a if n in kept else numba.unliteral(a) for n, a in zip(names, args, strict=True)], {})
 
@@ -167,16 +182,18 @@ def compiling(tell: Callable[[str, bool], None]) -> Iterator[None]:
 
 
 def _listen(tell: Callable[[str, bool], None]) -> Callable[[], None]:
-    """Register a listener for compilations, and return the function that removes it."""
+    """Register a listener `tell(name, done)` for compilations, and return the function that removes it."""
     from numba.core import event
 
     events: Any = event  # without types
 
     class CompileReport(events.Listener):  # type: ignore[misc]
         def on_start(self, found: Any) -> None:
+            """Report the start of a compilation."""
             tell(name_of(found.data["dispatcher"].py_func), False)
 
         def on_end(self, found: Any) -> None:
+            """Report the end of a compilation."""
             tell(name_of(found.data["dispatcher"].py_func), True)
 
     listener = CompileReport()
@@ -190,7 +207,7 @@ _BEGUN: set[str] = set()
 
 
 def _text() -> str:
-    """Return the progress line."""
+    """Return the progress line: how many functions are compiled, or that machine code is loaded."""
     if not _BEGUN:
         return "loading machine code"
     loaded = {kernel.name for kernel in _KERNELS}
@@ -237,7 +254,7 @@ def compile_mode() -> str:
 
 
 def may_use_code(kernel: Callable[..., Any], count: int) -> bool:
-    """Return whether to use machine code for a number of problems: it exists, or it may be compiled for them.
+    """Return whether to use machine code for `count` problems: it exists, or it may be compiled for them.
 
     Raises
     ------
@@ -282,11 +299,11 @@ def require_code(kernel: Callable[..., Any]) -> None:
 def is_available(kernel: Callable[..., Any]) -> bool:
     """Return whether the machine code of a kernel was used in this process, or was on disk at the first check."""
     assert isinstance(kernel, _Kernel)
-    return enabled() and (kernel.ready or _was_kept(kernel))
+    return enabled() and (kernel.ready or _was_cached(kernel))
 
 
 @cache  # cached, because a look into the folder takes longer than the work of the kernel
-def _was_kept(kernel: _Kernel) -> bool:
+def _was_cached(kernel: _Kernel) -> bool:
     """Return whether the machine code of a kernel is on disk."""
     return is_cached(kernel)
 

@@ -43,7 +43,7 @@ class Limits:
     high: Array
 
     def take(self, items: Array) -> Limits:
-        """Return the limits of the selected refinements."""
+        """Return the limits of the selected refinements; `items` are indices or a mask."""
         return Limits(self.column, self.low[items], self.high[items])
 
     def clip(self, x: Array) -> Array:
@@ -53,7 +53,10 @@ class Limits:
         return out
 
     def reached(self, x: Array, within: float = 0.0) -> Array:
-        """Return (M,) -1 for vectors (M, size) at the low limit, 1 at the high limit, and 0 between the limits."""
+        """Return -1 (M,) for vectors (M, size) at the low limit, 1 at the high limit, and 0 between the limits.
+
+        A vector is at a limit if its distance from the limit is at most `within`, in the unit of the unknown.
+        """
         z = x[:, self.column]
         return np.where(z - self.low <= within, -1, np.where(self.high - z <= within, 1, 0))
 
@@ -120,8 +123,8 @@ def refine(
     damped : bool
         If False, plain Taylor iteration: every step is accepted, even if it raises the cost.
     face : Face
-        Constraints that hold with equality, also in every epoch of a run. Steps follow their tangent space, and the
-        vectors are projected back onto them.
+        Levels that the estimate satisfies with equality, also in every epoch of a run. Steps follow their
+        tangent space, and the vectors are projected back onto them.
     folded : Folded, optional
         Restricts steps to a plane of symmetry of the problem, instead of a face.
     limits : Limits, optional
@@ -148,7 +151,7 @@ def refine(
     if weights is not None:
         return _iterate(problem, start, weights, rules, face, folded, limits)
     for _ in range(WEIGHINGS):
-        done = _remade(problem, start, rules, face, limits)
+        done = _refine_by_numpy(problem, start, rules, face, limits)
         start = done.x
     return done
 
@@ -156,8 +159,10 @@ def refine(
 # Refinement by numpy: all problems of a batch side by side; converged problems leave the batch.
 
 
-def _remade(problem: Problem, start: Array, rules: StopRules, face: Face = (), limits: Limits | None = None) -> Refined:
-    """Return the refinement by numpy, with weights at the start."""
+def _refine_by_numpy(
+    problem: Problem, start: Array, rules: StopRules, face: Face = (), limits: Limits | None = None
+) -> Refined:
+    """Return the refinement by numpy, with weights computed at the start; see `refine` for `face` and `limits`."""
     return _iterate(problem, start, _Weights.of(problem, start), rules, face, None, limits)
 
 
@@ -198,7 +203,7 @@ def _iterate(
     folded: Folded | None,
     limits: Limits | None,
 ) -> Refined:
-    """Return the refinement with fixed weights."""
+    """Return the refinement by numpy with fixed weights; `face`, `folded` and `limits`: see `refine`."""
     with np.errstate(all="ignore"):
         start = Equalities.of(problem, face).restore(start) if face else start
         start = start if limits is None else limits.clip(start)
@@ -219,7 +224,11 @@ def _iterate(
 
 @dataclass(slots=True)
 class _DescentState:
-    """The state of the iteration of every problem; a step changes only the entries of active problems."""
+    """The state of the iteration of N problems; a step changes only the entries of active problems.
+
+    `x` (N, size) are the vectors with the normal equations at them. `damping` and `growth` (N,) are Marquardt's factor
+    and its change after a rejected step. `status` (N,) are numbers of `Status`, `iterations` (N,) the steps tried.
+    """
 
     x: Array
     equations: Normal
@@ -232,7 +241,7 @@ class _DescentState:
     def begin(cls, problem: Problem, start: Array, weights: _Weights) -> _DescentState:
         """Return the state at given starts (N, size)."""
         count = len(start)
-        equations = _own(weights.equations(problem, start))
+        equations = _writable(weights.equations(problem, start))
         status = np.full(count, int(Status.MAX_ITERATIONS), dtype=np.int8)
         status[~np.isfinite(equations.cost)] = Status.NUMERICAL
         return cls(
@@ -247,7 +256,11 @@ class _DescentState:
 
 @dataclass(frozen=True, slots=True)
 class _ActiveProblems:
-    """The active problems of a refinement, with their weights and constraints."""
+    """The problems of a refinement that have not ended, with their weights and constraints.
+
+    `problem` is the batch of these N problems. `blur` (N,) is the rounding error of their whitened residuals. `face`,
+    `folded` and `limits` are arguments of `refine`.
+    """
 
     problem: Problem
     weights: _Weights
@@ -275,7 +288,10 @@ _ROUNDINGS = 4.0
 
 
 def _blur(problem: Problem, count: int) -> Array:
-    """Return the rounding error (N,) of the whitened residuals; it is large for arrival times counted from long ago."""
+    """Return the rounding error (N,) of the whitened residuals of `count` vectors, in standard deviations.
+
+    It is large for arrival times counted from long ago.
+    """
     squares: Any = 0.0
     for _, _, part in windows(problem, count):
         sigma = np.sqrt(variances(part.noise, part.count))
@@ -300,10 +316,13 @@ def _blur_of_face(problem: Problem, face: Face, equations: Normal) -> Array | fl
 
 
 def _advance(part: _ActiveProblems, state: _DescentState, active: Array, rules: StopRules, iteration: int) -> None:
-    """Try one step of every active problem."""
+    """Try one step of every active problem, and write the result to `state`.
+
+    `active` are the numbers of the problems of `part` in `state`. `iteration` is the number of this step, from 0.
+    """
     # In most batches all problems end together: while all are active, arrays are not copied.
     everything = len(active) == len(state.x)
-    now = state.equations if everything else _at(state.equations, active)
+    now = state.equations if everything else _selected(state.equations, active)
     here = state.x[active]
     damping = state.damping[active] if rules.damped else np.zeros(len(active))
     held = part.held
@@ -323,7 +342,7 @@ def _advance(part: _ActiveProblems, state: _DescentState, active: Array, rules: 
         rules.damped,
     )
     state.iterations[active] = iteration + 1
-    _keep(state, active, found.better, x, after)
+    _store_accepted(state, active, found.better, x, after)
     state.damping[active], state.growth[active] = found.damping, found.growth
     if part.limits is not None:
         # a step that stays at the limit is stalled: it could only move along the limit, as on a face
@@ -335,10 +354,10 @@ def _advance(part: _ActiveProblems, state: _DescentState, active: Array, rules: 
         state.status[active[~found.better]] = Status.NUMERICAL
 
 
-def _keep(state: _DescentState, active: Array, better: Array, x: Array, after: Normal) -> None:
-    """Store accepted vectors and their equations in the state."""
+def _store_accepted(state: _DescentState, active: Array, better: Array, x: Array, after: Normal) -> None:
+    """Store accepted vectors x and their equations `after` in the state; `better` marks the accepted steps."""
     if better.all() and len(active) == len(state.x):
-        state.x, state.equations = x, _own(after)
+        state.x, state.equations = x, _writable(after)
         return
     to = active[better]
     state.x[to] = x[better]
@@ -346,12 +365,12 @@ def _keep(state: _DescentState, active: Array, better: Array, x: Array, after: N
         mine[to] = new[better]
 
 
-def _own(equations: Normal) -> Normal:
+def _writable(equations: Normal) -> Normal:
     """Return normal equations whose arrays are writable."""
     return Normal(*(array if array.flags.writeable else np.array(array) for array in equations.parts))
 
 
-def _at(equations: Normal, index: Array) -> Normal:
+def _selected(equations: Normal, index: Array) -> Normal:
     """Return the normal equations of the selected problems."""
     return Normal(*(part[index] for part in equations.parts))
 
@@ -366,7 +385,10 @@ _WEIGHED = 2**21
 
 
 def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: StopRules) -> Refined | None:
-    """Return the refinement by machine code, or None if machine code does not support the problem."""
+    """Return the refinement by machine code, or None if machine code does not support the problem.
+
+    See `refine` for the arguments: starts (M, size), and the problem of each start.
+    """
     most = _OF_RUNS if problem.layout.n_local and problem.epochs > 1 else _UNKNOWNS
     few = problem.layout.n_shared + problem.layout.n_local <= most
     if not few or not serves(problem, len(start)):
@@ -381,6 +403,7 @@ def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: 
     parts = np.array_split(np.arange(len(start)), 1 + len(start) * problem.count * width // _WEIGHED)
 
     def work(part: Array) -> Refined | None:
+        """Return the refinement of the starts `part`."""
         return _refine_reweighted(problem.take(own[part]), start[part], rules)
 
     done = map_on_threads(work, parts) if len(parts) > 1 else [work(parts[0])]
@@ -391,7 +414,10 @@ def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: 
 def _refine_with_weights(
     problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: StopRules
 ) -> Refined | None:
-    """Return the refinement by machine code with given weights, or None if machine code is not supported."""
+    """Return the refinement by machine code with the weights `noise`, or None if machine code is not supported.
+
+    `start` (M, size) are the starts, `item` (M,) is the problem of each start.
+    """
     found = packed(problem, noise)
     if found is None:
         return None
@@ -404,11 +430,12 @@ def _refine_with_weights(
         done, lost = refine.refined(found, item, start, rules)
     # numpy refines the runs in which an epoch does not determine its local unknowns: it takes the step of least norm.
     if lost.any():
-        more = _remade(problem.take(item[lost]), start[lost], rules)
+        more = _refine_by_numpy(problem.take(item[lost]), start[lost], rules)
         for name in ("x", "cost", "status", "iterations"):
             getattr(done, name)[lost] = getattr(more, name)
 
     def make() -> Normal:
+        """Return the normal equations at the refined vectors."""
         if isinstance(found, PackedRuns):
             return sums_at(found, done.x, item, priors=True)
         return refine.equations(found, item, done)
@@ -434,6 +461,7 @@ def _join(parts: list[Refined]) -> Refined:
     """Return several refinements as one."""
 
     def make() -> Normal:
+        """Return the normal equations of all parts."""
         made = [part.equations for part in parts]
         return Normal(*(np.concatenate(same) for same in zip(*(one.parts for one in made), strict=True)))
 

@@ -65,7 +65,10 @@ class Manifest(NamedTuple):
         return {word[1:] for word in self.features.split(",") if word.startswith("+")}
 
     def misfit(self, here: Manifest) -> str:
-        """Return the first property in which this machine code does not fit the process `here`; "" if it fits."""
+        """Return the first property in which this machine code does not fit the process `here`; "" if it fits.
+
+        The result is a part of a log message, such as "python 3.12".
+        """
         for key in ("compiler", "python", "numba", "llvmlite", "triple"):
             if getattr(self, key) != getattr(here, key):
                 return f"{key} {getattr(self, key)}"

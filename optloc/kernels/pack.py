@@ -1,4 +1,9 @@
-"""The numbers of problems as plain arrays for the compiled kernels; `optloc.kernels.tables` has the indices."""
+"""The numbers of problems as plain arrays for the compiled kernels; `optloc.kernels.tables` has the indices.
+
+Numbers that all problems share are stored once; the other numbers have one row for each problem. Letters: N problems or
+runs, m rows, k epochs of a run, r rows of a group or epoch. A *group* contains rows whose noise is correlated; g is a
+number of groups.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +84,7 @@ def pack(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
         one.place[:, AT] += np.where(one.place[:, AT] >= 0, shared, -own)
     # An empty array means that all rows are present, so that no kernel reads it.
     weight = problem.weight
-    present = np.zeros((1, 0)) if np.all(weight > 0.0) else _plain(weight > 0.0, 1)
+    present = np.zeros((1, 0)) if np.all(weight > 0.0) else _contiguous(weight > 0.0, 1)
     return Packed(
         kept.tables,
         Numbers(
@@ -90,14 +95,14 @@ def pack(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
             prior.own,
             observed(problem),
             present,
-            _plain(np.sqrt(variances(problem.noise, problem.count)), 1),
+            _contiguous(np.sqrt(variances(problem.noise, problem.count)), 1),
             coarseness(problem),
         ),
     )
 
 
 class PackedRuns(NamedTuple):
-    """Runs in the form for machine code: their epochs as problems, and the number of epochs of each run."""
+    """Runs in the form for machine code: their epochs as problems (`packed`), and the number of epochs of a run."""
 
     packed: Packed
     epochs: int
@@ -132,12 +137,12 @@ def coarseness(problem: Problem) -> Array:
 def observed(problem: Problem) -> Array:
     """Return the measurements less corrections of a flat batch of problems, (N or 1, m), for `Numbers.observed`."""
     if len(problem.rows) == 1 and not problem.rows[0].correction.any():
-        return _plain(problem.rows[0].z, 1)
-    return _plain(problem.observed, 1)
+        return _contiguous(problem.rows[0].z, 1)
+    return _contiguous(problem.observed, 1)
 
 
-def _plain(values: Array, core: int) -> Array:
-    """Return an array (..., core axes) of a flat batch as contiguous doubles (N or 1, numbers)."""
+def _contiguous(values: Array, core: int) -> Array:
+    """Return an array as contiguous doubles (N or 1, numbers); its last `core` axes belong to one problem."""
     shape = values.shape
     flat = values.reshape(shape[0] if len(shape) > core else 1, int(np.prod(shape[len(shape) - core :])))
     return np.require(flat, np.float64, ["C", "W"])
@@ -145,21 +150,25 @@ def _plain(values: Array, core: int) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Divided:
-    """Shared numbers (numbers,), numbers of each problem (N or 1, numbers), and the indices of both."""
+    """Numbers of several parts, split into shared numbers and numbers of each problem.
+
+    `common` (numbers,) are the shared numbers, `own` (N or 1, numbers) the others. `place` (parts, 4) begins with the
+    index of each part: >= 0 in `common`, or -1 - its index in `own`.
+    """
 
     common: Array
     own: Array
     place: Array
 
     def size(self, own: bool) -> int:
-        """Return the count of the numbers of each problem, or the count of the shared numbers."""
+        """Return the number of separate numbers of a problem if `own` is True, else the number of shared ones."""
         return self.own.shape[1] if own else len(self.common)
 
     @classmethod
     def of(cls, parts: list[Array]) -> Divided:
         """Return parts (N or 1, numbers) split into shared and separate numbers.
 
-        `place` (parts, 4) begins with their indices.
+        A part with one row is shared.
         """
         place, lengths = np.zeros((len(parts), _COLUMNS), dtype=np.int64), [0, 0]
         for i, part in enumerate(parts):
@@ -176,13 +185,13 @@ class Divided:
 
 def sources(problem: Problem) -> Divided:
     """Return the data arrays of a flat batch of problems, see `optloc.kernels.tables.Sources`."""
-    parts = [_plain(array, core) for array, core in Sources.of(problem).arrays]
+    parts = [_contiguous(array, core) for array, core in Sources.of(problem).arrays]
     return Divided.of([np.zeros((1, 1)), *parts])
 
 
 def _whiteners(noise: tuple[Whitener, ...]) -> Divided:
     """Return whitening matrices as `Divided`, with one line of `place` for each group."""
-    divided, lines = Divided.of([_plain(w.matrix, 3) for w in noise]), []
+    divided, lines = Divided.of([_contiguous(w.matrix, 3) for w in noise]), []
     for start, w in zip(divided.place[:, AT], noise, strict=True):
         count, size = w.row.shape
         step = size * size if w.matrix.shape[-3] > 1 else 0
@@ -199,7 +208,7 @@ def _priors(problem: Problem) -> Divided:
     for name, mean, precision in prior_parts(problem):
         slot, shared = layout.find(name)
         arrays = (mean, precision) if shared else (_single(mean, 1), _single(precision, 2))
-        both = (_plain(arrays[0], 1), _plain(arrays[1], 2))
+        both = (_contiguous(arrays[0], 1), _contiguous(arrays[1], 2))
         count = max(len(part) for part in both)
         parts.append(np.concatenate([np.broadcast_to(part, (count, part.shape[1])) for part in both], axis=1))
         heads.append((slot.start, slot.size, int(not shared)))
@@ -243,17 +252,21 @@ class Folding:
         return len(self.rows[0])
 
     def groups(self, row: Array) -> tuple[Array, Array] | None:
-        """Return the groups (q, r) of one epoch, and their numbers (k, q) in each epoch, from groups of rows (g, r).
+        """Return the groups (q, r) of rows of one epoch, and their numbers (k, q) in each epoch.
 
-        The result is None if a group has rows of several epochs, or if the groups of two epochs differ.
+        `row` (g, r) are the groups of the run. The result is None if a group has rows of several epochs, or if the
+        groups of two epochs differ.
         """
         epoch, local = self.epoch[row], self.local[row]
-        own = _alike(epoch[:, 0], self.epochs, local)
+        own = _entries_of_epochs(epoch[:, 0], self.epochs, local)
         return None if own is None or (epoch != epoch[:, :1]).any() else (local[own[0]], own)
 
 
-def _alike(epoch: Array, epochs: int, *values: Array) -> Array | None:
-    """Return the entries (k, q) of each epoch, or None if the values (n, ...) of the entries differ between epochs."""
+def _entries_of_epochs(epoch: Array, epochs: int, *values: Array) -> Array | None:
+    """Return the entries (k, q) of each epoch, or None if they differ between epochs.
+
+    `epoch` (n,) is the epoch of each entry. The arrays `values` (n, ...) must be equal in all epochs, also in order.
+    """
     if not len(epoch) or len(epoch) % epochs:
         return np.zeros((epochs, 0), dtype=np.int64) if not len(epoch) else None
     own = np.argsort(epoch, kind="stable").reshape(epochs, -1)
@@ -279,7 +292,7 @@ def _fold(problem: Problem) -> Folding | None:
     """Return the common rows of the epochs, see `folding`."""
     k, rows, local, start = problem.epochs, [], np.zeros(problem.count, dtype=np.int64), 0
     for block, first in zip(problem.rows, problem.starts, strict=True):
-        own = _alike(block.epoch, k, block.a, block.b, block.target)
+        own = _entries_of_epochs(block.epoch, k, block.a, block.b, block.target)
         if own is None:
             return None
         rows.append(own)
@@ -287,7 +300,7 @@ def _fold(problem: Problem) -> Folding | None:
         start += own.shape[1]
     epoch, touches = problem.epoch, []
     for bias in problem.biases:
-        own = _alike(epoch[bias.row], k, local[bias.row], bias.member, bias.coefficient)
+        own = _entries_of_epochs(epoch[bias.row], k, local[bias.row], bias.member, bias.coefficient)
         form = form_of(bias)
         # Errors that depend on the time are a different function of their unknowns in each epoch.
         if own is None or form.changes or form.enters == "moves":
@@ -352,19 +365,22 @@ def fold(problem: Problem, found: Folding) -> Problem:
 
 
 def _fold_bias(bias: Bias, own: Array, found: Folding) -> Bias:
-    """Return a bias for the batch of epochs."""
+    """Return a bias for the batch of epochs `found`; `own` are its entries in the rows of one epoch."""
     return replace(bias, row=found.local[bias.row[own]], member=bias.member[own], coefficient=bias.coefficient[own])
 
 
 def fold_whiteners(noise: tuple[Whitener, ...], found: Folding, count: int) -> tuple[Whitener, ...] | None:
-    """Return the whitening matrices of N runs for the batch of `fold`, or None if the groups of two epochs differ."""
+    """Return the whitening matrices of `count` runs for the batch of `fold`; `found` are the common rows of epochs.
+
+    The result is None if the groups of two epochs differ.
+    """
     if any(found.groups(whitener.row) is None for whitener in noise):
         return None
     return tuple(Whitener(*_fold_groups(whitener.row, whitener.matrix, found, count)) for whitener in noise)
 
 
 def _fold_rows(rows: Rows, own: Array, count: int) -> Rows:
-    """Return rows of one kind for the batch of epochs."""
+    """Return rows of one kind for the batch of epochs of `count` runs; `own` (k, r) are the rows of each epoch."""
     first = own[0]
     return replace(
         rows,
@@ -379,7 +395,10 @@ def _fold_rows(rows: Rows, own: Array, count: int) -> Rows:
 
 
 def _fold_values(values: Array, own: Array, count: int) -> Array:
-    """Return values (N or none, m) of rows as (N k, r), or (r,) if all epochs have the same values."""
+    """Return values (N or none, m) of rows as (N k, r), or (r,) if all epochs have the same values.
+
+    `own` (k, r) are the rows of each epoch, `count` is N.
+    """
     picked = values[..., own]
     if values.ndim == 1 and (picked == picked[:1]).all():
         return np.asarray(picked[0])
@@ -387,7 +406,10 @@ def _fold_values(values: Array, own: Array, count: int) -> Array:
 
 
 def _fold_groups(row: Array, matrix: Array, found: Folding, count: int) -> tuple[Array, Array]:
-    """Return groups (g, r) and matrices (N or none, g or 1, r, r) for the batch of epochs."""
+    """Return groups (g, r) and matrices (N or none, g or 1, r, r) for the batch of epochs.
+
+    `found` are the common rows of the epochs, `count` is N.
+    """
     groups = found.groups(row)
     assert groups is not None
     local, own = groups

@@ -66,7 +66,7 @@ def _value(c: Array, degree: int, t: float) -> float:
 
 @compiled
 def _root(c: Array, degree: int, low: float, high: float, left: float) -> float:
-    """Return the root between two points of different signs.
+    """Return the root between `low` and `high`, where the values have different signs; `left` is the value at `low`.
 
     The iteration uses Newton's step if it stays between the points, else the middle.
     """

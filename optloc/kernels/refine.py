@@ -1,6 +1,9 @@
 """Damped Gauss-Newton for many problems in one call, with the rules of `optloc.kernels.least_squares` in lanes.
 
 When a problem in a lane has ended, the lane takes the next problem, so that all lanes work until no problem is left.
+Letters: n shared unknowns, `local` local unknowns of an epoch, B lanes. `m` is the memory (cells, B), `room` its
+addresses, r are registers, see `optloc.kernels.batched_rows`. `tag` (4, B) is the integer state of every lane, `used`
+is the number of open lanes. A *fresh* lane has a start that was not evaluated yet.
 """
 
 from __future__ import annotations
@@ -63,7 +66,7 @@ EMPTY = 2
 def new_answers(start: Array, kept: int | None = None) -> Answers:
     """Return arrays for the results of starts (M, p), which are copied.
 
-    They contain the equations of `kept` unknowns, by default of all.
+    They contain information and right side of the first `kept` unknowns, by default of all.
     """
     count, size = len(start), start.shape[1] if kept is None else kept
     return Answers(
@@ -131,7 +134,7 @@ def is_run(t: Tables) -> bool:
 
 @compiled
 def is_over(tag: Array, lane: int, limit: int) -> bool:
-    """Return whether the start in a lane has ended."""
+    """Return whether the start in a lane has ended: it has a final status, or `limit` steps were tried."""
     return bool(tag[STATUS, lane] != LIMIT or tag[STEPS, lane] >= limit)
 
 
@@ -139,7 +142,8 @@ def is_over(tag: Array, lane: int, limit: int) -> bool:
 def refill(m: Array, cells: int, tag: Array, used: int, following: int, last: int, limit: int) -> tuple[int, int]:
     """Give the lanes of ended starts to the next starts, or close them.
 
-    Returns the number of open lanes and the next start.
+    Returns the number of open lanes and the number of the next start. `following` is the next start before, `last` the
+    end of the range, `cells` the number of cells of a lane.
     """
     b = 0
     while b < used:
@@ -156,7 +160,7 @@ def refill(m: Array, cells: int, tag: Array, used: int, following: int, last: in
 
 @compiled
 def begin(c: Numbers, m: Array, room: LaneCells, tag: Array, used: int, item: Array, x: Array) -> None:
-    """Load the starts of empty lanes."""
+    """Load the starts of empty lanes: numbers of the problems `item`, and vectors x (M, size)."""
     for b in range(used):
         if tag[FRESH, b] == EMPTY:
             start = tag[START, b]
@@ -170,7 +174,7 @@ def begin(c: Numbers, m: Array, room: LaneCells, tag: Array, used: int, item: Ar
 
 @compiled
 def move(m: Array, cells: int, tag: Array, to: int, lane: int) -> None:
-    """Copy the problem of one lane into another lane."""
+    """Copy the problem of one lane, memory and state, into another lane `to`."""
     if to != lane:
         for i in range(tag.shape[0]):
             tag[i, to] = tag[i, lane]
@@ -182,7 +186,11 @@ def move(m: Array, cells: int, tag: Array, to: int, lane: int) -> None:
 def _judge(
     m: Array, room: LaneCells, size: int, runs: bool, line: int, tag: Array, rules: StopRules, used: int
 ) -> None:
-    """Accept the trial vectors that are better, and update damping and status."""
+    """Accept the trial vectors that are better, and update damping and status.
+
+    `size` is the length of a vector, `line` the number of unknowns of the equations plus one. If `runs` is True, only
+    vectors are stored, not equations.
+    """
     state, total = room.state, room.after + line * line - 1
     better, cost = state + BETTER, state + COST
     for b in range(used):
@@ -206,7 +214,10 @@ def _judge(
 
 @compiled
 def judge_trial(m: Array, room: LaneCells, now: int, after: int, rules: StopRules, b: int) -> int:
-    """Return the status of lane b after a step; write whether the step is better, and the new damping."""
+    """Return the status of lane b after a step; write whether the step is better, and the new damping.
+
+    `now` and `after` are the cells of the costs before and after the step.
+    """
     state = room.state
     better, small, stuck, m[state + DAMPING, b], m[state + GROWTH, b] = judge_lane(
         m[now, b],
@@ -227,7 +238,7 @@ def judge_trial(m: Array, room: LaneCells, now: int, after: int, rules: StopRule
 
 @compiled
 def _finish(m: Array, room: LaneCells, tag: Array, lane: int, out: Answers) -> None:
-    """Write the result of a lane."""
+    """Write the result of a lane, whose start has ended, to `out`."""
     start, size = tag[START, lane], out.matrix.shape[-1]
     last = room.now + size * (size + 1)
     out.cost[start], out.iterations[start] = m[room.state + COST, lane], tag[STEPS, lane]
@@ -243,7 +254,7 @@ def _finish(m: Array, room: LaneCells, tag: Array, lane: int, out: Answers) -> N
 
 @compiled
 def _advance(m: Array, room: LaneCells, n: int, local: int, tag: Array, damped: bool, used: int) -> None:
-    """Write the next trial vector of every lane that is not fresh, and the squared length of the step."""
+    """Write the next trial vector of every lane that is not fresh, and the squared length of the step to GAIN."""
     size, damping, gain = n + local, room.state + DAMPING, room.state + GAIN
     vector = room.now + size * (size + 1)
     for b in range(used):
@@ -267,7 +278,7 @@ def _advance(m: Array, room: LaneCells, n: int, local: int, tag: Array, damped: 
 def _advance_run(
     t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, tag: Array, damped: bool, used: int
 ) -> None:
-    """Write the next trial vector of every lane that is not fresh, and the squared length of the step."""
+    """Write the next trial vector of every lane that is not fresh, and the squared length of the step to GAIN."""
     n, damping, gain = t.shared, room.state + DAMPING, room.state + GAIN
     vector = room.now + (n + t.local) * (n + t.local + 1)
     for b in range(used):
@@ -322,7 +333,7 @@ def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, tag: Array
 
 @compiled
 def _own(m: Array, room: LaneCells, tag: Array, n: int, local: int, epoch: int, lanes: int) -> None:
-    """Write the step of the local unknowns of an epoch."""
+    """Write the step of the local unknowns of an epoch to `room.trial`, and add its squared length to GAIN."""
     complete(m, room, n, local, lanes)
     vector, at = room.after + (n + local) * (n + local + 1) + n, n + epoch * local
     for a in range(local):
@@ -334,7 +345,10 @@ def _own(m: Array, room: LaneCells, tag: Array, n: int, local: int, epoch: int, 
 
 @compiled
 def _add(m: Array, room: LaneCells, n: int, line: int, lanes: int) -> None:
-    """Add the damped sums of all epochs to the terms from the elimination of the local unknowns."""
+    """Add the damped sums of all epochs to the terms from the elimination of the local unknowns.
+
+    `line` is the number of unknowns of an epoch plus one.
+    """
     for i in range(n):
         for j in range(i + 1):
             for b in range(lanes):
@@ -368,7 +382,10 @@ def refined(packed: Packed, item: Array, start: Array, rules: StopRules) -> tupl
 
 
 def equations(packed: Packed, item: Array, done: Answers) -> Normal:
-    """Return the normal equations at the refined vectors."""
+    """Return the normal equations at the refined vectors `done`, of the problems `item` (M,).
+
+    They are computed again if they were not stored.
+    """
     n, matrix, vector = packed.tables.shared, done.matrix, done.vector
     if matrix.shape[-1] == 0:
         return normal_at(packed, done.x, item, priors=True)

@@ -4,6 +4,10 @@ The normal equations of a run have an arrow shape: one block for the unknowns th
 block for the local unknowns, with a coupling. A block of lanes evaluates the rows of 64 epochs together. Then the local
 unknowns of each epoch are eliminated (Schur complement), and the reduced equations are summed in the order of the
 epochs.
+
+Letters: n shared unknowns, `local` (l) local unknowns of each of k epochs, B lanes. `m` is the memory (cells, B),
+`room` its addresses, r are registers, see `optloc.kernels.batched_rows`. `used` is the number of lanes in use, and
+`now` the equations at the present vector.
 """
 
 from __future__ import annotations
@@ -52,7 +56,8 @@ class EpochShare(NamedTuple):
     cost : array (1,)
         Weighted sum of squared residuals.
     own : array (q, cells, B)
-        Equations of the local unknowns of each epoch, in blocks of lanes.
+        Equations of the local unknowns of each epoch, in q blocks of lanes: l rows of n + l + 1 cells, then l right
+        sides.
     """
 
     matrix: Array
@@ -71,7 +76,12 @@ def _share(n: int, local: int, parts: int, lanes: int) -> EpochShare:
 def _evaluate(
     packed: Packed, m: Array, r: Array, room: LaneCells, item: int, epochs: int, x: Array, priors: bool, out: EpochShare
 ) -> None:
-    """Write the equations of a run at its vector x (n + k l,)."""
+    """Write the equations of a run at its vector x (n + k l,) to `out`.
+
+    Each lane evaluates one epoch. The equations of the shared unknowns are summed. The equations of the local unknowns
+    are stored for the elimination. `item` is the number of the run, `epochs` is k. If `priors` is True, Gaussian priors
+    are added.
+    """
     t, c = packed
     n, local, lanes = t.shared, t.local, m.shape[1]
     line, last = n + local + 1, room.after + (n + local) * (n + local + 1)
@@ -98,7 +108,7 @@ def _evaluate(
 
 @compiled
 def _blur(packed: Packed, m: Array, room: LaneCells, item: int, epochs: int) -> float:
-    """Return the rounding error of the whitened residuals of a run."""
+    """Return the rounding error of the whitened residuals of run number `item`, in standard deviations."""
     c, squares = packed.numbers, 0.0
     for i in range(item * epochs, (item + 1) * epochs):
         load(m, 0, i, c.source, c.white, c.prior, c.observed, c.present)
@@ -109,7 +119,11 @@ def _blur(packed: Packed, m: Array, room: LaneCells, item: int, epochs: int) -> 
 
 @compiled
 def _keep(m: Array, rows: int, vector: int, count: int, local: int, own: Array, used: int) -> None:
-    """Store the equations of the local unknowns in `own`: rows, then right sides."""
+    """Copy the equations of the local unknowns to `own` (cells, B), because the next block overwrites the memory.
+
+    `rows` is the first of `count` cells with the rows of the local unknowns; `vector` is the first cell of their right
+    sides.
+    """
     for cell in range(count):
         for b in range(used):
             own[cell, b] = m[rows + cell, b]
@@ -120,7 +134,11 @@ def _keep(m: Array, rows: int, vector: int, count: int, local: int, own: Array, 
 
 @compiled
 def _sum(m: Array, matrix: int, line: int, vector: int, cost: int, n: int, used: int, out: EpochShare) -> None:
-    """Add the equations of the shared unknowns and the costs of all lanes to `out`."""
+    """Add the equations of the shared unknowns and the costs of all lanes to `out`.
+
+    `matrix`, `vector` and `cost` are the first cells of information, right side and cost; `line` is the length of a row
+    of the information.
+    """
     for i in range(n):
         for j in range(i + 1):
             for b in range(used):
@@ -133,7 +151,7 @@ def _sum(m: Array, matrix: int, line: int, vector: int, cost: int, n: int, used:
 
 @compiled
 def _factor_epochs(m: Array, room: LaneCells, n: int, local: int, own: Array, damping: float, used: int) -> None:
-    """Factor the damped systems of the local unknowns; CLOSED becomes 1.0 if they are determined."""
+    """Factor the damped systems of the local unknowns `own` (cells, B); CLOSED becomes 1.0 if they are determined."""
     line = n + local + 1
     for cell in range(local * line):
         for b in range(used):
@@ -158,9 +176,10 @@ def _reduce(
     matrix: Array,
     vector: Array,
 ) -> bool:
-    """Write the shared system without the local unknowns, and return whether each epoch determines all of them.
+    """Write the shared system without the local unknowns, and return whether each epoch determines all of its unknowns.
 
-    The lower triangle is written to `matrix` (n, n), the right side to `vector` (n,).
+    The lower triangle is written to `matrix` (n, n), the right side to `vector` (n,). The diagonals are multiplied by 1
+    + damping.
     """
     lanes, closed = m.shape[1], True
     for i in range(n):
@@ -186,7 +205,7 @@ def _reduce(
 
 @compiled
 def _factor_shared(m: Array, room: LaneCells, n: int, matrix: Array) -> bool:
-    """Factor the shared system in the first lane, and return whether it is positive definite."""
+    """Factor the shared system `matrix` (n, n) in the first lane, and return whether it is positive definite."""
     for i in range(n):
         for j in range(i + 1):
             m[room.shared + i * n + j, 0] = matrix[i, j]
@@ -197,7 +216,7 @@ def _factor_shared(m: Array, room: LaneCells, n: int, matrix: Array) -> bool:
 
 @compiled
 def _solve_shared(m: Array, room: LaneCells, n: int, right: Array) -> None:
-    """Replace a vector (n,) by the solution of the shared system, which is factored."""
+    """Replace the vector `right` (n,) by the solution of the shared system, which `_factor_shared` has factored."""
     for i in range(n):
         m[room.step + i, 0] = right[i]
     forward(m, room.shared, n, room.shared_scale, room.step, 1)
@@ -218,7 +237,10 @@ def _step(
     matrix: Array,
     move: Array,
 ) -> int:
-    """Write the damped step of the shared unknowns to `move` (n,), and return its status, see `LEFT_OPEN`."""
+    """Write the damped step of the shared unknowns to `move` (n,), and return its status.
+
+    The status is ok, numerical (the shared system is singular) or LEFT_OPEN. `matrix` (n, n) is scratch.
+    """
     if not _reduce(m, room, n, local, epochs, now, damping, matrix, move):
         return LEFT_OPEN
     if not _factor_shared(m, room, n, matrix):
@@ -240,7 +262,10 @@ def _move(
     x: Array,
     to: Array,
 ) -> float:
-    """Write the vector after one step from x, and return the squared length of the step in standard deviations."""
+    """Write the vector after one step from x to `to`, and return the squared length of the step in standard deviations.
+
+    `move` (n,) is the step of the shared unknowns; the steps of the local ones follow from it.
+    """
     lanes, gain = m.shape[1], 0.0
     for i in range(n):
         to[i] = x[i] + move[i]
@@ -287,7 +312,7 @@ class Spread(NamedTuple):
 def _spread(
     m: Array, room: LaneCells, n: int, local: int, epochs: int, now: EpochShare, vector: Array, start: int, out: Spread
 ) -> None:
-    """Write the covariances of a run from its equations; `vector` (n,) is scratch."""
+    """Write the covariances of a run from its equations to entry `start` of `out`; `vector` (n,) is scratch."""
     lanes, matrix, covariance = m.shape[1], out.information[start], out.covariance[start]
     closed = _reduce(m, room, n, local, epochs, now, 0.0, matrix, vector)
     out.regular[start] = _factor_shared(m, room, n, matrix) and closed
@@ -312,7 +337,10 @@ def _spread(
 def _spread_epochs(
     m: Array, room: LaneCells, n: int, local: int, covariance: Array, first: int, used: int, out: Array
 ) -> None:
-    """Write the covariance of the local unknowns of epochs, whose systems are factored."""
+    """Write the covariances (used, q, q) of the first q local unknowns of epochs to `out`, from `first` on.
+
+    The systems of these epochs are factored; `covariance` (n, n) belongs to the shared unknowns.
+    """
     size = out.shape[1]
     for j in range(n):
         backward(m, room.local, local, room.local_scale, room.half + j * local, used)
@@ -400,7 +428,10 @@ def refine_runs(
 def sum_runs(
     packed: Packed, x: Array, item: Array, epochs: int, first: int, last: int, priors: bool, out: Sums
 ) -> None:
-    """Write the normal equations of runs at the vectors first <= i < last of x (M, n + k l)."""
+    """Write the normal equations of runs at the vectors first <= i < last of x (M, n + k l) to `out`.
+
+    `item` (M,) is the run of each vector.
+    """
     t, c = packed
     n, local = t.shared, t.local
     lanes, room = blocks(packed, n + local, epochs), cell_layout(t, c, n + local)
@@ -430,7 +461,10 @@ def sum_runs(
 
 
 def refined_runs(runs: PackedRuns, item: Array, start: Array, rules: StopRules) -> tuple[Answers, Array]:
-    """Return the refined starts (M, size) of given runs (M,), and whether numpy must refine them instead (M,)."""
+    """Return the refined starts (M, size), and whether numpy must refine them instead (M,).
+
+    `item` (M,) is the run of each start.
+    """
     done, _ = fixed_runs(runs, item, start, rules, None)
     return done, np.asarray(done.status == LEFT_OPEN)
 
@@ -438,9 +472,9 @@ def refined_runs(runs: PackedRuns, item: Array, start: Array, rules: StopRules) 
 def fixed_runs(
     runs: PackedRuns, item: Array, start: Array, rules: StopRules, size: int | None
 ) -> tuple[Answers, Spread]:
-    """Return the refined starts (M, size) of given runs (M,), and their covariances.
+    """Return the refined starts (M, size), and their covariances; `item` (M,) is the run of each start.
 
-    The covariances contain the first `size` unknowns of each epoch. If `size` is None, they are empty.
+    The covariances contain the first `size` local unknowns of each epoch. If `size` is None, they are empty.
     """
     n, out, item = runs.packed.tables.shared, new_answers(start, 0), np.ascontiguousarray(item)
     count, wanted = len(start), 0 if size is None else len(start)
@@ -453,6 +487,7 @@ def fixed_runs(
     )
 
     def work(i: int) -> None:
+        """Refine start number i."""
         refine_runs(runs.packed, item, runs.epochs, i, i + 1, rules, out, spread)
 
     map_on_threads(work, range(count))
@@ -460,7 +495,10 @@ def fixed_runs(
 
 
 def sums_of_runs(runs: PackedRuns, x: Array, item: Array, *, priors: bool = False) -> Normal:
-    """Return the normal equations of runs at vectors x (M, size) of given runs (M,)."""
+    """Return the normal equations of runs at vectors x (M, size); `item` (M,) is the run of each vector.
+
+    If `priors` is True, Gaussian priors are added.
+    """
     t, count, k = runs.packed.tables, len(x), runs.epochs
     sums = Sums(
         np.empty((count, t.shared, t.shared)),

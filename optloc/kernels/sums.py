@@ -46,7 +46,7 @@ def equations_at(
 
 
 def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None, *, at: Array | None = None) -> Normal:
-    """Return the normal equations of the measurements without priors; the arguments are those of `equations_at`."""
+    """Return the normal equations of the measurements without priors; see `equations_at` for the arguments."""
     if x.shape[-1] == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     quick = _by_machine_code(problem, checked_vectors(problem, x), noise) if at is None else None
@@ -63,7 +63,10 @@ def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None
 
 
 def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None) -> Normal | None:
-    """Return the normal equations computed by machine code, or None if machine code does not support the problem."""
+    """Return the normal equations computed by machine code, or None if machine code does not support the problem.
+
+    See `summed` for the arguments. The result is also None if the leading axes of x do not belong to the problems.
+    """
     count, shape = x.size // x.shape[-1], x.shape[:-1]
     # one vector for each problem, or several vectors for each problem
     alike = problem.batch_shape in {(), (1,), (count,)} if x.ndim == 2 else problem.batch_shape == shape[-1:]
@@ -79,13 +82,16 @@ def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | N
 
 
 def packed(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | PackedRuns | None:
-    """Return problems in the form for machine code, or None if it does not support them; arguments as for `pack`."""
+    """Return problems in the form for machine code, or None if machine code does not support them.
+
+    See `pack` for the arguments.
+    """
     runs = pack_runs(problem, noise) if is_run(problem) else None
     return pack(problem, noise) if runs is None and problem.count <= _LONGEST else runs
 
 
 def sums_at(found: Packed | PackedRuns, x: Array, item: Array, *, priors: bool = False) -> Normal:
-    """Return the normal equations at vectors x (M, size), computed by machine code.
+    """Return the normal equations at vectors x (M, size), computed by machine code from the problems `found`.
 
     `item` (M,) is the problem of each vector.
     """

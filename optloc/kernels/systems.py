@@ -1,9 +1,10 @@
 """Small symmetric positive definite systems side by side in lanes; a singular system does not affect the other lanes.
 
 Systems of unknowns with mixed units (metres, radians, seconds) are scaled to a unit diagonal. They are flagged if a
-pivot vanishes, as in `optloc.base.linalg`. Their matrices and vectors are stored in cells of a memory (cells, B), row
-by row. Systems of lengths only, such as positions from ranges, are factored without scaling. This takes no square
-roots, and the number of lanes is known when they are compiled.
+pivot vanishes, as in `optloc.base.linalg`. Their matrices and vectors are stored in cells of a memory m (cells, B) of B
+lanes, row by row; arguments such as `right` are their first cells. Systems of lengths only, such as positions from
+ranges, are factored without scaling. This takes no square roots, and the number of lanes is known when they are
+compiled.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def factor(m: Array, matrix: int, n: int, scale: int, ok: int, least: float, lan
 
 @compiled
 def forward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
-    """Replace a vector by the inverse of the factor times the scaled vector."""
+    """Replace the vector (n,) at cell `right` by the inverse of the factor times the vector and its scale."""
     for i in range(n):
         for b in range(lanes):
             m[right + i, b] *= m[scale + i, b]
@@ -85,7 +86,7 @@ def forward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) ->
 
 @compiled
 def backward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
-    """Replace a vector that `forward` returned by the solution."""
+    """Replace the vector (n,) at cell `right`, which `forward` returned, by the solution, which is scaled."""
     for i in range(n - 1, -1, -1):
         for k in range(i + 1, n):
             for b in range(lanes):
@@ -144,7 +145,11 @@ def step(m: Array, room: LaneCells, n: int, local: int, damping: int, ok: int, l
 def factor_local(
     m: Array, room: LaneCells, source: int, n: int, local: int, damping: int, ok: int, least: float, lanes: int
 ) -> None:
-    """Factor the damped system of the local unknowns of the equations at cell `source`, and prepare its coupling."""
+    """Factor the damped system of the local unknowns of the equations at cell `source`.
+
+    The coupling with the shared unknowns and the right side, multiplied by the inverse factor, are written to
+    `room.half`.
+    """
     line, half = n + local + 1, room.half
     for i in range(local):
         row, own = source + (n + i) * line, room.local + i * local
@@ -183,7 +188,10 @@ def eliminate(m: Array, room: LaneCells, n: int, local: int, lanes: int) -> None
 
 @compiled
 def complete(m: Array, room: LaneCells, n: int, local: int, lanes: int) -> None:
-    """Write the step of the local unknowns after the step of the shared ones; the local system is factored."""
+    """Write the step of the local unknowns to `room.step`, after the step of the shared ones.
+
+    The local system is factored, and its coupling is in `room.half`.
+    """
     own = room.step + n
     for a in range(local):
         for b in range(lanes):
@@ -265,7 +273,7 @@ _FELT = 1e-13
 
 @compiled
 def eliminate_last(A: Array, right: Array, cost: Array, diagonal: Array, keep: int) -> None:
-    """Eliminate the last unknowns from normal equations: the result holds for any values of the others.
+    """Eliminate the last unknowns from normal equations: they take the best values for any values of the others.
 
     Parameters
     ----------
@@ -436,7 +444,7 @@ def cholesky(matrix: Array, size: int, least: float) -> bool:
 
 @compiled
 def substitute(lower: Array, right: Array) -> None:
-    """Replace a vector (n,) by the inverse of a lower triangular matrix times the vector."""
+    """Replace the vector `right` (n,) by the inverse of the lower triangular matrix `lower` times this vector."""
     for i in range(len(right)):
         for k in range(i):
             right[i] -= lower[i, k] * right[k]
@@ -445,7 +453,7 @@ def substitute(lower: Array, right: Array) -> None:
 
 @compiled
 def solve_factored(lower: Array, right: Array) -> None:
-    """Replace a vector (n,) by the solution of the system whose factor `cholesky` returned."""
+    """Replace the vector `right` (n,) by the solution of the system whose factor `cholesky` wrote to `lower`."""
     substitute(lower, right)
     for i in range(len(right) - 1, -1, -1):
         for k in range(i + 1, len(right)):
@@ -526,7 +534,7 @@ def principal_axes(matrix: Array, axes: Array, spare: Array) -> None:
 
 @compiled
 def _is_left(matrix: Array, trace: Array) -> bool:
-    """Return whether an off-diagonal entry is more than rounding."""
+    """Return whether an off-diagonal entry is more than rounding in any lane; `trace` (W,) is scratch."""
     n, left = len(matrix), 0.0
     for lane in range(LANES):
         trace[lane] = 0.0
@@ -547,7 +555,7 @@ def _is_left(matrix: Array, trace: Array) -> bool:
 
 @compiled
 def _turn(matrix: Array, axes: Array, p: int, q: int) -> None:
-    """Rotate axes p < q so that the entry (q, p) vanishes."""
+    """Rotate the axes p < q so that the entry (q, p) of the matrices vanishes."""
     n = len(matrix)
     for lane in range(LANES):
         entry, first, second = matrix[q, p, lane], matrix[p, p, lane], matrix[q, q, lane]

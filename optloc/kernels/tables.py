@@ -1,6 +1,8 @@
 """The indices that the compiled kernels follow, computed once for problems of equal structure.
 
-They define which data enter which row, and which unknowns a row depends on.
+They define which data enter which row, and which unknowns a row depends on. A *group* contains rows whose noise is
+correlated. An *input* is a component of a point of the measurement function, for instance a coordinate. Letters: m
+rows, g groups, n entries of a table.
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ class RowGroups:
 
     @classmethod
     def sorted(cls, problem: Problem, groups: tuple[Array, ...]) -> RowGroups:
-        """Return the groups (g, r) of a problem, sorted by epoch."""
+        """Return the groups of a problem, sorted by epoch; `groups` has one array (g, r) for each number r of rows."""
         rows = np.concatenate([group.ravel() for group in groups])
         size = np.concatenate([np.full(len(group), group.shape[1]) for group in groups])
         head = starts(size)[:-1]
@@ -99,7 +101,10 @@ class Entries:
 
     @classmethod
     def feeds(cls, links: BlockLinks, trace: Traced, start: int) -> Entries:
-        """Return the entries of those inputs of a block that its function needs."""
+        """Return the entries of those inputs of a block that its function needs.
+
+        `start` is the number of the first row of the block in the problem.
+        """
         place, parts = {seed: i for i, (seed, _) in enumerate(trace.tape.inputs)}, []
         for feed in links.feeds:
             if feed.seed in place:
@@ -219,13 +224,13 @@ class Tables(NamedTuple):
     group: int  # first row in the packet, rows, epoch; first column
     column: int  # unknowns of a group, ascending: shared ones, then local ones of its epoch
     factor: int  # first index of the factors of the terms in `real`
-    kinds: int
-    packets: int
-    groups: int
-    shared: int
-    local: int
-    epochs: int
-    registers: int
+    kinds: int  # number of kinds of rows
+    packets: int  # number of packets
+    groups: int  # number of groups
+    shared: int  # number of unknowns that all epochs share
+    local: int  # number of unknowns of each epoch
+    epochs: int  # number of epochs
+    registers: int  # greatest number of registers of a tape
     width: int  # greatest number of columns of a group, plus one for the residual
     rows: int  # greatest number of rows of a packet
     size: int  # greatest number of rows of a group
@@ -233,7 +238,10 @@ class Tables(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CachedTables:
-    """Tables, and the number of each group among the groups of the whitening matrices: int array (groups,)."""
+    """Tables, and the number of each group among the groups of the whitening matrices.
+
+    `tables` are the indices. `number` (groups,) is the original number of each sorted group.
+    """
 
     tables: Tables
     number: Array
@@ -272,13 +280,17 @@ class Sources:
         return tuple(array.ndim > core and array.shape[0] > 1 for array, core in self.arrays)
 
     def numbered(self, problem: Problem) -> Problem:
-        """Return the problem with each entry of these arrays replaced by its number."""
+        """Return the problem with each number of these arrays replaced by its index, counted for one problem.
+
+        After the usual operations on the data, the indices in the inputs show their sources.
+        """
         places = iter(
             start + np.arange(np.prod(array.shape[array.ndim - core :]), dtype=float).reshape(array.shape[-core:])
             for (array, core), start in zip(self.arrays, self.start, strict=True)
         )
 
         def place(array: Array | None) -> Array | None:
+            """Return the indices of the next array, or None if the problem does not have this array."""
             return None if array is None else next(places)
 
         s = problem.stations
@@ -336,7 +348,7 @@ def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> Ca
         if made is None:
             return None
         found.append(_TracedRows(links, made, inputs))
-    return _fill(problem, RowGroups.sorted(problem, groups), found, sources.lookup())
+    return _build_tables(problem, RowGroups.sorted(problem, groups), found, sources.lookup())
 
 
 def _spanning(problem: Problem, groups: tuple[Array, ...]) -> bool:
@@ -348,15 +360,18 @@ def _spanning(problem: Problem, groups: tuple[Array, ...]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _TracedRows:
-    """A block of rows, its tape, and the number in `Sources` of each input of each row."""
+    """A block of rows, its tape, and the number in `Sources` of each input of each row.
+
+    `links` contains the rows, `trace` the tape. `inputs` maps the seed of an input to the numbers (m,).
+    """
 
     links: BlockLinks
     trace: Traced
     inputs: dict[int, Array]
 
 
-def _fill(problem: Problem, groups: RowGroups, found: list[_TracedRows], lookup: Array) -> CachedTables:
-    """Return the tables of traced blocks of rows."""
+def _build_tables(problem: Problem, groups: RowGroups, found: list[_TracedRows], lookup: Array) -> CachedTables:
+    """Return the tables of the traced blocks `found`; `lookup` is the result of `Sources.lookup`."""
     pairs = list(zip(found, problem.starts, strict=True))
     feeds = Entries.joined([Entries.feeds(kind.links, kind.trace, start) for kind, start in pairs])
     scales = Entries.joined([Entries.terms(kind.links.gains, start) for kind, start in pairs])
@@ -367,7 +382,7 @@ def _fill(problem: Problem, groups: RowGroups, found: list[_TracedRows], lookup:
     inputs = np.concatenate([np.full(k.links.block.count, len(t.inputs)) for k, t in zip(found, tapes, strict=True)])
     source_at = starts(inputs[order.row])
     place = source_at[order.at[feeds.row]] + feeds.place
-    term, factor, at = _list(
+    term, factor, at = _sort_by_owner(
         [feeds, scales, adds],
         slots,
         [place, order.at[scales.row], order.at[adds.row]],
@@ -417,7 +432,10 @@ def _table(*columns: Array) -> Array:
 
 
 def _sources(found: list[_TracedRows], source_at: Array, order: Order, lookup: Array) -> Array:
-    """Return the index of each input of each evaluated row, see `Sources.lookup`."""
+    """Return the index of each input of each evaluated row, see `Sources.lookup`.
+
+    `found` are the blocks of rows. `source_at` is the first input of each evaluated row.
+    """
     out, start = np.zeros(int(source_at[-1]), dtype=np.int64), 0
     for kind in found:
         count = kind.links.block.count
@@ -429,10 +447,14 @@ def _sources(found: list[_TracedRows], source_at: Array, order: Order, lookup: A
     return np.asarray(lookup[out])
 
 
-def _list(
+def _sort_by_owner(
     parts: list[Entries], slots: list[Array], owners: list[Array], counts: list[int]
 ) -> tuple[Array, Array, list[Array]]:
-    """Return entries sorted by owner (an input or a row): indices, factors, and the first entry of each owner."""
+    """Return entries sorted by owner (an input or a row): indices, factors, and the first entry of each owner.
+
+    For each part, `slots` has the columns of its entries in their group, `owners` the owner of each entry, and `counts`
+    the number of owners.
+    """
     terms, factors, at, start = [], [], [], 0
     for part, slot, owner, count in zip(parts, slots, owners, counts, strict=True):
         order = np.argsort(owner, kind="stable")
@@ -444,7 +466,7 @@ def _list(
 
 
 def _tapes(found: list[_TracedRows]) -> tuple[Array, dict[str, Array]]:
-    """Return the constants of the tapes of all kinds, and the tapes one after the other."""
+    """Return the constants of the tapes of all kinds, and four tables by name: code, kind, constant, input."""
     tapes = [kind.trace.tape for kind in found]
     constants = [pair for tape in tapes for pair in tape.constants]
     inputs: list[tuple[int, int]] = []

@@ -60,7 +60,11 @@ def tape_table(tapes: Sequence[Tape], outputs: Sequence[Sequence[int]]) -> TapeT
 
 @compiled
 def run_tape(t: TapeTable, k: int, r: Array, count: int) -> None:
-    """Run tape k on the first `count` columns of the registers r (registers, n), which already contain the inputs."""
+    """Run tape k on the first `count` columns of the registers r (registers, n).
+
+    The columns are the problems. The registers already contain the inputs; the outputs are then in the registers that
+    the table names.
+    """
     table = t.table
     for i in range(table[k, CONSTANT], table[k + 1, CONSTANT]):
         value = t.value[i - table[0, CONSTANT]]

@@ -1,7 +1,7 @@
 """Measurement functions with their derivatives as tapes; each kind is traced once, including user-defined kinds.
 
-To trace a function means to call it with symbols that record every operation. A *tape* is the list of these operations
-on registers; machine code runs it without calling Python.
+To trace a function means to call it with symbols that record every operation. A *node* is a recorded operation, input
+or constant. A *tape* is the list of the operations on registers; machine code runs it without calling Python.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _NUMBER = {function.__name__: number for number, function in enumerate(_FUNCTION
 
 
 def operate(operation: int, left: Any, right: Any) -> Any:
-    """Return the result of an operation on numbers or arrays, computed by numpy."""
+    """Return the result of an operation (a number of `OPERATIONS`) on numbers or arrays, computed by numpy."""
     with np.errstate(all="ignore"):
         return _FUNCTIONS[operation](left) if operation in UNARY else _FUNCTIONS[operation](left, right)
 
@@ -69,7 +69,7 @@ class Recorder:
     known: dict[tuple[int, Any, Any], int] = field(default_factory=dict)
 
     def input(self, seed: int) -> Symbol:
-        """Return the symbol of an input."""
+        """Return the symbol of an input; `seed` is the number of the input."""
         return Symbol(self, self._number((INPUT, seed, 0)))
 
     def node(self, value: Any) -> int:
@@ -86,20 +86,20 @@ class Recorder:
         return float(value) if operation == CONSTANT else None
 
     def apply(self, operation: int, left: Any, right: Any = None) -> Symbol:
-        """Return the symbol of an operation on symbols or numbers."""
+        """Record an operation (a number of `OPERATIONS`) on symbols or numbers, and return its symbol."""
         u = self.node(left)
         v = u if operation in UNARY else self.node(right)
         return Symbol(self, self._simplify(operation, u, v))
 
     def _number(self, key: tuple[int, Any, Any]) -> int:
-        """Return the number of a node, which is added if it is new."""
+        """Return the number of the node `key`, (operation, left, right), which is added if it is new."""
         if key not in self.known:
             self.known[key] = len(self.nodes)
             self.nodes.append(key)
         return self.known[key]
 
     def _simplify(self, operation: int, u: int, v: int) -> int:
-        """Return the node of an operation.
+        """Return the number of the node of an operation on the nodes u and v.
 
         Constants are evaluated, and equivalent forms with identical rounding are used.
         """
@@ -116,7 +116,7 @@ class Recorder:
         return self._number((operation, u, v))
 
     def _is(self, node: int, operation: int) -> bool:
-        """Return whether a node is a given operation."""
+        """Return whether a node is the given operation."""
         return self.nodes[node][0] == operation
 
     def _add(self, u: int, v: int) -> int | None:
@@ -204,45 +204,57 @@ class Symbol:
     node: int
 
     def __elementary__(self) -> ModuleType:
+        """Return this module, whose functions `optloc.models.primitives` calls for symbols."""
         return sys.modules[__name__]
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        """Record a function of numpy that was called with symbols."""
         if method != "__call__" or options or ufunc.__name__ not in _NUMBER:
             return NotImplemented
         return self.recorder.apply(_NUMBER[ufunc.__name__], *inputs)
 
     def __add__(self, other: Any) -> Any:
+        """Record ``self + other``."""
         return self._with(ADD, self, other)
 
     def __radd__(self, other: Any) -> Any:
+        """Record ``other + self``."""
         return self._with(ADD, other, self)
 
     def __sub__(self, other: Any) -> Any:
+        """Record ``self - other``."""
         return self._with(SUB, self, other)
 
     def __rsub__(self, other: Any) -> Any:
+        """Record ``other - self``."""
         return self._with(SUB, other, self)
 
     def __mul__(self, other: Any) -> Any:
+        """Record ``self * other``."""
         return self._with(MUL, self, other)
 
     def __rmul__(self, other: Any) -> Any:
+        """Record ``other * self``."""
         return self._with(MUL, other, self)
 
     def __truediv__(self, other: Any) -> Any:
+        """Record ``self / other``."""
         return self._with(DIV, self, other)
 
     def __rtruediv__(self, other: Any) -> Any:
+        """Record ``other / self``."""
         return self._with(DIV, other, self)
 
     def __neg__(self) -> Symbol:
+        """Record ``-self``."""
         return self.recorder.apply(NEG, self)
 
     def __bool__(self) -> bool:
+        """Raise TypeError: the value is not known yet, so that a function cannot branch on it."""
         raise TypeError("a measurement function must not branch on its arguments")
 
     def _with(self, operation: int, left: Any, right: Any) -> Any:
-        """Return the symbol of an operation with a symbol or a number."""
+        """Return the symbol of an operation with a symbol or a number; NotImplemented for other operands."""
         for one in (left, right):
             if not isinstance(one, Symbol | int | float | np.number):
                 return NotImplemented
@@ -253,6 +265,7 @@ def _function(operation: int) -> Callable[..., Symbol]:
     """Return the function that records an operation."""
 
     def record(u: Any, v: Any = None) -> Symbol:
+        """Return the symbol of the operation on u, or on u and v."""
         owner = u if isinstance(u, Symbol) else v
         return owner.recorder.apply(operation, u, v)
 
@@ -294,7 +307,7 @@ class Tape:
 def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
     """Return the tape of the operations that the given outputs (symbols or numbers) need."""
     wanted = [recorder.node(value) for value in outputs]
-    needed = _trace_back(recorder, wanted)
+    needed = _needed_nodes(recorder, wanted)
     last = _last_uses(recorder, needed, wanted)
     # Registers whose values are not needed later are used again, so that fewer registers stay in the cache.
     free: list[int] = []
@@ -320,8 +333,8 @@ def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
     )
 
 
-def _trace_back(recorder: Recorder, wanted: list[int]) -> list[int]:
-    """Return the nodes that the wanted nodes depend on, in the order in which they were recorded."""
+def _needed_nodes(recorder: Recorder, wanted: list[int]) -> list[int]:
+    """Return the nodes that the `wanted` nodes depend on, in the order in which they were recorded."""
     found: set[int] = set()
     ahead = list(wanted)
     while ahead:
@@ -334,7 +347,7 @@ def _trace_back(recorder: Recorder, wanted: list[int]) -> list[int]:
 
 
 def _last_uses(recorder: Recorder, needed: list[int], wanted: list[int]) -> dict[int, int]:
-    """Return the last node that uses each node; outputs are used after all nodes."""
+    """Return a dictionary with the last node that uses each node; outputs are used after all nodes."""
     last: dict[int, int] = {}
     for node in needed:
         operation, left, right = recorder.nodes[node]
@@ -348,14 +361,14 @@ def evaluate(tape: Tape, inputs: dict[int, Any]) -> list[Any]:
 
     Tests compare the compiled interpreter with this function.
     """
-    own: list[Any] = [0.0] * tape.registers
+    values: list[Any] = [0.0] * tape.registers
     for seed, register in tape.inputs:
-        own[register] = inputs[seed]
+        values[register] = inputs[seed]
     for register, value in tape.constants:
-        own[register] = value
+        values[register] = value
     for operation, target, left, right in tape.code.tolist():
-        own[target] = operate(operation, own[left], own[right])
-    return [own[register] for register in tape.outputs]
+        values[target] = operate(operation, values[left], values[right])
+    return [values[register] for register in tape.outputs]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,10 @@
 """Symmetric block tridiagonal systems of epochs that are coupled to the next epoch.
 
-The time to solve them is linear in the number of epochs. Regular systems are banded matrices, which LAPACK factors.
-Blocks of the inverse, and systems with singular blocks, use cyclic reduction: every other block is eliminated, and the
-rest is a chain of half the length. For positive definite matrices this is Cholesky's method in another order.
+The time to solve them is linear in the number k of epochs. Every epoch has a block of l unknowns. Regular systems are
+banded matrices, which LAPACK factors. Blocks of the inverse, and systems with singular blocks, use cyclic reduction: it
+eliminates every other (odd) block. The even blocks are a chain of half the length. For positive definite matrices this
+is Cholesky's method in another order.
+
 B. L. Buzbee, G. H. Golub, C. W. Nielson, "On direct methods for solving Poisson's equations", SIAM J. Numer. Anal. 7
 (1970) 627-656.
 """
@@ -54,7 +56,10 @@ def solve(block: Array, link: Array, right: Array) -> tuple[Array, Array]:
 
 
 def _banded(block: Array, link: Array, right: Array) -> Array | None:
-    """Return the solution (k, l, p) of one chain by a banded factor, or None if the chain is not safely regular."""
+    """Return the solution (k, l, p) of one chain by a banded factor, or None if the chain is not safely regular.
+
+    See `solve` for the arguments, without batch axes.
+    """
     from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
     k, length = block.shape[:2]
@@ -79,21 +84,32 @@ def _banded(block: Array, link: Array, right: Array) -> Array | None:
 
 
 def inverse_blocks(block: Array, link: Array) -> tuple[Array, Array]:
-    """Return the diagonal blocks (..., k, l, l) of the inverse of a chain, and whether the chain is regular."""
+    """Return the diagonal blocks (..., k, l, l) of the inverse of a chain, and whether the chain is regular.
+
+    The blocks are NaN if the chain is singular.
+    """
     none = np.zeros((*block.shape[:-1], 0))
     _, (inner, _), ok = _reduce(block, link, none, np.abs(block).max((-1, -2, -3)), inverse=True)
     return inner, ok
 
 
 class _ChainParts(NamedTuple):
-    """Blocks of an inverse: on its diagonal, and next to it (each block with the next)."""
+    """Blocks of the inverse of a chain.
+
+    `inner` (..., k, l, l) are the blocks on the diagonal. `beside` (..., k - 1, l, l) are the blocks above it: rows of
+    an epoch, columns of the next.
+    """
 
     inner: Array
     beside: Array
 
 
 def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool) -> tuple[Array, _ChainParts, Array]:
-    """Return solutions, blocks of the inverse (empty if not requested), and whether the chain is regular."""
+    """Return the solutions, blocks of the inverse, and whether the chain is regular, by cyclic reduction.
+
+    `size` is the largest absolute entry of the blocks; a remainder that is rounding relative to it counts as zero. The
+    blocks of the inverse are computed only if `inverse` is True. The function calls itself for the even blocks.
+    """
     k, length = block.shape[-3:-1]
     eye = np.broadcast_to(np.eye(length) if inverse else np.zeros((length, 0)), (*block.shape[:-1], length * inverse))
     if k == 1:
@@ -107,50 +123,58 @@ def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool)
     after[..., : (k - 1) // 2, :, :] = link[..., 1::2, :, :]
     before = link[..., ::2, :, :].mT
     sides = np.concatenate([before, after, right[..., 1::2, :, :], eye[..., 1::2, :, :]], axis=-1)
-    solved = _regular(block[..., 1::2, :, :], sides)
-    back, on, own, self_ = np.split(solved, np.cumsum([length, length, right.shape[-1]]), axis=-1)
+    solved = _solve_blocks(block[..., 1::2, :, :], sides)
+    gain_before, gain_after, solved_right, own_inverse = np.split(
+        solved, np.cumsum([length, length, right.shape[-1]]), axis=-1
+    )
     # the reduced system of the even blocks
     rest, vector = block[..., ::2, :, :].copy(), right[..., ::2, :, :].copy()
     m = k // 2
-    rest[..., :m, :, :] -= before.mT @ back
-    vector[..., :m, :, :] -= before.mT @ own
+    rest[..., :m, :, :] -= before.mT @ gain_before
+    vector[..., :m, :, :] -= before.mT @ solved_right
     follow = (k - 1) // 2
-    rest[..., 1:, :, :] -= (after.mT @ on)[..., :follow, :, :]
-    vector[..., 1:, :, :] -= (after.mT @ own)[..., :follow, :, :]
-    between = -(before.mT @ on)[..., :follow, :, :]
+    rest[..., 1:, :, :] -= (after.mT @ gain_after)[..., :follow, :, :]
+    vector[..., 1:, :, :] -= (after.mT @ solved_right)[..., :follow, :, :]
+    between = -(before.mT @ gain_after)[..., :follow, :, :]
     even, parts, ok = _reduce(rest, between, vector, size, inverse)
     out = np.empty((*block.shape[:-3], k, length, right.shape[-1]))
     out[..., ::2, :, :] = even
     behind = _following_even(even, m)
-    out[..., 1::2, :, :] = own - back @ even[..., :m, :, :] - on @ behind
-    return out, _inner(parts, back, on, self_, k) if inverse else parts, ok
+    out[..., 1::2, :, :] = solved_right - gain_before @ even[..., :m, :, :] - gain_after @ behind
+    return out, _inverse_blocks_of_chain(parts, gain_before, gain_after, own_inverse, k) if inverse else parts, ok
 
 
 def _following_even(even: Array, count: int) -> Array:
-    """Return the values of the even blocks that follow the odd ones; zero after the last block."""
+    """Return, for each of `count` odd blocks, the value of the even block after it; zero if none follows."""
     out = np.zeros((*even.shape[:-3], count, *even.shape[-2:]))
     out[..., : even.shape[-3] - 1, :, :] = even[..., 1:, :, :]
     return out
 
 
-def _inner(parts: _ChainParts, back: Array, on: Array, own: Array, k: int) -> _ChainParts:
-    """Return the blocks of the inverse from the blocks of the even ones: x_odd = own - back x_before - on x_after."""
+def _inverse_blocks_of_chain(
+    parts: _ChainParts, gain_before: Array, gain_after: Array, own_inverse: Array, k: int
+) -> _ChainParts:
+    """Return the blocks of the inverse of the whole chain of k epochs, from the blocks of the even epochs.
+
+    The odd unknowns are ``x_odd = own - back x_before - on x_after``: `own` is the inverse of the odd blocks, `back`
+    and `on` are the coefficients of the even blocks before and after.
+    """
     m, first = k // 2, parts.inner[..., : k // 2, :, :]
-    second, across = _following_even(parts.inner, m), np.zeros_like(back)
+    second, across = _following_even(parts.inner, m), np.zeros_like(gain_before)
     across[..., : parts.beside.shape[-3], :, :] = parts.beside
-    with_before = -(back @ first + on @ across.mT)
-    with_after = -(back @ across + on @ second)
-    inner = np.empty((*back.shape[:-3], k, *back.shape[-2:]))
+    with_before = -(gain_before @ first + gain_after @ across.mT)
+    with_after = -(gain_before @ across + gain_after @ second)
+    inner = np.empty((*gain_before.shape[:-3], k, *gain_before.shape[-2:]))
     inner[..., ::2, :, :] = parts.inner
-    inner[..., 1::2, :, :] = own - with_before @ back.mT - with_after @ on.mT
-    beside = np.empty((*back.shape[:-3], k - 1, *back.shape[-2:]))
+    inner[..., 1::2, :, :] = own_inverse - with_before @ gain_before.mT - with_after @ gain_after.mT
+    beside = np.empty((*gain_before.shape[:-3], k - 1, *gain_before.shape[-2:]))
     beside[..., ::2, :, :] = with_before.mT
     beside[..., 1::2, :, :] = with_after[..., : (k - 1) // 2, :, :]
     return _ChainParts(inner, beside)
 
 
-def _regular(block: Array, right: Array) -> Array:
-    """Return the solutions of separate blocks, of least norm if a block is singular."""
+def _solve_blocks(block: Array, right: Array) -> Array:
+    """Return the solutions of separate systems ``block x = right``, of least norm if a matrix is singular."""
     solved, good = linalg.solve(block, right, _OPEN)
     if not good.all():
         root, _ = linalg.root(block[~good])

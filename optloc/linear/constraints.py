@@ -1,6 +1,8 @@
-"""Constraints: functions for users to state them, and the faces on which an estimate may lie.
+"""Constraints: functions for users to state them, and the faces on which an estimate may be.
 
-A *face* is a set of constraints that hold with equality together.
+A *level* is one bound of one constraint, satisfied with equality. A *face* is a set of levels that are satisfied
+together. Letters: N vectors x, `size` unknowns in a vector, the first n of which all epochs share, d coordinates, c
+levels of a face. A *band* is a constraint ``lower <= g(x) <= upper``; its *quantity* is g.
 """
 
 from __future__ import annotations
@@ -69,7 +71,7 @@ def height(
     target : int
         Number of the target.
     along : bool
-        Whether the constraint holds at every epoch, or only at the reference time.
+        Whether the constraint applies at every epoch, or only at the reference time.
     """
     low, high = (lower, upper) if exactly is None else (exactly, exactly)
     low, high = _metres(low, "height"), _metres(high, "height")
@@ -87,8 +89,9 @@ def reported(
 ) -> tuple[Motion, tuple[Band, ...]]:
     """Return motion and constraint of a target whose height is known at every epoch.
 
-    An example is an aircraft that reports its height. The way over ground has the given order. The height is the
-    reported one. If it is known only within a band, a constant and a rate may be added.
+    An example is an aircraft that reports its height. The course over ground is a polynomial of the given order. Its
+    height at each epoch is the reported height plus a polynomial of time, which the constraint bounds: it is zero if
+    `within` is zero.
 
     Parameters
     ----------
@@ -97,9 +100,9 @@ def reported(
     times : array (k,)
         Times of the epochs, seconds, ascending.
     within : float or str
-        Half the width of the band: metres, or text such as "50 ft"; zero: exact.
+        Half the width of the band about the reported height: metres, or text such as "50 ft"; 0: the height is exact.
     order : 1 or 2
-        Order of the motion.
+        Order of the motion over ground: 1 for a constant velocity, 2 for a constant acceleration.
     reference : float, optional
         Time to which the state belongs, seconds; the first epoch by default.
     target : int
@@ -108,7 +111,8 @@ def reported(
     Returns
     -------
     Motion
-        Motion over ground, with the shape of the height.
+        Motion over ground. Its field `rise` (..., k, 2) contains the heights relative to the height at the reference
+        time, metres, and their rates, m/s.
     tuple of Band
         The height at the reference time, and therefore at every epoch.
 
@@ -147,9 +151,9 @@ def visible(points: ArrayLike, *, elevation: Amount = 0.0, target: int = 0) -> t
         Number of the target.
     """
     # The bounded quantity is the sine, see `optloc.models.surfaces`, which increases with the elevation.
-    least = _number(np.sin(in_si(elevation, "angle", "elevation")))
+    least = _float_array(np.sin(in_si(elevation, "angle", "elevation")))
     return tuple(
-        Band("visible", least, _number(np.inf), point, f"sight of point {i}", target)
+        Band("visible", least, _float_array(np.inf), point, f"sight of point {i}", target)
         for i, point in enumerate(np.asarray(points, dtype=float))
     )
 
@@ -158,7 +162,11 @@ def speed(upper: Amount, *, lower: Amount = 0.0, target: int = 0) -> tuple[Band,
     """Return the constraint on a target's speed: metres per second, or text such as "90 km/h"."""
     upper, lower = float(in_si(upper, "speed", "speed")), float(in_si(lower, "speed", "speed"))
     # A lower bound of zero is left out: no speed is negative, and at zero the gradient does not exist.
-    return (Band("speed", _number(lower if lower > 0.0 else -np.inf), _number(upper), np.zeros(0), "speed", target),)
+    return (
+        Band(
+            "speed", _float_array(lower if lower > 0.0 else -np.inf), _float_array(upper), np.zeros(0), "speed", target
+        ),
+    )
 
 
 def polygon(vertices: ArrayLike, *, target: int = 0) -> tuple[Polygon, ...]:
@@ -166,22 +174,22 @@ def polygon(vertices: ArrayLike, *, target: int = 0) -> tuple[Polygon, ...]:
     return (Polygon(np.asarray(vertices, dtype=float), "polygon", target),)
 
 
-def _number(value: Any) -> Array:
+def _float_array(value: Any) -> Array:
     """Return a value as an array of floats."""
     return np.asarray(value, dtype=float)
 
 
 def _metres(value: Any, where: str) -> Array:
     """Return a length in metres, from a number or a text with a unit."""
-    return _number(in_si(value, "length", where, place=True))
+    return _float_array(in_si(value, "length", where, place=True))
 
 
-# Faces: sides that hold with equality together, and the projection of vectors onto them.
+# Faces: levels that are satisfied with equality together, and the projection of vectors onto them.
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """A constraint of a problem that holds with equality.
+    """A constraint of a problem that an estimate satisfies with equality.
 
     Parameters
     ----------
@@ -225,20 +233,25 @@ def decisive_epochs(problem: Problem, constraint: Band | Polygon) -> list[int | 
 
 
 def holds_along(problem: Problem, band: Band) -> bool:
-    """Return whether a band bounds a course: its target moves, and its state lasts for the run."""
+    """Return whether a band bounds a whole course.
+
+    This needs three conditions: the band applies along the course, the target moves, and its state lasts for the run.
+    """
     motion = problem.motions[band.target]
     return band.along and motion.span == "run" and motion.order > 0
 
 
 def faces(problem: Problem) -> list[Face]:
-    """Return every set of constraints that can hold with equality together.
+    """Return every set of levels that an estimate can satisfy together, sorted by their number.
 
     The set with only the equalities is the first.
     """
     found = [exact(problem)]
     for i, constraint in enumerate(problem.constraints):
         sides = (
-            [] if is_exact(constraint) else _meetings(list(_sides(i, constraint)), decisive_epochs(problem, constraint))
+            []
+            if is_exact(constraint)
+            else _combined_sides(list(_sides(i, constraint)), decisive_epochs(problem, constraint))
         )
         # More sides than dimensions have no common point. Speeds bound other unknowns, and do not count.
         wider = [(*face, *side) for face in found for side in sides]
@@ -246,8 +259,8 @@ def faces(problem: Problem) -> list[Face]:
     return sorted(found, key=len)
 
 
-def _meetings(sides: list[Face], epochs: list[int | None]) -> list[Face]:
-    """Return the sides of a constraint at each of some epochs, and the combinations of several epochs."""
+def _combined_sides(sides: list[Face], epochs: list[int | None]) -> list[Face]:
+    """Return all combinations of the `sides` of one constraint at the given epochs: at one epoch, or at several."""
     found: list[Face] = [()]
     for epoch in epochs:
         here = [tuple(replace(level, epoch=epoch) for level in side) for side in sides]
@@ -256,13 +269,13 @@ def _meetings(sides: list[Face], epochs: list[int | None]) -> list[Face]:
 
 
 def _most_at_once(problem: Problem, face: Face) -> int:
-    """Return the greatest number of levels of positions that a face has at one epoch."""
+    """Return the greatest number of levels at one epoch; levels of speed do not count, since they bound no position."""
     count = Counter(level.epoch for level in face if _kind(problem, level) != "speed")
     return max(count.values(), default=0)
 
 
 def on_face(problem: Problem, face: Face) -> Problem:
-    """Return the problem whose only constraints are equalities: the levels of a face, at the reference time."""
+    """Return the problem whose only constraints are the levels of a face, as equalities at the reference time."""
     bands = []
     for level in face:
         band = _band(problem.constraints[level.constraint], level.side)
@@ -286,14 +299,14 @@ def is_corner(problem: Problem, face: Face) -> bool:
 
 
 def is_held(problem: Problem, face: Face, x: Array, descent: Array) -> Array:
-    """Return (N,) whether each minimum along a face (N, size) is a constrained minimum: the cost grows inwards.
+    """Return whether each minimum along a face (N,) is a constrained minimum: the cost increases into the region.
 
     Parameters
     ----------
     problem : Problem
         N problems.
     face : Face
-        Constraints that hold with equality.
+        Levels that the vectors satisfy with equality.
     x : array (N, size)
         Vectors on the face.
     descent : array (N, n)
@@ -310,12 +323,12 @@ def is_held(problem: Problem, face: Face, x: Array, descent: Array) -> Array:
         if isinstance(constraint, Polygon):
             # at a concave corner, both sides are admitted, and the cost decreases along one of them
             here = [other.side for other in face if other.constraint == level.constraint]
-            out &= len(here) < 2 or _turn(constraint.vertices) * _turn(_corner(constraint, here)) > 0.0
+            out &= len(here) < 2 or _orientation(constraint.vertices) * _orientation(_corner(constraint, here)) > 0.0
     return out
 
 
 def bounds(problem: Problem) -> Face:
-    """Return every single side of the inequalities of a problem, at the reference time."""
+    """Return every single bound of the inequalities of a problem, at the reference time, without polygon corners."""
     sides = (side for i, c in enumerate(problem.constraints) if not is_exact(c) for side in _sides(i, c))
     return tuple(side[0] for side in sides if len(side) == 1)
 
@@ -324,7 +337,7 @@ def outwards(problem: Problem, level: Level) -> float:
     """Return 1 if the quantity of a level increases out of its bound, -1 if it decreases, 0 for an equality."""
     constraint = problem.constraints[level.constraint]
     if isinstance(constraint, Polygon):
-        return _turn(constraint.vertices)
+        return _orientation(constraint.vertices)
     return 0.0 if is_exact(constraint) else 1.0 if level.side == "upper" else -1.0
 
 
@@ -334,13 +347,13 @@ def is_flat(problem: Problem, level: Level) -> bool:
 
 
 def _corner(region: Polygon, edges: list[str | int]) -> Array:
-    """Return the corner (3, 2) between two successive edges of a polygon."""
+    """Return three points (3, 2) of a polygon: start of an edge, the corner at its end, and end of the next edge."""
     first, count = edges[0], len(region.vertices)
     assert isinstance(first, int)
     return region.vertices[[first, (first + 1) % count, (first + 2) % count]]
 
 
-def _turn(vertices: Array) -> float:
+def _orientation(vertices: Array) -> float:
     """Return 1 if corners (v, 2) are in counter-clockwise order around their interior, -1 if clockwise."""
     (x, y), (u, v) = vertices.T, np.roll(vertices, -1, axis=0).T
     return float(np.sign((x * v - u * y).sum()))
@@ -377,7 +390,7 @@ def needs_velocity(constraint: Band | Polygon) -> bool:
 
 
 def _sides(i: int, constraint: Band | Polygon) -> Iterator[Face]:
-    """Yield the finite bounds of a band, or the edges and corners of a polygon."""
+    """Yield the finite bounds of constraint number i if it is a band, or the edges and corners of a polygon."""
     if isinstance(constraint, Band):
         if np.isfinite(constraint.lower).all():
             yield (Level(i, "lower"),)
@@ -404,7 +417,10 @@ def levels(problem: Problem, face: Face, x: Array) -> tuple[Array, Array]:
 
 
 def restore(problem: Problem, face: Face, x: Array) -> Array:
-    """Return vectors (N, size) projected onto a face along the shortest way, by Newton steps."""
+    """Return vectors x (N, size) projected onto a face along the shortest way, by Newton steps.
+
+    Local unknowns do not move.
+    """
     n = problem.layout.n_shared
     # Newton squares a small relative distance: three steps reduce 1e-2 to rounding, and five are in reserve.
     for _ in range(8):
@@ -418,12 +434,12 @@ def restore(problem: Problem, face: Face, x: Array) -> Array:
 
 
 def tangent_at(problem: Problem, face: Face, x: Array) -> Array:
-    """Return a basis (N, n, n - c) of the tangent space of a face at vectors (N, size)."""
+    """Return a basis (N, n, n - c) of the directions that stay on a face, at vectors (N, size)."""
     return tangent(levels(problem, face, x)[1], np.ones((len(x), problem.layout.n_shared))).along
 
 
 def _band(constraint: Band | Polygon, side: str | int) -> Band:
-    """Return the band of a level; the edge of a polygon becomes a plane."""
+    """Return the band of a level; the edge with number `side` of a polygon becomes a plane."""
     if isinstance(constraint, Band):
         return constraint
     assert isinstance(side, int)
@@ -431,7 +447,7 @@ def _band(constraint: Band | Polygon, side: str | int) -> Band:
     along = there - here
     # Unit length, so that a level is in metres; it points outwards if corners are counter-clockwise.
     normal = np.array([along[1], -along[0]]) / np.hypot(*along)
-    value = _number(normal @ here)
+    value = _float_array(normal @ here)
     return Band("plane", value, value, normal, constraint.name, constraint.target)
 
 
@@ -439,7 +455,7 @@ def _band(constraint: Band | Polygon, side: str | int) -> Band:
 
 
 def conjunction(problem: Problem) -> list[Band]:
-    """Return the constraints as bands that must all hold.
+    """Return the constraints as bands that a valid estimate satisfies all together.
 
     Edges of convex polygons are included. Concave polygons are left out.
     """
@@ -451,53 +467,59 @@ def conjunction(problem: Problem) -> list[Band]:
         corners = c.vertices
         edge = np.roll(corners, -1, axis=0) - corners
         turn = edge[:, 0] * np.roll(edge, -1, axis=0)[:, 1] - edge[:, 1] * np.roll(edge, -1, axis=0)[:, 0]
-        # For a concave polygon, not all edges need to hold: the region is not a conjunction.
+        # For a concave polygon, a point inside can violate an edge: the region is not a conjunction.
         if (turn >= 0.0).all() or (turn <= 0.0).all():
             sign = 1.0 if turn.sum() > 0.0 else -1.0
             for i in range(len(corners)):
                 plane = _band(c, i)
                 bands.append(
                     replace(
-                        plane, coefficients=sign * plane.coefficients, upper=sign * plane.upper, lower=_number(-np.inf)
+                        plane,
+                        coefficients=sign * plane.coefficients,
+                        upper=sign * plane.upper,
+                        lower=_float_array(-np.inf),
                     )
                 )
     return bands
 
 
 def face_of(problem: Problem, x: Array) -> Array:
-    """Return the number (N,) of the face in `faces` on which vectors x (N, size) lie: the face with most levels."""
+    """Return the number (N,) in `faces` of the face with most levels on which vectors x (N, size) are; 0 if on none."""
     found = np.zeros(len(x), dtype=int)
     for number, face in enumerate(faces(problem)):
         if face:
             values, _ = levels(problem, face, x)
-            # Faces are sorted by number of levels, so that the last one that fits has the most.
+            # Faces are sorted by number of levels, so that the last face that fits has the most levels.
             found[(np.abs(values) <= 10.0 * TOLERANCE * (1.0 + np.abs(x).max(1, keepdims=True))).all(1)] = number
     return found
 
 
 def violation(problem: Problem, x: Array) -> Array:
-    """Return the relative violation (N,) of the worst constraint at vectors x (N, size), or 0."""
+    """Return the violation (N,) of the worst constraint at vectors x (N, size); 0 if all constraints are satisfied.
+
+    The violation is divided by one plus the absolute bound, or for a polygon by one plus its greatest coordinate.
+    """
     worst = np.zeros(len(x))
     for c in problem.constraints:
         if isinstance(c, Polygon):
-            worst = np.maximum(worst, _outside(c, _horizontal(problem, c.target, x)))
+            worst = np.maximum(worst, _polygon_violation(c, _horizontal(problem, c.target, x)))
             continue
         with np.errstate(all="ignore"):  # the speed of a target at rest has no derivative, and none is needed here
             values = [_quantity(problem, c, x, epoch)[0].value for epoch in decisive_epochs(problem, c)]
         for value in values:
-            worst = np.maximum(worst, _short(c, value))
+            worst = np.maximum(worst, _band_violation(c, value))
     return worst
 
 
-def _short(band: Band, value: Array) -> Array:
-    """Return the violation (N,) of a band by values (N,), relative to its size; negative if the band is satisfied."""
+def _band_violation(band: Band, value: Array) -> Array:
+    """Return the violation (N,) of the worse bound, divided by one plus the absolute bound; negative if satisfied."""
     worst = np.full(len(value), -np.inf)
     for bound, sign in ((band.lower, 1.0), (band.upper, -1.0)):
         with np.errstate(invalid="ignore"):
-            short = np.where(np.isfinite(bound), sign * (bound - value), -np.inf)
+            lacking = np.where(np.isfinite(bound), sign * (bound - value), -np.inf)
         # One measure for metres of a height and sines of an elevation: relative to the bound, absolute near zero.
         size = 1.0 + np.where(np.isfinite(bound), np.abs(bound), 0.0)
-        worst = np.maximum(worst, short / size)
+        worst = np.maximum(worst, lacking / size)
     return worst
 
 
@@ -507,7 +529,10 @@ def violation_names(problem: Problem) -> str:
 
 
 def _quantity(problem: Problem, band: Band, x: Array, epoch: int | None = None) -> tuple[Jet, dict[int, int]]:
-    """Return the bounded quantity at an epoch with its derivatives, and the column of x for each seed."""
+    """Return the bounded quantity (N,) at an epoch with its derivatives, and the column of x for each derivative.
+
+    The second result maps the seed of each derivative to the column. The epoch None is the reference time.
+    """
     d, columns, states = problem.dimension, dict[int, int](), []
     for j, name in enumerate(state_names(band.target, len(problem.motions), problem.motions[band.target].order)):
         slot, shared = problem.layout.find(name)
@@ -557,8 +582,8 @@ def _horizontal(problem: Problem, target: int, x: Array) -> Array:
     return x[:, slot.start : slot.start + 2]
 
 
-def _outside(region: Polygon, points: Array) -> Array:
-    """Return the distance of points (N, 2) from a polygon relative to its size; 0 inside."""
+def _polygon_violation(region: Polygon, points: Array) -> Array:
+    """Return the distance of points (N, 2) from a polygon, divided by one plus its greatest coordinate; 0 inside."""
     a, b = region.vertices, np.roll(region.vertices, -1, axis=0)
     p = points[:, None]
     along, to = b - a, p - a

@@ -1,4 +1,8 @@
-"""Positions of targets along their courses, in the frame of a problem: polynomials in space, or ways over ground."""
+"""Positions of targets along their courses, in the frame of a problem: polynomials in space, or courses over ground.
+
+A *course over ground* follows the curved Earth; its height is a polynomial of time plus a known *rise*. `since` is the
+time since the reference time of the state, seconds.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ from optloc.problem.problem import Problem
 
 
 def over_ground(problem: Problem) -> bool:
-    """Return whether the courses of a problem follow the Earth; this holds for all moving targets or for none."""
+    """Return whether the moving targets of a problem follow the curved Earth; either all of them do, or none."""
     return any(motion.over == "ground" for motion in problem.motions)
 
 
@@ -32,7 +36,7 @@ def elapsed(problem: Problem, target: int) -> Array:
 
 
 def to_ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return a position in the problem's frame as ECEF components of the same type, metres."""
+    """Return a position (3 components) in the problem's frame as ECEF components of the same type, metres."""
     # Written with scalar factors, because components may be jets or symbols, which do not support matrices.
     turn, origin = problem.frame.rotation_to_ecef(), problem.frame.origin_ecef()
     if problem.frame.kind == "ecef":
@@ -121,7 +125,7 @@ def height_at(problem: Problem, states: list[Components], since: float) -> Any:
 
 
 def _straight(states: list[Components], since: Any) -> Components:
-    """Return the position to which the states lead in space after `since` seconds."""
+    """Return the position to which the states (position, velocity, acceleration) lead on a straight course, metres."""
     place = states[0]
     for j, state in enumerate(states[1:], 1):
         place = tuple(p + since**j / factorial(j) * v for p, v in zip(place, state, strict=True))

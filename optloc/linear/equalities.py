@@ -1,4 +1,8 @@
-"""Equality constraints of a run, for states that last for the run and for states of each epoch."""
+"""Equality constraints of a run, for states that last for the run and for states of each epoch.
+
+M problems have k epochs. A vector has `size` unknowns: n shared unknowns, and l local ones for each epoch. A state has
+c equalities.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +30,10 @@ class Equalities:
     lasting : Face
         Equalities of states that all epochs share.
     single : Problem, optional
-        The states of one epoch, with their equalities and bounds (M or 1, k or 1). None if no epoch has own equalities.
+        The states of one epoch, with their equalities and bounds (M or 1, k or 1). None if every constrained state
+        lasts for the run.
     each : Face
-        Equalities of `single`, which hold in every epoch.
+        Equalities of `single`, which every epoch satisfies.
     """
 
     problem: Problem
@@ -53,14 +58,14 @@ class Equalities:
         x = restore(self.problem, self.lasting, x) if self.lasting else x
         if self.single is None:
             return x
-        return self._put(x, restore(self._single(x), self.each, self._states(x)))
+        return self._with_states(x, restore(self._single(x), self.each, self._states(x)))
 
     def retract(self, x: Array, move: Array) -> Array:
         """Return the vectors (M, size) after steps (M, size), projected onto the equalities."""
         return self.restore(x + move)
 
     def step(self, equations: Normal, damping: Array, x: Array) -> tuple[Array, Array]:
-        """Return the damped steps (M, size) that keep the equalities to first order, and whether they exist (M,).
+        """Return the damped steps (M, size) that satisfy the equalities to first order, and whether they exist (M,).
 
         Parameters
         ----------
@@ -74,7 +79,7 @@ class Equalities:
         along = tangent_at(self.problem, self.lasting, x) if self.lasting else None
         if self.single is None:
             return step(equations, damping, along)
-        basis = self._own_space(x)
+        basis = self._local_space(x)
         move, ok = step(_within(equations, basis), damping, along)
         n, (m, k, _, free) = self.problem.layout.n_shared, basis.shape
         local = (basis @ move[:, n:].reshape(m, k, free, 1))[..., 0] if free else np.zeros(basis.shape[:-1])
@@ -83,21 +88,21 @@ class Equalities:
     def shared(self, equations: Normal, x: Array) -> tuple[Array, Array]:
         """Return information (M, n, n) and right side (M, n) of the shared unknowns, with the local ones eliminated.
 
-        The local unknowns keep their equalities.
+        The local unknowns continue to satisfy their equalities.
         """
         if self.single is not None:
-            equations = _within(equations, self._own_space(x))
+            equations = _within(equations, self._local_space(x))
         information, vector, _ = marginal(equations)
         return information, vector
 
     def lasting_space(self, x: Array) -> Array:
-        """Return a basis (M, n, n - c) of the shared unknowns along their equalities."""
+        """Return a basis (M, n, n - c) of the steps of the shared unknowns that stay on their equalities."""
         if not self.lasting:
             return np.broadcast_to(np.eye(n := self.problem.layout.n_shared), (len(x), n, n))
         return tangent_at(self.problem, self.lasting, x)
 
-    def _own_space(self, x: Array) -> Array:
-        """Return bases (M, k, l, l - c) of the local unknowns of every epoch along its equalities."""
+    def _local_space(self, x: Array) -> Array:
+        """Return bases (M, k, l, l - c) of the steps of the local unknowns that stay on the equalities."""
         layout = self.problem.layout
         _, gradients = levels(self._single(x), self.each, self._states(x))
         local = np.zeros((*gradients.shape[:2], layout.n_local))
@@ -118,7 +123,7 @@ class Equalities:
         return self.single
 
     def _slots(self) -> list[tuple[slice, slice]]:
-        """Return pairs of slices of each state: in the local unknowns of the run, and in the vector of an epoch."""
+        """Return pairs of slices for each state: in the local unknowns of the run, and in the vector of an epoch."""
         own = {slot.name: slice(slot.start, slot.start + slot.size) for slot in self._epoch.layout.shared}
         local = [slot for slot in self.problem.layout.local if slot.name in own]
         return [(slice(slot.start, slot.start + slot.size), own[slot.name]) for slot in local]
@@ -131,7 +136,7 @@ class Equalities:
             out[:, there] = local.reshape(len(out), -1)[:, here]
         return out
 
-    def _put(self, x: Array, states: Array) -> Array:
+    def _with_states(self, x: Array, states: Array) -> Array:
         """Return vectors (M, size) whose epochs have the given states (M k, size of an epoch)."""
         shared, local = self.problem.layout.split(x)
         local = local.reshape(len(states), -1).copy()
@@ -148,14 +153,14 @@ def spare_rows(problem: Problem) -> Array:
         return found
     # an epoch without a row has no unknowns to constrain
     weight = np.atleast_2d(problem.weight)
-    heard = np.zeros((len(weight), problem.epochs), dtype=bool)
+    observed = np.zeros((len(weight), problem.epochs), dtype=bool)
     for i, row in enumerate(weight > 0.0):
-        heard[i, problem.epoch[row]] = True
-    return np.asarray(found + own * (heard.sum(1) - 1))
+        observed[i, problem.epoch[row]] = True
+    return np.asarray(found + own * (observed.sum(1) - 1))
 
 
 def _spread(band: Band | Polygon, shape: tuple[int, int]) -> Band | Polygon:
-    """Return an equality with one bound for each of M problems and k epochs, as one axis."""
+    """Return an equality whose bounds and coefficients have one axis (M k,), for M problems with k epochs each."""
     if isinstance(band, Polygon):
         return band
     lower, upper = (b if b.ndim == 0 else np.broadcast_to(b, shape).ravel() for b in (band.lower, band.upper))
@@ -165,12 +170,15 @@ def _spread(band: Band | Polygon, shape: tuple[int, int]) -> Band | Polygon:
 
 
 def _target(problem: Problem, constraint: int) -> int:
-    """Return the target of a constraint."""
+    """Return the number of the target of a constraint."""
     return problem.constraints[constraint].target
 
 
 def _within(equations: Normal, basis: Array) -> Normal:
-    """Return normal equations whose local unknowns move only along a basis (M, k, l, l - c)."""
+    """Return normal equations whose local unknowns move only along `basis` (M, k, l, l - c).
+
+    The new local unknowns are the l - c coefficients of the basis.
+    """
     turned = np.swapaxes(basis, -1, -2)
     return Normal(
         equations.shared,

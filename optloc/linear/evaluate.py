@@ -1,6 +1,8 @@
 """Predicted measurements and their derivatives at a point, for all rows at once.
 
-The indices from unknowns to rows are computed once for each structure.
+The indices from unknowns to rows are computed once for each structure. A *block* contains the m rows of one kind. An
+*input* is a component of a point of the measurement function h, for instance a coordinate of the target; its *seed* is
+its number. Vectors x (..., size) contain all unknowns; a *column* is a position in x.
 """
 
 from __future__ import annotations
@@ -56,7 +58,7 @@ class Feed:
     def table(self, count: int) -> tuple[Array, Array]:
         """Return column and factor, each (count,), for all rows of the block.
 
-        The factor is zero for rows without it.
+        The factor is zero for rows without this contribution.
         """
         # Column zero with factor zero for the other rows: a gather needs a valid column.
         column, gain = np.zeros(count, dtype=np.int64), np.zeros(count)
@@ -125,7 +127,7 @@ class BlockLinks:
 
 
 def columns(layout: Layout, name: str, epoch: Array) -> Array:
-    """Return the columns (m, size) of a slot in the full parameter vector for rows of given epochs."""
+    """Return the columns (m, size) of the unknown `name` in the full parameter vector, for rows of epochs (m,)."""
     slot, shared = layout.find(name)
     # Local unknowns of epoch k follow those of all earlier epochs.
     base = slot.start + (0 if shared else layout.n_shared + epoch * layout.n_local)
@@ -165,7 +167,10 @@ def _links_of(problem: Problem, block: Rows, start: int) -> BlockLinks:
 
 
 def _adds(problem: Problem, block: Rows, start: int) -> Terms:
-    """Return the offsets, drifts and emission times of a block of rows, as linear terms."""
+    """Return the offsets, drifts and emission times of a block of rows, as linear terms.
+
+    `start` is the number of the first row of the block.
+    """
     parts = [_terms(problem, block, start, "adds")]
     for target in problem.emitting if MODELS[block.kind].emission else ():
         rows = np.flatnonzero(block.target == target)
@@ -175,7 +180,10 @@ def _adds(problem: Problem, block: Rows, start: int) -> Terms:
 
 
 def _terms(problem: Problem, block: Rows, start: int, enters: str) -> Terms:
-    """Return the linear terms of the biases that enter a block of rows in the given way."""
+    """Return the linear terms of the biases that enter a block in the way `enters`: "adds" or "scales".
+
+    `start` is the number of the first row of the block.
+    """
     parts = [Terms(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))]
     for bias in _entering(problem, enters):
         inside = (bias.row >= start) & (bias.row < start + block.count)
@@ -188,7 +196,7 @@ def _terms(problem: Problem, block: Rows, start: int, enters: str) -> Terms:
 
 
 def _entering(problem: Problem, enters: str) -> list[Bias]:
-    """Return the biases that enter rows in the given way, see `BiasForm.enters`."""
+    """Return the biases that enter rows in the way `enters`: "adds", "scales", "turns" or "moves", see `BiasForm`."""
     return [bias for bias in problem.biases if form_of(bias).enters == enters]
 
 
@@ -200,7 +208,7 @@ def _append(parts: list[Terms]) -> Terms:
 
 
 def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
-    """Return the contributions of the states of targets to positions and rates."""
+    """Return the contributions of the states of targets to the positions and rates of the targets."""
     feeds, count = [], len(problem.motions)
     for i, motion in enumerate(problem.motions):
         if motion.known is not None or not np.any(block.target == i):
@@ -238,33 +246,40 @@ def _station_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
 
 
 def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
-    """Return the contributions of mount errors to the rotation of axes."""
+    """Return the contributions of mount errors (angles, radians) to the rotation of the axes of stations.
+
+    `start` is the number of the first row of the block.
+    """
     feeds = []
     for bias in _entering(problem, "turns"):
         left = np.flatnonzero((bias.row >= start) & (bias.row < start + block.count))
-        turns = 1 if problem.dimension == 2 else 3
+        angles = 1 if problem.dimension == 2 else 3
         while (
             left.size
         ):  # a row rotated by several members takes one pass for each, since a feed contains a row only once
             rows, first = np.unique(bias.row[left] - start, return_index=True)
-            touch, left = left[first], np.delete(left, first)
+            entries, left = left[first], np.delete(left, first)
             column = columns(problem.layout, bias.name, rows)
-            for c in range(turns):
-                picked = column[np.arange(len(rows)), bias.member[touch] * turns + c]
-                feeds.append(Feed(TURN + c, picked, bias.coefficient[touch], rows))
+            for c in range(angles):
+                picked = column[np.arange(len(rows)), bias.member[entries] * angles + c]
+                feeds.append(Feed(TURN + c, picked, bias.coefficient[entries], rows))
     return feeds
 
 
 def _course_feeds(problem: Problem, block: Rows, model: Model, start: int) -> list[Feed]:
-    """Return the contributions of time offsets along a course to positions and rates of stations, to first order."""
+    """Return the contributions of time offsets along a course to positions and rates of stations, to first order.
+
+    `start` is the number of the first row of the block. Rows contain the offset with factor +1 for the first station
+    and -1 for the second.
+    """
     feeds: list[Feed] = []
     for bias in _entering(problem, "moves"):
         rates = course(problem)
         inside = (bias.row >= start) & (bias.row < start + block.count)
-        for side, station, place, rate in ((1.0, block.a, A, RATE_A), (-1.0, block.b, B, RATE_B)):
-            touch = np.flatnonzero(inside & (bias.coefficient == side))
-            rows = bias.row[touch] - start
-            column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), bias.member[touch]]
+        for sign, station, place, rate in ((1.0, block.a, A, RATE_A), (-1.0, block.b, B, RATE_B)):
+            entries = np.flatnonzero(inside & (bias.coefficient == sign))
+            rows = bias.row[entries] - start
+            column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), bias.member[entries]]
             epoch = block.epoch[rows] if len(rates[0]) > 1 else np.zeros_like(rows)
             for seed, grows in ((place, rates[0]), (rate, rates[1]))[: 1 + model.velocity if len(rows) else 0]:
                 picked = grows[epoch, station[rows]]
@@ -276,7 +291,7 @@ def _course_feeds(problem: Problem, block: Rows, model: Model, start: int) -> li
 
 
 def checked_vectors(problem: Problem, x: Array) -> Array:
-    """Return the parameter vectors (..., size); raise `InvalidProblem` for vectors of another length."""
+    """Return the parameter vectors (..., size) unchanged; raise `InvalidProblem` for vectors of another length."""
     size = problem.layout.size
     if x.shape[-1:] != (size,):
         raise InvalidProblem(f"a vector of shape {x.shape} for {size} unknowns", "vector", "order it by problem.layout")
@@ -300,7 +315,7 @@ def points(problem: Problem, links: BlockLinks, x: Array, differentiate: bool) -
     # First data, then contributions of unknowns: an offset of a station is added to its surveyed position.
     inputs = {seed: as_array_like(value, x) for seed, value in given(problem, links).items()}
     for feed in links.feeds:
-        inputs[feed.seed] = _feed(inputs.get(feed.seed, 0.0), feed, x, links.block.count)
+        inputs[feed.seed] = _add_feed(inputs.get(feed.seed, 0.0), feed, x, links.block.count)
     if isinstance(x, Portable):  # data are computed in the same way as inputs from the vector
         inputs = {seed: np.asarray(value).view(Portable) for seed, value in inputs.items()}
     if differentiate:
@@ -326,9 +341,11 @@ def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point,
     d = problem.dimension
 
     def vector(seed: int) -> tuple[Any, ...]:
+        """Return the d components from `seed` on."""
         return tuple(inputs.get(seed + c, 0.0) for c in range(d))
 
     def station(place: int, rate: int, axes: int) -> Point:
+        """Return a station from the seeds of its position, rate and axes."""
         # Inputs are 16 numbers apart and axes 3: nine numbers of one set of axes fit before the next input.
         own = tuple(vector(axes + 3 * i) for i in range(d)) if axes in inputs else None
         if TURN in inputs:
@@ -337,6 +354,7 @@ def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point,
         return seen(vector(place), vector(rate) if model.velocity else None, own)
 
     def seen(place: tuple[Any, ...], rate: tuple[Any, ...] | None, axes: Any = None) -> Point:
+        """Return a point with the quantities that the model needs: ECEF position, medium, vertical."""
         medium = problem.medium if model.straight else None
         if not isinstance(medium, Atmosphere):
             return Point(place, rate, axes, to_ecef(problem, place) if model.ecef else None, medium=medium)
@@ -384,7 +402,10 @@ def given(problem: Problem, links: BlockLinks) -> dict[int, Any]:
 
 
 def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> dict[int, Any]:
-    """Return the components of a per-station vector (rank 1) or set of axes (rank 2) at each row."""
+    """Return the components of a vector (rank 1) or set of axes (rank 2) of the station of each row, by seed.
+
+    `index` (m,) are the station numbers, `seed` is the number of the first component.
+    """
     epochs, count = array.shape[-2 - rank : -rank]
     # Epoch and station as one index, so that one table gathers rows of moving stations.
     joint = library(array).reshape(array, (*array.shape[: -2 - rank], epochs * count, *array.shape[-rank:]))
@@ -395,8 +416,8 @@ def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> d
     return {seed + 3 * i + c: picked[..., i, c] for i in d for c in d}
 
 
-def _feed(value: Any, feed: Feed, x: Array, count: int) -> Any:
-    """Return the value of an input plus the contribution of an unknown."""
+def _add_feed(value: Any, feed: Feed, x: Array, count: int) -> Any:
+    """Return the value (..., m) of an input plus the contribution of an unknown; `count` is the number of rows m."""
     column, gain = feed.table(count)
     part = gather(x, column)
     # Most unknowns have the factor one; a product with ones would cost as much as the rest.
@@ -462,7 +483,7 @@ _Terms = list[tuple[Array, Array, Any]]
 
 
 def _derive(problem: Problem, links: BlockLinks, x: Array) -> tuple[Any, _Terms]:
-    """Return the values (..., m) of one block, including biases, and their derivatives."""
+    """Return the values (..., m) of one block, including biases, and their derivatives as terms."""
     jet, m, fold = (
         links.model.h(*points(problem, links, x, differentiate=True)),
         links.block.count,
@@ -485,17 +506,24 @@ def _derive(problem: Problem, links: BlockLinks, x: Array) -> tuple[Any, _Terms]
 
 
 def _fold(layout: Layout) -> Any:
-    """Return the map from columns of the full vector to columns of [shared, local of the row's epoch]."""
+    """Return a function that maps columns of the full vector to columns of the Jacobian.
+
+    The Jacobian has the shared unknowns first, then the local unknowns of the row's epoch.
+    """
     n, length = layout.n_shared, layout.n_local
 
     def fold(column: Array) -> Array:
+        """Return the columns of the Jacobian for columns of the full vector."""
         return column if length == 0 else np.where(column < n, column, n + (column - n) % length)
 
     return fold
 
 
 def _bias(links: BlockLinks, x: Array, value: Any) -> tuple[Any, Any]:
-    """Return values with scales, offsets, drifts and emission times, and the factor that scales them, or None."""
+    """Return the values (..., m) with scales, offsets, drifts and emission times, and the factor that scales them.
+
+    The factor is None if no scale applies.
+    """
     m, gain = links.block.count, None
     if links.gains.row.size:
         gain = 1.0 + links.gains.total(x, m)
@@ -514,7 +542,7 @@ def _residual(block: Rows, value: Any, periodic: bool) -> Any:
 
 
 def _add(terms: _Terms, jacobian: Array) -> None:
-    """Add derivatives to the block's part of the Jacobian."""
+    """Add derivatives to the block's part of the Jacobian (..., m, n + l)."""
     for column, coefficient, factor in terms:
         # If all rows of the block have the same column (a shared position), a slice is enough; otherwise a scatter is
         # needed.

@@ -87,7 +87,7 @@ def gauss_newton(problem: Problem, x: Any, *, steps: int = 10, damping: float = 
 
 
 def whiteners(problem: Problem, x: Any) -> tuple[Whitener, ...] | None:
-    """Return the whitening matrices of a problem, or None if they depend on `x`.
+    """Return the whitening matrices of a problem, or None if they depend on `x`, so that each step computes its own.
 
     In the second case, arrays of another library than numpy raise `InvalidProblem`.
     """
@@ -103,5 +103,5 @@ def whiteners(problem: Problem, x: Any) -> tuple[Whitener, ...] | None:
 
 
 def _equations(problem: Problem, x: Any, noise: tuple[Whitener, ...] | None) -> Normal:
-    """Return the normal equations with priors at vectors x (..., size)."""
+    """Return the normal equations with priors at vectors x (..., size); `noise` is the result of `whiteners`."""
     return with_priors(problem, x, normal(linearise(problem, x, noise), problem.epochs))

@@ -3,6 +3,9 @@
 Rows z = D r + n (range, tdoa, toa, range_sum; D contains 0 and +-1) connect stations into a graph. In each connected
 group, the ranges that fit best are r = c + sign * t: known (t = 0), or known up to one unknown t, the range to a
 reference station. c and its covariance contain all information of these rows.
+
+A *node* is an unknown of the rows: the range to a station at an epoch, or an emission time. Letters: N problems, m
+rows, q nodes, the first s of which are ranges.
 """
 
 from __future__ import annotations
@@ -166,7 +169,7 @@ def reduce(problem: Problem) -> Problem:
 
 
 def _check(problem: Problem) -> None:
-    """Raise `InvalidProblem` if the rows have no common ranges: several targets, or unknown errors."""
+    """Raise `InvalidProblem` if the rows cannot be reduced: several targets, or biases."""
     if len(problem.motions) > 1:
         raise InvalidProblem("there are several targets", "reduce", "reduce the rows of one target")
     if problem.biases:
@@ -177,7 +180,10 @@ def _check(problem: Problem) -> None:
 
 
 def _keep_noise(noise: Noise, others: Array) -> list[Block]:
-    """Return the noise of the rows that stay."""
+    """Return the noise blocks of the rows `others`, which stay.
+
+    `InvalidProblem` is raised if noise correlates them with range rows.
+    """
     blocks = []
     for block in noise.blocks:
         stays = np.isin(block.row, others)
@@ -191,7 +197,11 @@ def _keep_noise(noise: Noise, others: Array) -> list[Block]:
 
 
 def _reduced_rows(found: Ranges, shape: tuple[int, ...]) -> tuple[list[Rows], Array]:
-    """Return range, tdoa and range_sum rows of the statistic with batch axes `shape`, and their joint covariance."""
+    """Return range, tdoa and range_sum rows with the ranges in `found`, and their joint covariance.
+
+    `shape` contains the batch axes of the rows. The kind depends on the sign of t: a range without t, a difference for
+    a plus, and a sum for a minus.
+    """
     free, reference = bool(found.free[0]), int(found.reference[0])
     nodes = [n for n in np.flatnonzero(found.inside[0]) if not (free and n == reference)]
     # r_i = c_i + t is a difference to the reference, r_i = c_i - t a sum with the reference
@@ -209,7 +219,7 @@ def _reduced_rows(found: Ranges, shape: tuple[int, ...]) -> tuple[list[Rows], Ar
 
 
 def _patterns(present: Array) -> tuple[Array, Array]:
-    """Return the distinct rows of a mask (N, m), and the number of the row of each problem."""
+    """Return the distinct rows of a mask (N, m), and for each problem (N,) the number of its row."""
     if present.all() or (present == present[:1]).all():
         return present[:1], np.zeros(len(present), dtype=int)
     patterns, pattern = np.unique(present, axis=0, return_inverse=True)
@@ -222,7 +232,7 @@ def _stays(problem: Problem) -> bool:
 
 
 def _design(problem: Problem) -> tuple[Array, Array, Array]:
-    """Return D (m, q) over nodes, and station and epoch of the station nodes."""
+    """Return D (m, q), and station and epoch (s,) of the nodes that are ranges."""
     moving = problem.stations.position.shape[-3] > 1 or (problem.epochs > 1 and not _stays(problem))
     entries: list[tuple[int, tuple[int, int, int], float]] = []
     coefficient: float
@@ -249,11 +259,15 @@ def _design(problem: Problem) -> tuple[Array, Array, Array]:
 
 @lru_cache(maxsize=_GRAPHS)
 def _graph(rows: bytes, count: int, stations: int) -> Graph:
-    """Return the graph of nodes from the bytes of D, whose columns are the nodes, stations first."""
+    """Return the graph of the nodes.
+
+    `rows` are the bytes of the present rows of D. `count` is the number q of nodes; the first `stations` nodes are
+    ranges. Bytes are hashable, so that graphs are cached.
+    """
     group, sign = _connect(np.frombuffer(rows).reshape(-1, count))
     names = np.unique(group[group >= 0])
     members = tuple(np.flatnonzero(group[:stations] == name) for name in names)
-    # the group with most stations; if equal, the first one, so that the same rows always give the same group
+    # The group with most stations; of equal groups the first, so that the same rows always give the same group.
     main = max(range(len(names)), key=lambda i: (len(members[i]), -i)) if len(names) else -1
     inside = (group == names[main])[:stations] if len(names) else np.zeros(stations, dtype=bool)
     reference = int(np.flatnonzero(inside)[0]) if inside.any() else 0
@@ -301,7 +315,10 @@ def _connect(design: Array) -> tuple[Array, Array]:
 
 
 def _least_squares(problem: Problem, design: Array, pinned: Array) -> tuple[Array, Array, Array]:
-    """Return the values of all nodes (N, q), their covariance (N or 1, q, q) and the misfit (N,)."""
+    """Return the values of all nodes (N, q), metres, their covariance (N or 1, q, q), m^2, and the misfit (N,).
+
+    `pinned` (N, q) marks nodes whose value is set to zero. The misfit is the chi-square of the redundant rows.
+    """
     q = design.shape[1]
     used = np.any(design != 0.0, axis=1)
     z = np.where(used & (problem.weight > 0.0), problem.observed, 0.0)[..., None]

@@ -3,6 +3,8 @@
 If all stations are in a plane, ranges depend only on the square of the target's distance w from the plane. On the plane
 the derivatives by w vanish, so Gauss-Newton steps in w do not converge. Steps in q = w^2 converge, and a minimum on the
 plane is a minimum at the bound q = 0.
+
+Letters: N or M problems, s stations, m rows, d coordinates.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from optloc.problem.problem import Problem
 def one_position(problem: Problem) -> bool:
     """Return whether the only unknown state is one position.
 
-    This holds for a single unknown target, if it and the stations are at rest, or if there is only one epoch.
+    This is the case for a single unknown target, if it and the stations are at rest, or if there is only one epoch.
     """
     if len(problem.motions) != 1 or problem.motions[0].known is not None or problem.motions[0].span == "epoch":
         return False
@@ -35,7 +37,7 @@ def is_of_ranges(kind: str) -> bool:
 
 
 def rows_of_stations(problem: Problem) -> Array:
-    """Return the mask (s, m) of the rows of each station."""
+    """Return the mask (s, m): True if a row measures with a station."""
     every, parts = np.arange(problem.stations.count)[:, None], []
     for rows in problem.rows:
         taken = MODELS[rows.kind].stations
@@ -114,7 +116,7 @@ class Folded:
         return step(_without(equations, self.column, stays), damping)
 
     def retract(self, x: Array, move: Array) -> Array:
-        """Return the vectors (M, size) after steps (M, size)."""
+        """Return the vectors (M, size) after steps (M, size): w moves by a step of q = w^2, kept positive."""
         out, w = x + move, x[:, self.column]
         square = w * w + 2.0 * w * move[:, self.column]
         out[:, self.column] = np.sqrt(np.maximum(square, self.least**2))
@@ -122,7 +124,10 @@ class Folded:
 
 
 def _without(equations: Normal, column: int, items: Array) -> Normal:
-    """Return normal equations in which a shared unknown of the selected problems does not move."""
+    """Return normal equations in which the shared unknown `column` of the selected problems does not move.
+
+    `items` (M,) is the mask of these problems.
+    """
     if not items.any():
         return equations
     shared, cross, vector = (np.array(part) for part in (equations.shared, equations.cross, equations.shared_vector))

@@ -1,7 +1,8 @@
 """Normal equations of a problem linearised at a point: one block for shared unknowns, and one block for each epoch.
 
 The matrix has the shape of an arrow: local unknowns of different epochs are coupled only by shared unknowns, or by
-walks.
+walks. Letters: n shared unknowns, l local unknowns of each of k epochs, m rows, s stations, d coordinates. A *group*
+contains r rows whose noise may be correlated; g groups have the same r.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def with_station_noise(problem: Problem, x: Array | None = None) -> Problem:
         # Ranges do not depend on velocities.
         nothing = np.zeros((stations.count, problem.dimension, problem.dimension))
         covariance = nothing if stations.covariance is None else stations.covariance
-        more = [_alike(problem, members, covariance) for members in groups]
+        more = [_isotropic_covariance(problem, members, covariance) for members in groups]
     else:
         # G is the Jacobian with respect to station errors as unknowns, which are the last of the local ones.
         named, x = with_offsets(problem, x, np.zeros(()))
@@ -77,7 +78,7 @@ def depends_on_place(problem: Problem) -> bool:
 
 
 def whitener_at(problem: Problem, x: Array) -> tuple[Whitener, ...]:
-    """Return the whitening matrices of a problem's rows, including station errors of span "noise", at vectors x."""
+    """Return the whitening matrices of a problem's rows at vectors x, including station errors of span "noise"."""
     return whiten(with_station_noise(problem, x).noise, problem.weight)
 
 
@@ -116,30 +117,31 @@ def _groups(problem: Problem) -> list[Array]:
     return group_members(epoch)
 
 
-def _alike(problem: Problem, members: Array, covariance: Array) -> Array:
-    """Return the covariance that isotropic station errors add to groups of rows (g, r).
+def _isotropic_covariance(problem: Problem, members: Array, covariance: Array) -> Array:
+    """Return the covariance (..., g, r, r) that isotropic station errors add to groups of rows `members` (g, r), m^2.
 
-    They have the effect of arrival errors with the variance of one axis.
+    `covariance` (..., s, d, d) belongs to the station positions. The errors have the effect of arrival errors with the
+    variance of one axis.
     """
     # For isotropic errors, this is the variance of each axis; for others, the mean over all directions.
     variance = np.trace(covariance, axis1=-2, axis2=-1) / problem.dimension
     ends = []
     for place in (0, 1):
         station = np.concatenate([(rows.a, rows.b)[place] for rows in problem.rows])
-        sign = np.concatenate([np.full(rows.count, _signs(rows)[place]) for rows in problem.rows])
+        sign = np.concatenate([np.full(rows.count, _range_signs(rows)[place]) for rows in problem.rows])
         ends.append((station[members], sign[members]))
     return arrivals(ends, variance)
 
 
-def _signs(rows: Rows) -> tuple[int, int]:
+def _range_signs(rows: Rows) -> tuple[int, int]:
     """Return the coefficients of the ranges to both stations of rows; zeros if the kind has none."""
     return MODELS[rows.kind].ranges or (0, 0)
 
 
 def _propagate_all(parts: Sequence[Array], members: Array, problem: Problem) -> Array:
-    """Return the covariance that all station errors add to groups of rows (g, r).
+    """Return the covariance (..., g, r, r) that all station errors add to groups of rows `members` (g, r).
 
-    `parts` are the Jacobians (..., m, s * d) with respect to each sort of errors.
+    `parts` are the Jacobians (..., m, s * d) with respect to each sort of errors: positions, then velocities.
     """
     errors = problem.stations.errors
     added = [_propagate(part[..., members, :], c) for part, (_, _, c) in zip(parts, errors, strict=True)]
@@ -147,7 +149,11 @@ def _propagate_all(parts: Sequence[Array], members: Array, problem: Problem) -> 
 
 
 def _propagate(sensitivity: Array, covariance: Array) -> Array:
-    """Return G P G' (..., g, r, r) of derivatives G (..., g, r, s * d) and station covariances P (..., s, d, d)."""
+    """Return G P G' (..., g, r, r): the covariance that the errors of stations add to groups of rows.
+
+    G is `sensitivity` (..., g, r, s * d), the derivative of the rows by the station coordinates. P is `covariance`
+    (..., s, d, d) of each station.
+    """
     s, d = covariance.shape[-3:-1]
     # Errors of stations are independent: P is applied station by station, without a matrix of s d by s d.
     own = sensitivity.reshape(*sensitivity.shape[:-1], s, d)
@@ -252,7 +258,7 @@ class Normal:
 
     @property
     def parts(self) -> tuple[Array, ...]:
-        """Return the arrays of all fields, in their order."""
+        """Return the arrays of all fields, in their order; `link` is left out if it is None."""
         own = (self.shared, self.local, self.cross, self.shared_vector, self.local_vector, self.cost)
         return own if self.link is None else (*own, self.link)
 
@@ -278,14 +284,17 @@ def total(parts: Sequence[Normal]) -> Normal:
 
 
 def normal(linear: Linear, epochs: int) -> Normal:
-    """Return the normal equations of a linearised problem.
+    """Return the normal equations of a linearised problem: information, right side and cost.
+
+    The information is J' W J and the right side J' W residual, with the Jacobian J and the inverse noise covariance W.
+    Priors are not included, see `with_priors`.
 
     Parameters
     ----------
     linear : Linear
-        Residual, Jacobian, noise.
+        Residual, Jacobian and whitening matrices of the noise.
     epochs : int
-        Number of epochs k.
+        Number of epochs k. Without local unknowns, the result has one empty block for all epochs.
     """
     n, length, xp = linear.shared.shape[-1], linear.local.shape[-1], library(linear.residual)
     # Jacobian and residual as one matrix, whose Gram matrix contains information, right side and cost.
@@ -313,9 +322,9 @@ def normal(linear: Linear, epochs: int) -> Normal:
 
 
 def _by_epoch(white: Any, epoch: Array, epochs: int) -> Any:
-    """Return the rows (..., m, p) sorted by epoch (..., k, r, p).
+    """Return the rows (..., m, p) sorted by epoch, (..., k, r, p); r is the greatest number of rows of an epoch.
 
-    Rows beyond the number of rows of an epoch are zero.
+    `epoch` (m,) is the epoch of each row. Rows beyond the number of rows of an epoch are zero.
     """
     # All epochs have the same length in the array: shorter ones are filled with zeros, which add nothing.
     order = np.argsort(epoch, kind="stable")
@@ -372,13 +381,17 @@ def eliminated(equations: Normal) -> Normal:
 
 
 def _solve_local(equations: Normal, right: Array) -> tuple[Array, Array]:
-    """Return solutions (..., k, l, p) of the local systems, of least norm if they are singular, and ok (...)."""
+    """Return the solutions (..., k, l, p) of the local systems for right sides of this shape, and ok (...).
+
+    The solution has the least norm if a system is singular. `ok` is False if the only epoch leaves unknowns
+    undetermined.
+    """
     local, xp = equations.local, library(equations.local)
     if equations.link is not None:
-        return chain.solve(_hold_untouched(local), equations.link, right)
+        return chain.solve(_fix_unused(local), equations.link, right)
     # If a single epoch leaves its local unknowns undetermined, so is the fix; the caller handles this case.
     if local.shape[-3] == 1:
-        solved, good = linalg.solve(_hold_untouched(local), right)
+        solved, good = linalg.solve(_fix_unused(local), right)
         return solved, xp.all(good, axis=-1)
     solved, good = linalg.solve(local, right, OPEN)
     # In a run, an epoch may leave a combination undetermined (one arrival, unknown emission time). The least norm moves
@@ -392,7 +405,7 @@ def _solve_local(equations: Normal, right: Array) -> tuple[Array, Array]:
     return solved, xp.ones_like(solved[..., 0, 0, 0], dtype=xp.bool)
 
 
-def _hold_untouched(local: Array) -> Array:
+def _fix_unused(local: Array) -> Array:
     """Return local blocks with 1 on the diagonal for unknowns without rows, so that their step is zero."""
     dead = library(local).linalg.diagonal(local) == 0.0
     grown: Array = local + as_number(dead, local)[..., None] * eye(local.shape[-1], local)
@@ -415,7 +428,7 @@ def local_covariance(equations: Normal, shared: Array, size: int) -> Array:
         inverse, good = linalg.inverse(equations.local, OPEN)
         gain = inverse @ np.swapaxes(equations.cross, -1, -2)
     else:
-        held = _hold_untouched(equations.local)
+        held = _fix_unused(equations.local)
         inverse, whole = chain.inverse_blocks(held, equations.link)
         gain, _ = chain.solve(held, equations.link, equations.cross.mT)
         # an epoch may still leave some of its other local unknowns undetermined
@@ -442,7 +455,7 @@ def step(equations: Normal, damping: Array, along: Array | None = None) -> tuple
     if equations.link is not None:
         # Walks follow the shared unknowns, so that the rows have little information about these unknowns. This
         # information is damped.
-        information = _grow(information, damping)
+        information = _scale_diagonal(information, damping)
     if along is not None:
         shared, good = linalg.solve_within(information, vector, along)
         ok = ok & good
@@ -460,17 +473,17 @@ def step(equations: Normal, damping: Array, along: Array | None = None) -> tuple
 
 
 def _damp(equations: Normal, damping: Array) -> Normal:
-    """Return normal equations with a damped diagonal; the local unknowns of walks are not damped."""
-    local = _grow(equations.local, damping[..., None])
+    """Return normal equations with the diagonal times 1 + damping; the local unknowns of walks are not damped."""
+    local = _scale_diagonal(equations.local, damping[..., None])
     if equations.link is None:
-        return replace(equations, shared=_grow(equations.shared, damping), local=local)
+        return replace(equations, shared=_scale_diagonal(equations.shared, damping), local=local)
     # Walks are linear. Their steps have a high precision compared with the rows, and damping would keep them from
     # moving.
     walking = np.diagonal(equations.link, axis1=-2, axis2=-1).any(tuple(range(equations.link.ndim - 2)))
     return replace(equations, local=np.where(walking, equations.local, local))
 
 
-def _grow(matrix: Array, factor: Array) -> Array:
+def _scale_diagonal(matrix: Array, factor: Array) -> Array:
     """Return a matrix with its diagonal times (1 + factor): Marquardt's scaling is independent of units."""
     grown: Array = matrix * (1.0 + factor[..., None, None] * eye(matrix.shape[-1], matrix))
     return grown
@@ -485,7 +498,7 @@ def covariance(equations: Normal) -> tuple[Array, Array]:
 
 
 def decrement(equations: Normal, move: Array, layout_n: int) -> Array:
-    """Return the squared length (...) of a step in standard deviations."""
+    """Return the squared length (...) of a step in standard deviations; `layout_n` unknowns of it are shared."""
     shared = move[..., :layout_n]
     local = move[..., layout_n:].reshape(*equations.local_vector.shape)
     return np.asarray((shared * equations.shared_vector).sum(-1) + (local * equations.local_vector).sum((-1, -2)))
@@ -554,7 +567,10 @@ def _with_walks(problem: Problem, x: Array, equations: Normal) -> Normal:
 
 
 def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
-    """Return (name, mean, precision) of every prior except walks; local ones have an epoch axis of length one."""
+    """Return (name, mean, precision) of every prior except walks; local ones have an epoch axis of length one.
+
+    The precision is the inverse covariance.
+    """
     parts, layout = [], problem.layout
     for prior in problem.priors:
         precision, _ = linalg.inverse(prior.covariance)

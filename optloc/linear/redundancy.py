@@ -35,13 +35,13 @@ def degrees_of_freedom(problem: Problem) -> Array:
     states, emissions = _sizes(problem, known)
     for _, _, part in windows(problem, len(problem.weight) if problem.weight.ndim > 1 else 1):
         for whitener in whiten(part.noise, part.weight):
-            # One matrix may represent all groups. A whitening matrix has as many nonzero rows as the rank of its
+            # One matrix may represent all groups. The number of nonzero rows of a whitening matrix is the rank of its
             # covariance.
             same = len(whitener.row) if whitener.matrix.shape[-3] == 1 else 1
             rank = rank + same * (whitener.matrix != 0.0).any(-1).sum((-1, -2))
         local = local + _local_unknowns(part, states, emissions)
     shared = sum(slot.size for slot in problem.layout.shared if slot.name not in known)
-    # The steps of a walk add as many rows as unknowns, so that only its initial unknowns count.
+    # The steps of a walk add the same number of rows and unknowns, so that only its initial unknowns count.
     unknowns = shared + local + count_free_unknowns(problem)
     return np.broadcast_to(rank - unknowns + len(exact(problem)), problem.batch_shape).astype(np.int32)
 
@@ -95,7 +95,7 @@ def _local_unknowns(problem: Problem, states: Array, emissions: Array) -> Array:
 
 
 def _targets(problem: Problem) -> tuple[list[Array], list[Array]]:
-    """Return the targets of the rows of each kind, and whether the rows contain the emission time."""
+    """Return, for each kind, the targets of its rows, and whether its rows contain the emission time."""
     targets = [np.asarray(rows.target) for rows in problem.rows]
     return targets, [np.full(rows.count, MODELS[rows.kind].emission) for rows in problem.rows]
 

@@ -54,7 +54,10 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
 def _displace(
     problem: Problem, truth: Array, shape: tuple[int, ...], rng: np.random.Generator
 ) -> tuple[Problem, Array]:
-    """Return the problem with stations moved by drawn errors of span "noise", and the truth for this problem."""
+    """Return the problem with stations moved by drawn errors of span "noise", and the truth for this problem.
+
+    `shape` contains the leading axes of the draws. Without these errors, problem and truth are returned unchanged.
+    """
     stations = problem.stations
     if not stations.weighed:
         return problem, truth

@@ -1,6 +1,7 @@
 """Residuals and constraints of a problem as CasADi expressions, for nonlinear programs.
 
-They use the same models and the same indices as the numerical code.
+They use the same models and the same indices as the numerical code. Letters: m rows, p or q numbers that are parameters
+of the expressions.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def residual(problem: Problem, x: Any, p: Any, z: Any) -> list[Any]:
 
 
 def _total(terms: Terms, row: int, x: Any) -> Any:
-    """Return the sum of the linear terms of a row."""
+    """Return the sum of the linear terms of a row at the vector x, as an expression."""
     return sum(float(terms.coefficient[i]) * x[int(terms.column[i])] for i in np.flatnonzero(terms.row == row))
 
 
@@ -112,7 +113,7 @@ def constrained(problem: Problem, x: Any, p: Any, length: Any) -> tuple[list[Any
 
 
 def _states(problem: Problem, target: int, x: Any) -> list[tuple[Any, ...]]:
-    """Return the state of a target as tuples of symbols: position, velocity, acceleration."""
+    """Return the state of a target in the vector x as tuples of symbols: position, velocity, acceleration."""
     names = state_names(target, len(problem.motions), problem.motions[target].order)
     starts = [problem.layout.find(name)[0].start for name in names]
     return [tuple(x[start + i] for i in range(problem.dimension)) for start in starts]

@@ -1,4 +1,7 @@
-"""Parameter vectors from positions: the other unknowns get their prior mean, or the value that fits best."""
+"""Parameter vectors from positions: the other unknowns get their prior mean, or the value that fits best.
+
+Letters: N problems, q positions of each, d coordinates, `size` unknowns of a problem.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +51,10 @@ def complete(problem: Problem, shared: Array) -> Array:
 
 
 def _fit_emission_times(problem: Problem, x: Array) -> Array:
-    """Return vectors (N, q, size) with the emission times that fit best: the mean of the remaining residuals."""
+    """Return vectors (N, q, size) with the emission times that fit best: the mean of the residuals without them.
+
+    Vectors with NaN are not changed.
+    """
     size, q = x.shape[:2]
     part, out = problem.take(np.repeat(np.arange(size), q)), x.reshape(size * q, x.shape[-1]).copy()
     usable = np.asarray(np.isfinite(out).all(-1))
@@ -62,9 +68,9 @@ def _fit_emission_times(problem: Problem, x: Array) -> Array:
         if len(column):
             order = np.argsort(column, kind="stable")
             columns_of_rows, first = np.unique(column[order], return_index=True)
-            heard = np.add.reduceat(1.0 * present[:, rows[order]], first, axis=-1)
+            counts = np.add.reduceat(1.0 * present[:, rows[order]], first, axis=-1)
             total = np.add.reduceat(np.where(present, left, 0.0)[:, rows[order]], first, axis=-1)
-            out[:, columns_of_rows] += np.where(usable[:, None], total / np.maximum(heard, 1.0), 0.0)
+            out[:, columns_of_rows] += np.where(usable[:, None], total / np.maximum(counts, 1.0), 0.0)
     return out.reshape(size, q, -1)
 
 

@@ -1,4 +1,7 @@
-"""Random walks of biases as information that couples the unknowns of successive epochs."""
+"""Random walks of biases as information that couples the unknowns of successive epochs.
+
+Letters: k epochs, l local unknowns of each. A walk has q members with o states each: a value, and a rate if it has one.
+"""
 
 from __future__ import annotations
 
@@ -55,8 +58,8 @@ class Chain:
 def chain_at(problem: Problem, x: Array) -> Chain:
     """Return the information of the walks of a problem at vectors x (..., size).
 
-    A step ``e = x_{j+1} - F x_j`` with precision W has the information ``F'WF``, ``-F'W`` and ``W``. Its right side is
-    ``F'We`` and ``-We``.
+    The states of epoch j + 1 are ``x_{j+1} = F x_j`` plus noise of covariance Q. The step ``e = x_{j+1} - F x_j`` with
+    precision W = Q^-1 has the information ``F'WF``, ``-F'W`` and ``W``. Its right side is ``F'We`` and ``-We``.
     """
     layout, k = problem.layout, problem.epochs
     local = layout.split(x)[1]
@@ -85,7 +88,7 @@ def chain_at(problem: Problem, x: Array) -> Chain:
 
 
 def _steps(problem: Problem) -> Iterator[tuple[Bias, Array, Array, Array]]:
-    """Yield each walk, the local columns (q, o) of its states, and the transitions and covariances of its steps."""
+    """Yield each walk, the local columns (q, o) of its states, and the transitions F and covariances Q of its steps."""
     for bias in problem.biases:
         steps = form_of(bias).steps
         if steps is not None:

@@ -47,7 +47,7 @@ class Block:
 
 def block_of(problem, module):
     """Return a single problem with its measurements and stations in a block, for the evaluator of a module."""
-    one = plan._bare(problem)
+    one = plan._without_measurements(problem)
     admission = admission_of(one)
     dof = int(degrees_of_freedom(one.flat())[0])
     drawn = draw_ranges(one, admission) if module is ranges else draw_tapes(one, admission, dof)

@@ -10,13 +10,13 @@ from optloc import assemble, measured, with_bias
 from optloc.engine.admission import admission_of
 from optloc.engine.draw import _is_bounded, draw_ranges, draw_tapes
 from optloc.engine.memory import BY_HEIGHT, BY_SQUARES, HEARD, RANGED, SEEN, SIGN
-from optloc.engine.plan import _bare
+from optloc.engine.plan import _without_measurements
 from optloc.linear.constraints import height
 from optloc.problem import ECEF, Prior
 
 
 def drawn(problem):
-    one = _bare(problem)
+    one = _without_measurements(problem)
     return draw_ranges(one, admission_of(one))
 
 
@@ -54,11 +54,11 @@ def test_stations_without_a_link_have_no_plan_of_ranges():
 
 
 def test_the_way_of_a_start_depends_on_rows_and_heights():
-    one = _bare(CASES["tdoa+azimuth-2d"].problem)
+    one = _without_measurements(CASES["tdoa+azimuth-2d"].problem)
     assert draw_tapes(one, admission_of(one), 1).model.start == BY_SQUARES
     place = 7e6 * np.eye(3) + 1e6
     held = assemble(place, measured("tdoa", a=[1, 2], b=0, sigma=1.0), frame=ECEF, constraints=height(exactly=100.0))
-    one = _bare(held)
+    one = _without_measurements(held)
     model = draw_tapes(one, admission_of(one), 0).model
     assert (model.start, model.height) == (BY_HEIGHT, 0)
 
@@ -75,7 +75,7 @@ def test_costs_grow_without_bound_where_ranges_add_up_or_a_position_has_a_prior(
 
 
 def test_stations_of_angles_are_marked_beside_those_with_any_row():
-    one = _bare(CASES["range+azimuth-2d"].problem)  # ranges to stations 0 and 4, azimuths of 1 and 2
+    one = _without_measurements(CASES["range+azimuth-2d"].problem)  # ranges to stations 0 and 4, azimuths of 1 and 2
     found = draw_tapes(one, admission_of(one), 2)
     station = found.node[1]
     assert sorted(station[found.model.station[HEARD] == 1.0]) == [0, 1, 2, 4]

@@ -141,7 +141,7 @@ def test_the_value_is_below_the_weighted_cost_everywhere():
         found = rows.seen(source).start(reach=5.0)
         assert found.answer.solved
         assert 0.0 <= found.bound <= found.value * (1 + 1e-6) + 1e-6
-        held = rows.place[doppler_sdp._ends(rows.rates, rows.speed)[0]]
+        held = rows.place[doppler_sdp._nodes_of_rows(rows.rates, rows.speed)[0]]
         for x in rng.uniform(-15e3, 15e3, (200, d)):
             ratio = np.linalg.norm(x - held, axis=1) / found.far
             cost = (((ratio * (rows.z - rows.at(x))) / rows.sigma) ** 2).sum()

@@ -93,7 +93,7 @@ def test_an_edit_of_one_module_renews_few_lines():
 def test_digests_differ_and_are_the_same_each_time():
     made = {name: digests.digest_of(kernel) for name, kernel in shipped().items()}
     assert len(set(made.values())) >= 0.98 * len(made)  # kernels that call each other share one
-    digests._own.cache_clear()
+    digests._digest_and_callees.cache_clear()
     assert {name: digests.digest_of(kernel) for name, kernel in shipped().items()} == made
 
 
@@ -227,7 +227,7 @@ def test_the_places_of_fields_count_though_the_code_names_them_alone(monkeypatch
         return outer.inner.low
 
     def digest():
-        digests._own.cache_clear()
+        digests._digest_and_callees.cache_clear()
         return digests.digest_of(digests.Compilable(kernel, taken_in=False))
 
     before = digest()
