@@ -9,9 +9,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import platform
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.resources import as_file, files
 from importlib.resources.abc import Traversable
 from itertools import combinations, product
@@ -23,7 +25,7 @@ import numpy as np
 
 from optloc.files import join, kind_model, parse_toml, read, read_text, validated, within
 from optloc.lab.study.document import Level, NetworkTable, ScenarioTable, StudyFile, sigma_of
-from optloc.lab.study.methods import StudyMethod, methods_of
+from optloc.lab.study.methods import StudyMethod, methods_of, version_of
 from optloc.lab.study.networks import NetworkCase, check_network, noise_of
 from optloc.lab.study.simulation import Case, add_injected_errors, check_truth, metres, place_stations
 from optloc.models import MODELS
@@ -448,3 +450,22 @@ def workers() -> int:
     """Return the number of processes that this machine can run at a time."""
     # Containers and schedulers may allow fewer processors than the machine has.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@cache
+def versions() -> str:
+    """Return the versions of optloc, Python and the libraries that affect numbers, as one line."""
+    names = ("optloc", "numpy", "scipy", "numba", "cvxpy", "clarabel", "casadi", "pyarrow")
+    return "; ".join([f"Python {platform.python_version()}", *(f"{name} {version_of(name)}" for name in names)])
+
+
+@cache
+def machine() -> str:
+    """Return the processor, the number of its cores and the system of this machine as one line."""
+    name = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
+    except OSError:
+        pass
+    return f"{name}, {os.cpu_count()} cores, {platform.system()}"

@@ -231,8 +231,8 @@ class _Work:
     def _part_of_failure(self, task: _Task, lost: Lost) -> TrialPart | None:
         """Return the part of a failed task, with a failure in every row; None if the task is tried again.
 
-        After the first death of its process, the task is tried again. Otherwise it is divided into halves. A single trial,
-        and a task of an abandoned cell, gets the failure in its rows.
+        After the first death of its process, the task is tried again. Otherwise it is divided into halves. A single
+        trial, and a task of an abandoned cell, gets the failure in its rows.
         """
         chunk, cell = task.chunk, task.chunk.cell.key
         if cell not in self._given_up:
