@@ -32,9 +32,9 @@ _QUATERNION = ["qx", "qy", "qz", "qw"]
 class MarkGroups:
     """Groups of six bearings of one marker each, in SI units and radians.
 
-    `place` (n, 6, 3) are the positions of the camera in metres, and `axes` (n, 6, 3, 3) its axes in the room, one axis
-    in each row. `angles` (n, 6, 2) are azimuths and elevations, `truth` (n, 3) the positions of the markers in metres,
-    and `rate` (n, 6) the turning rates of the camera in rad/s.
+    `place` (n, 6, 3) are the positions of the camera in metres. `axes` (n, 6, 3, 3) are its axes in the room, one axis
+    in each row. `angles` (n, 6, 2) are azimuths and elevations. `truth` (n, 3) are the positions of the markers in
+    metres, and `rate` (n, 6) the turning rates of the camera in rad/s.
     """
 
     place: Array
@@ -70,8 +70,8 @@ class MarkGroups:
 class CameraBearings:
     """One run of the camera.
 
-    `poses` are the poses of the camera by frame, `rows` the bearings of the markers in order of time, and `markers` the
-    positions of the markers by tag.
+    `poses` are the poses of the camera by frame. `rows` are the bearings of the markers in order of time. `markers` are
+    the positions of the markers by tag.
     """
 
     poses: pd.DataFrame

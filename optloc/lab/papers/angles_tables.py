@@ -300,13 +300,13 @@ def _as_cells(values: Iterable[float]) -> tuple[str, ...]:
 
 
 def table_straight(curves: Sequence[ErrorCurve]) -> TextTable:
-    """Return the errors of simulation 1 over the whole track."""
+    """Return a table of the errors of simulation 1 over the whole track."""
     lines = [("printed", *_as_cells(PRINTED_STRAIGHT)), *((c.label, *_as_cells(c.total())) for c in curves)]
     return tabulate("simulation-1", ("", *_PARTS), lines)
 
 
 def table_winding(curves: Sequence[ErrorCurve]) -> TextTable:
-    """Return the errors of simulation 2, over the whole track and without its first ten seconds."""
+    """Return a table of the errors of simulation 2, over the whole track and without its first ten seconds."""
     lines = [("0 to 50 s", "printed", *_as_cells(PRINTED_WINDING))]
     for first in (0, 10):
         lines += [(f"{first} to 50 s", c.label, *_as_cells(c.total(first))) for c in curves]
@@ -314,7 +314,7 @@ def table_winding(curves: Sequence[ErrorCurve]) -> TextTable:
 
 
 def table_circles(found: Mapping[float, Sequence[ErrorCurve]], snapshot: ErrorCurve) -> TextTable:
-    """Return the position errors of the repaired simulation 3."""
+    """Return a table of the position errors of the repaired simulation 3."""
     lines = [(ABSENT, "bound of every second by itself", *_as_cells(snapshot.phases(REPAIRED)))]
     for limit, curves in found.items():
         lines += [(f"{limit:g}", c.label, *_as_cells(c.phases(REPAIRED))) for c in curves]
@@ -322,7 +322,7 @@ def table_circles(found: Mapping[float, Sequence[ErrorCurve]], snapshot: ErrorCu
 
 
 def table_readings(found: Sequence[TableReading]) -> TextTable:
-    """Return the position errors of simulation 3 as printed."""
+    """Return a table of the position errors of simulation 3 as printed."""
     lines = []
     for reading in found:
         pairs = [value for pair in zip(reading.error, reading.bound, strict=True) for value in pair]
@@ -332,7 +332,7 @@ def table_readings(found: Sequence[TableReading]) -> TextTable:
 
 
 def table_starts(found: Lost) -> TextTable:
-    """Return the shares of lost tracks."""
+    """Return a table of the shares of lost tracks."""
     header = ("start", "a_max", "single step", "converged", "modified gain", "modified covariance")
     lines = [
         (f"{sigma:g} m" if sigma else "fit of 3 s", f"{limit:g}", *map(percent, shares.values()))
@@ -342,18 +342,18 @@ def table_starts(found: Lost) -> TextTable:
 
 
 def table_clamps(found: Mapping[str, float]) -> TextTable:
-    """Return the shares of lost tracks with and without a clamped variance."""
+    """Return a table of the shares of lost tracks with and without a clamped variance."""
     return tabulate("clamp", ("variance", "lost"), [(name, percent(share)) for name, share in found.items()])
 
 
 def table_wholes(found: Sequence[tuple[str, Array]], bound: Array) -> TextTable:
-    """Return the errors at the end of simulation 1 of fits to the whole track."""
+    """Return a table of the errors at the end of simulation 1 of fits to the whole track."""
     lines = [("Cramér-Rao bound", *_as_cells(bound)), *((name, *_as_cells(error)) for name, error in found)]
     return tabulate("whole-track", ("", *_PARTS), lines)
 
 
 def table_rays(found: Sequence[SimulatedRays]) -> TextTable:
-    """Return bias and error of fixes of a fixed target."""
+    """Return a table of bias and error of fixes of a fixed target."""
     names = ("plain", "weighted", "instrumental", "maximum likelihood")
     lines = [
         (f"{rays.stations}", f"{1e3 * rays.sigma:g} mrad", name, *_as_cells((*values, rays.bound)))
@@ -371,7 +371,7 @@ Style = tuple[str, str, str]
 
 
 def three_parts(curves: Mapping[Style, ErrorCurve], values: Sequence[float]) -> Figure:
-    """Return errors of position, velocity and acceleration against time, one panel for each.
+    """Return a figure of errors of position, velocity and acceleration against time, one panel for each.
 
     Parameters
     ----------
@@ -436,7 +436,10 @@ def figure_circles(found: Mapping[float, Sequence[ErrorCurve]], snapshot: ErrorC
 
 
 def figure_starts(ends: Mapping[str, Array]) -> Figure:
-    """Return the share of tracks that end nearer to the truth than each distance; `ends` (trials,) are in metres."""
+    """Return a figure of the share of tracks that end within each distance from the truth.
+
+    `ends` are the distances (trials,) of the last states in metres, by start and filter.
+    """
     figure = canvas(7.0, 4.4)
     ax = figure.subplots()
     styles = ((Ink.RED, "-", 1.5), (Ink.BLUE, "-", 4.0), (Ink.GREEN, "--", 1.5))

@@ -160,7 +160,7 @@ def kalman(drawn: Problem, update: str) -> Track:
 
 
 def run_still(epochs: int, trials: int, sequence: np.random.SeedSequence) -> dict[str, Errors]:
-    """Return the errors for a fixed target: those of the corrected recursion, and those of the closed-form fix.
+    """Return the errors for a fixed target, by estimator: the corrected recursion, and the closed-form fix.
 
     `sequence` is the seed of the draws.
     """
@@ -341,7 +341,7 @@ def _cells(errors: Array) -> tuple[str, str, str]:
 
 
 def table_still(found: Mapping[str, Errors], bounds: Mapping[int, Array]) -> TextTable:
-    """Return root mean square errors of a fixed target; `found` is by estimator, `bounds` (3,) by number of epochs."""
+    """Return a table of rms errors of a fixed target; `found` is by estimator, `bounds` (3,) by number of epochs."""
     lines = []
     for count, bound in bounds.items():
         lines += [(str(count), name, *_cells(errors.rms(count))) for name, errors in found.items()]
@@ -350,7 +350,7 @@ def table_still(found: Mapping[str, Errors], bounds: Mapping[int, Array]) -> Tex
 
 
 def table_claims(found: Mapping[str, Errors]) -> TextTable:
-    """Return the share of runs in which the errors are within the paper's claims for 10 epochs, and the rms errors."""
+    """Return a table of the share of runs within the paper's claims for 10 epochs, and of the rms errors."""
     lines = []
     for name, column, limit, claim in CLAIMS:
         within = [np.abs(errors.error[:, errors.epochs == 10, column]) < limit for errors in found.values()]
@@ -364,7 +364,7 @@ def table_claims(found: Mapping[str, Errors]) -> TextTable:
 def table_slow(
     tracks: Mapping[str, Errors], fits: Mapping[int, Mapping[str, Errors]], bounds: Mapping[int, Array]
 ) -> TextTable:
-    """Return root mean square errors of the slow target.
+    """Return a table of root mean square errors of the slow target.
 
     `tracks` is by tracker. `fits` are fits of whole records, by number of epochs; `bounds` (3,) has the same numbers.
     """
@@ -385,7 +385,7 @@ def table_slow(
 
 
 def table_short(trials: int, sequences: Sequence[np.random.SeedSequence], tick: Tick) -> TextTable:
-    """Return batch fits of ten epochs and their bound, with the noise of the paper and a path ten times as noisy."""
+    """Return a table of batch fits of ten epochs and their bound, with printed and with ten times the path noise."""
     lines = []
     for sequence, (name, path) in zip(sequences, {"20 ns": PATH, "200 ns": 10.0 * PATH}.items(), strict=True):
         errors = run_batches(10, trials, sequence, path=path)["batch maximum likelihood"]
@@ -398,13 +398,13 @@ def table_short(trials: int, sequences: Sequence[np.random.SeedSequence], tick: 
 
 
 def table_directions() -> TextTable:
-    """Return the bound of the range of one epoch against azimuth."""
+    """Return a table of the bound of the range of one epoch against azimuth."""
     lines = [(f"{azimuth:.3f}", kilometres(bound_single(azimuth))) for azimuth in _AZIMUTHS]
     return tabulate("directions", ("azimuth, rad", "bound of the range, km"), lines)
 
 
 def table_ground(trials: int, sequence: np.random.SeedSequence, tick: Tick) -> TextTable:
-    """Return the effect of a ground or a known height in all `CASES`."""
+    """Return a table of the effect of a ground or a known height in all `CASES`."""
     lines = []
     for (name, direction), child in zip(CASES.items(), sequence.spawn(len(CASES)), strict=True):
         by_constraint = fix_grounded(*direction, trials, child)
@@ -414,7 +414,7 @@ def table_ground(trials: int, sequence: np.random.SeedSequence, tick: Tick) -> T
 
 
 def table_printed(azimuth: Array) -> TextTable:
-    """Return the error of the angle step as printed; azimuth errors are (trials, epochs), radians."""
+    """Return a table of the error of the angle step as printed; azimuth errors are (trials, epochs), radians."""
     rms = np.sqrt((azimuth**2).mean(0))
     epochs = azimuth.shape[1]
     shown = [i for i in (1, 2, 5, 10, 50, epochs) if i <= epochs]
@@ -441,7 +441,7 @@ _RUN = ("single fix", "simplified, no restart", "restart every 50", "line fit")
 
 
 def against_time(found: Mapping[str, Errors], bound: tuple[Array, Array], points: Mapping[str, Errors]) -> Figure:
-    """Return root mean square errors of range, azimuth and elevation against the number of epochs.
+    """Return a figure of root mean square errors of range, azimuth and elevation against the number of epochs.
 
     Parameters
     ----------
@@ -468,7 +468,7 @@ def against_time(found: Mapping[str, Errors], bound: tuple[Array, Array], points
 
 
 def one_run(found: Mapping[str, Errors]) -> Figure:
-    """Return the errors of the first run of each estimator against the number of epochs."""
+    """Return a figure of the errors of the first run of each estimator against the number of epochs."""
     figure = canvas(15.0, 4.6)
     for i, (ax, (name, factor)) in enumerate(zip(figure.subplots(1, 3), _AXES.items(), strict=True)):
         for curve, errors in found.items():

@@ -1,6 +1,6 @@
 """Tables and figures of the paper in Missiles and Space Vehicles 2024/5: printed, reproduced, bound, theory.
 
-The letters in shapes are those of `optloc.lab.papers.kinematic`. NEES is the normalised estimation error squared.
+`optloc.lab.papers.kinematic` defines the letters in shapes. NEES is the normalised estimation error squared.
 """
 
 from __future__ import annotations
@@ -104,10 +104,10 @@ def table_errors(lines: Sequence[TableLine]) -> TextTable:
 
 
 def table_ratios(fix: KinematicScore, matched: Mapping[str, KinematicScore], steps: int) -> TextTable:
-    """Return the ratios of filter errors to the error of a single fix, which do not depend on the noise.
+    """Return a table of the ratios of filter errors to the error of a single fix, which do not depend on the noise.
 
-    `fix` are the errors of single fixes, `matched` are the errors of filters on their own motion by model, and `steps`
-    is the number of updates.
+    `fix` are the errors of single fixes. `matched` are the errors of each filter on the motion of its model, by model.
+    `steps` is the number of updates.
     """
     rows = []
     for name, score in matched.items():
@@ -117,7 +117,7 @@ def table_ratios(fix: KinematicScore, matched: Mapping[str, KinematicScore], ste
 
 
 def table_efficiency(drawn: Mapping[str, KinematicDraw]) -> TextTable:
-    """Return the root mean square errors at the last step of filter, iterated filter and batch, with the bound."""
+    """Return a table of the rms errors at the last step of filter, iterated filter and batch, with the bound."""
     rows = []
     for name in ("CV", "CA"):
         data, order = drawn[name], ORDERS[name]
@@ -131,19 +131,19 @@ def table_efficiency(drawn: Mapping[str, KinematicDraw]) -> TextTable:
 
 
 def table_models(found: Mapping[str, Sequence[KinematicScore]]) -> TextTable:
-    """Return the mean errors of filters; `found` has the scores on CV, on CA and on the changing motion, by filter."""
+    """Return a table of mean errors; `found` has the scores on CV, CA and the changing motion, by filter."""
     header = ("filter", "CV", "CA", f"CV, CA from step {_HALFWAY}")
     return tabulate("models", header, [(name, *(km(each.mean) for each in scores)) for name, scores in found.items()])
 
 
 def table_choice(found: Mapping[str, Array]) -> TextTable:
-    """Return the shares of runs in which the likelihood prefers the right model, by motion and step."""
+    """Return a table of the shares of runs in which the likelihood prefers the right model, by motion and step."""
     rows = [(name, *(f"{100.0 * shares[step - 1]:.1f}" for step in _STEPS)) for name, shares in found.items()]
     return tabulate("choice", ("motion", *(f"step {step}" for step in _STEPS)), rows)
 
 
 def table_association(found: Mapping[str, Association]) -> TextTable:
-    """Return the errors and lost tracks of the rules of association, by motion."""
+    """Return a table of the errors and lost tracks of the rules of association, by motion."""
     rows = []
     for motion, test in found.items():
         for rule, score in test.scores.items():
@@ -165,7 +165,7 @@ def table_equations(
     matched: Mapping[str, KinematicScore],
     tests: Mapping[str, Association],
 ) -> TextTable:
-    """Return the effects of the printed equations and of their corrected form.
+    """Return a table of the effects of the printed equations and of their corrected form.
 
     `drawn` and `matched` are the draws and the errors of the matched filters, by motion. `tests` are the association
     tests.
@@ -216,7 +216,7 @@ _COLOURS = (Ink.BLUE, Ink.RED, Ink.GREEN, Ink.PINK)
 
 
 def figure_scene(drawn: KinematicDraw, position: Array, score: KinematicScore, bound: Array | None) -> Figure:
-    """Return one run in the plane, and the mean error of each target against the step.
+    """Return a figure of one run in the plane, and the mean error of each target against the step.
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ def figure_scene(drawn: KinematicDraw, position: Array, score: KinematicScore, b
 
 
 def figure_models(found: Mapping[str, Array], names: Sequence[str]) -> Figure:
-    """Return the mean probability of each model against the step, one panel for each motion.
+    """Return a figure of the mean probability of each model against the step, one panel for each motion.
 
     `found` has arrays (k, q) by motion, `names` are the q models.
     """
@@ -272,7 +272,7 @@ def figure_models(found: Mapping[str, Array], names: Sequence[str]) -> Figure:
 
 
 def figure_losses(found: Mapping[str, KinematicScore]) -> Figure:
-    """Return the share of lost tracks against the step; `found` is by rule."""
+    """Return a figure of the share of lost tracks against the step; `found` is by rule."""
     figure = canvas(7.0, 4.6)
     ax = figure.subplots()
     for i, (rule, score) in enumerate(found.items()):

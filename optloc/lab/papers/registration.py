@@ -283,7 +283,7 @@ class RegistrationSetting:
 def one_shot(scenario: RegistrationScenario = PRINTED, *, sigma: float | None = None, shape: Shape = "full") -> Array:
     """Return the paper's sigma0: the bound of each coordinate (3,) from the first epoch with known biases, metres.
 
-    The paper measures the width of starts in sigma0. `sigma` and `shape` are those of `problem`.
+    The paper measures the width of starts in sigma0. `sigma` and `shape` are as in `problem`.
     """
     fixed = replace(scenario, course=None)
     first_epoch = problem(fixed, 1, sigma=sigma, prior=1e-6, shape=shape)  # a micrometre: the biases are known
@@ -412,7 +412,7 @@ def mirror(scenario: RegistrationScenario) -> tuple[Array, Array]:
 def ghost(
     scenario: RegistrationScenario, epochs: int, *, sigma: float | None = None, station_sigma: float = 1.0
 ) -> GhostSolution | None:
-    """Return the second minimum of the cost for noise-free measurements of a scene; None if there is none.
+    """Return the second minimum of the cost for noise-free measurements of a scene, or None.
 
     Least squares starts at the mirror image of the target. The result is None if it ends at the truth.
 

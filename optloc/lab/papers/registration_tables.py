@@ -262,7 +262,7 @@ def _single_accuracy(score: RegistrationScore, first_bias: int, true_vector: Arr
 
 
 def table_errors(name: str, histories: Mapping[str, History], printed: Mapping[str, float]) -> TextTable:
-    """Return root mean square errors, bounds and lost trials against time: the numbers of a figure.
+    """Return a table of root mean square errors, bounds and lost trials against time: the numbers of a figure.
 
     `histories` is by environment; `printed` are errors at 600 s in the paper's text, by environment.
     """
@@ -331,7 +331,7 @@ _CURVE = 40  # points of the bound, enough for a smooth curve
 
 
 def against_time(histories: Mapping[str, History], printed: Mapping[str, float], zoom: int | None = None) -> Figure:
-    """Return root mean square position errors and the bound against time, one panel for each history.
+    """Return a figure of root mean square position errors and the bound against time, one panel for each history.
 
     Parameters
     ----------
@@ -376,7 +376,7 @@ def _panel(ax: Axes, history: History, printed: float, since: int) -> None:
 
 
 def table_readings() -> TextTable:
-    """Return the bounds of the fixed target under each reading of the noise, metres."""
+    """Return a table of the bounds of the fixed target under each reading of the noise, metres."""
     shapes: dict[Shape, str] = {"full": "I + 11'", "half": "(I + 11') / 2", "diag": "I"}
     printed = (f"{FIXED['1 m']:.0f}", f"{FIXED['5 m']:.0f}", f"{BOUND:.1f}")
     lines: list[tuple[str, ...]] = [("printed", "", "", *printed, ", ".join(f"{v:.0f}" for v in SIGMA0))]
@@ -391,13 +391,13 @@ def table_readings() -> TextTable:
 
 
 def _position_bound(epochs: int, sigma: float, station_sigma: float, shape: Shape) -> float:
-    """Return the bound of the position of the fixed target, metres; the parameters are those of `problem`."""
+    """Return the bound of the position of the fixed target, metres; parameters as in `problem`."""
     without_rows = problem(PRINTED, epochs, sigma=sigma, station_sigma=station_sigma, shape=shape)
     return rms(crlb(without_rows, truth(PRINTED, without_rows)))
 
 
 def table_minima() -> TextTable:
-    """Return the position and the cost of the second minimum of the printed scene with a fixed target, by seconds."""
+    """Return a table of the position and the cost of the second minimum of the printed scene, by seconds."""
     lines = []
     for epochs in (40, 100, 200, 300, 600, 700):
         found, noisy = ghost(PRINTED, epochs), ghost(PRINTED, epochs, sigma=40.0 * NANOSECOND)
@@ -420,7 +420,7 @@ def _chance(share: float) -> str:
 
 
 def table_gains() -> TextTable:
-    """Return the bound of the fixed target for gain ratios of growing accuracy."""
+    """Return a table of the bound of the fixed target for gain ratios of growing accuracy."""
     lines = []
     for sigma in (None, _GAIN, 0.1 * _GAIN, 0.01 * _GAIN, 0.001 * _GAIN):
         without_rows = problem(PRINTED, 600, gain_sigma=sigma)
@@ -431,7 +431,7 @@ def table_gains() -> TextTable:
 
 
 def table_scenes(cases: Mapping[str, TableCase]) -> TextTable:
-    """Return the results for the same target with the printed stations and with stations that span space."""
+    """Return a table of the results for the same target with the printed stations and with stations that span space."""
     lines = []
     for (name, case), scenario in zip(cases.items(), (PRINTED, SPATIAL), strict=True):
         flat, close = flatness(scenario, 700), separation(scenario, 700)

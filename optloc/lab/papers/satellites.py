@@ -369,7 +369,7 @@ def table_fixed(found: Mapping[str, SatelliteRun], bound: Array) -> TextTable:
 
 
 def table_relative(panels: Mapping[str, tuple[Mapping[str, SatelliteRun], Array]]) -> TextTable:
-    """Return the values of the paper's figure, in its unit: mean errors over 100 km, by start and filter.
+    """Return a table of the values of the paper's figure, in its unit: mean errors over 100 km, by start and filter.
 
     `panels` has the runs by filter, and the bound (steps,), by the title of the start.
     """
@@ -399,7 +399,7 @@ def table_starts(found: Mapping[float, tuple[Mapping[str, SatelliteRun], Array]]
 
 
 def table_pairs(found: Mapping[float, tuple[Mapping[str, SatelliteRun], Array]]) -> TextTable:
-    """Return the share of runs in which the modified covariance has a smaller final error than each other filter."""
+    """Return a table of the share of runs in which the MVEKF has a smaller final error than each other filter."""
     lines = []
     for width, (runs, _) in found.items():
         modified = runs["mvekf"].error[:, -1]
@@ -409,7 +409,7 @@ def table_pairs(found: Mapping[float, tuple[Mapping[str, SatelliteRun], Array]])
 
 
 def table_heights(found: Mapping[str, SatelliteRun]) -> TextTable:
-    """Return errors and claimed errors of the IEKF from fixes, by the knowledge of the height."""
+    """Return a table of errors and claimed errors of the IEKF from fixes, by the knowledge of the height."""
     steps = [step for step in _STEPS_HEIGHT if step <= len(next(iter(found.values())).rms)]
     lines = [
         (name, *(f"{metres(run.rms[s - 1])} ({metres(run.claimed[:, s - 1].mean())})" for s in steps))
@@ -419,7 +419,7 @@ def table_heights(found: Mapping[str, SatelliteRun]) -> TextTable:
 
 
 def table_moving(found: Mapping[str, tuple[SatelliteRun, Array]], still: Array) -> TextTable:
-    """Return errors and bounds with moving satellites, by heading.
+    """Return a table of errors and bounds with moving satellites, by heading.
 
     `still` (steps,) is the posterior bound with fixed satellites, metres.
     """
@@ -435,7 +435,7 @@ _AWAY = (0.0, 5.0, 10.0, 20.0, 25.0)
 
 
 def table_one_shot() -> TextTable:
-    """Return the bounds of a single fix, by known values, and by distance from the point below the satellites."""
+    """Return a table of the bounds of a single fix, by known values, and by distance from the point below."""
     cases = {
         "50 ns each, height 500 m": problem(1, order=0),
         "50 ns each, height known": problem(1, order=0, height=None),
@@ -464,7 +464,7 @@ _STYLE_HEIGHT = ((Ink.BLUE, 1.8), (Ink.GREEN, 1.8), (Ink.SKY, 1.8), (Ink.RED, 4.
 
 
 def figure_filters(panels: Mapping[str, tuple[Mapping[str, SatelliteRun], Array]]) -> Figure:
-    """Return root mean square errors and the posterior bound against steps, one panel for each start.
+    """Return a figure of root mean square errors and the posterior bound against steps, one panel for each start.
 
     `panels` has the filters and the bound (steps,) by title.
     """
@@ -487,7 +487,7 @@ def figure_filters(panels: Mapping[str, tuple[Mapping[str, SatelliteRun], Array]
 
 
 def figure_heights(found: Mapping[str, SatelliteRun]) -> Figure:
-    """Return errors, and the claimed errors (dotted), against steps, by the knowledge of the height."""
+    """Return a figure of errors, and the claimed errors (dotted), against steps, by the knowledge of the height."""
     figure = canvas(8.0, 5.2)
     ax = figure.subplots()
     for (colour, width), (name, run) in zip(_STYLE_HEIGHT, found.items(), strict=True):

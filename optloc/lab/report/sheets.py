@@ -83,7 +83,7 @@ def _sheet(name: str, title: str, note: str, frame: pd.DataFrame, columns: list[
 
 
 def _case(words: tuple[str, ...] = ("case", "noise", "method")) -> list[Column]:
-    """Return those of the columns case, noise level and method that `words` names."""
+    """Return the columns that `words` names: case, noise (level) and method."""
     columns: dict[str, Column] = {
         "case": ("case", lambda r: str(r.case)),
         "noise": ("noise", lambda r: noise_text(r.noise_label)),
@@ -93,7 +93,7 @@ def _case(words: tuple[str, ...] = ("case", "noise", "method")) -> list[Column]:
 
 
 def best_first(frame: pd.DataFrame, order: list[str]) -> Sheet:
-    """Return the ranking of the methods, best first."""
+    """Return a table of the ranking of the methods, best first."""
     table = ranking(frame, order, SHIFT)
     sums = frame.groupby("method", observed=True)[["answered", "right", "wrong", "false"]].sum()
     # Over all rows; the times are over the trials that every method ran.
@@ -123,7 +123,7 @@ def best_first(frame: pd.DataFrame, order: list[str]) -> Sheet:
 
 
 def success(cells: pd.DataFrame) -> Sheet:
-    """Return the shares of right answers of each method, cell by cell."""
+    """Return a table of the shares of right answers of each method, cell by cell."""
     names = "case noise noise_unit noise_label method trials answered right wrong died".split()
     table = cells[names].copy()
     table["right_low"], table["right_high"] = wilson(table["right"].to_numpy(), table["trials"].to_numpy())
@@ -139,7 +139,7 @@ def success(cells: pd.DataFrame) -> Sheet:
 
 
 def statuses(frame: pd.DataFrame) -> Sheet:
-    """Return the statuses of the answers of each method, with the trials in which a lower cost is known."""
+    """Return a table of the statuses of the answers of each method, with the trials in which a lower cost is known."""
     columns: list[Column] = [
         ("method", lambda r: str(r.method)),
         ("status", lambda r: str(r.status)),
@@ -155,7 +155,7 @@ def statuses(frame: pd.DataFrame) -> Sheet:
 
 
 def accuracy(cells: pd.DataFrame) -> Sheet:
-    """Return the errors of the answers relative to the bound, cell by cell."""
+    """Return a table of the errors of the answers relative to the bound, cell by cell."""
     names = "case noise noise_unit noise_label method rmse bound ratio ratio_half deviation_median deviation_p95 nees"
     columns = [
         *_case(),
@@ -175,7 +175,7 @@ def accuracy(cells: pd.DataFrame) -> Sheet:
 
 
 def timing(cells: pd.DataFrame) -> Sheet:
-    """Return the times of a fix, cell by cell."""
+    """Return a table of the times of a fix, cell by cell."""
     names = "case noise noise_unit noise_label method rows seconds_median seconds_p10 seconds_p90 build iterations"
     columns = [
         *_case(),
@@ -194,7 +194,7 @@ def timing(cells: pd.DataFrame) -> Sheet:
 
 
 def solved_within(profile: Profiles) -> Sheet:
-    """Return the shares of trials that each method solves within multiples of the least work of any method."""
+    """Return a table of the shares of trials that each method solves within multiples of the least work."""
     import pandas as pd
 
     rows = [
@@ -239,7 +239,7 @@ def _proven(kind: str, row: Any) -> str:
 
 
 def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
-    """Return the proofs of each method's answers, and the number of false ones."""
+    """Return a table of the proofs of each method's answers, and the number of false ones."""
     import pandas as pd
 
     lines = []
@@ -273,7 +273,7 @@ def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
 
 
 def made_with(frame: pd.DataFrame) -> Sheet:
-    """Return the machines and library versions that computed the rows."""
+    """Return a table of the machines and library versions that computed the rows."""
     names = ["machine", "versions"]
     table = frame.groupby(names, observed=True).size().rename("rows").reset_index()
     columns: list[Column] = [
@@ -289,8 +289,8 @@ def sheets(
 ) -> Iterator[Sheet]:
     """Yield all tables in reading order.
 
-    `frame` are all judged rows, `rivals` the rows of the ranked methods, `cells` the statistics of the cells, and
-    `order` the methods with the best first. `found` are the profiles; without them, their table is left out.
+    `frame` are all judged rows, and `rivals` the rows of the ranked methods. `cells` are the statistics of the cells,
+    and `order` are the methods with the best first. `found` are the profiles; with None, their table is left out.
     """
     yield best_first(rivals, [name for name in order if name in set(rivals["method"])])
     yield success(cells)

@@ -329,7 +329,7 @@ def by_nuclear_norm(network: Network, seed: int) -> NetworkResult:
 
 
 def only_networks(drawn: DrawnCase, start: Array) -> Fix:
-    """Raise InvalidProblem: this baseline has no fixes."""
+    """Raise InvalidProblem: the function `run` of baselines that solve networks only."""
     raise InvalidProblem("this baseline solves networks only", "baseline", "give [[network]] tables")
 
 

@@ -482,7 +482,7 @@ def trials_of(
 
 
 def _trials_of_study(folder: Path, names: Sequence[str], count: int, case: str | None, noise: str | None) -> Trials:
-    """Return trials and methods of a study for one case and noise level; the arguments are those of `trials_of`."""
+    """Return trials and methods of a study for one case and noise level; arguments as `trials_of`."""
     manifest = read_manifest(folder)
     design = design_of_manifest(manifest)
     if design is None:

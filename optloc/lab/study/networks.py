@@ -4,9 +4,9 @@ A network consists of stations with unknown positions and clocks. Each pulse arr
 one measurement. Networks are known up to a rigid motion and a reflection, so errors are measured after the best
 alignment.
 
-Letters in shapes: k trials, m stations, n pulses, d coordinates. The p unknowns of a covariance are the coordinates of
-all stations (m d, station by station), then their m clocks, unless the stations share one clock. Clock offsets and
-emission times are multiplied by the propagation speed, and are in metres.
+Letters in shapes: k trials, m stations, n pulses, d coordinates. A covariance has p unknowns. These are first the m d
+coordinates of all stations, station by station. If the stations do not share one clock, their m clock offsets follow.
+Clock offsets and emission times are multiplied by the propagation speed, and are in metres.
 """
 
 from __future__ import annotations

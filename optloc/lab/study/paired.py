@@ -115,7 +115,7 @@ def paired(frame: pd.DataFrame, against: str) -> list[Pair]:
 def _pair(both: pd.DataFrame, case: str, noise: str, method: str, against: str) -> Pair:
     """Return the comparison of two methods over the trials that both have run.
 
-    `both` has one row for each trial: the columns of `method`, and those of `against` with the suffix "_other".
+    `both` has one row for each trial: the columns of `method`, and the columns of `against` with the suffix "_other".
     """
     from scipy.stats import binomtest
 

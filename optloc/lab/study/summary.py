@@ -152,7 +152,7 @@ def cells(frame: pd.DataFrame) -> pd.DataFrame:
         - seconds_median, seconds_p10, seconds_p90: quantiles of the time of a fix;
         - build: longest time of a first fix, seconds; iterations: mean number.
 
-        Errors and bounds are those of `accuracy_rows`.
+        Errors and bounds are computed over the rows `accuracy_rows`.
     """
     import pandas as pd
 
@@ -241,7 +241,7 @@ def accuracy_rows(part: pd.DataFrame) -> Array:
 
 
 def _quantile(values: Array, share: float) -> float:
-    """Return the quantile `share` (0 to 1) of the finite values; NaN if there are none."""
+    """Return the quantile `share` (0 to 1) of the finite values; NaN without finite values."""
     good = values[np.isfinite(values)]
     return float(np.quantile(good, share)) if len(good) else float("nan")
 

@@ -244,8 +244,8 @@ Values = dict[str, Any]
 # Most characters of a reason: every row has one, and the message of a library may contain a matrix.
 _REASON_LENGTH = 200
 
-# Cases and methods of which this process has solved a trial. The first trial includes compilation and
-# canonicalisation, so its time is stored in the column `build`, and is not part of the times of other trials.
+# Cases and methods of which this process has solved a trial. The time of the first trial includes compilation and
+# canonicalisation. So it is stored in the column `build`, and is not part of the times of other trials.
 _solved_before: set[tuple[str, str]] = set()
 
 

@@ -42,9 +42,10 @@ _THREAD_VARIABLES = (
     "NUMEXPR_NUM",
     "NUMBA_NUM",
 )
-# Code that the new process runs. Its function `die_with(file, on)` switches on, or off, that the system kills the
-# worker's group when the parent closes its end of the pipe or writes to it. This is on while a chunk is computed. A
-# thread that waits for the end of the pipe works on every system, but not while machine code holds the interpreter.
+# Code that the new process runs. Its function `die_with(file, on)` switches a signal of the pipe `file` on or off.
+# While the signal is on, the system kills the worker's group if the parent closes its end of the pipe or writes to it.
+# It is on while a chunk is computed. A thread that waits for the end of the pipe works on every system. But it does not
+# run while machine code holds the interpreter.
 _BEGIN = """
 import contextlib, os, pickle, select, signal, sys
 def die_with(file, on):
