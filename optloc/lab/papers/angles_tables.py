@@ -110,7 +110,7 @@ class ErrorCurve:
     error: Array
 
     def total(self, first: int = 0, last: int | None = None) -> Array:
-        """Return the root mean square (3,) over first < t <= last seconds."""
+        """Return the root mean square errors (3,) over the times first < t <= last, seconds."""
         inside = (self.seconds > first) & (self.seconds <= (np.inf if last is None else last))
         return np.asarray(np.sqrt((self.error[inside] ** 2).mean(0)))
 
@@ -139,7 +139,7 @@ def bound_curve(label: str, scenario: AnglesScenario, start: State, dynamics: Dy
 
 
 def run_straight(drawn: AnglesDraw, tick: Tick) -> list[ErrorCurve]:
-    """Return simulation 1: the filter with the right and the printed transition, three limits, and bounds."""
+    """Return the errors of simulation 1: the right and the printed transition, three values of a_max, and bounds."""
     # The paper prints no a_max: these are 150, 10 and one and a half times the acceleration of the target.
     start, curves = start_at_truth(drawn, STRAIGHT_START, known=2), []
     for limit in (30.0, 2.0, 0.3):
@@ -153,7 +153,7 @@ def run_straight(drawn: AnglesDraw, tick: Tick) -> list[ErrorCurve]:
 
 
 def run_winding(drawn: AnglesDraw, tick: Tick) -> list[ErrorCurve]:
-    """Return simulation 2: started at rest, and by a fit of the first three epochs."""
+    """Return the errors of simulation 2: started at rest, and by a fit of the first three epochs, and a bound."""
     # The paper prints no a_max: 30 m/s² and this start reproduce the printed errors within 15 %.
     model = current_statistical(TIME_CONSTANT, 30.0)
     start = start_at_truth(drawn, WINDING_START, known=1)
@@ -314,7 +314,7 @@ def table_winding(curves: Sequence[ErrorCurve]) -> TextTable:
 
 
 def table_circles(found: Mapping[float, Sequence[ErrorCurve]], snapshot: ErrorCurve) -> TextTable:
-    """Return a table of the position errors of the repaired simulation 3."""
+    """Return a table of the position errors of the repaired simulation 3 by phase; `found` is by a_max."""
     lines = [(ABSENT, "bound of every second by itself", *_as_cells(snapshot.phases(REPAIRED)))]
     for limit, curves in found.items():
         lines += [(f"{limit:g}", c.label, *_as_cells(c.phases(REPAIRED))) for c in curves]
@@ -322,7 +322,7 @@ def table_circles(found: Mapping[float, Sequence[ErrorCurve]], snapshot: ErrorCu
 
 
 def table_readings(found: Sequence[TableReading]) -> TextTable:
-    """Return a table of the position errors of simulation 3 as printed."""
+    """Return a table of the position errors of simulation 3 as printed, by reading, a_max and phase."""
     lines = []
     for reading in found:
         pairs = [value for pair in zip(reading.error, reading.bound, strict=True) for value in pair]
@@ -332,7 +332,7 @@ def table_readings(found: Sequence[TableReading]) -> TextTable:
 
 
 def table_starts(found: Lost) -> TextTable:
-    """Return a table of the shares of lost tracks."""
+    """Return a table of the shares of lost tracks, by start, a_max and filter."""
     header = ("start", "a_max", "single step", "converged", "modified gain", "modified covariance")
     lines = [
         (f"{sigma:g} m" if sigma else "fit of 3 s", f"{limit:g}", *map(percent, shares.values()))
@@ -347,7 +347,7 @@ def table_clamps(found: Mapping[str, float]) -> TextTable:
 
 
 def table_wholes(found: Sequence[tuple[str, Array]], bound: Array) -> TextTable:
-    """Return a table of the errors at the end of simulation 1 of fits to the whole track."""
+    """Return a table of the errors at the end of simulation 1, by fit; `bound` (3,) is the Cramer-Rao bound."""
     lines = [("Cramér-Rao bound", *_as_cells(bound)), *((name, *_as_cells(error)) for name, error in found)]
     return tabulate("whole-track", ("", *_PARTS), lines)
 
@@ -392,7 +392,7 @@ def three_parts(curves: Mapping[Style, ErrorCurve], values: Sequence[float]) -> 
 
 
 def figure_straight(curves: Sequence[ErrorCurve]) -> Figure:
-    """Return figures 1 to 3: simulation 1."""
+    """Return a figure with figures 1 to 3 of the paper: the errors of simulation 1 against time."""
     by_label = {c.label: c for c in curves}
     return three_parts(
         {
@@ -407,13 +407,13 @@ def figure_straight(curves: Sequence[ErrorCurve]) -> Figure:
 
 
 def figure_winding(curves: Sequence[ErrorCurve]) -> Figure:
-    """Return figures 4 to 6: simulation 2."""
+    """Return a figure with figures 4 to 6 of the paper: the errors of simulation 2 against time."""
     styles = ((Ink.RED, "-"), (Ink.BLUE, "-"), (Ink.BLACK, "--"))
     return three_parts({(c.label, *style): c for c, style in zip(curves, styles, strict=True)}, PRINTED_WINDING)
 
 
 def figure_circles(found: Mapping[float, Sequence[ErrorCurve]], snapshot: ErrorCurve) -> Figure:
-    """Return figure 7: position errors of the repaired simulation 3, one panel for each limit."""
+    """Return figure 7: position errors of the repaired simulation 3, one panel for each a_max; `found` is by a_max."""
     figure = canvas(13.0, 4.6)
     axes = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
     for ax, (limit, curves) in zip(axes, found.items(), strict=True):

@@ -153,7 +153,7 @@ def of_track(track: Track, epochs: int, *, slow: bool) -> Errors:
 
 
 def kalman(drawn: Problem, update: str) -> Track:
-    """Return the track of a Cartesian Kalman filter with constant velocity, started from the first epoch."""
+    """Return the track of a Cartesian Kalman filter with constant velocity; it starts at the fix of the first epoch."""
     dynamics = polynomial(1)
     start = state_of(drawn, first_fix(drawn, dynamics, 1, speed=SPEED), 1)
     return followed(drawn, start, dynamics, update)

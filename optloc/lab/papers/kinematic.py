@@ -221,7 +221,7 @@ class KinematicScore:
 
     @property
     def level(self) -> float:
-        """Return the mean NEES at the last step."""
+        """Return the mean NEES at the last step; its expectation is 2 if the covariances are right."""
         return float(self.nees[..., -1].mean())
 
     @property

@@ -137,7 +137,7 @@ def table_models(found: Mapping[str, Sequence[KinematicScore]]) -> TextTable:
 
 
 def table_choice(found: Mapping[str, Array]) -> TextTable:
-    """Return a table of the shares of runs in which the likelihood prefers the right model, by motion and step."""
+    """Return a table of the shares of runs that choose the right model, by motion and step; `found` has arrays (k,)."""
     rows = [(name, *(f"{100.0 * shares[step - 1]:.1f}" for step in _STEPS)) for name, shares in found.items()]
     return tabulate("choice", ("motion", *(f"step {step}" for step in _STEPS)), rows)
 

@@ -113,7 +113,7 @@ class Study(Generic[S]):
 
 
 def tabulate(name: str, header: Iterable[str], rows: Iterable[tuple[str, ...]]) -> TextTable:
-    """Return a table; the page of its paper contains its title and note."""
+    """Return a table without title and note; `typeset` takes them from the page of the paper."""
     return TextTable(name, "", tuple(header), tuple(rows))
 
 

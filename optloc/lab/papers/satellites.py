@@ -180,7 +180,7 @@ class SatelliteRun:
 
     @property
     def relative(self) -> Array:
-        """Return the mean error (steps,) over the distance by which the paper divides."""
+        """Return the mean errors (steps,), divided by 100 km as in the paper."""
         return np.asarray(self.error.mean(0) / _DISTANCE)
 
 

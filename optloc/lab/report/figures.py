@@ -232,7 +232,7 @@ def profile_picture(result: Profiles, looks: Looks) -> Figure:
 
 
 def _data_profile(axes: Axes, result: Profiles, looks: Looks) -> None:
-    """Draw the share of trials that each method solves within budgets of work."""
+    """Draw the share of trials that each method solves against the work that it may use on each trial."""
     work = result.spent[result.solved]
     budgets = np.geomspace(work.min() / 1.5, 1.5 * work.max(), _CURVE_POINTS)
     _curves(axes, result, looks, budgets, result.data(budgets))
@@ -240,7 +240,7 @@ def _data_profile(axes: Axes, result: Profiles, looks: Looks) -> None:
 
 
 def _performance_profile(axes: Axes, result: Profiles, looks: Looks) -> None:
-    """Draw the share of trials that each method solves within multiples of the least work."""
+    """Draw the share of trials that each method solves against the work as a multiple of the least work."""
     work = np.where(result.solved, result.spent, np.inf)
     with np.errstate(invalid="ignore"):
         slower = np.where(result.solved, work / work.min(0), 1.0)
@@ -267,7 +267,7 @@ _WIDTHS = (3.5, 1.2)
 
 
 def history_picture(result: Histories, looks: Looks) -> Figure:
-    """Return the descent of the cost against evaluations and against iterations: medians over trials, and quartiles."""
+    """Return a figure of the cost against evaluations and against iterations: medians over trials, and quartiles."""
     trials = result.frame["trial"].nunique()
     figure, panel_axes = panels(f"{result.title}: {trials} trial{'s' * (trials > 1)}", len(COUNTS))
     for axes, (by, label) in zip(panel_axes, COUNTS.items(), strict=True):

@@ -220,7 +220,7 @@ def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None
 
 
 def _study_content(folder: Path) -> _StudyContent:
-    """Return the content of the report from the output folder of a study."""
+    """Return the content of the report from the output folder; raise InvalidProblem without a finished part."""
     manifest = read_manifest(folder)
     rows = read_frame(folder, [*summary.COLUMNS])
     if not len(rows):

@@ -144,7 +144,7 @@ _LISTENER: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 @contextmanager
 def listening(by: Listener) -> Iterator[None]:
-    """Call a listener at each evaluation of a cost by an external method inside this context."""
+    """Register a listener that external methods call at each evaluation of a cost inside this context."""
     token = _LISTENER.set(by)
     try:
         yield
@@ -153,7 +153,7 @@ def listening(by: Listener) -> Iterator[None]:
 
 
 def teller(trial: int) -> Callable[[float], None]:
-    """Return a function that passes the costs of a trial to the current listener."""
+    """Return a function that passes each cost of a trial to the registered listener; without one, it does nothing."""
     listener = _LISTENER.get()
     return (lambda _: None) if listener is None else lambda cost: listener(trial, cost)
 

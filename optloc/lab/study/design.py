@@ -140,7 +140,7 @@ class StudyDesign:
 
     @property
     def chunks(self) -> Iterator[Chunk]:
-        """Yield the chunks: the first of every cell, then the second of every cell, and so on."""
+        """Yield the chunks in the order of computation: the first of every cell, then the second of every cell, etc."""
         by_cell = [
             [Chunk(cell, first, min(n, cell.case.trials - first)) for first in range(0, cell.case.trials, n)]
             for cell, n in ((cell, cell.stretch) for cell in self.cells)

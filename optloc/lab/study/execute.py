@@ -64,7 +64,7 @@ class Executor:
 
 
 def executor(name: str, jobs: int | None = None, address: str | None = None, limit: float = TASK_LIMIT) -> Executor:
-    """Return an executor; raise InvalidProblem for an unknown name, a useless address or an invalid limit."""
+    """Return an executor; raise InvalidProblem for an unknown name, an address that it cannot use, or a wrong limit."""
     if name not in EXECUTORS:
         raise InvalidProblem(f"unknown executor {name!r}", "--executor", nearest(name, list(EXECUTORS)))
     if address is not None and not EXECUTORS[name].scheduler:

@@ -509,7 +509,7 @@ def _trials_of_study(folder: Path, names: Sequence[str], count: int, case: str |
 
 
 def _chosen(wanted: str | None, known: Mapping[str, object], what: str) -> str:
-    """Return the wanted name `word`, or the first known name if it is None; raise InvalidProblem if it is unknown.
+    """Return the name `wanted`, or the first known name if it is None; raise InvalidProblem if it is unknown.
 
     `what` is the option of the command that selects the name.
     """

@@ -258,7 +258,7 @@ def _add(counts: Array, trial: int) -> None:
 
 
 def require_program(method: StudyMethod, call: MethodRun) -> None:
-    """Raise InvalidProblem if the requested solver has solved no program in the call `found`."""
+    """Raise InvalidProblem if the requested solver has solved no program in the call."""
     # Otherwise the study would report results of another solver under its name.
     if not call.used:
         what = f"{method.method or method.baseline} has no program that {method.solver} solves"

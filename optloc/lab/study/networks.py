@@ -80,7 +80,7 @@ class NetworkCase:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Return the columns of the table that all trials share."""
+        """Return the columns of the table that all trials share, by name."""
         table = self.table
         rows = table.stations * table.pulses
         sizes = {"dimension": table.dimension, "stations": table.stations, "rows": rows, "epochs": table.pulses}

@@ -59,7 +59,7 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
         The rows with five more columns:
 
         - `above`: cost less the lowest known cost, of all methods and of the truth;
-        - `right`: answered, and no better point is known;
+        - `right`: answered, with a cost, and no better point is known;
         - `wrong`: status ok, but a better point is known, or the row has no cost;
         - `false`: a global proof, but a better point is known, or the row has no cost;
         - `case`: scenario and swept values as text.

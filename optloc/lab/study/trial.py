@@ -547,7 +547,7 @@ def _biases_in_metres(problem: Problem) -> Array:
 
 
 def _root_trace(matrix: Array) -> Array:
-    """Return the roots of the traces (n,) of matrices (n, q, q): the standard deviation of a vector's length."""
+    """Return the roots of the traces (n,) of covariances (n, q, q): the rms length of errors."""
     with np.errstate(invalid="ignore"):
         return np.asarray(np.sqrt(np.trace(matrix, axis1=-2, axis2=-1)))
 
