@@ -292,7 +292,7 @@ def _local_workers() -> WorkerPool:
     return WorkerPool(workers())
 
 
-def compute_beside_worker(names: Sequence[str], chunk: Chunk, seconds: float) -> TrialPart | Lost:
+def compute_next_to_worker(names: Sequence[str], chunk: Chunk, seconds: float) -> TrialPart | Lost:
     """Return the part of a chunk, or its failure, from a process next to a cluster's worker.
 
     A worker of a cluster has no limits of time and memory for a chunk; this process has them. `names` are the plugins
@@ -334,7 +334,7 @@ def _dask(by: Executor) -> Iterator[Begun]:
             raise InvalidProblem("the scheduler has no workers", by.address or "dask", advice)
         yield Begun(
             {"backend": "dask", "client": client, "n_jobs": -1},
-            partial(compute_beside_worker, plugins()),
+            partial(compute_next_to_worker, plugins()),
             (KilledWorker,),
         )
 
@@ -376,7 +376,7 @@ def _ray(by: Executor) -> Iterator[Begun]:
         jobs = int(ray.cluster_resources().get("CPU", 1))
         deaths = (ray.exceptions.RayActorError, ray.exceptions.WorkerCrashedError)
         yield Begun(
-            {"backend": "ray", "n_jobs": jobs}, partial(compute_beside_worker, plugins()), deaths, streams=False
+            {"backend": "ray", "n_jobs": jobs}, partial(compute_next_to_worker, plugins()), deaths, streams=False
         )
     finally:
         ray.shutdown()

@@ -25,9 +25,9 @@ from optloc.problem import Amount, Array, Bias, Frame, InvalidProblem, Problem, 
 Rng = np.random.Generator
 
 # Most numbers and most trials of a block. Both decide the seed of a trial: with other values the data differ, and
-# earlier studies could not continue. A block is large enough that NumPy draws it in one step. Its numbers (at most
-# 200 kB) are so few that a chunk with a small part of a block draws few unused numbers. 500 trials are also the least
-# of a chunk of a fast method.
+# earlier studies could not continue. A block is large enough that NumPy draws it in one step. It is small (25 000
+# numbers, 200 kB), so a chunk that needs a small part of a block draws few unused numbers. 500 trials are also the
+# least of a chunk of a fast method.
 _NUMBERS, _MOST = 25_000, 500
 
 

@@ -26,9 +26,9 @@ from optloc.lab.study.design import Chunk
 from optloc.lab.study.trial import DIED, LATE, Lost, TrialPart, compute
 from optloc.problem import InvalidProblem, load_plugin, plugins
 
-# Seconds. The start of a worker takes half a second if a processor is free. An idle worker ends after a minute, because
-# a cluster does not signal the end of a study. After the end of a pipe, the process needs a moment to end, and only
-# then has an exit code.
+# Time limits, seconds. For the start of a worker: it takes half a second if a processor is free. Until an idle worker
+# ends: a cluster does not signal the end of a study. From the end of the pipe to the end of the process: only then is
+# there an exit code.
 _START, _IDLE, _END_WAIT = 120.0, 60.0, 0.2
 # Variables that limit the threads of libraries. Workers times threads would exceed the processors, and each thread of
 # BLAS reserves memory.
