@@ -358,7 +358,7 @@ def _template(table: ScenarioTable, folder: Path, where: str, seed: int) -> Prob
 
 
 def _problem_of_layout(table: ScenarioTable, where: str, seed: int) -> Problem:
-    """Return the problem of a layout: stations and rows, where every standard deviation is 1.
+    """Return the problem of a layout: stations and rows, where each row or arrival has the standard deviation 1.
 
     The levels of the study scale the noise later. Only random stations still have to be drawn for each trial. `seed` is
     the seed of the study.

@@ -78,7 +78,7 @@ class StudyMethod:
 
     @property
     def identity(self) -> str:
-        """Return the settings that decide the answers, as one JSON text; equal texts mean equal answers."""
+        """Return the settings that decide the answers, as one JSON text, the same for equal methods."""
         # Without the chunk: it divides the work, and is part of the fingerprint of the design.
         settings = json.dumps(self.settings, sort_keys=True)
         parts = (self.name, self.method, self.baseline, self.solver, settings, self.start, self.width, self.batch)
