@@ -41,7 +41,7 @@ def _run(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
     if size not in get_args(Size):
         raise InvalidProblem(f"there is no size {size!r}", "--size", nearest(size, get_args(Size)))
     folder = Path(f"optloc-{name}") if out is None else out
-    # Before the work, so that a folder that cannot be written to is reported at once.
+    # The folder is created before the work, so that a folder that is not writable is reported at once.
     make_folder(folder)
     claim(folder / "README.md")
     ready = reproduction(name, cast(Size, size), seed)

@@ -31,7 +31,7 @@ from optloc.cli import (
 from optloc.files import claim
 from optloc.problem import InvalidProblem
 
-# Heavy libraries are imported inside the commands, so that --help answers at once.
+# Heavy libraries are imported inside the commands, so that --help replies at once.
 
 # Least difference of two shares of answers that is reported, in standard deviations. By chance 3 in 1000 exceed it.
 _DIFFERS = 3.0
@@ -359,44 +359,49 @@ def schema(verbose: Verbose = False) -> None:
 
 
 def _print_json(value: Any) -> None:
+    """Print a value as JSON on standard output."""
     from optloc.cli import dumps
 
     typer.echo(dumps(value))
 
 
 def _say(line: str) -> None:
+    """Print a line for people."""
     from optloc.cli import say
 
     say(Screen(), line)
 
 
-def _record(found: Any) -> dict[str, Any]:
-    """Return the progress of a study as a dictionary for JSON."""
-    m = found.manifest
+def _record(state: Any) -> dict[str, Any]:
+    """Return the progress of a study (`Progress`) as a dictionary for JSON."""
+    manifest = state.manifest
     return {
-        "name": m.name,
-        "title": m.title,
-        "seed": m.seed,
-        "version": m.version,
-        "created": m.created,
-        "machine": m.machine,
-        "versions": m.versions,
-        "complete": found.complete,
-        "chunks": found.done,
-        "chunks_planned": found.chunks,
-        "rows": found.rows,
-        "rows_planned": m.rows,
-        "statuses": found.counts,
+        "name": manifest.name,
+        "title": manifest.title,
+        "seed": manifest.seed,
+        "version": manifest.version,
+        "created": manifest.created,
+        "machine": manifest.machine,
+        "versions": manifest.versions,
+        "complete": state.complete,
+        "chunks": state.done,
+        "chunks_planned": state.chunks,
+        "rows": state.rows,
+        "rows_planned": manifest.rows,
+        "statuses": state.counts,
         "methods": [
-            {"method": k, "status": s, "rows": n, "reason": found.failures.get((k, s), "")}
-            for (k, s), n in found.methods.items()
+            {"method": method, "status": status, "rows": count, "reason": state.failures.get((method, status), "")}
+            for (method, status), count in state.methods.items()
         ],
     }
 
 
 @contextmanager
 def _bar(title: str, total: int, quiet: bool) -> Iterator[Any]:
-    """Yield a function that advances a progress bar and updates its counts of statuses; only terminals show the bar."""
+    """Yield a function that advances a progress bar by rows, and updates its counts of statuses.
+
+    `total` is the number of all rows. Only terminals show the bar.
+    """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Screen(stderr=True)
@@ -414,87 +419,94 @@ def _bar(title: str, total: int, quiet: bool) -> Iterator[Any]:
 
 
 def _in_words(counts: Counter[str], most: int = 3) -> str:
-    """Return the most frequent statuses with their counts as text; the others are summed up."""
+    """Return the most frequent statuses with their counts as text; the counts of the others are added."""
     first = [f"{status} {count}" for status, count in counts.most_common(most)]
     rest = counts.total() - sum(count for _, count in counts.most_common(most))
     return ", ".join([*first, *([f"other {rest}"] if rest else [])])
 
 
-def _show(found: Any, console: Console) -> None:
+def _show(progress: Any, console: Console) -> None:
     """Print the progress of a study: a table of statuses by method, and the reasons of failures."""
-    m = found.manifest
-    state = "complete" if found.complete else f"{found.done} of {found.chunks} chunks"
-    line = f"{m.title or m.name}: {state}, {found.rows} of {m.rows} rows"
+    manifest = progress.manifest
+    state = "complete" if progress.complete else f"{progress.done} of {progress.chunks} chunks"
+    line = f"{manifest.title or manifest.name}: {state}, {progress.rows} of {manifest.rows} rows"
     console.print(line, style="bold", highlight=False, markup=False, soft_wrap=True)
     table = Table("method")
-    statuses = [status for status, _ in Counter(found.counts).most_common()]
+    statuses = [status for status, _ in Counter(progress.counts).most_common()]
     for name in statuses:
         table.add_column(name, justify="right")
-    for method in dict.fromkeys(method for method, _ in found.methods):
-        table.add_row(method, *(str(found.methods.get((method, name), 0)) for name in statuses))
+    for method in dict.fromkeys(method for method, _ in progress.methods):
+        table.add_row(method, *(str(progress.methods.get((method, name), 0)) for name in statuses))
     console.print(table)
-    for (method, name), reason in found.failures.items():
-        line = f"{method}: {name} in {found.methods[method, name]} trials, for example: {reason}"
+    for (method, name), reason in progress.failures.items():
+        line = f"{method}: {name} in {progress.methods[method, name]} trials, for example: {reason}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def _show_comparison(found: list[Any], one: Path, two: Path, console: Console) -> None:
-    """Print a table for each case and noise level with both studies."""
+def _show_comparison(differences: list[Any], one: Path, two: Path, console: Console) -> None:
+    """Print a table for each case and noise level with both studies; `differences` are from `summary.compared`."""
     console.print(f"A = {one}, B = {two}", highlight=False, markup=False, soft_wrap=True)
-    for case, same in groupby(found, lambda difference: difference.cell[:3]):
+    for case, group in groupby(differences, lambda difference: difference.cell[:3]):
         scenario, sweep, noise = case
         title = " ".join([scenario, *([] if sweep == "{}" else [sweep]), noise])
         console.print(title, style="bold", highlight=False, markup=False, soft_wrap=True)
         table = Table("method")
         for name in ("answers A", "B, %", "z", "RMSE A", "B, m", "time B/A", "values"):
             table.add_column(name, justify="right", no_wrap=True)
-        for d in same:
-            values = "identical" if d.identical else "same data" if d.same_data else "other data"
-            times = d.two.seconds / d.one.seconds if d.one.seconds else nan
-            numbers = (100 * d.one.answered, 100 * d.two.answered, d.z, d.one.rmse, d.two.rmse, times)
-            table.add_row(d.cell[3], *("-" if isnan(n) else f"{n:.4g}" for n in numbers), values)
+        for difference in group:
+            values = "identical" if difference.identical else "same data" if difference.same_data else "other data"
+            times = difference.two.seconds / difference.one.seconds if difference.one.seconds else nan
+            numbers = (
+                100 * difference.one.answered,
+                100 * difference.two.answered,
+                difference.z,
+                difference.one.rmse,
+                difference.two.rmse,
+                times,
+            )
+            table.add_row(difference.cell[3], *("-" if isnan(n) else f"{n:.4g}" for n in numbers), values)
         console.print(table)
 
 
-def _show_pairs(found: list[Any], console: Console) -> None:
+def _show_pairs(pairs: list[Any], console: Console) -> None:
     """Print a table for each case and noise level with the paired comparisons of methods."""
-    for (case, noise), same in groupby(found, lambda one: (one.case, one.noise)):
-        rows = list(same)
+    for (case, noise), group in groupby(pairs, lambda pair: (pair.case, pair.noise)):
+        rows = list(group)
         title = f"{case}, {noise}: against {rows[0].against}"
         console.print(title, style="bold", highlight=False, markup=False, soft_wrap=True)
         table = Table("method")
         for name in ("trials", "only it right", "only other right", "p", "error difference, m", "time ratio"):
             table.add_column(name, justify="right")
-        for one in rows:
-            cells = (f"{m.value:.2g} [{m.low:.2g}, {m.high:.2g}]" for m in (one.error, one.time))
-            counts = (str(n) for n in (one.trials, one.alone, one.other_alone))
-            table.add_row(one.method, *counts, f"{one.p:.2g}", *cells)
+        for pair in rows:
+            cells = (f"{median.value:.2g} [{median.low:.2g}, {median.high:.2g}]" for median in (pair.error, pair.time))
+            counts = (str(n) for n in (pair.trials, pair.alone, pair.other_alone))
+            table.add_row(pair.method, *counts, f"{pair.p:.2g}", *cells)
         console.print(table)
 
 
-def _profile_record(found: Any) -> dict[str, Any]:
-    """Return data and performance profiles as a dictionary for JSON."""
+def _profile_record(profile: Any) -> dict[str, Any]:
+    """Return data and performance profiles (`Profiles`) as a dictionary for JSON."""
     from dataclasses import asdict
 
     from optloc.lab.study.profiles import RATIOS, shares
 
-    budgets = found.budgets
+    budgets = profile.budgets
     return {
-        "tau": found.tau,
-        "work": found.work,
-        "trials": found.spent.shape[1],
-        "trials_of_the_study": found.total,
-        "not_told": list(found.silent),
+        "tau": profile.tau,
+        "work": profile.work,
+        "trials": profile.spent.shape[1],
+        "trials_of_the_study": profile.total,
+        "not_told": list(profile.silent),
         "ratios": list(RATIOS),
         "budgets": budgets,
         "methods": [
-            asdict(one) | {"within": list(one.within.values()), "data_profile": curve}
-            for one, curve in zip(shares(found), found.data(budgets), strict=True)
+            asdict(share) | {"within": list(share.within.values()), "data_profile": curve}
+            for share, curve in zip(shares(profile), profile.data(budgets), strict=True)
         ],
     }
 
 
-def _show_profiles(found: Any, console: Console) -> None:
+def _show_profiles(profile: Any, console: Console) -> None:
     """Print the shares of trials that each method solves within multiples of the least work."""
     from optloc.lab.report.sheets import duration, number, percent, solved_within
     from optloc.lab.study.profiles import RATIOS, shares
@@ -502,30 +514,32 @@ def _show_profiles(found: Any, console: Console) -> None:
     table = Table("method")
     for name in ("trials", "solved, %", *(f"{ratio:g}×" for ratio in RATIOS), "median"):
         table.add_column(name, justify="right")
-    shown = duration if found.work == "processor" else number
-    for one in shares(found):
-        within = (percent(one.within[ratio]) for ratio in RATIOS)
-        table.add_row(one.method, str(one.trials), percent(one.solved / one.trials), *within, shown(one.median))
+    shown = duration if profile.work == "processor" else number
+    for share in shares(profile):
+        within = (percent(share.within[ratio]) for ratio in RATIOS)
+        table.add_row(
+            share.method, str(share.trials), percent(share.solved / share.trials), *within, shown(share.median)
+        )
     console.print(table)
-    console.print(solved_within(found).shown.note, highlight=False, markup=False, soft_wrap=True)
+    console.print(solved_within(profile).shown.note, highlight=False, markup=False, soft_wrap=True)
 
 
-def _show_histories(found: Any, reached: list[Any], tau: float, console: Console) -> None:
+def _show_histories(result: Any, reached: list[Any], tau: float, console: Console) -> None:
     """Print for each method how many trials reach the minimum, and the quartiles of the work."""
-    console.print(found.title, style="bold", highlight=False, markup=False, soft_wrap=True)
+    console.print(result.title, style="bold", highlight=False, markup=False, soft_wrap=True)
     table = Table("method")
     for name in ("trials", f"within {tau:g}", "evaluations", "iterations"):
         table.add_column(name, justify="right")
-    for one in reached:
-        counts = (_quartiles(one.evaluations), _quartiles(one.iterations))
-        table.add_row(one.method, str(one.trials), str(one.reached), *counts)
+    for reach in reached:
+        counts = (_quartiles(reach.evaluations), _quartiles(reach.iterations))
+        table.add_row(reach.method, str(reach.trials), str(reach.reached), *counts)
     console.print(table)
-    for remark in found.remarks:
+    for remark in result.remarks:
         console.print(f"{remark}.", highlight=False, markup=False, soft_wrap=True)
 
 
 def _quartiles(values: tuple[float, ...] | None) -> str:
-    """Return the median with the quartiles in brackets; a dash if the method does not count."""
+    """Return three quartiles as text: the median, and the other two in brackets; a dash for None."""
     if values is None:
         return "-"
     low, middle, high = ("∞" if isinf(value) else f"{value:g}" for value in values)

@@ -1,7 +1,8 @@
 """Messages of airliners, each received by five of 27 receivers: arrival times and a height, in ECEF.
 
 Each message is an epoch with a free position and an unknown emission time. Arrival times are counted from the first
-arrival of the message, so that metres keep their digits. The height is from the GNSS of the aircraft.
+arrival of the message, so that metres keep their digits. They are multiplied by the speed of light. The height is from
+the GNSS of the aircraft.
 
 Noise: arrivals 30 m, the robust residual spread that comes with the set. Timing is 10 m of it; the rest are station
 biases, refraction and errors of the truth. Heights have 30 m (their quantum is 25 ft). Propagation is as in vacuum, or
@@ -36,8 +37,8 @@ class Messages:
 
     def horizontal(self, position: Array, messages: Array) -> Array:
         """Return the horizontal errors (n,) of positions (n, 3) of the messages with these indices (n,), metres."""
-        there = self.truth[messages]
-        local = np.einsum("kij,kj->ki", ECEF.enu_axes(there), position - there)
+        truth = self.truth[messages]
+        local = np.einsum("kij,kj->ki", ECEF.enu_axes(truth), position - truth)
         return np.asarray(np.linalg.norm(local[:, :2], axis=1))
 
 
@@ -45,8 +46,9 @@ class Messages:
 class Heard:
     """Messages as a batch: each message has its own stations, so every array has the message as its first axis.
 
-    `stations` (n, s, 3) are ECEF metres, `arrival` (n, s) metres, `excess` (n, s) the known excess of each path in
-    metres. `geodetic` (n, 3) is the true latitude, longitude (radians) and height (metres) of each aircraft.
+    `stations` (n, s, 3) are ECEF metres. `arrival` (n, s) are arrival times and `excess` (n, s) the known excess of
+    each path, in metres. `geodetic` (n, 3) is the true latitude, longitude (radians) and height (metres) of each
+    aircraft.
     """
 
     stations: Array
@@ -65,8 +67,8 @@ class Heard:
         `given` selects the use of the height: "exactly" (a constraint), "row" (a measurement) or "nothing".
         """
         choose(given, ("exactly", "row", "nothing"), "given")
-        each = np.arange(self.arrival.shape[1])
-        rows = [measured("toa", self.arrival, a=each, sigma=ARRIVAL, correction=self.excess)]
+        stations = np.arange(self.arrival.shape[1])
+        rows = [measured("toa", self.arrival, a=stations, sigma=ARRIVAL, correction=self.excess)]
         if given == "row":
             rows.append(measured("height", self.geodetic[:, 2:], sigma=HEIGHT))
         known = [height(exactly=self.geodetic[:, 2])] if given == "exactly" else []
@@ -81,12 +83,12 @@ class Heard:
 
     def unbiased(self) -> Heard:
         """Return the messages with the median residual of each station at the truth as a further known correction."""
-        off = self.arrival - self.excess - np.linalg.norm(self.truth[:, None] - self.stations, axis=-1)
+        residual = self.arrival - self.excess - np.linalg.norm(self.truth[:, None] - self.stations, axis=-1)
         # The median of the five residuals of a message estimates its emission time.
-        off = off - np.median(off, axis=1, keepdims=True)
+        residual = residual - np.median(residual, axis=1, keepdims=True)
         _, station = np.unique(self.stations.reshape(-1, 3), axis=0, return_inverse=True)
-        station = station.reshape(off.shape)
-        bias = np.array([np.median(off[station == s]) for s in range(station.max() + 1)])
+        station = station.reshape(residual.shape)
+        bias = np.array([np.median(residual[station == s]) for s in range(station.max() + 1)])
         return replace(self, excess=self.excess + bias[station])
 
     def take(self, index: Array) -> Heard:
@@ -101,7 +103,7 @@ def dataset(folder: Path, *, refraction: bool = False) -> tuple[Problem, Array]:
 
 
 def load(folder: Path, *, refraction: bool = False) -> Messages:
-    """Return all messages as one problem."""
+    """Return all messages as one problem; with `refraction`, the arrivals are corrected for the air."""
     import pandas as pd
 
     stations, rows, truth = (table(folder, name) for name in ("stations", "measurements", "truth"))
@@ -110,23 +112,26 @@ def load(folder: Path, *, refraction: bool = False) -> Messages:
     # Count from the first arrival: seconds of the day times c would leave few digits for metres.
     first = rows.groupby(["set", "msg"])["toa_s"].transform("min")
     z = SPEED_OF_LIGHT * (rows["toa_s"] - first).to_numpy()
-    place, there = places(stations), places(truth)
+    position, true_position = places(stations), places(truth)
     a, excess = pd.Index(stations["station"]).get_indexer(rows["station"]), np.zeros(len(rows))
     if refraction:
-        distance = np.linalg.norm(there[epoch] - place[a], axis=-1)
+        distance = np.linalg.norm(true_position[epoch] - position[a], axis=-1)
         excess = _refraction(stations["h_m"].to_numpy()[a], truth["h_geo_m"].to_numpy()[epoch], distance)
     problem = assemble(
-        station_array(place, stations["station"].astype(str).tolist()),
+        station_array(position, stations["station"].astype(str).tolist()),
         measured("toa", z, a=a, sigma=ARRIVAL, epoch=epoch, correction=excess),
         measured("height", truth["h_geo_m"].to_numpy(), sigma=HEIGHT, epoch=np.arange(len(truth))),
         motions=(Motion(span="epoch"),),
         frame=ECEF,
     )
-    return Messages(problem, there)
+    return Messages(problem, true_position)
 
 
 def heard(folder: Path, *, refraction: bool = False) -> Heard:
-    """Return all messages as a batch, each with the five stations that received it."""
+    """Return all messages as a batch, each with the five stations that received it.
+
+    With `refraction`, the arrivals are corrected for the air.
+    """
     import pandas as pd
 
     stations, rows, truth = (table(folder, name) for name in ("stations", "measurements", "truth"))
@@ -137,18 +142,21 @@ def heard(folder: Path, *, refraction: bool = False) -> Heard:
     rows = rows.iloc[np.argsort(message, kind="stable")]
     toa = rows["toa_s"].to_numpy().reshape(len(truth), -1)
     receivers = stations.loc[rows["station"]]
-    place = places(receivers).reshape(*toa.shape, 3)
+    position = places(receivers).reshape(*toa.shape, 3)
     geodetic = np.column_stack([np.deg2rad(truth[["lat_deg", "lon_deg"]]), truth["h_geo_m"]])
     arrival = SPEED_OF_LIGHT * (toa - toa.min(-1, keepdims=True))
-    made = Heard(place, arrival, np.zeros_like(arrival), geodetic)
+    batch = Heard(position, arrival, np.zeros_like(arrival), geodetic)
     if not refraction:
-        return made
-    distance = np.linalg.norm(made.truth[:, None] - place, axis=-1)
-    return replace(made, excess=_refraction(receivers["h_m"].to_numpy().reshape(toa.shape), geodetic[:, 2:], distance))
+        return batch
+    distance = np.linalg.norm(batch.truth[:, None] - position, axis=-1)
+    return replace(batch, excess=_refraction(receivers["h_m"].to_numpy().reshape(toa.shape), geodetic[:, 2:], distance))
 
 
 def _refraction(low: Array, high: Array, distance: Array) -> Array:
-    """Return the excess of optical paths through air between two heights, metres."""
+    """Return the excess of optical paths through air between two heights, metres.
+
+    `low` and `high` are the heights of receiver and aircraft, and `distance` the lengths of the paths, metres.
+    """
     # Mean refractivity of an exponential atmosphere along a straight path between the heights.
     drop = np.exp(-low / SCALE_HEIGHT) - np.exp(-high / SCALE_HEIGHT)
     return np.asarray(REFRACTIVITY * SCALE_HEIGHT * drop / (high - low) * distance)

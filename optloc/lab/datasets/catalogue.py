@@ -44,7 +44,11 @@ class Dataset:
 
 @dataclass(frozen=True, slots=True)
 class DatasetEntry:
-    """Entry of the table: folder, description, source and licence of a set, and the SHA-256 of each of its files."""
+    """Entry of the table of data sets.
+
+    `folder` is the folder of the files, and `sha256` are the SHA-256 of the files by name. The other fields are those
+    of `Dataset`.
+    """
 
     folder: str
     description: str
@@ -149,10 +153,12 @@ def available(folder: str | Path | None = None) -> tuple[str, ...]:
     """
     try:
         # Only the existence of the files is tested: `load` checks their sums.
-        place = root(folder)
+        path = root(folder)
     except InvalidProblem:
         return ()
-    return tuple(n for n, e in ENTRIES.items() if all((place / e.folder / file).is_file() for file in e.sha256))
+    return tuple(
+        name for name, entry in ENTRIES.items() if all((path / entry.folder / file).is_file() for file in entry.sha256)
+    )
 
 
 def load(name: str, *, folder: str | Path | None = None, verify: bool = True, **options: Any) -> Dataset:

@@ -2,7 +2,8 @@
 
 Satellites move, so every problem of a batch has its own stations. A draw of three has noise of 1 m a pseudorange. This
 is about the robust spread that comes with the set (0.4 to 2 m, mostly slow errors of each satellite). In an epoch with
-all satellites the noise is 1 m over the sine of the elevation. Satellites below 10 deg are left out.
+all satellites the noise is 1 m over the sine of the elevation. Satellites below 10 deg are left out. In shapes, n are
+problems and s satellites.
 """
 
 from __future__ import annotations
@@ -28,10 +29,12 @@ _XYZ = ("sat_x_m", "sat_y_m", "sat_z_m")
 
 @dataclass(frozen=True, slots=True)
 class Receptions:
-    """Problems of one session: satellites (n, s, 3), pseudoranges, sigmas and weights (n, s), all in metres.
+    """Problems of one session, each with its own satellites.
 
-    `systems` (s,) are the initials of the satellite systems. `truth` is the receiver (3,), ECEF metres. `geodetic` is
-    its latitude, longitude (radians) and height (metres).
+    `satellites` (n, s, 3) are positions in ECEF metres. `z`, `sigma` and `weight` (n, s) are the pseudoranges and their
+    standard deviations in metres, and weights: 0 for an absent satellite, else 1. `systems` (s,) are the initials of
+    the satellite systems. `truth` is the receiver (3,), ECEF metres. `geodetic` is its latitude, longitude (radians)
+    and height (metres).
     """
 
     satellites: Array
@@ -45,9 +48,9 @@ class Receptions:
     def by_arrival(self, offset: tuple[str, ...]) -> Problem:
         """Return the epochs as arrivals with an unknown clock, and unknown clock offsets of the systems in `offset`."""
         # A bias affects rows by their station: each satellite of a system refers to the offset of the system.
-        touched = [i for i, system in enumerate(self.systems) if system in offset]
-        member = np.array([offset.index(self.systems[i]) for i in touched])
-        bias = Bias("system", offset, np.array(touched), member, np.ones(len(touched)))
+        offset_satellites = [i for i, system in enumerate(self.systems) if system in offset]
+        member = np.array([offset.index(self.systems[i]) for i in offset_satellites])
+        bias = Bias("system", offset, np.array(offset_satellites), member, np.ones(len(offset_satellites)))
         count = self.satellites.shape[-2]
         return assemble(
             station_array(self.satellites[:, None]),
@@ -87,7 +90,7 @@ class Session:
     geodetic: tuple[float, float, float]
 
     def epochs(self, every: int = 1) -> Receptions:
-        """Return every n-th epoch with all its satellites."""
+        """Return every `every`-th epoch with all its satellites."""
         times = np.unique(self.rows["t_gps_s"])[::every]
         rows = self.rows[self.rows["t_gps_s"].isin(times)]
         names = sorted(rows["sat"].unique())
@@ -95,42 +98,45 @@ class Session:
         shape = (len(times), len(names))
         z, sigma, weight = np.zeros(shape), np.ones(shape), np.zeros(shape)
         # An absent satellite has weight zero and the position of its first epoch, because no row may be NaN.
-        place = np.empty((*shape, 3))
-        place[:] = places(rows.groupby("sat")[list(_XYZ)].first().loc[names], _XYZ)
-        z[k, s], weight[k, s], place[k, s] = rows[self.column], 1.0, places(rows, _XYZ)
+        position = np.empty((*shape, 3))
+        position[:] = places(rows.groupby("sat")[list(_XYZ)].first().loc[names], _XYZ)
+        z[k, s], weight[k, s], position[k, s] = rows[self.column], 1.0, places(rows, _XYZ)
         # The path through the atmosphere, and with it the error of atmospheric models, grows as 1 / sin of the
         # elevation.
         sigma[k, s] = SIGMA / np.sin(rows["el_rad"])
-        return Receptions(place, z, sigma, weight, tuple(n[0] for n in names), self.truth, self.geodetic)
+        return Receptions(position, z, sigma, weight, tuple(name[0] for name in names), self.truth, self.geodetic)
 
     def run(self, column: str | None = None) -> Problem:
-        """Return all epochs as one problem of a fixed receiver: arrivals, with an unknown clock in each epoch."""
+        """Return all epochs as one problem of a fixed receiver: arrivals, with an unknown clock in each epoch.
+
+        `column` is the column of the pseudorange; by default the column of the session.
+        """
         rows, column = self.rows, column or self.column
         (times, k), (names, s) = (np.unique(rows[c].to_numpy(), return_inverse=True) for c in ("t_gps_s", "sat"))
-        place = np.zeros((len(times), len(names), 3))
-        place[k, s] = places(rows, _XYZ)
+        position = np.zeros((len(times), len(names), 3))
+        position[k, s] = places(rows, _XYZ)
         return assemble(
-            station_array(place, names.tolist()),
+            station_array(position, names.tolist()),
             measured("toa", rows[column].to_numpy(), a=s, epoch=k, sigma=SIGMA / np.sin(rows["el_rad"].to_numpy())),
             times=times - times[0],
             frame=ECEF,
         )
 
     def three(self) -> Problem:
-        """Return the differences of three satellites that are present in all epochs, with the exact height.
+        """Return the problem of three satellites that are present in all epochs: differences, and the exact height.
 
         Of all such GPS satellites these are the three with the best horizontal geometry at the first epoch.
         """
         times = np.unique(self.rows["t_gps_s"])
         rows = self.rows[self.rows["sat"].str.startswith("G")]
-        always = [str(name) for name, count in rows.groupby("sat").size().items() if count == len(times)]
-        wide = rows[rows["sat"].isin(always)].pivot_table([*_XYZ, self.column], "t_gps_s", "sat")
-        place = np.stack([wide[column][always].to_numpy() for column in _XYZ], axis=-1)
-        triples = np.array(list(combinations(range(len(always)), 3)))
-        best = triples[np.argmax(conditioning(place[0, triples], self.truth, self.geodetic))]
-        z = wide[self.column][always].to_numpy()[:, best]
+        present = [str(name) for name, count in rows.groupby("sat").size().items() if count == len(times)]
+        table = rows[rows["sat"].isin(present)].pivot_table([*_XYZ, self.column], "t_gps_s", "sat")
+        position = np.stack([table[column][present].to_numpy() for column in _XYZ], axis=-1)
+        triples = np.array(list(combinations(range(len(present)), 3)))
+        best = triples[np.argmax(conditioning(position[0, triples], self.truth, self.geodetic))]
+        z = table[self.column][present].to_numpy()[:, best]
         k = len(times)
-        rows_of = measured(
+        differences = measured(
             "tdoa",
             (z[:, 1:] - z[:, :1]).ravel(),
             a=np.tile([1, 2], k),
@@ -139,8 +145,8 @@ class Session:
             arrival_sigma=SIGMA,
         )
         return assemble(
-            station_array(place[:, best]),
-            rows_of,
+            station_array(position[:, best]),
+            differences,
             times=times - times[0],
             frame=ECEF,
             constraints=[height(exactly=self.geodetic[2])],
@@ -151,23 +157,24 @@ class Session:
         rng = np.random.default_rng(seed)
         members = list(self.rows.groupby("t_gps_s").indices.values())
         drawn = np.array([rng.choice(members[rng.integers(len(members))], 3, replace=False) for _ in range(count)])
-        place = places(self.rows, _XYZ)[drawn]
+        position = places(self.rows, _XYZ)[drawn]
         z = self.rows[self.column].to_numpy()[drawn]
-        return Receptions(place, z, np.full_like(z, SIGMA), np.ones_like(z), ("", "", ""), self.truth, self.geodetic)
+        return Receptions(position, z, np.full_like(z, SIGMA), np.ones_like(z), ("", "", ""), self.truth, self.geodetic)
 
 
 def conditioning(satellites: Array, truth: Array, geodetic: tuple[float, float, float]) -> Array:
-    """Return the smallest singular value (n,) of the horizontal parts of the differences of directions to satellites.
+    """Return the smallest singular value (n,) of the horizontal differences of the directions to three satellites.
 
-    The satellites (n, s, 3) are in ECEF metres.
+    A large value means a good horizontal geometry. `satellites` (n, 3, 3) and `truth` (3,) are in ECEF metres;
+    `geodetic` is the latitude, longitude (radians) and height of `truth`.
     """
     lat, lon = geodetic[:2]
     up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
-    line = satellites - truth
-    line = line / np.linalg.norm(line, axis=-1, keepdims=True)
+    direction = satellites - truth
+    direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     # The height is known, so only the horizontal components matter.
-    apart = line[:, 1:] - line[:, :1]
-    return np.asarray(np.linalg.svd(apart - (apart @ up)[..., None] * up, compute_uv=False)[:, 1])
+    difference = direction[:, 1:] - direction[:, :1]
+    return np.asarray(np.linalg.svd(difference - (difference @ up)[..., None] * up, compute_uv=False)[:, 1])
 
 
 def dataset(
@@ -194,5 +201,5 @@ def load(folder: Path, session: str, column: str) -> Session:
     truth, rows = (found[found["session"] == session] for found in tables)
     site = truth.iloc[0]
     rows = rows[(rows["el_rad"] > MASK) & rows[column].notna()]
-    place = (float(np.deg2rad(site["lat_deg"])), float(np.deg2rad(site["lon_deg"])), float(site["h_m"]))
-    return Session(rows, column, places(truth)[0], place)
+    geodetic = (float(np.deg2rad(site["lat_deg"])), float(np.deg2rad(site["lon_deg"])), float(site["h_m"]))
+    return Session(rows, column, places(truth)[0], geodetic)

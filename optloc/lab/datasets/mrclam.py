@@ -2,7 +2,7 @@
 
 The azimuth is from landmark to robot in world axes. Noise: 2 deg an azimuth (their robust spread is 0.5 deg; 1 in 100
 is beyond 5 deg) and 0.1 m a range. Ranges without azimuths have 0.15 m, the spread of their residuals. This number
-changes the statistics of the fixes, but not the positions of the minima.
+changes the statistics of the fixes, but not the positions of the minima. In shapes, s are landmarks and k epochs.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ COLUMN = {"azimuth": "az_rad", "range": "range_m"}
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
-    """One set: landmarks (s, 2) and true positions (k, 2) in metres, and its rows.
+    """One set: landmarks, true positions and measurements.
 
-    Each row has a landmark `a`, an `epoch` and, by kind, a value `z` in radians or metres.
+    `landmarks` (s, 2) and `truth` (k, 2) are in metres. Each of the m rows has a landmark `a` (m,) and an `epoch` (m,).
+    `z` are the values (m,) by kind, radians or metres: a row has an azimuth and a range.
     """
 
     landmarks: Array
@@ -49,14 +50,17 @@ class Sightings:
 
 
 def sigmas(kinds: tuple[str, ...]) -> dict[str, float]:
-    """Return the standard deviation of each kind, radians or metres."""
+    """Return the standard deviation of each kind, radians or metres; a range without an azimuth has a larger one."""
     return ALONE if len(kinds) == 1 else SIGMA
 
 
 def dataset(
     folder: Path, *, number: int = 1, kinds: tuple[str, ...] = ("azimuth", "range"), every: int = 1
 ) -> tuple[Problem, Array]:
-    """Return every n-th epoch of a set with rows of these kinds, and the truth (k, 2), metres."""
+    """Return every `every`-th epoch of a set with rows of these kinds, and the true positions (k, 2), metres.
+
+    `number` is the number of the set: 1, 2 or 5.
+    """
     for kind in kinds:
         choose(kind, COLUMN, "kinds")
     data = load(folder, number).every(every)

@@ -36,7 +36,7 @@ def dataset(folder: Path, *, form: str = "raw") -> tuple[Problem, Array]:
 
 
 def load(folder: Path, form: str) -> Windows:
-    """Return the windows; `form` is "raw", "offset", "affine" or "scaled"."""
+    """Return the windows of the set; `form` is "raw", "offset", "affine" or "scaled", see the module."""
     import pandas as pd
 
     sigma = SIGMA[choose(form, SIGMA, "form")]
@@ -47,18 +47,19 @@ def load(folder: Path, form: str) -> Windows:
     distance = np.linalg.norm(along(rows["t_s"].to_numpy(), truth) - stations[a], axis=1)
     rows = rows.assign(a=a, distance=distance, z=_calibrate(form, rows["range_m"].to_numpy(), distance, a))
     times = np.arange(rows["t_s"].iloc[0] + LEAD, truth["t_s"].iloc[-1], STEP)
-    rows, at = cut_windows(rows, times, WIDTH), along(times, truth)
+    rows, centres = cut_windows(rows, times, WIDTH), along(times, truth)
     rows = rows[rows.groupby("window")["a"].transform("nunique") >= LEAST]
     kept, epoch = np.unique(rows["window"], return_inverse=True)
     a, z = rows["a"].to_numpy(), rows["z"].to_numpy()
-    moved = rows["distance"].to_numpy() - np.linalg.norm(at[rows["window"]] - stations[a], axis=1)
+    correction = rows["distance"].to_numpy() - np.linalg.norm(centres[rows["window"]] - stations[a], axis=1)
     inside = [np.flatnonzero(epoch == k) for k in range(len(kept))]
     windows = tuple(
-        Window(a[i], None, (z - moved)[i], sigma**2 * np.eye(len(i)), at[k]) for i, k in zip(inside, kept, strict=True)
+        Window(a[i], None, (z - correction)[i], sigma**2 * np.eye(len(i)), centres[k])
+        for i, k in zip(inside, kept, strict=True)
     )
     problem = assemble(
         stations,
-        measured("range", z, a=a, sigma=sigma, epoch=epoch, correction=moved),
+        measured("range", z, a=a, sigma=sigma, epoch=epoch, correction=correction),
         times=times[kept],
         motions=(Motion(span="epoch"),),
     )
@@ -66,13 +67,16 @@ def load(folder: Path, form: str) -> Windows:
 
 
 def _calibrate(form: str, z: Array, distance: Array, a: Array) -> Array:
-    """Return the ranges (n,) in metres, calibrated by the residuals of each beacon a (n,) at the truth."""
+    """Return the ranges (n,) in metres, calibrated by the residuals of each beacon at the truth.
+
+    `z` are the measured and `distance` the true ranges (n,) in metres, and `a` (n,) are the beacons of the rows.
+    """
     if form in ("raw", "scaled"):
         return z
-    out = np.empty_like(z)
+    calibrated = np.empty_like(z)
     for beacon in np.unique(a):
         rows = a == beacon
         excess = z[rows] - distance[rows]
         scale, offset = np.polyfit(distance[rows], excess, 1) if form == "affine" else (0.0, excess.mean())
-        out[rows] = (z[rows] - offset) / (1.0 + scale)
-    return out
+        calibrated[rows] = (z[rows] - offset) / (1.0 + scale)
+    return calibrated

@@ -18,7 +18,7 @@ from optloc.problem import Array, InvalidProblem, Problem, nearest
 if TYPE_CHECKING:
     import pandas as pd
 
-# A variable, and no default folder: optloc contains no data and downloads none.
+# The folder is given by an environment variable, and has no default: optloc contains no data and downloads none.
 VARIABLE = "OPTLOC_DATA"
 XYZ = ("x_m", "y_m", "z_m")
 
@@ -29,12 +29,10 @@ def root(folder: str | Path | None = None) -> Path:
     if not str(given):
         advice = f"set the variable {VARIABLE} to the folder of the data sets, or give the folder as folder="
         raise InvalidProblem("no folder of data sets is set, and optloc contains no data", VARIABLE, advice)
-    place = Path(given).expanduser()
-    if not place.is_dir():
-        raise InvalidProblem(
-            "there is no such folder", str(place), f"correct {VARIABLE}, or give the folder as folder="
-        )
-    return place
+    path = Path(given).expanduser()
+    if not path.is_dir():
+        raise InvalidProblem("there is no such folder", str(path), f"correct {VARIABLE}, or give the folder as folder=")
+    return path
 
 
 def check_files(folder: Path, sha256: Mapping[str, str]) -> None:
@@ -101,7 +99,11 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Windows:
-    """All windows of a set: stations (s, d) in metres, the windows, and one problem with an epoch for each window."""
+    """All windows of a set.
+
+    `stations` (s, d) are in metres. `problem` is one problem with an epoch for each window; `windows` contains the same
+    rows window by window.
+    """
 
     name: str
     stations: Array

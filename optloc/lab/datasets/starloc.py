@@ -32,9 +32,9 @@ _QUATERNION = ["qx", "qy", "qz", "qw"]
 class MarkGroups:
     """Groups of six bearings of one marker each, in SI units and radians.
 
-    `place` (n, 6, 3) and `axes` (n, 6, 3, 3) are the camera's positions and its axes in the room, one axis a row.
-    `angles` (n, 6, 2) are azimuths and elevations, `truth` (n, 3) the markers, `rate` (n, 6) the turning rate of the
-    camera in rad/s.
+    `place` (n, 6, 3) are the positions of the camera in metres. `axes` (n, 6, 3, 3) are its axes in the room, one axis
+    in each row. `angles` (n, 6, 2) are azimuths and elevations. `truth` (n, 3) are the positions of the markers in
+    metres, and `rate` (n, 6) the turning rates of the camera in rad/s.
     """
 
     place: Array
@@ -68,7 +68,11 @@ class MarkGroups:
 
 @dataclass(frozen=True, slots=True)
 class CameraBearings:
-    """One run: the bearings of the markers in order of time, the poses of the camera by frame, the markers by tag."""
+    """One run of the camera.
+
+    `poses` are the poses of the camera by frame. `rows` are the bearings of the markers in order of time. `markers` are
+    the positions of the markers by tag.
+    """
 
     poses: pd.DataFrame
     rows: pd.DataFrame
@@ -80,7 +84,7 @@ class CameraBearings:
         return replace(self, rows=self.rows[self.rows["frame"].isin(frames)])
 
     def often(self) -> CameraBearings:
-        """Return the bearings of markers with at least six bearings."""
+        """Return the run without the markers that have fewer than six bearings."""
         counts = self.rows["tag"].value_counts()
         return replace(self, rows=self.rows[self.rows["tag"].isin(counts.index[counts >= SIZE])])
 
@@ -107,7 +111,7 @@ class CameraBearings:
         )
 
     def groups(self, count: int, seed: int) -> MarkGroups:
-        """Return `count` groups of six random bearings of a marker."""
+        """Return `count` groups of six random bearings of a marker; the markers are random too."""
         rng = np.random.default_rng(seed)
         counts = self.rows["tag"].value_counts().sort_index()
         counts = counts[counts >= SIZE]
@@ -160,27 +164,27 @@ def read_run(folder: Path, name: str, attitude: str, *, without: tuple[int, ...]
 
 
 def load(folder: Path, name: str, attitude: str, groups: int, seed: int) -> MarkGroups:
-    """Return groups of one run; `attitude` of the mount: by design ("nom") or calibrated ("cal")."""
+    """Return `groups` random groups of one run; `attitude` of the mount: by design ("nom") or calibrated ("cal")."""
     return read_run(folder, name, attitude).groups(groups, seed)
 
 
 def _sigma(rate: Array) -> Array:
-    """Return the standard deviation of angles at turning rates in rad/s, radians."""
+    """Return the standard deviations of angles in radians, at turning rates in rad/s."""
     return np.hypot(STILL, LAG * rate)
 
 
 def _axes(poses: pd.DataFrame) -> Array:
-    """Return the axes (n, 3, 3) of the camera in the room, one axis a row."""
+    """Return the axes (n, 3, 3) of the camera in the room, one axis in each row."""
     from scipy.spatial.transform import Rotation
 
     return np.swapaxes(Rotation.from_quat(poses[_QUATERNION].to_numpy()).as_matrix(), -1, -2)
 
 
 def _rate(poses: pd.DataFrame) -> Array:
-    """Return the turning rate of the camera at each frame, rad/s: the larger of the rates before and after it."""
+    """Return the turning rate of the camera at each frame (n,), rad/s: the larger of the rates before and after it."""
     from scipy.spatial.transform import Rotation
 
-    # the first and the last frame have one neighbour only
+    # The first and the last frame have one neighbour only.
     attitude, times = Rotation.from_quat(poses[_QUATERNION].to_numpy()), poses["t_s"].to_numpy()
     step = (attitude[:-1].inv() * attitude[1:]).magnitude() / np.diff(times)
     return np.asarray(np.maximum(np.append(step, 0.0), np.insert(step, 0, 0.0)))

@@ -44,23 +44,29 @@ WIDTH = {"TDOA2": 0.1, "TDOA3": 0.3}
 
 
 def dataset(folder: Path, *, flight: str = "F01", shared: bool = True) -> tuple[Problem, Array]:
-    """Return the windows of a flight as epochs of one problem, and the truth (k, 3), metres."""
+    """Return the windows of a flight as epochs of one problem, and the true positions (k, 3), metres.
+
+    With `shared`, rows of a window share the errors of their anchors; otherwise rows are independent.
+    """
     data = load(folder, flight, shared=shared)
     return data.problem, data.truth
 
 
 def load(folder: Path, flight: str, *, shared: bool = True) -> Windows:
-    """Return the windows of one flight; `shared` models the errors of anchors that the rows of a window share."""
+    """Return the windows of one flight; with `shared`, rows of a window share the errors of their anchors."""
     width, stations, rows, truth = _flight(folder, flight)
     # 0.01 s: a flight that ends at a half second has a window there
     times = np.arange(0.0, truth["t_s"].max() + 0.01, STEP)
-    rows, at = cut_windows(rows, times, width), along(times, truth)
-    rows = rows[at[rows["window"], 2] > AIRBORNE]
+    rows, centres = cut_windows(rows, times, width), along(times, truth)
+    rows = rows[centres[rows["window"], 2] > AIRBORNE]
     kept, epoch = np.unique(rows["window"], return_inverse=True)
     a, b, z = rows["anchor_b"].to_numpy(), rows["anchor_a"].to_numpy(), rows["rdiff_m"].to_numpy()
     inside = [np.flatnonzero(epoch == k) for k in range(len(kept))]
     covariances = [_covariance(a[i], b[i], len(stations), shared=shared) for i in inside]
-    windows = tuple(Window(a[i], b[i], z[i], r, at[k]) for i, r, k in zip(inside, covariances, kept, strict=True))
+    windows = tuple(
+        Window(a[i], b[i], z[i], covariance, centres[k])
+        for i, covariance, k in zip(inside, covariances, kept, strict=True)
+    )
     problem = _problem(stations, a, b, z, epoch, STEP * kept)
     if shared:
         problem = replace(problem, noise=_noise(inside, covariances))
@@ -70,16 +76,16 @@ def load(folder: Path, flight: str, *, shared: bool = True) -> Windows:
 def course(
     folder: Path, flight: str, width: float, *, airborne: bool = True, until: float = np.inf
 ) -> tuple[Problem, Array]:
-    """Return a flight as one run of adjacent windows, and the truth (k, 3) in metres, both at the windows' mean times.
+    """Return a flight as one run of adjacent windows, and the true positions (k, 3) in metres.
 
-    With `airborne`, the run covers the first to the last time at which the tag is higher than 0.5 m. `width` and
-    `until` are in seconds.
+    Both are at the mean times of the windows. With `airborne`, the run covers the first to the last time at which the
+    tag is higher than 0.5 m. `width` is the length of a window, and rows before `until` are used; both are in seconds.
     """
     _, stations, rows, truth = _flight(folder, flight)
     rows = rows[rows["t_s"] < until]
     if airborne:
-        high = truth.loc[truth["z_m"] > AIRBORNE, "t_s"]
-        rows = rows[rows["t_s"].between(high.min(), high.max())]
+        flying = truth.loc[truth["z_m"] > AIRBORNE, "t_s"]
+        rows = rows[rows["t_s"].between(flying.min(), flying.max())]
     # Adjacent windows that contain rows, at the mean time of the rows.
     _, epoch = np.unique(np.floor(rows["t_s"] / width), return_inverse=True)
     times = np.bincount(epoch, rows["t_s"]) / np.bincount(epoch)
@@ -104,13 +110,16 @@ def _flight(folder: Path, flight: str) -> tuple[float, Array, pd.DataFrame, pd.D
 
 
 def _problem(stations: Array, a: Array, b: Array, z: Array, epoch: Array, times: Array) -> Problem:
-    """Return the problem of range differences z (m,) in metres, with a free target in each epoch."""
+    """Return the problem of range differences z (m,) in metres, with a free target in each epoch.
+
+    `a` and `b` (m,) are the anchors of the rows, and `times` the seconds of the epochs.
+    """
     rows = measured("tdoa", z, a=a, b=b, sigma=INDEPENDENT, epoch=epoch)
     return assemble(stations, rows, times=times, motions=(Motion(span="epoch"),))
 
 
 def _covariance(a: Array, b: Array, stations: int, *, shared: bool) -> Array:
-    """Return the covariance (m, m) of the rows of a window, m^2."""
+    """Return the covariance (m, m) of the rows of a window, m^2; `stations` is the number of anchors."""
     if not shared:
         return INDEPENDENT**2 * np.eye(len(a))
     # The error of an anchor enters all its rows of the window, with the sign of the anchor in the difference.
@@ -119,5 +128,5 @@ def _covariance(a: Array, b: Array, stations: int, *, shared: bool) -> Array:
 
 
 def _noise(inside: list[Array], covariances: list[Array]) -> Noise:
-    """Return the noise of all windows; `inside` are the row numbers of each."""
+    """Return the noise of all windows; `inside` are the row numbers of each window, `covariances` their covariances."""
     return group([Block(rows[None], covariance[None]) for rows, covariance in zip(inside, covariances, strict=True)])

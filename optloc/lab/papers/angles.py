@@ -2,6 +2,9 @@
 
 All trials of a setting run as one batch. `optloc.lab.papers.angles_tables` makes the tables and figures; the page is
 ``angles.md``.
+
+Letters in shapes: s stations, d coordinates, k epochs (one a second), q scored epochs (the last of a track). A state is
+position, velocity and acceleration, n = 3 d numbers in SI units.
 """
 
 from __future__ import annotations
@@ -83,7 +86,11 @@ class AnglesScenario:
 
 
 def _states(*parts: tuple[Array, Array, Array]) -> Array:
-    """Return positions, velocities and accelerations (k + 1, d) of consecutive parts, which share end points."""
+    """Return the states (k + 1, 3, d) of a course from consecutive parts.
+
+    Each part is positions, velocities and accelerations, (epochs, d) each. A part begins at the last epoch of the part
+    before it, so its first epoch is left out.
+    """
     return np.concatenate([np.stack(part, axis=1)[i > 0 :] for i, part in enumerate(parts)])
 
 
@@ -91,22 +98,22 @@ def _straight() -> AnglesScenario:
     """Return simulation 1: a straight course with constant acceleration."""
     # Printed: 2 m/s and 0.2 m/s² for 50 s. The direction is not printed.
     t, still = np.arange(51.0)[:, None], np.zeros((51, 2))
-    ahead = np.array([1.0, 0.0])
-    states = _states(((2.0 * t + 0.1 * t**2) * ahead, (2.0 + 0.2 * t) * ahead, still + 0.2 * ahead))
+    direction = np.array([1.0, 0.0])
+    states = _states(((2.0 * t + 0.1 * t**2) * direction, (2.0 + 0.2 * t) * direction, still + 0.2 * direction))
     return AnglesScenario("simulation 1", _BASE, states, _FINE, (50,))
 
 
 def _winding() -> AnglesScenario:
     """Return simulation 2: a sine."""
     # Printed: x = 2t, y = 10 sin(5πt/180). The real and imaginary parts of a complex wave are cosine and sine.
-    t, rate = np.arange(51.0), np.pi / 36.0
-    wave, zero = np.exp(1j * rate * t), np.zeros(51)
+    t, frequency = np.arange(51.0), np.pi / 36.0
+    wave, zero = np.exp(1j * frequency * t), np.zeros(51)
     parts = [
         np.stack(pair, axis=-1)
         for pair in (
             (2.0 * t, 10.0 * wave.imag),
-            (zero + 2.0, 10.0 * rate * wave.real),
-            (zero, -10.0 * rate**2 * wave.imag),
+            (zero + 2.0, 10.0 * frequency * wave.real),
+            (zero, -10.0 * frequency**2 * wave.imag),
         )
     ]
     return AnglesScenario("simulation 2", _BASE, _states((parts[0], parts[1], parts[2])), _FINE, (50,))
@@ -131,16 +138,20 @@ def fly_circle(name: str, slow: float, fast: float, rate: float, seconds: tuple[
     The last part has the velocity of the first, as printed, so the heading jumps at the end of the circle.
     """
     ahead, left = np.array([2.0, 1.0, 0.0]) / np.sqrt(5.0), np.array([-1.0, 2.0, 0.0]) / np.sqrt(5.0)
-    one, two, three = (np.arange(n + 1.0)[:, None] for n in seconds)
-    begin, radius = np.array([-10e3, 50e3, 10e3]), fast / rate
-    leave = begin + slow * seconds[0] * ahead
-    # The centre is to the left of the course. `0.0 * one` and the like repeat a constant once a second.
-    sine, cosine = np.sin(rate * two), np.cos(rate * two)
-    circle = leave + radius * (sine * ahead + (1.0 - cosine) * left)
+    straight_times, circle_times, last_times = (np.arange(n + 1.0)[:, None] for n in seconds)
+    first_point, radius = np.array([-10e3, 50e3, 10e3]), fast / rate
+    circle_start = first_point + slow * seconds[0] * ahead
+    # The centre is to the left of the course. `0.0 * straight_times` and the like repeat a constant once a second.
+    sine, cosine = np.sin(rate * circle_times), np.cos(rate * circle_times)
+    circle = circle_start + radius * (sine * ahead + (1.0 - cosine) * left)
     states = _states(
-        (begin + slow * one * ahead, slow * ahead + 0.0 * one, 0.0 * one * ahead),
+        (
+            first_point + slow * straight_times * ahead,
+            slow * ahead + 0.0 * straight_times,
+            0.0 * straight_times * ahead,
+        ),
         (circle, fast * (cosine * ahead + sine * left), fast * rate * (cosine * left - sine * ahead)),
-        (circle[-1] + slow * three * ahead, slow * ahead + 0.0 * three, 0.0 * three * ahead),
+        (circle[-1] + slow * last_times * ahead, slow * ahead + 0.0 * last_times, 0.0 * last_times * ahead),
     )
     ends = np.cumsum(seconds)
     return AnglesScenario(name, _WIDE, states, 5e-3, (int(ends[0]), int(ends[1]), int(ends[2])))
@@ -212,22 +223,25 @@ class AnglesDraw:
 
 
 def draw(scenario: AnglesScenario, trials: int, seed: int, key: int) -> AnglesDraw:
-    """Return trials of a simulation; they depend on seed and key only."""
-    one, two = np.random.SeedSequence(seed, spawn_key=(key,)).spawn(2)
+    """Return trials of a simulation; `seed` and `key` (number of the draw in the reproduction) decide the numbers."""
+    measurements, starts = np.random.SeedSequence(seed, spawn_key=(key,)).spawn(2)
     truth = scenario.states[1:, 0].ravel()
-    problem = simulate(scenario.problem(), truth, one, trials=trials)
-    return AnglesDraw(scenario, problem, trials, lambda: np.random.default_rng(two))
+    problem = simulate(scenario.problem(), truth, measurements, trials=trials)
+    return AnglesDraw(scenario, problem, trials, lambda: np.random.default_rng(starts))
 
 
 def start_at_truth(drawn: AnglesDraw, sigmas: Sigmas, *, known: int = 3) -> State:
-    """Return the true state at t = 0 as the start of all trials; derivatives from the order `known` on are zero."""
+    """Return the true state at t = 0 as the start of all trials, with the standard deviations `sigmas`.
+
+    Derivatives from the order `known` on are zero: with 2, the acceleration is zero; with 1, also the velocity.
+    """
     d, mean = drawn.scenario.dimension, drawn.scenario.truth[0].copy()
     mean[known * d :] = 0.0
     return _repeated(mean, _diagonal(sigmas, d), drawn.trials)
 
 
 def scatter_starts(drawn: AnglesDraw, sigmas: Sigmas) -> State:
-    """Return random starts at t = 0 around the truth; their covariance is the claimed one."""
+    """Return random starts at t = 0 around the truth, whose covariance is correct."""
     d = drawn.scenario.dimension
     state = _repeated(drawn.scenario.truth[0], _diagonal(sigmas, d), drawn.trials)
     error = drawn.rng().standard_normal(state.mean.shape) * np.repeat(sigmas, d)
@@ -235,14 +249,20 @@ def scatter_starts(drawn: AnglesDraw, sigmas: Sigmas) -> State:
 
 
 def fit_start(drawn: AnglesDraw, epochs: int, order: int = 2) -> State:
-    """Return the states after some epochs, fitted to these epochs without a guess."""
+    """Return the states after the first `epochs` epochs, fitted to these epochs without a guess.
+
+    `order` is the order of the polynomial: 2 for a constant acceleration.
+    """
     fix = fitted(cut(drawn.problem, 0, epochs), order)
     mean, cov = fix.gaussian()
     return State(float(epochs), np.asarray(mean), np.asarray(cov))
 
 
 def first_fix(drawn: AnglesDraw, speed: float, rate: float) -> State:
-    """Return the fix of the first epoch, with velocity and acceleration zero; `speed` and `rate` are their sigmas."""
+    """Return the fix of the first epoch as a start, with velocity and acceleration zero.
+
+    `speed` and `rate` are the standard deviations of each coordinate of velocity and acceleration, SI units.
+    """
     d = drawn.scenario.dimension
     fix = solve(replace(cut(drawn.problem, 0, 1), motions=(Motion(),)))
     cov = np.zeros((drawn.trials, 3 * d, 3 * d))
@@ -261,10 +281,11 @@ def fixes(drawn: AnglesDraw) -> tuple[Array, Array]:
 def linear_track(places: tuple[Array, Array], start: State, dynamics: Dynamics) -> Array:
     """Return the states (trials, k, n) of a linear Kalman filter whose measurements are fixes.
 
-    `places` are the fixes at 1, 2, ... seconds and their covariances; `start` is the state before the first fix used.
+    `places` are the fixes (trials, k, d) at 1, 2, ... seconds and their covariances; `start` is the state before the
+    first fix that is used.
     """
     # Written out, because measurements of the position need no linearisation.
-    mean, cov, out = start.mean, start.cov, []
+    mean, cov, states = start.mean, start.cov, []
     d = places[0].shape[-1]
     for k in range(int(start.time), places[0].shape[1]):
         F, Q, drive = dynamics.step(1.0, mean, d)
@@ -273,24 +294,30 @@ def linear_track(places: tuple[Array, Array], start: State, dynamics: Dynamics) 
         gain = np.swapaxes(np.linalg.solve(S, cov[..., :d, :]), -1, -2)
         mean = mean + (gain @ (places[0][:, k] - mean[..., :d])[..., None])[..., 0]
         cov = cov - gain @ S @ np.swapaxes(gain, -1, -2)
-        out.append(mean)
-    return np.stack(out, axis=1)
+        states.append(mean)
+    return np.stack(states, axis=1)
 
 
 def fixed_variance(limit: float) -> Dynamics:
-    """Return Singer's model with the variance that the current statistical model has at acceleration zero."""
+    """Return Singer's model with the variance that the current statistical model has at acceleration zero.
+
+    `limit` is the largest acceleration of that model, m/s^2.
+    """
     return singer(TIME_CONSTANT, float(np.sqrt((4.0 - np.pi) / np.pi)) * limit)
 
 
 def errors(drawn: AnglesDraw, track: Track | Array) -> Array:
-    """Return the errors (trials, q, 3, d) of position, velocity and acceleration at the last q epochs."""
+    """Return the errors (trials, q, 3, d) of position, velocity and acceleration at the last q epochs, SI units.
+
+    `track` is a track, or its states (trials, q, n).
+    """
     mean = track.mean if isinstance(track, Track) else track
     true = drawn.scenario.states[-mean.shape[1] :]
     return np.asarray(mean.reshape(*mean.shape[:2], 3, -1) - true)
 
 
 def rms(error: Array, axes: tuple[int, ...] = (0, 1)) -> Array:
-    """Return root mean square lengths of errors (trials, q, ..., d) over trials and epochs."""
+    """Return root mean square lengths of errors (trials, q, ..., d) over `axes`: by default trials and epochs."""
     return np.asarray(np.sqrt((error**2).sum(-1).mean(axes)))
 
 
@@ -306,15 +333,15 @@ def share_lost(drawn: AnglesDraw, track: Track) -> float:
 
 
 def track_all(drawn: AnglesDraw, start: State, dynamics: Dynamics, update: str = "ekf") -> Track:
-    """Return the tracks of all trials."""
+    """Return the tracks of all trials from a start; `dynamics` is the motion model, `update` the name of the filter."""
     return followed(drawn.problem, start, dynamics, update)
 
 
 def bound(scenario: AnglesScenario, start: State, dynamics: Dynamics) -> Array:
-    """Return the posterior bound (q, 3) of the root mean square error of position, velocity and acceleration."""
+    """Return the posterior bound (q, 3) of the rms error of position, velocity and acceleration, SI units."""
     # The linearisation point is the truth, and all trials share the covariance of the start.
-    alone = State(start.time, scenario.truth[int(start.time)], start.cov[0])
-    cov = posterior_bound(scenario.problem(), scenario.truth[1:], alone, dynamics)
+    single = State(start.time, scenario.truth[int(start.time)], start.cov[0])
+    cov = posterior_bound(scenario.problem(), scenario.truth[1:], single, dynamics)
     variance = np.diagonal(cov, axis1=-2, axis2=-1).reshape(len(cov), 3, -1)
     return np.asarray(np.sqrt(variance.sum(-1)))
 
@@ -326,10 +353,12 @@ def snapshot_bound(scenario: AnglesScenario) -> Array:
 
 
 def _diagonal(sigmas: Sigmas, d: int) -> Array:
+    """Return the covariance (3 d, 3 d) of a state whose coordinates are independent."""
     return np.diag(np.repeat(np.square(sigmas), d))
 
 
 def _repeated(mean: Array, cov: Array, trials: int) -> State:
+    """Return the same mean and covariance at t = 0 for all trials."""
     return State(0.0, np.tile(mean, (trials, 1)), np.tile(cov, (trials, 1, 1)))
 
 
@@ -341,14 +370,14 @@ def printed_transition(time_constant: float, limit: float) -> Dynamics:
 
     `time_constant` is in seconds, `limit` is the largest acceleration of an axis in m/s^2.
     """
-    right = current_statistical(time_constant, limit)
+    correct = current_statistical(time_constant, limit)
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
-        F, Q, drive = right.step(dt, mean, d)
+        F, Q, drive = correct.step(dt, mean, d)
         F[2 * d :, 2 * d :] = (1.0 - np.exp(-dt / time_constant)) * np.eye(d)
         return F, Q, drive
 
-    return replace(right, name="printed f33", step=step)
+    return replace(correct, name="printed f33", step=step)
 
 
 def printed_variance(time_constant: float, limit: float) -> Dynamics:
@@ -357,16 +386,16 @@ def printed_variance(time_constant: float, limit: float) -> Dynamics:
     The variance vanishes if the acceleration is near its limit, and grows without bound beyond. Parameters as for
     `printed_transition`.
     """
-    right = current_statistical(time_constant, limit)
+    correct = current_statistical(time_constant, limit)
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
-        F, _, drive = right.step(dt, mean, d)
+        F, _, drive = correct.step(dt, mean, d)
         _, Q, _ = correlated(1.0 / time_constant, dt)
         variance = (4.0 - np.pi) / np.pi * (limit - np.abs(mean[..., 2 * d :])) ** 2
         noise = np.einsum("ij,...c,cb->...icjb", Q, variance, np.eye(d))
         return F, noise.reshape(*mean.shape, mean.shape[-1]), drive
 
-    return replace(right, name="no clamp", step=step)
+    return replace(correct, name="no clamp", step=step)
 
 
 # Fits to whole tracks and to a fixed target: pseudo-linear, instrumental variables, maximum likelihood.
@@ -404,59 +433,74 @@ def whole_track_bound() -> Array:
     return np.asarray(np.sqrt(np.diagonal(crlb(run, STRAIGHT.truth[-1])).reshape(3, -1).sum(-1)))
 
 
-def run_wholes(drawn: AnglesDraw, tick: Tick) -> list[tuple[str, Array]]:
-    """Return errors (3,) at the end of simulation 1 of fits to the whole track, and of the filter."""
-    run = replace(drawn.problem, motions=(Motion(2, reference=float(STRAIGHT.epochs)),))
-    exact, unit = STRAIGHT.truth[-1], np.array([1.0, 1.0, 2.0])[:, None]  # the last coefficient is half of a
-    found = courses(run)
-    assert found is not None
-    parts = {"plain": found.plain, "weighted": found.weighted, "instrumental variables": found.instrumental}
-    out = [(name, _size((unit * c).reshape(len(c), -1) - exact)) for name, c in parts.items()]
-    out.append(("maximum likelihood (optloc)", _size(fitted(drawn.problem, 2).x - exact)))
+def whole_track_errors(drawn: AnglesDraw, tick: Tick) -> list[tuple[str, Array]]:
+    """Return the errors (3,) at the end of simulation 1, by method.
+
+    The methods are three fits to the whole track in closed form, the most likely track, and the filter with two values
+    of a_max. The errors are root mean squares over trials of position, velocity and acceleration, SI units.
+    """
+    problem = replace(drawn.problem, motions=(Motion(2, reference=float(STRAIGHT.epochs)),))
+    true_state, scale_of_order = (
+        STRAIGHT.truth[-1],
+        np.array([1.0, 1.0, 2.0])[:, None],
+    )  # the last coefficient is half of a
+    fits = courses(problem)
+    assert fits is not None
+    fits_by_name = {"plain": fits.plain, "weighted": fits.weighted, "instrumental variables": fits.instrumental}
+    errors = [
+        (name, _rms_by_order((scale_of_order * coefficients).reshape(len(coefficients), -1) - true_state))
+        for name, coefficients in fits_by_name.items()
+    ]
+    errors.append(("maximum likelihood (optloc)", _rms_by_order(fitted(drawn.problem, 2).x - true_state)))
     start = start_at_truth(drawn, STRAIGHT_START, known=2)
     for limit in (30.0, 2.0):
         track = track_all(drawn, start, current_statistical(TIME_CONSTANT, limit))
-        out.append((f"filter, a_max {limit:g}", _size(track.mean[:, -1] - exact)))
+        errors.append((f"filter, a_max {limit:g}", _rms_by_order(track.mean[:, -1] - true_state)))
     tick()
-    return out
+    return errors
 
 
 def run_rays(count: int, seed: int, key: int, tick: Tick) -> list[SimulatedRays]:
-    """Return the errors of fixes of a fixed target, for few and for many stations."""
-    out = []
+    """Return the errors of `count` fixes of a fixed target, for few and for many stations.
+
+    `key` is the number of the first draw in the reproduction.
+    """
+    results = []
     # Noise of 0.02 and 0.05 rad is four and ten times the noise of simulation 3: the bias of plain fixes grows with it.
     for i, (stations, sigma) in enumerate(((2, 0.05), (4, 0.05), (50, 0.02), (50, 0.05))):
-        run = still(stations, sigma)
-        drawn = simulate(run, PLACE, np.random.SeedSequence(seed, spawn_key=(key + i,)), trials=count)
-        found = courses(drawn)
-        assert found is not None
-        fixes = [c[:, 0] for c in (found.plain, found.weighted, found.instrumental)]
+        problem = fixed_target(stations, sigma)
+        drawn = simulate(problem, PLACE, np.random.SeedSequence(seed, spawn_key=(key + i,)), trials=count)
+        fits = courses(drawn)
+        assert fits is not None
+        fixes = [coefficients[:, 0] for coefficients in (fits.plain, fits.weighted, fits.instrumental)]
         fixes.append(solve(drawn, "searched").position)  # proofs of a hundred rows would take most of the time
-        least = float(np.sqrt(np.trace(crlb(run, PLACE))))
-        out.append(SimulatedRays(stations, sigma, least, tuple(_bias(each - PLACE) for each in fixes)))
+        least = float(np.sqrt(np.trace(crlb(problem, PLACE))))
+        results.append(
+            SimulatedRays(stations, sigma, least, tuple(_bias_and_error(position - PLACE) for position in fixes))
+        )
         tick()
-    return out
+    return results
 
 
-def still(count: int, sigma: float) -> Problem:
-    """Return one epoch of angles to a fixed target.
+def fixed_target(count: int, sigma: float) -> Problem:
+    """Return the problem of one epoch of angles to a fixed target; `count` is the number of stations.
 
     Two stations have the positions of simulation 3. The text gives no positions for more stations. Here they are
     between the two, and every second station is 20 km further away from the target.
     """
-    place = np.zeros((count, 3))
-    place[:, 0] = np.linspace(-40e3, 40e3, count)
-    place[:, 1] = np.where(np.arange(count) % 2, 0.0, -20e3) * (count > 2)
+    stations = np.zeros((count, 3))
+    stations[:, 0] = np.linspace(-40e3, 40e3, count)
+    stations[:, 1] = np.where(np.arange(count) % 2, 0.0, -20e3) * (count > 2)
     a = np.arange(count)
-    return assemble(place, *(measured(kind, a=a, sigma=sigma) for kind in ("azimuth", "elevation")))
+    return assemble(stations, *(measured(kind, a=a, sigma=sigma) for kind in ("azimuth", "elevation")))
 
 
-def _size(error: Array) -> Array:
+def _rms_by_order(error: Array) -> Array:
     """Return root mean square lengths (3,) of position, velocity and acceleration of errors (trials, 3 d)."""
     return rms(error.reshape(len(error), 3, -1), (0,))
 
 
-def _bias(error: Array) -> tuple[float, float]:
+def _bias_and_error(error: Array) -> tuple[float, float]:
     """Return the length of the mean error, and the root mean square error, of finite errors (trials, d)."""
-    good = error[np.isfinite(error).all(-1)]
-    return float(np.linalg.norm(good.mean(0))), float(np.sqrt((good**2).sum(-1).mean()))
+    finite = error[np.isfinite(error).all(-1)]
+    return float(np.linalg.norm(finite.mean(0))), float(np.sqrt((finite**2).sum(-1).mean()))

@@ -1,4 +1,9 @@
-"""Simulations, tables and figures of the paper `angles`: each reproduced value with the printed value and the bound."""
+"""Simulations, tables and figures of the paper of Liu Zhe et al.: each value with the printed value and the bound.
+
+A `run_...` function computes one simulation, and a `table_...` or `figure_...` function shows its result. a_max is the
+largest acceleration of the motion model in m/s^2, and is called `limit` here. Each function calls `tick` after each
+piece of work.
+"""
 
 from __future__ import annotations
 
@@ -34,13 +39,13 @@ from optloc.lab.papers.angles import (
     printed_variance,
     rms,
     run_rays,
-    run_wholes,
     scatter_starts,
     share_lost,
     snapshot_bound,
     start_at_truth,
     track_all,
     whole_track_bound,
+    whole_track_errors,
 )
 from optloc.lab.papers.report import (
     Ink,
@@ -105,7 +110,7 @@ class ErrorCurve:
     error: Array
 
     def total(self, first: int = 0, last: int | None = None) -> Array:
-        """Return the root mean square (3,) over first < t <= last seconds."""
+        """Return the root mean square errors (3,) over the times first < t <= last, seconds."""
         inside = (self.seconds > first) & (self.seconds <= (np.inf if last is None else last))
         return np.asarray(np.sqrt((self.error[inside] ** 2).mean(0)))
 
@@ -116,66 +121,66 @@ class ErrorCurve:
 
 
 def track_curve(label: str, drawn: AnglesDraw, start: State, dynamics: Dynamics, update: str = "ekf") -> ErrorCurve:
-    """Return the errors of the tracks from a start."""
+    """Return the errors of the tracks of all trials from a start, against time."""
     return score_curve(label, drawn, track_all(drawn, start, dynamics, update).mean)
 
 
 def score_curve(label: str, drawn: AnglesDraw, mean: Array) -> ErrorCurve:
-    """Return the errors of states (trials, q, n) at the last q epochs."""
+    """Return the errors of states `mean` (trials, q, n) at the last q epochs, against time."""
     error = rms(errors(drawn, mean), (0,))
     last = drawn.scenario.epochs
     return ErrorCurve(label, np.arange(last - len(error) + 1.0, last + 1.0), error)
 
 
 def bound_curve(label: str, scenario: AnglesScenario, start: State, dynamics: Dynamics) -> ErrorCurve:
-    """Return the posterior bound from a start."""
+    """Return the posterior bound of tracks from a start, against time."""
     least = bound(scenario, start, dynamics)
     return ErrorCurve(label, np.arange(start.time + 1.0, scenario.epochs + 1.0), least)
 
 
 def run_straight(drawn: AnglesDraw, tick: Tick) -> list[ErrorCurve]:
-    """Return simulation 1: the filter with the right and the printed transition, three limits, and bounds."""
+    """Return the errors of simulation 1: the right and the printed transition, three values of a_max, and bounds."""
     # The paper prints no a_max: these are 150, 10 and one and a half times the acceleration of the target.
-    start, out = start_at_truth(drawn, STRAIGHT_START, known=2), []
+    start, curves = start_at_truth(drawn, STRAIGHT_START, known=2), []
     for limit in (30.0, 2.0, 0.3):
         for name, make in (("filter", current_statistical), ("printed f33", printed_transition)):
-            out.append(track_curve(f"{name}, a_max {limit:g}", drawn, start, make(TIME_CONSTANT, limit)))
+            curves.append(track_curve(f"{name}, a_max {limit:g}", drawn, start, make(TIME_CONSTANT, limit)))
             tick()
-    out.append(bound_curve("posterior bound, a_max 2", STRAIGHT, start, fixed_variance(2.0)))
-    out.append(bound_curve("bound of one track", STRAIGHT, start, polynomial(2)))
+    curves.append(bound_curve("posterior bound, a_max 2", STRAIGHT, start, fixed_variance(2.0)))
+    curves.append(bound_curve("bound of one track", STRAIGHT, start, polynomial(2)))
     tick()
-    return out
+    return curves
 
 
 def run_winding(drawn: AnglesDraw, tick: Tick) -> list[ErrorCurve]:
-    """Return simulation 2: started at rest, and by a fit of the first three epochs."""
+    """Return the errors of simulation 2: started at rest, and by a fit of the first three epochs, and a bound."""
     # The paper prints no a_max: 30 m/s² and this start reproduce the printed errors within 15 %.
     model = current_statistical(TIME_CONSTANT, 30.0)
     start = start_at_truth(drawn, WINDING_START, known=1)
-    out = [
+    curves = [
         track_curve("filter, started at rest", drawn, start, model),
         track_curve("filter, started by a fit of 3 s", drawn, fit_start(drawn, 3), model, "iekf"),
         bound_curve("posterior bound", WINDING, start, fixed_variance(30.0)),
     ]
     tick()
-    return out
+    return curves
 
 
 def run_circles(drawn: AnglesDraw, tick: Tick) -> dict[float, list[ErrorCurve]]:
-    """Return the repaired simulation 3 by limit: three filters and the bound."""
-    start, out = first_fix(drawn, *CIRCLE_START), {}
-    places = fixes(drawn)
+    """Return the errors of the repaired simulation 3 by a_max: three filters and the bound."""
+    start, curves = first_fix(drawn, *CIRCLE_START), {}
+    positions = fixes(drawn)
     tick()
     for limit in (100.0, 300.0):  # a third above the peak of 74 m/s², and four times the peak
         model = current_statistical(TIME_CONSTANT, limit)
-        out[limit] = [
+        curves[limit] = [
             track_curve("single step", drawn, start, model),
             track_curve("converged", drawn, start, model, "iekf"),
-            score_curve("fixes, then a linear filter", drawn, linear_track(places, start, model)),
+            score_curve("fixes, then a linear filter", drawn, linear_track(positions, start, model)),
             bound_curve("posterior bound", REPAIRED, start, fixed_variance(limit)),
         ]
         tick()
-    return out
+    return curves
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,22 +204,28 @@ class TableReading:
 
 
 def run_readings(count: int, seed: int, key: int, tick: Tick) -> list[TableReading]:
-    """Return simulation 3 as printed."""
-    out = []
+    """Return the errors of simulation 3 as printed, for each reading of its unit and two values of a_max.
+
+    `count` is the number of trials, and `key` is the number of the first draw in the reproduction.
+    """
+    readings = []
     for i, scenario in enumerate(READINGS):
         drawn = draw(scenario, count, seed, key + i)
         start = first_fix(drawn, *CIRCLE_START)
         for limit in (100.0, 300.0):
-            found = track_curve("", drawn, start, current_statistical(TIME_CONSTANT, limit))
+            curve = track_curve("", drawn, start, current_statistical(TIME_CONSTANT, limit))
             tick()
             least = bound_curve("", scenario, start, fixed_variance(limit))
-            out.append(TableReading(scenario, limit, found.phases(scenario), least.phases(scenario)))
+            readings.append(TableReading(scenario, limit, curve.phases(scenario), least.phases(scenario)))
             tick()
-    return out
+    return readings
 
 
 def run_snapshot() -> ErrorCurve:
-    """Return the bound of a separate fix at each second of the repaired simulation 3; the last two columns are NaN."""
+    """Return the bound of the position of a separate fix at each second of the repaired simulation 3.
+
+    The columns of velocity and acceleration are NaN, because a fix does not determine them.
+    """
     least = snapshot_bound(REPAIRED)
     error = np.full((len(least), 3), np.nan)
     error[:, 0] = least
@@ -222,34 +233,37 @@ def run_snapshot() -> ErrorCurve:
 
 
 Lost = dict[tuple[float, float], dict[str, float]]
-"""Shares of lost tracks by filter, by standard deviation of the start's coordinates, metres, and largest acceleration.
+"""Shares of lost tracks by filter. The keys are the standard deviation of the start's coordinates in metres, and a_max.
 
-The first is zero for a start by a fit of the first epochs."""
+A standard deviation of zero means a start by a fit of the first epochs."""
 
 
 def run_starts(drawn: AnglesDraw, tick: Tick) -> Lost:
     """Return the shares of tracks lost from starts near the line through the stations, and from a fit of 3 epochs."""
-    out: Lost = {}
+    lost: Lost = {}
     fit = fit_start(drawn, 3)
     # Metres off the line through both stations, which are 50 and 100 m away.
     for sigma, limit in ((1.0, 5.0), (1.0, 30.0), (3.0, 5.0), (3.0, 30.0), (0.0, 30.0)):
         start = scatter_starts(drawn, (sigma, *_CLOSE)) if sigma else fit
         model = current_statistical(TIME_CONSTANT, limit)
-        out[sigma, limit] = {name: share_lost(drawn, track_all(drawn, start, model, name)) for name in UPDATES}
+        lost[sigma, limit] = {name: share_lost(drawn, track_all(drawn, start, model, name)) for name in UPDATES}
         tick()
-    return out
+    return lost
 
 
 def run_clamps(drawn: AnglesDraw, tick: Tick) -> dict[str, float]:
-    """Return the share of lost tracks with the published and with the clamped variance, from 3 m and with a_max 0.3."""
+    """Return the shares of lost tracks with the published and with the clamped variance.
+
+    The starts have standard deviations of 3 m, and a_max is 0.3.
+    """
     # 0.3 is 0.1 m/s² above the target's acceleration: starts that are 0.2 m/s² wide cross the limit.
     start = scatter_starts(drawn, (3.0, *_CLOSE))
     models = {"as published": printed_variance, "clamped": current_statistical}
-    found = {
-        name: share_lost(drawn, track_all(drawn, start, make(TIME_CONSTANT, 0.3))) for name, make in models.items()
+    lost = {
+        name: share_lost(drawn, track_all(drawn, start, model(TIME_CONSTANT, 0.3))) for name, model in models.items()
     }
     tick()
-    return found
+    return lost
 
 
 def run_ends(drawn: AnglesDraw, tick: Tick) -> dict[str, Array]:
@@ -280,44 +294,45 @@ def short(value: float) -> str:
     return f"{value:.2e}" if value < 1e-3 else f"{value:.{2 - int(np.floor(np.log10(value)))}f}"
 
 
-def _row(values: Iterable[float]) -> tuple[str, ...]:
+def _as_cells(values: Iterable[float]) -> tuple[str, ...]:
+    """Return numbers as cells of a table."""
     return tuple(map(short, values))
 
 
 def table_straight(curves: Sequence[ErrorCurve]) -> TextTable:
-    """Return the errors of simulation 1 over the whole track."""
-    lines = [("printed", *_row(PRINTED_STRAIGHT)), *((c.label, *_row(c.total())) for c in curves)]
+    """Return a table of the errors of simulation 1 over the whole track."""
+    lines = [("printed", *_as_cells(PRINTED_STRAIGHT)), *((c.label, *_as_cells(c.total())) for c in curves)]
     return tabulate("simulation-1", ("", *_PARTS), lines)
 
 
 def table_winding(curves: Sequence[ErrorCurve]) -> TextTable:
-    """Return the errors of simulation 2, over the whole track and without its first ten seconds."""
-    lines = [("0 to 50 s", "printed", *_row(PRINTED_WINDING))]
+    """Return a table of the errors of simulation 2, over the whole track and without its first ten seconds."""
+    lines = [("0 to 50 s", "printed", *_as_cells(PRINTED_WINDING))]
     for first in (0, 10):
-        lines += [(f"{first} to 50 s", c.label, *_row(c.total(first))) for c in curves]
+        lines += [(f"{first} to 50 s", c.label, *_as_cells(c.total(first))) for c in curves]
     return tabulate("simulation-2", ("scored", "", *_PARTS), lines)
 
 
 def table_circles(found: Mapping[float, Sequence[ErrorCurve]], snapshot: ErrorCurve) -> TextTable:
-    """Return the position errors of the repaired simulation 3."""
-    lines = [(ABSENT, "bound of every second by itself", *_row(snapshot.phases(REPAIRED)))]
+    """Return a table of the position errors of the repaired simulation 3 by phase; `found` is by a_max."""
+    lines = [(ABSENT, "bound of every second by itself", *_as_cells(snapshot.phases(REPAIRED)))]
     for limit, curves in found.items():
-        lines += [(f"{limit:g}", c.label, *_row(c.phases(REPAIRED))) for c in curves]
+        lines += [(f"{limit:g}", c.label, *_as_cells(c.phases(REPAIRED))) for c in curves]
     return tabulate("simulation-3", ("a_max", "", "straight", "circle", "straight again"), lines)
 
 
 def table_readings(found: Sequence[TableReading]) -> TextTable:
-    """Return the position errors of simulation 3 as printed."""
+    """Return a table of the position errors of simulation 3 as printed, by reading, a_max and phase."""
     lines = []
-    for each in found:
-        pairs = [value for pair in zip(each.error, each.bound, strict=True) for value in pair]
-        lines.append((each.scenario.name.removeprefix("as printed, in "), f"{each.limit:g}", *_row(pairs)))
+    for reading in found:
+        pairs = [value for pair in zip(reading.error, reading.bound, strict=True) for value in pair]
+        lines.append((reading.scenario.name.removeprefix("as printed, in "), f"{reading.limit:g}", *_as_cells(pairs)))
     header = ("reading", "a_max", "straight", "bound", "circle", "bound", "straight again", "bound")
     return tabulate("readings", header, lines)
 
 
 def table_starts(found: Lost) -> TextTable:
-    """Return the shares of lost tracks."""
+    """Return a table of the shares of lost tracks, by start, a_max and filter."""
     header = ("start", "a_max", "single step", "converged", "modified gain", "modified covariance")
     lines = [
         (f"{sigma:g} m" if sigma else "fit of 3 s", f"{limit:g}", *map(percent, shares.values()))
@@ -327,23 +342,23 @@ def table_starts(found: Lost) -> TextTable:
 
 
 def table_clamps(found: Mapping[str, float]) -> TextTable:
-    """Return the shares of lost tracks with and without a clamped variance."""
+    """Return a table of the shares of lost tracks with and without a clamped variance."""
     return tabulate("clamp", ("variance", "lost"), [(name, percent(share)) for name, share in found.items()])
 
 
 def table_wholes(found: Sequence[tuple[str, Array]], bound: Array) -> TextTable:
-    """Return the errors at the end of simulation 1 of fits to the whole track."""
-    lines = [("Cramér-Rao bound", *_row(bound)), *((name, *_row(error)) for name, error in found)]
+    """Return a table of the errors at the end of simulation 1, by fit; `bound` (3,) is the Cramer-Rao bound."""
+    lines = [("Cramér-Rao bound", *_as_cells(bound)), *((name, *_as_cells(error)) for name, error in found)]
     return tabulate("whole-track", ("", *_PARTS), lines)
 
 
 def table_rays(found: Sequence[SimulatedRays]) -> TextTable:
-    """Return bias and error of fixes of a fixed target."""
+    """Return a table of bias and error of fixes of a fixed target."""
     names = ("plain", "weighted", "instrumental", "maximum likelihood")
     lines = [
-        (f"{each.stations}", f"{1e3 * each.sigma:g} mrad", name, *_row((*values, each.bound)))
-        for each in found
-        for name, values in zip(names, each.fixes, strict=True)
+        (f"{rays.stations}", f"{1e3 * rays.sigma:g} mrad", name, *_as_cells((*values, rays.bound)))
+        for rays in found
+        for name, values in zip(names, rays.fixes, strict=True)
     ]
     return tabulate("rays", ("stations", "noise", "fix", "bias", "error", "bound"), lines)
 
@@ -356,7 +371,7 @@ Style = tuple[str, str, str]
 
 
 def three_parts(curves: Mapping[Style, ErrorCurve], values: Sequence[float]) -> Figure:
-    """Return errors of position, velocity and acceleration against time, one panel for each.
+    """Return a figure of errors of position, velocity and acceleration against time, one panel for each.
 
     Parameters
     ----------
@@ -377,42 +392,42 @@ def three_parts(curves: Mapping[Style, ErrorCurve], values: Sequence[float]) -> 
 
 
 def figure_straight(curves: Sequence[ErrorCurve]) -> Figure:
-    """Return figures 1 to 3: simulation 1."""
-    by = {c.label: c for c in curves}
+    """Return a figure with figures 1 to 3 of the paper: the errors of simulation 1 against time."""
+    by_label = {c.label: c for c in curves}
     return three_parts(
         {
-            ("filter, a_max 2", Ink.BLUE, "-"): by["filter, a_max 2"],
-            ("filter, a_max 30", Ink.GREEN, "-"): by["filter, a_max 30"],
-            ("printed f33, a_max 2", Ink.RED, "-"): by["printed f33, a_max 2"],
-            ("posterior bound, a_max 2", Ink.BLACK, "--"): by["posterior bound, a_max 2"],
-            ("bound of one track", Ink.GREY, "--"): by["bound of one track"],
+            ("filter, a_max 2", Ink.BLUE, "-"): by_label["filter, a_max 2"],
+            ("filter, a_max 30", Ink.GREEN, "-"): by_label["filter, a_max 30"],
+            ("printed f33, a_max 2", Ink.RED, "-"): by_label["printed f33, a_max 2"],
+            ("posterior bound, a_max 2", Ink.BLACK, "--"): by_label["posterior bound, a_max 2"],
+            ("bound of one track", Ink.GREY, "--"): by_label["bound of one track"],
         },
         PRINTED_STRAIGHT,
     )
 
 
 def figure_winding(curves: Sequence[ErrorCurve]) -> Figure:
-    """Return figures 4 to 6: simulation 2."""
-    looks = ((Ink.RED, "-"), (Ink.BLUE, "-"), (Ink.BLACK, "--"))
-    return three_parts({(c.label, *look): c for c, look in zip(curves, looks, strict=True)}, PRINTED_WINDING)
+    """Return a figure with figures 4 to 6 of the paper: the errors of simulation 2 against time."""
+    styles = ((Ink.RED, "-"), (Ink.BLUE, "-"), (Ink.BLACK, "--"))
+    return three_parts({(c.label, *style): c for c, style in zip(curves, styles, strict=True)}, PRINTED_WINDING)
 
 
 def figure_circles(found: Mapping[float, Sequence[ErrorCurve]], snapshot: ErrorCurve) -> Figure:
-    """Return figure 7: position errors of the repaired simulation 3, one panel for each limit."""
+    """Return figure 7: position errors of the repaired simulation 3, one panel for each a_max; `found` is by a_max."""
     figure = canvas(13.0, 4.6)
     axes = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
     for ax, (limit, curves) in zip(axes, found.items(), strict=True):
         ax.axvspan(*REPAIRED.phases[:2], color="#EEEEEE")
         ax.plot(snapshot.seconds, snapshot.error[:, 0], ":", color=Ink.GREY, label="bound of every second by itself")
-        by = {c.label: c for c in curves}
+        by_label = {c.label: c for c in curves}
         # The two filters hardly differ: the converged one is a broad line behind the other.
-        looks = (
+        styles = (
             ("converged", Ink.RED, "-", 4.0),
             ("single step", Ink.BLUE, "-", 1.2),
             ("posterior bound", Ink.BLACK, "--", 1.5),
         )
-        for curve, colour, line, width in looks:
-            ax.plot(by[curve].seconds, by[curve].error[:, 0], line, color=colour, label=curve, lw=width)
+        for curve, colour, line, width in styles:
+            ax.plot(by_label[curve].seconds, by_label[curve].error[:, 0], line, color=colour, label=curve, lw=width)
         label(ax, "time, s", "position error, m (root mean square)" if ax is axes[0] else "")
         ax.set_title(f"a_max = {limit:g} m/s²; shaded: circle with 74 m/s²")
         ax.set_ylim(0.0, 1800.0)
@@ -421,11 +436,14 @@ def figure_circles(found: Mapping[float, Sequence[ErrorCurve]], snapshot: ErrorC
 
 
 def figure_starts(ends: Mapping[str, Array]) -> Figure:
-    """Return the share of tracks that end nearer to the truth than each distance; `ends` (trials,) are in metres."""
+    """Return a figure of the share of tracks that end within each distance from the truth.
+
+    `ends` are the distances (trials,) of the last states in metres, by start and filter.
+    """
     figure = canvas(7.0, 4.4)
     ax = figure.subplots()
-    looks = ((Ink.RED, "-", 1.5), (Ink.BLUE, "-", 4.0), (Ink.GREEN, "--", 1.5))
-    for (curve, values), (colour, line, width) in zip(ends.items(), looks, strict=True):
+    styles = ((Ink.RED, "-", 1.5), (Ink.BLUE, "-", 4.0), (Ink.GREEN, "--", 1.5))
+    for (curve, values), (colour, line, width) in zip(ends.items(), styles, strict=True):
         ordered = np.sort(np.append(np.where(np.isfinite(values), values, np.inf), _EDGES))
         share = np.searchsorted(np.sort(values), ordered, side="right") / len(values)
         ax.step(ordered, share, line, where="post", color=colour, label=curve, lw=width)
@@ -470,18 +488,18 @@ _SIZES: dict[Size, AnglesSample] = {"quick": AnglesSample(200, 200, 60, 10), "fu
 
 def _run(sample: AnglesSample, seed: int, tick: Tick) -> Report:
     """Run all simulations of the paper, and return the report."""
-    one = draw(STRAIGHT, sample.trials, seed, 0)
-    straight = run_straight(one, tick)
-    wholes = run_wholes(one, tick)
+    straight_draw = draw(STRAIGHT, sample.trials, seed, 0)
+    straight = run_straight(straight_draw, tick)
+    whole_tracks = whole_track_errors(straight_draw, tick)
     winding = run_winding(draw(WINDING, sample.trials, seed, 1), tick)
     circles, snapshot = run_circles(draw(REPAIRED, sample.circles, seed, 2), tick), run_snapshot()
-    many = draw(STRAIGHT, sample.many, seed, 3)
-    starts, clamps, ends = run_starts(many, tick), run_clamps(many, tick), run_ends(many, tick)
+    many_draw = draw(STRAIGHT, sample.many, seed, 3)
+    starts, clamps, ends = run_starts(many_draw, tick), run_clamps(many_draw, tick), run_ends(many_draw, tick)
     rays = run_rays(sample.trials, seed, 4, tick)
     readings = run_readings(sample.readings, seed, 8, tick)
     tables = (
         table_straight(straight),
-        table_wholes(wholes, whole_track_bound()),
+        table_wholes(whole_tracks, whole_track_bound()),
         table_starts(starts),
         table_clamps(clamps),
         table_winding(winding),

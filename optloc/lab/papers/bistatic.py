@@ -1,7 +1,8 @@
 """Slow targets by one receiver and one illuminator of opportunity: excess path, azimuth and elevation.
 
 The recursion of the paper, its corrections, and fixes without a guess run on the same data; the page is
-``bistatic.md``.
+``bistatic.md``. Errors are range, azimuth and elevation from the receiver, in metres and radians. In shapes, q is the
+number of scored epochs. The recursion averages range and angles ("simplified"), and may restart.
 """
 
 from __future__ import annotations
@@ -60,15 +61,15 @@ states."""
 
 def place(distance: float = RANGE, azimuth: float = AZIMUTH, elevation: float = ELEVATION) -> Array:
     """Return a position (3,) in metres from a distance in metres and angles in radians."""
-    ahead = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
-    return distance * np.array(ahead)
+    direction = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
+    return distance * np.array(direction)
 
 
 def problem(epochs: int, *, order: int = 0, path: float = PATH, reference: float | None = None) -> Problem:
-    """Return the estimation problem of the first epochs, without measurements.
+    """Return the estimation problem of the first `epochs` epochs, without measurements.
 
     `order` is 0 for a fixed target and 1 for uniform motion. `path` is the standard deviation of the excess path in
-    metres. The state holds at the second `reference`, 0 by default.
+    metres. The unknown state is the state at the time `reference` in seconds, 0 by default.
     """
     epoch = np.arange(epochs)
     return assemble(
@@ -89,7 +90,7 @@ def draw(
 
 
 def truth(epochs: int, *, slow: bool = False) -> Array:
-    """Return the true positions (epochs, 3), metres."""
+    """Return the true positions (epochs, 3) of the fixed or of the slow target, metres."""
     return place() + np.arange(epochs)[:, None] * (COURSE if slow else 0.0)
 
 
@@ -122,11 +123,11 @@ class Errors:
     error: Array
 
     def rms(self, epochs: int) -> Array:
-        """Return root mean square errors (3,) after a number of epochs."""
+        """Return the root mean square errors (3,) over the trials after `epochs` epochs."""
         return np.asarray(np.sqrt((self.error[:, self.epochs == epochs] ** 2).mean((0, 1))))
 
     def mean(self, epochs: int) -> Array:
-        """Return mean errors (3,) after a number of epochs."""
+        """Return the mean errors (3,) over the trials after `epochs` epochs."""
         return np.asarray(self.error[:, self.epochs == epochs].mean((0, 1)))
 
     def over(self, first: int) -> float:
@@ -135,28 +136,34 @@ class Errors:
 
 
 def _errors(position: Array, slow: bool, epochs: Array) -> Errors:
-    """Return the errors of positions (trials, q, 3) after numbers of epochs (q,)."""
-    exact = polar(truth(int(epochs.max()), slow=slow)[epochs - 1])
-    error = polar(position) - exact
+    """Return the errors of positions (trials, q, 3) after the numbers of epochs `epochs` (q,).
+
+    `slow` is True for the slow target.
+    """
+    true = polar(truth(int(epochs.max()), slow=slow)[epochs - 1])
+    error = polar(position) - true
     # Azimuths are compared on the circle.
     error[..., 1] = np.arctan2(np.sin(error[..., 1]), np.cos(error[..., 1]))
     return Errors(epochs, error)
 
 
 def of_track(track: Track, epochs: int, *, slow: bool) -> Errors:
-    """Return the errors of a track that ends after a number of epochs."""
+    """Return the errors of a track that ends after `epochs` epochs; `slow` is True for the slow target."""
     return _errors(track.position, slow, np.arange(epochs - len(track.times) + 1, epochs + 1))
 
 
 def kalman(drawn: Problem, update: str) -> Track:
-    """Return the track of a Cartesian Kalman filter with constant velocity, started from the first epoch."""
+    """Return the track of a Cartesian Kalman filter with constant velocity; it starts at the fix of the first epoch."""
     dynamics = polynomial(1)
     start = state_of(drawn, first_fix(drawn, dynamics, 1, speed=SPEED), 1)
     return followed(drawn, start, dynamics, update)
 
 
 def run_still(epochs: int, trials: int, sequence: np.random.SeedSequence) -> dict[str, Errors]:
-    """Return the errors for a fixed target: of the corrected recursion, and of the closed-form fix."""
+    """Return the errors for a fixed target, by estimator: the corrected recursion, and the closed-form fix.
+
+    `sequence` is the seed of the draws.
+    """
     drawn = draw(epochs, trials, sequence)
     return {
         "simplified": of_track(simplified(drawn), epochs, slow=False),
@@ -185,19 +192,21 @@ TRACKERS: Mapping[str, Tracker] = {
 
 
 def run_slow(epochs: int, trials: int, sequence: np.random.SeedSequence, tick: Tick) -> dict[str, Errors]:
-    """Return the errors of all `TRACKERS` for the slow target."""
+    """Return the errors of all `TRACKERS` for the slow target, by name; `sequence` is the seed of the draws."""
     drawn = draw(epochs, trials, sequence, slow=True)
-    out = {}
+    errors = {}
     for name, tracker in TRACKERS.items():
-        out[name] = of_track(tracker(drawn), epochs, slow=True)
+        errors[name] = of_track(tracker(drawn), epochs, slow=True)
         tick()
-    return out
+    return errors
 
 
 def run_batches(
     epochs: int, trials: int, sequence: np.random.SeedSequence, *, path: float = PATH, whole: int | None = None
 ) -> dict[str, Errors]:
-    """Return the errors after a number of epochs of the pseudo-linear course, and of the batch fit that starts from it.
+    """Return the errors of two estimates of a uniform course from its first `epochs` epochs, by name.
+
+    The pseudo-linear course is a closed form; the batch fit is least squares that starts from it.
 
     Parameters
     ----------
@@ -218,44 +227,53 @@ def run_batches(
     course = course_starts(run)
     assert course is not None
     fix = solve(run, "lsr", start=course.reshape(trials, 6))
-    at = np.array([epochs])
+    last = np.array([epochs])
     return {
-        "pseudo-linear course": _errors(course[:, None, 0], True, at),
-        "batch maximum likelihood": _errors(fix.position[:, None], True, at),
+        "pseudo-linear course": _errors(course[:, None, 0], True, last),
+        "batch maximum likelihood": _errors(fix.position[:, None], True, last),
     }
 
 
-def _spread(cov: Array, at: Array) -> Array:
-    """Return standard deviations (..., 3) of range, azimuth and elevation from covariances (..., 3, 3) at positions."""
-    r = np.linalg.norm(at, axis=-1)
-    flat = np.hypot(at[..., 0], at[..., 1])
-    u = at / r[..., None]
-    east = np.stack([-at[..., 1], at[..., 0], 0.0 * flat], axis=-1) / flat[..., None]
-    axes = np.stack([u, east, np.cross(u, east)], axis=-2)
-    size = np.sqrt(np.einsum("...ai,...ij,...aj->...a", axes, cov, axes))
+def _polar_sigmas(cov: Array, position: Array) -> Array:
+    """Return the standard deviations (..., 3) of range, azimuth and elevation, metres and radians.
+
+    `cov` (..., 3, 3) are the covariances of the positions `position` (..., 3), m^2 and metres.
+    """
+    r = np.linalg.norm(position, axis=-1)
+    horizontal = np.hypot(position[..., 0], position[..., 1])
+    outward = position / r[..., None]
+    east = np.stack([-position[..., 1], position[..., 0], 0.0 * horizontal], axis=-1) / horizontal[..., None]
+    axes = np.stack([outward, east, np.cross(outward, east)], axis=-2)
+    deviation = np.sqrt(np.einsum("...ai,...ij,...aj->...a", axes, cov, axes))
     # An error across is divided by the range for the elevation, and by its horizontal part for the azimuth.
-    return np.asarray(size / np.stack([np.ones_like(r), flat, r], axis=-1))
+    return np.asarray(deviation / np.stack([np.ones_like(r), horizontal, r], axis=-1))
 
 
 def bound_still(epochs: Array) -> Array:
-    """Return the bound (q, 3) of range, azimuth and elevation of a fixed target, after numbers of epochs (q,)."""
+    """Return the bounds (q, 3) of range, azimuth and elevation of a fixed target, after numbers of epochs (q,).
+
+    Bounds are standard deviations in metres and radians.
+    """
     course = crlb_course(problem(int(epochs.max())), place(), epochs)
-    return _spread(course.covariance, place())
+    return _polar_sigmas(course.covariance, place())
 
 
 def bound_moving(epochs: Array, path: float = PATH) -> Array:
-    """Return the bound (q, 3) of range, azimuth and elevation of the slow target, after numbers of epochs (q,)."""
+    """Return the bounds (q, 3) of range, azimuth and elevation of the slow target, after numbers of epochs (q,).
+
+    Bounds are standard deviations at the last epoch, in metres and radians.
+    """
     course = crlb_course(problem(int(epochs.max()), order=1, path=path), np.concatenate([place(), COURSE]), epochs)
-    since = (epochs - 1.0)[:, None, None]
-    ahead = np.concatenate([np.broadcast_to(np.eye(3), (len(epochs), 3, 3)), since * np.eye(3)], axis=-1)
-    cov = ahead @ course.covariance @ np.swapaxes(ahead, -1, -2)
-    return _spread(cov, truth(int(epochs.max()), slow=True)[epochs - 1])
+    elapsed = (epochs - 1.0)[:, None, None]
+    transition = np.concatenate([np.broadcast_to(np.eye(3), (len(epochs), 3, 3)), elapsed * np.eye(3)], axis=-1)
+    cov = transition @ course.covariance @ np.swapaxes(transition, -1, -2)
+    return _polar_sigmas(cov, truth(int(epochs.max()), slow=True)[epochs - 1])
 
 
 def bound_single(azimuth: float, elevation: float = 0.123) -> float:
-    """Return the bound of the range after one epoch in another direction, metres."""
-    at = place(azimuth=azimuth, elevation=elevation)
-    return float(_spread(crlb(problem(1), at), at)[0])
+    """Return the bound of the range after one epoch in another direction: a standard deviation in metres."""
+    position = place(azimuth=azimuth, elevation=elevation)
+    return float(_polar_sigmas(crlb(problem(1), position), position)[0])
 
 
 def printed_angles(epochs: int, trials: int, sequence: np.random.SeedSequence) -> Array:
@@ -264,11 +282,11 @@ def printed_angles(epochs: int, trials: int, sequence: np.random.SeedSequence) -
     Printed is a_i = a_(i-1) - (a'_i - a_(i-1)) / i, which moves away from the measurement.
     """
     noise = ANGLE * np.random.default_rng(sequence).standard_normal((trials, epochs))
-    out = noise.copy()
+    errors = noise.copy()
     # The factor is 1 + 1/i instead of 1 - 1/i, so the old error grows, and a new error is added.
     for i in range(2, epochs + 1):
-        out[:, i - 1] = out[:, i - 2] - (noise[:, i - 1] - out[:, i - 2]) / i
-    return out
+        errors[:, i - 1] = errors[:, i - 2] - (noise[:, i - 1] - errors[:, i - 2]) / i
+    return errors
 
 
 # Effect of a ground below the target, or of its known height, on the fix of one epoch.
@@ -283,27 +301,27 @@ CASES = {
 
 
 def fix_grounded(azimuth: float, elevation: float, trials: int, sequence: np.random.SeedSequence) -> dict[str, Array]:
-    """Return root mean square errors (range, height, in space) of fixes of one epoch, metres, by the known constraint.
+    """Return rms errors (3,) of fixes of one epoch by the known constraint: range, height, in space; metres.
 
     `azimuth` and `elevation` are the direction of the target in radians; `sequence` is the seed of the draws.
     """
-    at = place(azimuth=azimuth, elevation=elevation)
-    drawn = simulate(problem(1), at, sequence, trials)
-    open_ = np.full(3, np.inf)
-    floor, level = np.array([-np.inf, -np.inf, 0.0]), np.array([np.inf, np.inf, at[2]])
+    position = place(azimuth=azimuth, elevation=elevation)
+    drawn = simulate(problem(1), position, sequence, trials)
+    unbounded = np.full(3, np.inf)
+    floor, known_height = np.array([-np.inf, -np.inf, 0.0]), np.array([np.inf, np.inf, position[2]])
     # A known height is a slab without thickness; the ground is one without an upper face.
     regions = {
         "free": (),
-        "above ground": box(floor.tolist(), open_.tolist()),
-        "known height": box((-level * [1, 1, -1]).tolist(), level.tolist()),
+        "above ground": box(floor.tolist(), unbounded.tolist()),
+        "known height": box((-known_height * [1, 1, -1]).tolist(), known_height.tolist()),
     }
-    out = {}
+    errors = {}
     for name, region in regions.items():
-        found = solve(replace(drawn, constraints=region), "searched").position  # errors over many draws
-        error = found - at
-        away = np.linalg.norm(found, axis=-1) - RANGE
-        out[name] = np.sqrt(np.mean([away**2, error[:, 2] ** 2, (error**2).sum(-1)], axis=1))
-    return out
+        fixes = solve(replace(drawn, constraints=region), "searched").position  # errors over many draws
+        error = fixes - position
+        range_error = np.linalg.norm(fixes, axis=-1) - RANGE
+        errors[name] = np.sqrt(np.mean([range_error**2, error[:, 2] ** 2, (error**2).sum(-1)], axis=1))
+    return errors
 
 
 # Tables of the claims, the recursion, the corrections and the bounds.
@@ -323,7 +341,7 @@ def _cells(errors: Array) -> tuple[str, str, str]:
 
 
 def table_still(found: Mapping[str, Errors], bounds: Mapping[int, Array]) -> TextTable:
-    """Return root mean square errors of a fixed target; `found` is by estimator, `bounds` (3,) by number of epochs."""
+    """Return a table of rms errors of a fixed target; `found` is by estimator, `bounds` (3,) by number of epochs."""
     lines = []
     for count, bound in bounds.items():
         lines += [(str(count), name, *_cells(errors.rms(count))) for name, errors in found.items()]
@@ -332,13 +350,13 @@ def table_still(found: Mapping[str, Errors], bounds: Mapping[int, Array]) -> Tex
 
 
 def table_claims(found: Mapping[str, Errors]) -> TextTable:
-    """Return the share of runs in which the paper's claims for 10 epochs hold."""
+    """Return a table of the share of runs within the paper's claims for 10 epochs, and of the rms errors."""
     lines = []
     for name, column, limit, claim in CLAIMS:
         within = [np.abs(errors.error[:, errors.epochs == 10, column]) < limit for errors in found.values()]
-        spread = [errors.rms(10)[column] for errors in found.values()]
+        rms = [errors.rms(10)[column] for errors in found.values()]
         unit = "{:.0f} m" if column == 0 else "{:.4f} rad"
-        lines.append((name, claim, *(percent(each.mean()) for each in within), *map(unit.format, spread)))
+        lines.append((name, claim, *(percent(inside.mean()) for inside in within), *map(unit.format, rms)))
     header = ("error", "printed", *(f"{name}, share" for name in found), *(f"{name}, rms" for name in found))
     return tabulate("claims", header, lines)
 
@@ -346,7 +364,7 @@ def table_claims(found: Mapping[str, Errors]) -> TextTable:
 def table_slow(
     tracks: Mapping[str, Errors], fits: Mapping[int, Mapping[str, Errors]], bounds: Mapping[int, Array]
 ) -> TextTable:
-    """Return root mean square errors of the slow target.
+    """Return a table of root mean square errors of the slow target.
 
     `tracks` is by tracker. `fits` are fits of whole records, by number of epochs; `bounds` (3,) has the same numbers.
     """
@@ -367,7 +385,7 @@ def table_slow(
 
 
 def table_short(trials: int, sequences: Sequence[np.random.SeedSequence], tick: Tick) -> TextTable:
-    """Return batch fits of ten epochs and their bound, with the noise of the paper and a path ten times as noisy."""
+    """Return a table of batch fits of ten epochs and their bound, with printed and with ten times the path noise."""
     lines = []
     for sequence, (name, path) in zip(sequences, {"20 ns": PATH, "200 ns": 10.0 * PATH}.items(), strict=True):
         errors = run_batches(10, trials, sequence, path=path)["batch maximum likelihood"]
@@ -380,27 +398,27 @@ def table_short(trials: int, sequences: Sequence[np.random.SeedSequence], tick: 
 
 
 def table_directions() -> TextTable:
-    """Return the bound of the range of one epoch against azimuth."""
+    """Return a table of the bound of the range of one epoch against azimuth."""
     lines = [(f"{azimuth:.3f}", kilometres(bound_single(azimuth))) for azimuth in _AZIMUTHS]
     return tabulate("directions", ("azimuth, rad", "bound of the range, km"), lines)
 
 
 def table_ground(trials: int, sequence: np.random.SeedSequence, tick: Tick) -> TextTable:
-    """Return the effect of a ground or a known height in all `CASES`."""
+    """Return a table of the effect of a ground or a known height in all `CASES`."""
     lines = []
     for (name, direction), child in zip(CASES.items(), sequence.spawn(len(CASES)), strict=True):
-        found = fix_grounded(*direction, trials, child)
-        lines += [(name, how, *map(kilometres, errors)) for how, errors in found.items()]
+        by_constraint = fix_grounded(*direction, trials, child)
+        lines += [(name, constraint, *map(kilometres, errors)) for constraint, errors in by_constraint.items()]
         tick()
     return tabulate("ground", ("case", "known", "range, km", "height, km", "in space, km"), lines)
 
 
 def table_printed(azimuth: Array) -> TextTable:
-    """Return the error of the angle step as printed; azimuth errors are (trials, epochs), radians."""
-    spread = np.sqrt((azimuth**2).mean(0))
-    last = azimuth.shape[1]
-    shown = [i for i in (1, 2, 5, 10, 50, last) if i <= last]
-    lines = [(str(i), f"{spread[i - 1]:.3f}", f"{ANGLE / np.sqrt(i):.4f}") for i in shown]
+    """Return a table of the error of the angle step as printed; azimuth errors are (trials, epochs), radians."""
+    rms = np.sqrt((azimuth**2).mean(0))
+    epochs = azimuth.shape[1]
+    shown = [i for i in (1, 2, 5, 10, 50, epochs) if i <= epochs]
+    lines = [(str(i), f"{rms[i - 1]:.3f}", f"{ANGLE / np.sqrt(i):.4f}") for i in shown]
     return tabulate("printed", ("epochs", "as printed, rad", "with the sign corrected, rad"), lines)
 
 
@@ -423,7 +441,7 @@ _RUN = ("single fix", "simplified, no restart", "restart every 50", "line fit")
 
 
 def against_time(found: Mapping[str, Errors], bound: tuple[Array, Array], points: Mapping[str, Errors]) -> Figure:
-    """Return root mean square errors of range, azimuth and elevation against the number of epochs.
+    """Return a figure of root mean square errors of range, azimuth and elevation against the number of epochs.
 
     Parameters
     ----------
@@ -435,14 +453,14 @@ def against_time(found: Mapping[str, Errors], bound: tuple[Array, Array], points
         Estimates, each after one number of epochs.
     """
     figure = canvas(15.0, 4.6)
-    for i, (ax, (name, unit)) in enumerate(zip(figure.subplots(1, 3), _AXES.items(), strict=True)):
-        ax.plot(bound[0], unit * bound[1][:, i], color=Ink.BLACK, lw=1.0, label="Cramér-Rao bound")
+    for i, (ax, (name, factor)) in enumerate(zip(figure.subplots(1, 3), _AXES.items(), strict=True)):
+        ax.plot(bound[0], factor * bound[1][:, i], color=Ink.BLACK, lw=1.0, label="Cramér-Rao bound")
         for curve, errors in found.items():
-            spread, (colour, dash) = np.sqrt((errors.error[..., i] ** 2).mean(0)), _STYLE[curve]
-            ax.plot(errors.epochs, unit * spread, dash, color=colour, lw=1.6, label=curve)
+            rms, (colour, dash) = np.sqrt((errors.error[..., i] ** 2).mean(0)), _STYLE[curve]
+            ax.plot(errors.epochs, factor * rms, dash, color=colour, lw=1.6, label=curve)
         for point, errors in points.items():
-            spread = np.sqrt((errors.error[..., i] ** 2).mean(0))
-            ax.plot(errors.epochs, unit * spread, "D", color=Ink.BLACK, mfc="none", ms=7, label=point)
+            rms = np.sqrt((errors.error[..., i] ** 2).mean(0))
+            ax.plot(errors.epochs, factor * rms, "D", color=Ink.BLACK, mfc="none", ms=7, label=point)
         scale(ax)
         label(ax, "epochs, one a second", f"error of {name} (root mean square)")
     explain(figure, 4)
@@ -450,12 +468,12 @@ def against_time(found: Mapping[str, Errors], bound: tuple[Array, Array], points
 
 
 def one_run(found: Mapping[str, Errors]) -> Figure:
-    """Return the errors of the first run of each estimator against the number of epochs."""
+    """Return a figure of the errors of the first run of each estimator against the number of epochs."""
     figure = canvas(15.0, 4.6)
-    for i, (ax, (name, unit)) in enumerate(zip(figure.subplots(1, 3), _AXES.items(), strict=True)):
+    for i, (ax, (name, factor)) in enumerate(zip(figure.subplots(1, 3), _AXES.items(), strict=True)):
         for curve, errors in found.items():
-            thin = 0.7 if curve == "single fix" else 1.6  # it jumps every second and would hide the others
-            ax.plot(errors.epochs, unit * errors.error[0, :, i], color=_STYLE[curve][0], lw=thin, label=curve)
+            width = 0.7 if curve == "single fix" else 1.6  # it jumps every second and would hide the others
+            ax.plot(errors.epochs, factor * errors.error[0, :, i], color=_STYLE[curve][0], lw=width, label=curve)
         ax.axhline(0.0, color=Ink.BLACK, lw=0.8)
         label(ax, "epochs, one a second", f"error of {name}")
     explain(figure, 4)
@@ -463,17 +481,17 @@ def one_run(found: Mapping[str, Errors]) -> Figure:
 
 
 def _figures(
-    stays: Mapping[str, Errors], tracks: Mapping[str, Errors], fits: Mapping[int, Mapping[str, Errors]]
+    fixed: Mapping[str, Errors], tracks: Mapping[str, Errors], fits: Mapping[int, Mapping[str, Errors]]
 ) -> dict[str, Figure]:
     """Return the figures of the fixed target, of the slow one and of one run, by file name."""
     counts = np.unique(np.geomspace(1, max(fits), 40).astype(int))
     # Two epochs determine a course, but its bound is beyond the axis.
     later = counts[counts >= 5]
     batch = "batch maximum likelihood"
-    ends = np.concatenate([fits[k][batch].error for k in sorted(fits)], axis=1)
-    points = {batch: Errors(np.array(sorted(fits)), ends)}
+    last_errors = np.concatenate([fits[k][batch].error for k in sorted(fits)], axis=1)
+    points = {batch: Errors(np.array(sorted(fits)), last_errors)}
     return {
-        "still": against_time(stays, (counts, bound_still(counts)), {}),
+        "still": against_time(fixed, (counts, bound_still(counts)), {}),
         "slow": against_time({name: tracks[name] for name in _SHOWN}, (later, bound_moving(later)), points),
         "run": one_run({name: tracks[name] for name in _RUN}),
     }
@@ -516,7 +534,7 @@ def _run(sample: BistaticSample, seed: int, tick: Tick) -> Report:
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))
 
-    stays = run_still(sample.epochs, sample.still, sequence(0))
+    fixed = run_still(sample.epochs, sample.still, sequence(0))
     tick()
     tracks = run_slow(sample.epochs, sample.slow, sequence(1), tick)
     fits = {}
@@ -526,15 +544,15 @@ def _run(sample: BistaticSample, seed: int, tick: Tick) -> Report:
     bounds = {count: bound_moving(np.array([count]))[0] for count in (_EARLY, sample.epochs)}
     counts = [count for count in _COUNTS if count <= sample.epochs]
     tables = (
-        table_still(stays, {count: bound_still(np.array([count]))[0] for count in counts}),
-        table_claims(stays),
+        table_still(fixed, {count: bound_still(np.array([count]))[0] for count in counts}),
+        table_claims(fixed),
         table_slow(tracks, fits, bounds),
         table_short(sample.slow, (sequence(2), sequence(3)), tick),
         table_directions(),
         table_ground(sample.ground, sequence(4), tick),
         table_printed(printed_angles(sample.epochs, sample.still, sequence(5))),
     )
-    return typeset("bistatic", sample, seed, tables, _figures(stays, tracks, fits))
+    return typeset("bistatic", sample, seed, tables, _figures(fixed, tracks, fits))
 
 
 STUDY = Study(_SIZES, lambda _: len(TRACKERS) + len(CASES) + 5, _run)

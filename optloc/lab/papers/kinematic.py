@@ -1,6 +1,9 @@
 """Static, uniform and accelerated targets by range differences: scene, filters and errors of a paper.
 
 `optloc.lab.papers.kinematic_tables` makes the tables and figures; the page is ``kinematic.md``.
+
+Letters in shapes: n trials, t targets, s stations, k epochs (k = steps + 1; after the first epoch: k steps), q models.
+A state is position, velocity and acceleration in the plane. CV and CA are models of constant velocity and acceleration.
 """
 
 from __future__ import annotations
@@ -95,11 +98,11 @@ class KinematicScenario:
         An acceleration begins at `since` seconds.
         """
         t = self.times[:, None]
-        late = np.maximum(t - since, 0.0)  # seconds of acceleration
+        accelerated = np.maximum(t - since, 0.0)  # seconds of acceleration
         v = self.velocity[:, None] * (order > 0)
         a = self.acceleration[:, None] * (order > 1)
-        place = self.position[:, None] + v * t + 0.5 * a * late**2
-        return np.concatenate([place, v + a * late, a * (t >= since)], axis=-1)
+        position = self.position[:, None] + v * t + 0.5 * a * accelerated**2
+        return np.concatenate([position, v + a * accelerated, a * (t >= since)], axis=-1)
 
     def problem(self) -> Problem:
         """Return a run of one target without measurements; every epoch has a free position."""
@@ -118,11 +121,11 @@ class KinematicDraw:
     scenario : KinematicScenario
         The scene.
     truth : array (t, k, 6)
-        States of the targets.
+        States of the targets, SI units.
     runs : Problem
         Batch (n, t) of runs of one target.
     fix : State
-        Positions (n, t) from the first epoch.
+        Positions (n, t) from the first epoch, with their covariances.
     """
 
     scenario: KinematicScenario
@@ -142,8 +145,8 @@ def draw(scenario: KinematicScenario, truth: Array, trials: int, key: tuple[int,
     `truth` (t, k, 6) is from `KinematicScenario.course`, `trials` is the number n of independent trials, `key` the
     seed.
     """
-    places = truth[..., :2].reshape(len(truth), -1)
-    runs = simulate(scenario.problem(), places, np.random.SeedSequence(key), trials=trials)
+    positions = truth[..., :2].reshape(len(truth), -1)
+    runs = simulate(scenario.problem(), positions, np.random.SeedSequence(key), trials=trials)
     # Drawn along the course. A tracker takes scan by scan, and a target is static within a scan.
     runs = replace(runs, motions=(Motion(0),))
     first = solve(cut(runs, 0, 1))
@@ -151,7 +154,7 @@ def draw(scenario: KinematicScenario, truth: Array, trials: int, key: tuple[int,
 
 
 def strip_labels(drawn: KinematicDraw, detection: float, false: float, key: tuple[int, ...]) -> RowCandidates:
-    """Return the rows of all targets without labels, some missing, with false rows added.
+    """Return the rows of all targets without the names of the targets; some are missing, and false rows are added.
 
     Parameters
     ----------
@@ -165,15 +168,15 @@ def strip_labels(drawn: KinematicDraw, detection: float, false: float, key: tupl
         Seed of missing and false rows.
     """
     rng = np.random.default_rng(np.random.SeedSequence(key))
-    # (n, k m, t): the rows of a channel are together and carry no target; NaN is a missing row.
-    seen = np.moveaxis(drawn.runs.z, 1, -1)
-    seen = np.where(rng.random(seen.shape) < detection, seen, np.nan)
-    count = rng.poisson(false, seen.shape[:-1])[..., None]
-    reach = baseline(drawn.scenario)
-    more = rng.uniform(-reach, reach, (*seen.shape[:-1], int(count.max(initial=0))))
-    more = np.where(np.arange(more.shape[-1]) < count, more, np.nan)
+    # (n, k m, t): the rows of a channel are in one group without the target; m are the channels, NaN is a missing row.
+    rows = np.moveaxis(drawn.runs.z, 1, -1)
+    rows = np.where(rng.random(rows.shape) < detection, rows, np.nan)
+    number = rng.poisson(false, rows.shape[:-1])[..., None]
+    longest = baseline(drawn.scenario)
+    false_rows = rng.uniform(-longest, longest, (*rows.shape[:-1], int(number.max(initial=0))))
+    false_rows = np.where(np.arange(false_rows.shape[-1]) < number, false_rows, np.nan)
     channels = replace(drawn.scenario.problem(), motions=(Motion(0),))
-    return RowCandidates(channels, np.concatenate([seen, more], axis=-1))
+    return RowCandidates(channels, np.concatenate([rows, false_rows], axis=-1))
 
 
 def baseline(scenario: KinematicScenario) -> float:
@@ -218,7 +221,7 @@ class KinematicScore:
 
     @property
     def level(self) -> float:
-        """Return the mean NEES at the last step."""
+        """Return the mean NEES at the last step; its expectation is 2 if the covariances are right."""
         return float(self.nees[..., -1].mean())
 
     @property
@@ -229,25 +232,28 @@ class KinematicScore:
 
 def score(drawn: KinematicDraw, position: Array, cov: Array | None = None) -> KinematicScore:
     """Return the errors of positions (n, t, k, 2) after the first epoch, and their NEES if covariances are given."""
-    away = position - drawn.position
-    nees = np.full(away.shape[:-1], np.nan)
+    error = position - drawn.position
+    nees = np.full(error.shape[:-1], np.nan)
     if cov is not None:
-        nees = (away * np.linalg.solve(cov, away[..., None])[..., 0]).sum(-1)
-    return KinematicScore(np.linalg.norm(away, axis=-1), nees)
+        nees = (error * np.linalg.solve(cov, error[..., None])[..., 0]).sum(-1)
+    return KinematicScore(np.linalg.norm(error, axis=-1), nees)
 
 
 def start_from_fix(drawn: KinematicDraw, order: int) -> State:
-    """Return the state of the first epoch: the fix, and priors of velocity and acceleration."""
+    """Return the state of the first epoch: the fix, and prior values of velocity and acceleration.
+
+    `order` is the order of the state: 0 position only, 1 with velocity, 2 with acceleration.
+    """
     return resized(drawn.fix, order, 2, speed=drawn.scenario.speed, rate=drawn.scenario.rate)
 
 
 def track_all(drawn: KinematicDraw, dynamics: Dynamics, update: Update | str = "ekf") -> Track:
-    """Return the tracks of all runs by one model."""
+    """Return the tracks of all runs by one model; `update` is the filter or its name."""
     return followed(drawn.runs, start_from_fix(drawn, dynamics.order), dynamics, update)
 
 
 def score_track(drawn: KinematicDraw, track: Track) -> KinematicScore:
-    """Return the errors of tracks."""
+    """Return the position errors and the NEES of tracks."""
     return score(drawn, track.position, track.cov[..., :2, :2])
 
 
@@ -256,32 +262,39 @@ def fixes(drawn: KinematicDraw) -> KinematicScore:
 
     The first epoch is left out, as it is with tracks.
     """
-    found = solve(replace(drawn.runs, motions=(Motion(0, span="epoch"),)))
-    return score(drawn, found.position[..., 1:, :], found.covariance()[..., 1:, :, :])
+    estimate = solve(replace(drawn.runs, motions=(Motion(0, span="epoch"),)))
+    return score(drawn, estimate.position[..., 1:, :], estimate.covariance()[..., 1:, :, :])
 
 
 def batch(drawn: KinematicDraw, order: int) -> KinematicScore:
-    """Return the errors at the last epoch of maximum-likelihood estimates of whole runs, without a guess."""
+    """Return the errors at the last epoch of maximum-likelihood estimates of whole runs, without a guess.
+
+    `order` is the order of the motion, as in `start_from_fix`.
+    """
     sizes = {"velocity": drawn.scenario.speed, "acceleration": drawn.scenario.rate}
     priors = [Prior(name, np.zeros(2), size**2 * np.eye(2)) for name, size in list(sizes.items())[:order]]
-    found = solve(replace(drawn.runs, motions=(Motion(order),), priors=tuple(priors)))
-    # Estimates hold at time zero; tracks are scored at the last epoch.
+    estimate = solve(replace(drawn.runs, motions=(Motion(order),), priors=tuple(priors)))
+    # Estimates are states at time zero; tracks are scored at the last epoch.
     T = float(drawn.scenario.times[-1])
-    ahead = np.kron([1.0, T, 0.5 * T * T][: order + 1], np.eye(2))
-    away = found.x @ ahead.T - drawn.position[:, -1]
-    cov = ahead @ found.cov @ ahead.T
-    nees = (away * np.linalg.solve(cov, away[..., None])[..., 0]).sum(-1)
-    return KinematicScore(np.linalg.norm(away, axis=-1)[..., None], nees[..., None])
+    transition = np.kron([1.0, T, 0.5 * T * T][: order + 1], np.eye(2))
+    error = estimate.x @ transition.T - drawn.position[:, -1]
+    cov = transition @ estimate.cov @ transition.T
+    nees = (error * np.linalg.solve(cov, error[..., None])[..., 0]).sum(-1)
+    return KinematicScore(np.linalg.norm(error, axis=-1)[..., None], nees[..., None])
 
 
 def bounds(scenario: KinematicScenario, truth: Array, order: int) -> Array:
-    """Return the posterior Cramer-Rao bound of the position (t, k, 2, 2), m^2, with the first fix."""
-    made = replace(scenario.problem(), motions=(Motion(0),))
-    first = crlb(cut(made, 0, 1), truth[:, 0, :2])
+    """Return the posterior Cramer-Rao bound of the position after each epoch (t, k, 2, 2), m^2.
+
+    The bound begins with the bound of the first fix. `truth` (t, k, 6) are the true states; `order` is the order of the
+    model.
+    """
+    static = replace(scenario.problem(), motions=(Motion(0),))
+    first = crlb(cut(static, 0, 1), truth[:, 0, :2])
     n = 2 * (order + 1)
     fix = State(float(scenario.times[0]), truth[:, 0, :2], first)
     start = resized(fix, order, 2, speed=scenario.speed, rate=scenario.rate)
-    later = posterior_bound(made, truth[..., :n], start, polynomial(order))
+    later = posterior_bound(static, truth[..., :n], start, polynomial(order))
     return np.concatenate([first[:, None], later[..., :2, :2]], axis=1)
 
 
@@ -300,7 +313,10 @@ def mean_error(cov: Array) -> Array:
 
 
 def polynomial_ratio(order: int, points: int) -> float:
-    """Return the end-point error of a line (order 1) or parabola (2) through equal points, relative to one point."""
+    """Return the end-point error of a line (order 1) or a parabola (order 2) through points of equal accuracy.
+
+    The error is relative to the error of one point; `points` is the number of equidistant points.
+    """
     # The corner of the inverse normal matrix of equidistant points, in closed form.
     k = points
     if order == 1:
@@ -309,7 +325,7 @@ def polynomial_ratio(order: int, points: int) -> float:
 
 
 def theory(order: int, steps: int) -> float:
-    """Return the mean of `polynomial_ratio` over the steps after one fix."""
+    """Return the mean of `polynomial_ratio` over `steps` epochs after one fix: the expected ratio of errors."""
     return float(np.mean([polynomial_ratio(order, k) for k in range(2, steps + 2)]))
 
 
@@ -332,18 +348,18 @@ class PaperFilter:
     switch: float = 0.0
 
     def run(self, drawn: KinematicDraw) -> KinematicScore:
-        """Return the errors of a draw."""
+        """Return the errors of the filter on a draw."""
         scene = drawn.scenario
         if len(self.models) == 1:
             return score_track(drawn, track_all(drawn, self.models[0]))
         if not self.switch:
-            made = parallel(drawn.runs, drawn.fix, self.models, speed=scene.speed, rate=scene.rate, update="ekf")
-            return score(drawn, made.position)
+            best = parallel(drawn.runs, drawn.fix, self.models, speed=scene.speed, rate=scene.rate, update="ekf")
+            return score(drawn, best.position)
         q = len(self.models)
         # Rows sum to one: a switch goes to each other model with equal probability.
-        chain = np.full((q, q), self.switch / (q - 1)) + (1.0 - self.switch * q / (q - 1)) * np.eye(q)
-        found = imm(drawn.runs, drawn.fix, self.models, chain, speed=scene.speed, rate=scene.rate, update="ekf")
-        return score_track(drawn, found.track)
+        transitions = np.full((q, q), self.switch / (q - 1)) + (1.0 - self.switch * q / (q - 1)) * np.eye(q)
+        mixed = imm(drawn.runs, drawn.fix, self.models, transitions, speed=scene.speed, rate=scene.rate, update="ekf")
+        return score_track(drawn, mixed.track)
 
 
 PLAIN = tuple(polynomial(order) for order in (0, 1, 2))
@@ -380,14 +396,14 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class Association:
-    """The association test of one motion.
+    """Result of the association test for one motion.
 
     Parameters
     ----------
     drawn : KinematicDraw
         The truth, and labelled measurements.
     scores : dict of str to KinematicScore
-        By rule.
+        Errors by rule.
     """
 
     drawn: KinematicDraw
@@ -395,7 +411,11 @@ class Association:
 
 
 def rules(scenario: KinematicScenario, detection: float, false: float) -> tuple[Rule, ...]:
-    """Return the rules that are compared."""
+    """Return the rules of association that are compared.
+
+    `detection` is the probability that a row is detected, and `false` the mean number of false rows of a channel and
+    epoch.
+    """
     # False rows are uniform over range differences from minus to plus the longest baseline.
     known = Clutter(detection, false / (2.0 * baseline(scenario)))
     return (
@@ -432,13 +452,13 @@ def association(
         Probability that a row is detected; mean number of false rows of a channel and epoch.
     """
     drawn = draw(scenario, scenario.course(order), trials, (*key, 0))
-    given = strip_labels(drawn, detection, false, (*key, 1))
+    unlabelled = strip_labels(drawn, detection, false, (*key, 1))
     scores = {}
     for rule in rules(scenario, detection, false):
-        found = associated(
-            given, start_from_fix(drawn, order), polynomial(order), rule.associate, "ekf", missing=rule.missing
+        result = associated(
+            unlabelled, start_from_fix(drawn, order), polynomial(order), rule.associate, "ekf", missing=rule.missing
         )
-        scores[rule.name] = score_track(drawn, found.track)
+        scores[rule.name] = score_track(drawn, result.track)
     return Association(drawn, scores)
 
 
@@ -448,7 +468,7 @@ def association(
 def predict_twice(dynamics: Dynamics, interval: float, dimension: int) -> Update:
     """Return the update of equations 28 to 31 as printed, which applies the transition a second time within H.
 
-    `interval` is the time between epochs in seconds; `dimension` is 2 or 3.
+    H is the Jacobian of the measurements. `interval` is the time between epochs in seconds; `dimension` is 2 or 3.
     """
     n = (dynamics.order + 1) * dimension
     F = dynamics.step(interval, np.zeros(n), dimension)[0]
@@ -495,12 +515,12 @@ def taylor(problem: Problem, start: Array, *, sign: float = 1.0, steps: int = 50
     return x
 
 
-def weighting(problem: Problem, place: Array, covariance: Array) -> tuple[float, float]:
-    """Return root mean square errors of a fix with equal weights and with optimal weights, to first order, metres.
+def weighting(problem: Problem, position: Array, covariance: Array) -> tuple[float, float]:
+    """Return the root mean square errors of a fix with equal weights and with optimal weights, to first order, metres.
 
-    `place` (d,) is the target, `covariance` (m, m) the true covariance of the rows of one epoch.
+    `position` (d,) is the target, `covariance` (m, m) the true covariance of the m rows of one epoch.
     """
-    H = linearise(problem, place).shared
-    plain = np.linalg.solve(H.T @ H, H.T)
-    best = np.linalg.inv(H.T @ np.linalg.solve(covariance, H))
-    return float(np.sqrt(np.trace(plain @ covariance @ plain.T))), float(np.sqrt(np.trace(best)))
+    H = linearise(problem, position).shared
+    unweighted = np.linalg.solve(H.T @ H, H.T)
+    optimal = np.linalg.inv(H.T @ np.linalg.solve(covariance, H))
+    return float(np.sqrt(np.trace(unweighted @ covariance @ unweighted.T))), float(np.sqrt(np.trace(optimal)))

@@ -2,6 +2,9 @@
 
 Both run on the same data. `optloc.lab.papers.registration_tables` makes the tables and figures; the page is
 ``registration.md``.
+
+Letters in shapes: s stations, k epochs, n unknowns (the parameter vector: position, velocity of a moving target, delays
+of s - 1 stations in metres, gains of s - 1 stations). Units are SI units.
 """
 
 from __future__ import annotations
@@ -41,7 +44,8 @@ NANOSECOND = 1e-9 * SPEED
 
 Shape = Literal["full", "half", "diag"]
 
-# Variance of the independent noise of a row, and of the common noise of all rows of an epoch, over sigma squared.
+# Variance of the independent noise of a row, and of the common noise of all rows of an epoch, over sigma squared. The
+# shapes are readings of the paper, see `problem`.
 _SHAPES: dict[Shape, tuple[float, float]] = {"full": (1.0, 1.0), "half": (0.5, 0.5), "diag": (1.0, 0.0)}
 
 
@@ -85,16 +89,19 @@ class RegistrationScenario:
         return tuple(str(i + 1) for i in range(len(self.position)))
 
     def times(self, epochs: int) -> Array:
-        """Return the seconds (k,) of the first epochs."""
+        """Return the times (k,) of the first `epochs` epochs, seconds."""
         return self.interval * np.arange(epochs)
 
     def track(self, epochs: int) -> Array:
-        """Return the positions (k, s, 3) of the stations, metres."""
+        """Return the positions (k, s, 3) of the stations at the first `epochs` epochs, metres."""
         return np.asarray(self.position + self.times(epochs)[:, None, None] * self.velocity)
 
 
 def _fleet(*rows: tuple[float, ...]) -> tuple[Array, Array]:
-    """Return positions and velocities of stations given in kilometres and metres per second."""
+    """Return positions (s, 3) in metres and velocities (s, 3) in m/s of stations.
+
+    Each row has three coordinates in kilometres, and three of the velocity in metres per second.
+    """
     table = np.array(rows, dtype=float)
     return 1e3 * table[:, :3], table[:, 3:]
 
@@ -162,28 +169,28 @@ def problem(
     Problem
         Unknowns: position, velocity if the target moves, "delay", and "gain" with gain ratios.
     """
-    count, spread = len(scenario.position), scenario.sigma if sigma is None else sigma
-    a, epoch = np.tile(np.arange(1, count), epochs), np.repeat(np.arange(epochs), count - 1)
-    kinds = {"tdoa": spread} if gain_sigma is None else {"tdoa": spread, "groa": gain_sigma}
+    stations, arrival_sigma = len(scenario.position), scenario.sigma if sigma is None else sigma
+    a, epoch = np.tile(np.arange(1, stations), epochs), np.repeat(np.arange(epochs), stations - 1)
+    kinds = {"tdoa": arrival_sigma} if gain_sigma is None else {"tdoa": arrival_sigma, "groa": gain_sigma}
     rows = [measured(kind, a=a, b=0, epoch=epoch, sigma=size) for kind, size in kinds.items()]
-    covariance = np.broadcast_to(station_sigma**2 * np.eye(3), (count, 3, 3)) if station_sigma else None
+    covariance = np.broadcast_to(station_sigma**2 * np.eye(3), (stations, 3, 3)) if station_sigma else None
     # The reference is station 0; a station error that lasts one epoch is noise of its rows.
-    made = assemble(
+    problem = assemble(
         Stations(scenario.track(epochs), scenario.names, covariance=covariance, span="noise"),
         *rows,
         times=scenario.times(epochs),
         motions=[Motion(order=0 if scenario.course is None else 1)],
     )
-    own, common = _SHAPES[shape]
-    unit = own * np.eye(count - 1) + common
-    members = np.arange(made.count).reshape(-1, count - 1)
+    independent, common = _SHAPES[shape]
+    unit = independent * np.eye(stations - 1) + common
+    members = np.arange(problem.count).reshape(-1, stations - 1)
     # One block for each epoch and kind: (epochs, s - 1) rows that share the arrival at the reference.
     blocks = [
         Block(part, size**2 * unit[None])
         for part, size in zip(np.split(members, len(kinds)), kinds.values(), strict=True)
     ]
-    made = with_bias(replace(made, noise=Noise(tuple(blocks))), "delay", per="pair", kind="tdoa", sigma=prior)
-    return made if gain_sigma is None else with_bias(made, "gain", per="pair", kind="groa")
+    problem = with_bias(replace(problem, noise=Noise(tuple(blocks))), "delay", per="pair", kind="tdoa", sigma=prior)
+    return problem if gain_sigma is None else with_bias(problem, "gain", per="pair", kind="groa")
 
 
 def truth(scenario: RegistrationScenario, problem: Problem) -> Array:
@@ -228,7 +235,7 @@ class RegistrationSetting:
     gain_sigma: float | None = None
 
     def problem(self, epochs: int) -> Problem:
-        """Return the problem of the first epochs, without measurements."""
+        """Return the problem of the first `epochs` epochs, without measurements."""
         return problem(
             self.scenario,
             epochs,
@@ -238,22 +245,22 @@ class RegistrationSetting:
         )
 
     def draw(self, epochs: int) -> Problem:
-        """Return all trials with measurements."""
-        made = self.problem(epochs)
-        return simulate(made, truth(self.scenario, made), self._sequence(0), self.trials)
+        """Return the problem of the first `epochs` epochs with the simulated measurements of all trials."""
+        problem = self.problem(epochs)
+        return simulate(problem, truth(self.scenario, problem), self._sequence(0), self.trials)
 
     def first(self, drawn: Problem, epochs: int) -> Problem:
-        """Return the first epochs of a draw."""
+        """Return the first `epochs` epochs of a draw."""
         return self.problem(epochs).with_rows(z=drawn.z[..., drawn.epoch < epochs])
 
     def bound(self, epochs: int) -> Array:
-        """Return the Cramer-Rao bound of the shared unknowns (n, n) after some epochs."""
+        """Return the Cramer-Rao bound (n, n) of the unknowns after `epochs` epochs, in SI units."""
         return np.asarray(self.bounds((epochs,))[0])
 
     def bounds(self, epochs: Sequence[int] | Array) -> Array:
-        """Return the bounds (t, n, n) after several numbers of epochs."""
-        made = self.problem(max(epochs))
-        return crlb_course(made, truth(self.scenario, made), epochs).covariance
+        """Return the Cramer-Rao bounds (t, n, n) after each of the t numbers of epochs in `epochs`."""
+        problem = self.problem(max(epochs))
+        return crlb_course(problem, truth(self.scenario, problem), epochs).covariance
 
     def starts(self, width: float) -> Array:
         """Return Gaussian starts (trials, n) around the truth, `width` one-shot standard deviations wide, SI units.
@@ -269,14 +276,18 @@ class RegistrationSetting:
         return np.asarray(centre + width * spread * rng.standard_normal((self.trials, len(centre))))
 
     def _sequence(self, purpose: int) -> np.random.SeedSequence:
+        """Return the seed for one purpose of the draw: 0 for measurements, 1 for starts."""
         return np.random.SeedSequence(self.seed, spawn_key=(self.key, purpose))
 
 
 def one_shot(scenario: RegistrationScenario = PRINTED, *, sigma: float | None = None, shape: Shape = "full") -> Array:
-    """Return the paper's sigma0, metres: the bound of each coordinate (3,) from the first epoch with known biases."""
-    still = replace(scenario, course=None)
-    made = problem(still, 1, sigma=sigma, prior=1e-6, shape=shape)  # a micrometre: the biases are known
-    return np.asarray(np.sqrt(np.diagonal(crlb(made, truth(still, made)))[:3]))
+    """Return the paper's sigma0: the bound of each coordinate (3,) from the first epoch with known biases, metres.
+
+    The paper measures the width of starts in sigma0. `sigma` and `shape` are as in `problem`.
+    """
+    fixed = replace(scenario, course=None)
+    first_epoch = problem(fixed, 1, sigma=sigma, prior=1e-6, shape=shape)  # a micrometre: the biases are known
+    return np.asarray(np.sqrt(np.diagonal(crlb(first_epoch, truth(fixed, first_epoch)))[:3]))
 
 
 def rms(bound: Array) -> float:
@@ -312,7 +323,7 @@ class RegistrationScore:
 
 
 def score(estimate: Array, exact: Array, bound: Array) -> RegistrationScore:
-    """Return the score of estimates (trials, n) of a truth (n,) with a bound (n, n)."""
+    """Return the errors of estimates (trials, n) of a true vector (n,), and the lost trials by the bound (n, n)."""
     error = estimate - exact
     with np.errstate(invalid="ignore", over="ignore"):
         # Written so that NaN counts as far.
@@ -325,11 +336,11 @@ def branch(fix: Fix, exact: Array) -> Array:
 
     For a target that moves straight, two mirror images explain the data exactly, and a fix lists both.
     """
-    pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
+    candidates = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
     with np.errstate(invalid="ignore"):
-        apart = ((pool[..., :3] - exact[:3]) ** 2).sum(-1)
-    best = np.argmin(np.where(np.isfinite(apart), apart, np.inf), axis=1)
-    return np.asarray(pool[np.arange(len(pool)), best])
+        distance = ((candidates[..., :3] - exact[:3]) ** 2).sum(-1)
+    nearest = np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=1)
+    return np.asarray(candidates[np.arange(len(candidates)), nearest])
 
 
 def wander(
@@ -341,9 +352,10 @@ def wander(
     width: float = 1.0,
     first: int = FIRST,
 ) -> tuple[RegistrationScore, ...]:
-    """Return the scores of the paper's recursion after some numbers of epochs.
+    """Return the scores of the paper's recursion after each of the numbers of epochs `epochs`.
 
-    `bounds` are the bounds (n, n) at these epochs. `width` is the width of the starts in one-shot standard deviations.
+    `drawn` are the measurements of all trials. `bounds` are the bounds (n, n) at these epochs. `width` is the width of
+    the starts in one-shot standard deviations, and `first` is the number of epochs of the first estimate.
     """
     scene, last = setting.scenario, max(epochs)
     z, *gains = (rows.z.reshape(setting.trials, drawn.epochs, -1)[:, :last] for rows in drawn.rows)
@@ -393,14 +405,16 @@ def mirror(scenario: RegistrationScenario) -> tuple[Array, Array]:
     normal = np.linalg.svd(scenario.position - centre)[2][-1]  # the direction of least spread
     course = np.zeros(3) if scenario.course is None else scenario.course
     drift = scenario.velocity.mean(0)
-    place = scenario.target - 2.0 * ((scenario.target - centre) @ normal) * normal
-    return place, course - 2.0 * ((course - drift) @ normal) * normal
+    position = scenario.target - 2.0 * ((scenario.target - centre) @ normal) * normal
+    return position, course - 2.0 * ((course - drift) @ normal) * normal
 
 
 def ghost(
     scenario: RegistrationScenario, epochs: int, *, sigma: float | None = None, station_sigma: float = 1.0
 ) -> GhostSolution | None:
-    """Return the minimum that is reached from the mirror image of the target, or None if this minimum is the truth.
+    """Return the second minimum of the cost for noise-free measurements of a scene, or None.
+
+    Least squares starts at the mirror image of the target. The result is None if it ends at the truth.
 
     Parameters
     ----------
@@ -411,16 +425,16 @@ def ghost(
     sigma, station_sigma : float
         As in `problem`.
     """
-    made = problem(scenario, epochs, sigma=sigma, station_sigma=station_sigma)
-    exact = truth(scenario, made)
-    place, velocity = mirror(scenario)
+    without_rows = problem(scenario, epochs, sigma=sigma, station_sigma=station_sigma)
+    exact = truth(scenario, without_rows)
+    position, velocity = mirror(scenario)
     if scenario.course is None:
         # The image drifts with the stations; the best fixed target is at the middle of its path.
-        state = place + 0.5 * scenario.times(epochs)[-1] * velocity
+        state = position + 0.5 * scenario.times(epochs)[-1] * velocity
     else:
-        state = np.concatenate([place, velocity])
+        state = np.concatenate([position, velocity])
     start = np.concatenate([state, exact[len(state) :]])
-    fix = solve(made.with_rows(z=predict(made, exact)), "lsr", start=start)
+    fix = solve(without_rows.with_rows(z=predict(without_rows, exact)), "lsr", start=start)
     if np.linalg.norm(fix.x[:3] - exact[:3]) < _SAME:
         return None
     return GhostSolution(fix.x, float(fix.cost))
@@ -471,21 +485,21 @@ def files() -> Mapping[str, str]:
     rng = np.random.default_rng(_SEED)
     times = _INTERVAL * np.arange(_EPOCHS)
     track = SPATIAL.position + times[:, None, None] * SPATIAL.velocity
-    true = track + _STATION * rng.standard_normal(track.shape)
-    arrival = 1e9 / SPEED_OF_LIGHT * np.sqrt(((SPATIAL.target - true) ** 2).sum(-1))
+    displaced = track + _STATION * rng.standard_normal(track.shape)
+    arrival = 1e9 / SPEED_OF_LIGHT * np.sqrt(((SPATIAL.target - displaced) ** 2).sum(-1))
     arrival += _ARRIVAL * rng.standard_normal(arrival.shape) + np.array([0.0, *DELAYS])
     rows = [
         f"{t:.0f},{name},{value:.1f}"
-        for t, late in zip(times, arrival - arrival[:, :1], strict=True)
-        for name, value in zip(NAMES[1:], late[1:], strict=True)
+        for t, difference in zip(times, arrival - arrival[:, :1], strict=True)
+        for name, value in zip(NAMES[1:], difference[1:], strict=True)
     ]
-    ends = [
+    end_rows = [
         f"{name},{times[k]:.0f},{x:.0f},{y:.0f},{z:.0f}"
         for k in (0, -1)
         for name, (x, y, z) in zip(NAMES, track[k], strict=True)
     ]
     return {
         "registration.toml": _PROBLEM,
-        "registration-stations.csv": "\n".join(["name,time,x,y,z", *ends]) + "\n",
+        "registration-stations.csv": "\n".join(["name,time,x,y,z", *end_rows]) + "\n",
         "registration-rows.csv": "\n".join(["time,a,z", *rows]) + "\n",
     }

@@ -1,6 +1,7 @@
-"""Algorithm of the paper `registration` as printed: two undamped steps over all past data at every new epoch.
+"""Algorithm of the paper on TDOA and GROA registration as printed: two undamped steps over all past data at each epoch.
 
-It starts from a given position at the fortieth epoch and does not search for another minimum: a baseline.
+It starts from a given position at the fortieth epoch and does not search for another minimum: a baseline. Equation
+numbers are those of the paper. In shapes, k are epochs, s stations, m = s - 1 channels, n unknowns of the target.
 """
 
 from __future__ import annotations
@@ -40,28 +41,28 @@ def recursion(track: Array, times: Array, z: Array, start: Array, *, first: int 
         State and biases after `first`, `first + 1` ... epochs; NaN after the steps have diverged.
     """
     trials, epochs = z.shape[:2]
-    out = np.empty((trials, epochs - first + 1, start.shape[-1] + z.shape[-1]))
+    estimates = np.empty((trials, epochs - first + 1, start.shape[-1] + z.shape[-1]))
     arrivals = np.zeros((trials, z.shape[-1] + 1, epochs))
     arrivals[:, 1:] = z.swapaxes(1, 2)
     track = np.ascontiguousarray(track.T)
     with np.errstate(all="ignore"):  # steps that diverge overflow, and stay lost
-        for low in range(0, trials, _BLOCK):
-            part = slice(low, low + _BLOCK)
-            state = start[part]
+        for first_trial in range(0, trials, _BLOCK):
+            block = slice(first_trial, first_trial + _BLOCK)
+            state = start[block]
             for k in range(first, epochs + 1):
                 for _ in range(iterations):
-                    move, bias = step(state, arrivals[part, :, :k], track[..., :k], times[:k])
+                    move, bias = step(state, arrivals[block, :, :k], track[..., :k], times[:k])
                     state = state + move
-                out[part, k - first] = np.concatenate([state, bias], axis=-1)
-    return out
+                estimates[block, k - first] = np.concatenate([state, bias], axis=-1)
+    return estimates
 
 
 def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Array, Array]:
     """Return one Gauss-Newton step (trials, n) of the state, and the biases (trials, s - 1) after the step.
 
-    The step uses the sums of eq. 11 and 12 over the epochs. R is proportional to I + 11', so its inverse removes the
-    mean of each epoch from the arrivals. Elimination of the unknown biases removes the mean of each channel over the
-    run. Outer products remain.
+    The step uses the sums of eq. 11 and 12 over the epochs. The covariance R of an epoch is proportional to I + 11', so
+    its inverse removes the mean of each epoch from the arrivals. Elimination of the unknown biases removes the mean of
+    each channel over the run. Outer products remain. The step is NaN if the equations are singular.
 
     Parameters
     ----------
@@ -137,11 +138,11 @@ def joint_recursion(
     """
     trials, epochs = z.shape[:2]
     measured = np.concatenate([z, gains], axis=-1)
-    out = np.empty((trials, epochs - first + 1, start.shape[-1] + measured.shape[-1]))
+    estimates = np.empty((trials, epochs - first + 1, start.shape[-1] + measured.shape[-1]))
     with np.errstate(all="ignore"):  # steps that diverge overflow, and stay lost
-        for low in range(0, trials, _BLOCK):
-            part = slice(low, low + _BLOCK)
-            state, weights = start[part], joint_weights(start[part], track[:first], sigma)
+        for first_trial in range(0, trials, _BLOCK):
+            block = slice(first_trial, first_trial + _BLOCK)
+            state, weights = start[block], joint_weights(start[block], track[:first], sigma)
             weight = np.empty((len(state), epochs, *weights.shape[-2:]))
             weight[:, :first], total = weights, weights.sum(1)
             for k in range(first, epochs + 1):
@@ -149,47 +150,50 @@ def joint_recursion(
                     weight[:, k - 1] = joint_weights(state, track[k - 1 : k], sigma)[:, 0]
                     total += weight[:, k - 1]
                 for _ in range(iterations):
-                    move, bias = joint_step(state, measured[part, :k], track[:k], weight[:, :k], total)
+                    move, bias = joint_step(state, measured[block, :k], track[:k], weight[:, :k], total)
                     state = state + move
-                out[part, k - first] = np.concatenate([state, bias], axis=-1)
-    return out
+                estimates[block, k - first] = np.concatenate([state, bias], axis=-1)
+    return estimates
 
 
 def joint_weights(state: Array, track: Array, sigma: tuple[float, float, float]) -> Array:
-    """Return the inverse covariances (trials, k, 2 m, 2 m) of differences and ratios, m of each, at positions.
+    """Return the inverse covariances (trials, k, 2 m, 2 m) of m differences and m ratios.
 
-    The covariance is R of eq. 40: noise of one kind is sigma^2 (I + 11'). The errors of the stations couple both kinds
-    by G_i . G_j' = size^2 (1 + delta) of the lines of sight, here with r_1 and the ratios of the ranges.
+    `state` (trials, 3) are the positions of the target. `sigma` are the standard deviations of `joint_recursion`; the
+    third is `size`. The covariance is R of eq. 40: noise of one kind is sigma^2 (I + 11'). The errors of the stations
+    couple both kinds by G_i . G_j' = size^2 (1 + delta) of the lines of sight. The code writes these products with r_1,
+    the range of the first station, and the ratios of the ranges.
     """
     arrival, gain, size = sigma
     distance = np.linalg.norm(state[:, None, None] - track, axis=-1)
     first, ratio = distance[..., :1, None], distance[..., 1:, None] / distance[..., :1, None]
     count = ratio.shape[-2]
-    shape, one = np.eye(count) + 1.0, np.ones_like(ratio)
-    both = size**2 * (one @ ratio.swapaxes(-1, -2) + np.eye(count)) / first
-    own = size**2 * (ratio @ ratio.swapaxes(-1, -2) + np.eye(count)) / first**2
-    upper = np.concatenate([np.broadcast_to((arrival**2 + size**2) * shape, own.shape), both], axis=-1)
-    lower = np.concatenate([both.swapaxes(-1, -2), own + gain**2 * shape], axis=-1)
+    shape, ones = np.eye(count) + 1.0, np.ones_like(ratio)
+    coupling = size**2 * (ones @ ratio.swapaxes(-1, -2) + np.eye(count)) / first
+    ratio_part = size**2 * (ratio @ ratio.swapaxes(-1, -2) + np.eye(count)) / first**2
+    upper = np.concatenate([np.broadcast_to((arrival**2 + size**2) * shape, ratio_part.shape), coupling], axis=-1)
+    lower = np.concatenate([coupling.swapaxes(-1, -2), ratio_part + gain**2 * shape], axis=-1)
     return linalg.inverse(np.concatenate([upper, lower], axis=-2))[0]
 
 
 def joint_step(state: Array, measured: Array, track: Array, weight: Array, total: Array) -> tuple[Array, Array]:
     """Return one Gauss-Newton step (trials, 3) of the position, and the biases (trials, 2 m) after the step.
 
-    The step uses the sums of eq. 11 and 12 with the matrices of eq. 39; the constant biases are eliminated.
+    The step uses the sums of eq. 11 and 12 with the matrices of eq. 39; the constant biases are eliminated. The step is
+    NaN if the equations are singular.
 
     Parameters
     ----------
     state : array (trials, 3)
-        Positions.
+        Positions, metres.
     measured : array (trials, k, 2 m)
-        Range differences, then gain ratios.
+        Range differences in metres, then gain ratios.
     track : array (k, s, 3)
-        Stations.
+        Stations, metres.
     weight : array (trials, k, 2 m, 2 m)
         Inverse covariances.
     total : array (trials, 2 m, 2 m)
-        Their sum.
+        Their sum over the epochs.
     """
     line = state[:, None, None] - track
     distance = np.linalg.norm(line, axis=-1, keepdims=True)
@@ -200,14 +204,14 @@ def joint_step(state: Array, measured: Array, track: Array, weight: Array, total
         axis=-2,
     )
     value = np.concatenate([distance[..., 1:, 0] - distance[..., :1, 0], ratio[..., 0]], axis=-1)
-    both = np.concatenate([slope, (measured - value)[..., None]], axis=-1)  # (trials, k, 2 m, 4)
-    white = weight @ both
-    trials, wide = len(state), both.shape[-1]
-    sums = both.reshape(trials, -1, wide).swapaxes(1, 2) @ white.reshape(trials, -1, wide)
-    shared = white.sum(1)
-    away, fine = linalg.solve(total, shared)
-    reduced = sums - shared.swapaxes(1, 2) @ away
-    solved, ok = linalg.solve(reduced[:, :-1, :-1], reduced[:, :-1, -1:])
+    slope_and_misfit = np.concatenate([slope, (measured - value)[..., None]], axis=-1)  # (trials, k, 2 m, 4)
+    weighted = weight @ slope_and_misfit
+    trials, columns = len(state), slope_and_misfit.shape[-1]
+    sums = slope_and_misfit.reshape(trials, -1, columns).swapaxes(1, 2) @ weighted.reshape(trials, -1, columns)
+    shared = weighted.sum(1)
+    bias_of, total_ok = linalg.solve(total, shared)
+    reduced = sums - shared.swapaxes(1, 2) @ bias_of
+    solution, ok = linalg.solve(reduced[:, :-1, :-1], reduced[:, :-1, -1:])
     # A singular system has no step: return NaN, which counts as lost, instead of an arbitrary solution.
-    move = np.where((ok & fine)[:, None], solved[..., 0], np.nan)
-    return move, away[..., -1] - (away[..., :-1] @ move[..., None])[..., 0]
+    move = np.where((ok & total_ok)[:, None], solution[..., 0], np.nan)
+    return move, bias_of[..., -1] - (bias_of[..., :-1] @ move[..., None])[..., 0]

@@ -1,4 +1,9 @@
-"""Tables and figures of the paper `registration`: printed value, reproduced value, bound, and lost trials."""
+"""Tables and figures of the paper on TDOA and GROA registration: printed value, reproduced value, bound, lost trials.
+
+The recursion of the paper (`plain`) and the fixes of optloc (`found`) use the same data. A lost trial is far from the
+truth, see `optloc.lab.papers.registration.FAR`. The image is the mirror image of the target in the plane of the
+stations, a second minimum of the cost.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +60,7 @@ if TYPE_CHECKING:
 # Values printed in section 4 of the paper.
 
 SIGMA0 = (1855.0, 2758.0, 160.0)
-"""Coordinates of the single-epoch bound, metres."""
+"""Coordinates of sigma0, the single-epoch bound with known biases, metres."""
 
 ACCURACY_FIXED = {
     150: (99.60, 89.38, 92.10, 86.65),
@@ -113,9 +118,9 @@ class History:
     setting : RegistrationSetting
         Setting of the draw.
     epochs : tuple of int
-        Numbers of epochs.
+        Numbers of epochs (t).
     bounds : array (t, n, n)
-        Cramer-Rao bound at each.
+        Cramer-Rao bound of the n unknowns at each, SI units.
     plain : tuple of RegistrationScore
         The paper's recursion on the same data.
     found : tuple of RegistrationScore
@@ -152,18 +157,18 @@ def run_history(setting: RegistrationSetting, epochs: Sequence[int], tick: Tick,
     # One long draw: shorter runs are its first parts, so that curves against time show the same trials.
     drawn = setting.draw(max(epochs))
     bounds = setting.bounds(epochs)
-    exact = truth(setting.scenario, drawn)
-    wandered = wander(setting, drawn, epochs, bounds, first=first)
+    true_vector = truth(setting.scenario, drawn)
+    plain = wander(setting, drawn, epochs, bounds, first=first)
     tick()
     found, ambiguous, silent = [], [], []
     for k, bound in zip(epochs, bounds, strict=True):
         fix = solve(setting.first(drawn, k), _METHOD)
-        found.append(score(fix.x if setting.scenario.course is None else branch(fix, exact), exact, bound))
+        found.append(score(fix.x if setting.scenario.course is None else branch(fix, true_vector), true_vector, bound))
         ambiguous.append(float((fix.code == Status.AMBIGUOUS).mean()))
-        sure = fix.answered & ~fix.has(Status.AMBIGUOUS, Status.UNBOUNDED, Status.MISFIT)
-        silent.append(float((found[-1].lost & sure).mean()))
+        unsuspected = fix.answered & ~fix.has(Status.AMBIGUOUS, Status.UNBOUNDED, Status.MISFIT)
+        silent.append(float((found[-1].lost & unsuspected).mean()))
         tick()
-    return History(setting, tuple(epochs), bounds, wandered, tuple(found), tuple(ambiguous), tuple(silent))
+    return History(setting, tuple(epochs), bounds, plain, tuple(found), tuple(ambiguous), tuple(silent))
 
 
 # The tables of the paper.
@@ -208,7 +213,7 @@ def metres(value: float) -> str:
 
 
 def accuracy(error: Array, bias: Array) -> Array:
-    """Return 100 (1 - |error| / |bias|), and zero if the error exceeds the bias."""
+    """Return the accuracy 100 (1 - |error| / |bias|) in per cent; zero if the error exceeds the bias."""
     return np.asarray(np.maximum(0.0, 100.0 * (1.0 - np.abs(error) / np.abs(bias))))
 
 
@@ -217,17 +222,17 @@ def table_biases(name: str, history: History, rows: Mapping[int, Sequence[float]
 
     `history` contains scores at these epochs; `rows` are the printed accuracies of the channels, by second.
     """
-    exact = truth(history.setting.scenario, history.setting.problem(1))
+    true_vector = truth(history.setting.scenario, history.setting.problem(1))
     lines = []
     for second, values in rows.items():
-        at, n = history.epochs.index(second), len(exact) - len(values)
-        plain, found = history.plain[at], history.found[at]
-        spread = np.sqrt(np.diagonal(history.bounds[at]))[n:]
+        index, first_bias = history.epochs.index(second), len(true_vector) - len(values)
+        plain, found = history.plain[index], history.found[index]
+        deviation = np.sqrt(np.diagonal(history.bounds[index]))[first_bias:]
         columns = (
-            _mean(plain, n, exact),
-            _mean(found, n, exact),
-            _single(found, n, exact),
-            accuracy(spread, exact[n:]),
+            _mean_accuracy(plain, first_bias, true_vector),
+            _mean_accuracy(found, first_bias, true_vector),
+            _single_accuracy(found, first_bias, true_vector),
+            accuracy(deviation, true_vector[first_bias:]),
         )
         for i, value in enumerate(values):
             shown = (ABSENT if i >= len(column) else f"{column[i]:.2f}" for column in columns)
@@ -239,33 +244,36 @@ def table_biases(name: str, history: History, rows: Mapping[int, Sequence[float]
     return tabulate(name, header, lines)
 
 
-def _mean(score: RegistrationScore, n: int, exact: Array) -> Array:
-    """Return the accuracy of the mean over all trials that are not lost; empty if all are lost."""
+def _mean_accuracy(score: RegistrationScore, first_bias: int, true_vector: Array) -> Array:
+    """Return the accuracy of the mean error over all trials that are not lost, per cent, for each bias.
+
+    `first_bias` is the index of the first bias in the vector. The result is empty if all trials are lost.
+    """
     if score.lost.all():
         return np.zeros(0)
-    error = score.error[~score.lost, n:].mean(0)
-    return accuracy(error, exact[n : n + len(error)])
+    error = score.error[~score.lost, first_bias:].mean(0)
+    return accuracy(error, true_vector[first_bias : first_bias + len(error)])
 
 
-def _single(score: RegistrationScore, n: int, exact: Array) -> Array:
-    """Return the accuracy of the root mean square error of one run."""
-    error = score.error[~score.lost, n:]
-    return accuracy(np.sqrt((error**2).mean(0)), exact[n:]) if len(error) else np.zeros(0)
+def _single_accuracy(score: RegistrationScore, first_bias: int, true_vector: Array) -> Array:
+    """Return the accuracy of the rms error of one run, per cent, for each bias; parameters as in `_mean_accuracy`."""
+    error = score.error[~score.lost, first_bias:]
+    return accuracy(np.sqrt((error**2).mean(0)), true_vector[first_bias:]) if len(error) else np.zeros(0)
 
 
 def table_errors(name: str, histories: Mapping[str, History], printed: Mapping[str, float]) -> TextTable:
-    """Return root mean square errors, bounds and lost trials against time: the numbers of a figure.
+    """Return a table of root mean square errors, bounds and lost trials against time: the numbers of a figure.
 
     `histories` is by environment; `printed` are errors at 600 s in the paper's text, by environment.
     """
     lines = []
     for environment, history in histories.items():
-        for at, second in enumerate(history.epochs):
-            plain, found = history.plain[at], history.found[at]
-            named = f"{printed[environment]:.0f}" if second == 600 else ""
-            lengths = (plain.rmse, found.rmse, rms(history.bounds[at]))
-            shares = (plain.share, found.share, history.silent[at], history.ambiguous[at])
-            lines.append((environment, str(second), named, *map(metres, lengths), *map(percent, shares)))
+        for index, second in enumerate(history.epochs):
+            plain, found = history.plain[index], history.found[index]
+            printed_text = f"{printed[environment]:.0f}" if second == 600 else ""
+            lengths = (plain.rmse, found.rmse, rms(history.bounds[index]))
+            shares = (plain.share, found.share, history.silent[index], history.ambiguous[index])
+            lines.append((environment, str(second), printed_text, *map(metres, lengths), *map(percent, shares)))
     header = (
         "environment", "second", "printed", "recursion", "optloc", "bound",
         "recursion lost", "optloc lost", "lost unnoticed", "ambiguous",
@@ -277,7 +285,7 @@ _COMPARED = ("recursion", "optloc", "bound", "recursion lost", "ended at the ima
 
 
 def table_starts(cases: Sequence[TableCase]) -> TextTable:
-    """Return table 3: the width of the initial error."""
+    """Return table 3: errors, bounds and lost trials by the width of the start."""
     lines = []
     for case in cases:
         error, divergence = INITIAL[int(case.label)]
@@ -286,7 +294,7 @@ def table_starts(cases: Sequence[TableCase]) -> TextTable:
 
 
 def table_noises(cases: Sequence[TableCase], sure: Sequence[RegistrationScore], later: Sequence[float]) -> TextTable:
-    """Return table 4: the noise.
+    """Return table 4: errors, bounds and lost trials by the noise.
 
     Parameters
     ----------
@@ -298,11 +306,11 @@ def table_noises(cases: Sequence[TableCase], sure: Sequence[RegistrationScore], 
         Bounds after 700 epochs, metres.
     """
     lines = []
-    for case, certain, bound in zip(cases, sure, later, strict=True):
+    for case, from_truth, bound in zip(cases, sure, later, strict=True):
         error, least, divergence = NOISE[int(case.label)]
-        read = f"{case.sigma / NANOSECOND:.0f} ns"
-        line = (f"{case.label:.0f} ns", read, f"{error:.1f}", f"{least:.1f}", f"{divergence:.1f} %")
-        lines.append((*line, *_compared(case), percent(certain.share), metres(bound)))
+        read_as = f"{case.sigma / NANOSECOND:.0f} ns"
+        line = (f"{case.label:.0f} ns", read_as, f"{error:.1f}", f"{least:.1f}", f"{divergence:.1f} %")
+        lines.append((*line, *_compared(case), percent(from_truth.share), metres(bound)))
     header = (
         "printed noise", "read as", "printed error", "printed bound", "printed divergence",
         *_COMPARED, "recursion from the truth lost", "bound at 700 s",
@@ -323,7 +331,7 @@ _CURVE = 40  # points of the bound, enough for a smooth curve
 
 
 def against_time(histories: Mapping[str, History], printed: Mapping[str, float], zoom: int | None = None) -> Figure:
-    """Return root mean square position errors and the bound against time, one panel for each history.
+    """Return a figure of root mean square position errors and the bound against time, one panel for each history.
 
     Parameters
     ----------
@@ -368,37 +376,37 @@ def _panel(ax: Axes, history: History, printed: float, since: int) -> None:
 
 
 def table_readings() -> TextTable:
-    """Return the bounds of the fixed target under each reading of the noise, metres."""
+    """Return a table of the bounds of the fixed target under each reading of the noise, metres."""
     shapes: dict[Shape, str] = {"full": "I + 11'", "half": "(I + 11') / 2", "diag": "I"}
-    named = (f"{FIXED['1 m']:.0f}", f"{FIXED['5 m']:.0f}", f"{BOUND:.1f}")
-    lines: list[tuple[str, ...]] = [("printed", "", "", *named, ", ".join(f"{v:.0f}" for v in SIGMA0))]
+    printed = (f"{FIXED['1 m']:.0f}", f"{FIXED['5 m']:.0f}", f"{BOUND:.1f}")
+    lines: list[tuple[str, ...]] = [("printed", "", "", *printed, ", ".join(f"{v:.0f}" for v in SIGMA0))]
     for (shape, name), delay in product(shapes.items(), (10, 20)):
         sigma = delay * NANOSECOND
         cases = ((600, 0.0), (600, 1.0), (600, 5.0), (700, 1.0))
-        bounds = (f"{_bound(epochs, sigma, errors, shape):.2f}" for epochs, errors in cases)
-        shot = ", ".join(f"{v:.1f}" for v in one_shot(sigma=sigma, shape=shape))
-        lines.append((name, f"{delay} ns", *bounds, shot))
+        bounds = (f"{_position_bound(epochs, sigma, errors, shape):.2f}" for epochs, errors in cases)
+        sigma0 = ", ".join(f"{v:.1f}" for v in one_shot(sigma=sigma, shape=shape))
+        lines.append((name, f"{delay} ns", *bounds, sigma0))
     header = ("covariance", "σ", "600 s, no station error", "600 s, 1 m", "600 s, 5 m", "700 s, 1 m", "sigma0, 1 m")
     return tabulate("readings", header, lines)
 
 
-def _bound(epochs: int, sigma: float, station_sigma: float, shape: Shape) -> float:
-    """Return the bound of the position of the fixed target, metres."""
-    made = problem(PRINTED, epochs, sigma=sigma, station_sigma=station_sigma, shape=shape)
-    return rms(crlb(made, truth(PRINTED, made)))
+def _position_bound(epochs: int, sigma: float, station_sigma: float, shape: Shape) -> float:
+    """Return the bound of the position of the fixed target, metres; parameters as in `problem`."""
+    without_rows = problem(PRINTED, epochs, sigma=sigma, station_sigma=station_sigma, shape=shape)
+    return rms(crlb(without_rows, truth(PRINTED, without_rows)))
 
 
 def table_minima() -> TextTable:
-    """Return the second minimum of the printed scene with a fixed target."""
+    """Return a table of the position and the cost of the second minimum of the printed scene, by seconds."""
     lines = []
     for epochs in (40, 100, 200, 300, 600, 700):
         found, noisy = ghost(PRINTED, epochs), ghost(PRINTED, epochs, sigma=40.0 * NANOSECOND)
         if found is None or noisy is None:
             continue
         offset = np.abs(found.x[5:7] - PRINTED.delays[2:]).mean()
-        place = " ".join(f"{v:.1f}" for v in 1e-3 * found.x[:3])
+        position = " ".join(f"{v:.1f}" for v in 1e-3 * found.x[:3])
         chances = (_chance(found.doubt), _chance(noisy.doubt))
-        lines.append((str(epochs), place, f"{offset:.0f}", metres(found.gap), *chances))
+        lines.append((str(epochs), position, f"{offset:.0f}", metres(found.gap), *chances))
     header = (
         "seconds", "image, km", "offset of its biases 4 and 5, m", "cost gap",
         "taken for the truth, 10 ns", "taken for the truth, 40 ns",
@@ -407,20 +415,23 @@ def table_minima() -> TextTable:
 
 
 def _chance(share: float) -> str:
+    """Return a probability as text."""
     return f"{share:.2g}" if share >= 1e-9 else "< 1e-9"
 
 
 def table_gains() -> TextTable:
-    """Return the bound of the fixed target for gain ratios of growing accuracy."""
+    """Return a table of the bound of the fixed target for gain ratios of growing accuracy."""
     lines = []
     for sigma in (None, _GAIN, 0.1 * _GAIN, 0.01 * _GAIN, 0.001 * _GAIN):
-        made = problem(PRINTED, 600, gain_sigma=sigma)
-        lines.append(("none" if sigma is None else f"{sigma:g}", f"{rms(crlb(made, truth(PRINTED, made))):.4f}"))
+        without_rows = problem(PRINTED, 600, gain_sigma=sigma)
+        lines.append(
+            ("none" if sigma is None else f"{sigma:g}", f"{rms(crlb(without_rows, truth(PRINTED, without_rows))):.4f}")
+        )
     return tabulate("gains", ("standard deviation of a ratio", "bound, m"), lines)
 
 
 def table_scenes(cases: Mapping[str, TableCase]) -> TextTable:
-    """Return the results for the same target with the printed stations and with stations that span space."""
+    """Return a table of the results for the same target with the printed stations and with stations that span space."""
     lines = []
     for (name, case), scenario in zip(cases.items(), (PRINTED, SPATIAL), strict=True):
         flat, close = flatness(scenario, 700), separation(scenario, 700)
@@ -510,17 +521,17 @@ def _run(sample: RegistrationSample, seed: int, tick: Tick) -> Report:
         name: run_history(RegistrationSetting(PRINTED, sample.trials, seed, key, None, size, _GAIN), sample.fixed, tick)
         for key, (name, size) in enumerate((("5 m", 5.0), ("1 m", 1.0)), 3)
     }
-    starts = _starts(RegistrationSetting(PRINTED, sample.many, seed, 5), sample.last, tick)
+    starts = _start_cases(RegistrationSetting(PRINTED, sample.many, seed, 5), sample.last, tick)
     noisy = [
         RegistrationSetting(PRINTED, sample.many, seed, 6 + i, (ns - 10) * NANOSECOND) for i, ns in enumerate(NOISE)
     ]
-    spatial = _case(RegistrationSetting(SPATIAL, sample.many, seed, 10), sample.last, _WIDEST, tick)
+    spatial = _score_case(RegistrationSetting(SPATIAL, sample.many, seed, 10), sample.last, _WIDEST, tick)
     tables = (
         table_biases("table-2", fixed["1 m"], ACCURACY_FIXED),
         table_biases("table-5", moving["1 m"], ACCURACY_MOVING),
         table_biases("table-6", joint["1 m"], ACCURACY_JOINT),
         table_starts(starts),
-        _noises(noisy, sample.last, tick),
+        _noise_table(noisy, sample.last, tick),
         table_errors("figure-1", fixed, FIXED),
         table_errors("figure-2", moving, PRINTED_MOVING),
         table_errors("figure-3", joint, JOINT),
@@ -537,48 +548,51 @@ def _run(sample: RegistrationSample, seed: int, tick: Tick) -> Report:
     return typeset("registration", sample, seed, tables, figures)
 
 
-def _case(setting: RegistrationSetting, epochs: int, width: float, tick: Tick, label: float = 0.0) -> TableCase:
-    """Return the scores of the recursion and of the fix on the same draw."""
+def _score_case(setting: RegistrationSetting, epochs: int, width: float, tick: Tick, label: float = 0.0) -> TableCase:
+    """Return the scores of the recursion and of the fix on the same draw.
+
+    `width` is the width of the recursion's starts in sigma0, and by default the `label` of the case.
+    """
     drawn, bound = setting.draw(epochs), setting.bound(epochs)
-    (plain,) = wander(setting, drawn, (epochs,), (bound,), width=width)
+    (recursion_score,) = wander(setting, drawn, (epochs,), (bound,), width=width)
     found = score(solve(drawn, _METHOD).x, truth(setting.scenario, drawn), bound)
     tick()
-    sigma, image = setting.sigma or setting.scenario.sigma, _at_image(setting, epochs, plain)
-    return TableCase(label or width, epochs, sigma, rms(bound), plain, found, image)
+    sigma, image = setting.sigma or setting.scenario.sigma, _at_image(setting, epochs, recursion_score)
+    return TableCase(label or width, epochs, sigma, rms(bound), recursion_score, found, image)
 
 
-def _at_image(setting: RegistrationSetting, epochs: int, plain: RegistrationScore) -> float:
-    """Return the share of trials that ended at the second minimum of the scene."""
+def _at_image(setting: RegistrationSetting, epochs: int, recursion_score: RegistrationScore) -> float:
+    """Return the share of trials whose recursion ended at the image of the target."""
     image = ghost(setting.scenario, epochs, sigma=setting.sigma)
     if image is None:
         return 0.0
     with np.errstate(invalid="ignore", over="ignore"):
-        apart = np.linalg.norm(plain.error[:, :3] - (image.x[:3] - setting.scenario.target), axis=-1)
-    return float((plain.lost & (apart < _NEAR)).mean())
+        distance = np.linalg.norm(recursion_score.error[:, :3] - (image.x[:3] - setting.scenario.target), axis=-1)
+    return float((recursion_score.lost & (distance < _NEAR)).mean())
 
 
-def _starts(setting: RegistrationSetting, epochs: int, tick: Tick) -> list[TableCase]:
+def _start_cases(setting: RegistrationSetting, epochs: int, tick: Tick) -> list[TableCase]:
     """Return the columns of table 3: one draw, and the recursion from starts of growing width."""
     drawn, bound = setting.draw(epochs), setting.bound(epochs)
     found = score(solve(drawn, _METHOD).x, truth(setting.scenario, drawn), bound)
     cases = []
     for width in INITIAL:
-        (plain,) = wander(setting, drawn, (epochs,), (bound,), width=float(width))
-        image = _at_image(setting, epochs, plain)
-        cases.append(TableCase(float(width), epochs, setting.scenario.sigma, rms(bound), plain, found, image))
+        (recursion_score,) = wander(setting, drawn, (epochs,), (bound,), width=float(width))
+        image = _at_image(setting, epochs, recursion_score)
+        cases.append(TableCase(float(width), epochs, setting.scenario.sigma, rms(bound), recursion_score, found, image))
         tick()
     return cases
 
 
-def _noises(settings: Sequence[RegistrationSetting], epochs: int, tick: Tick) -> TextTable:
-    """Return table 4, whose labels are 10 ns too large; the recursion also starts at the truth."""
+def _noise_table(settings: Sequence[RegistrationSetting], epochs: int, tick: Tick) -> TextTable:
+    """Return table 4 from noise that is 10 ns less than its labels; the recursion also starts at the truth."""
     cases: list[TableCase] = []
-    sure: list[RegistrationScore] = []
+    from_truth: list[RegistrationScore] = []
     for setting, printed in zip(settings, NOISE, strict=True):
-        cases.append(_case(setting, epochs, 1.0, tick, printed))
-        sure += wander(setting, setting.draw(epochs), (epochs,), (setting.bound(epochs),), width=0.0)
+        cases.append(_score_case(setting, epochs, 1.0, tick, printed))
+        from_truth += wander(setting, setting.draw(epochs), (epochs,), (setting.bound(epochs),), width=0.0)
         tick()
-    return table_noises(cases, sure, [rms(setting.bound(700)) for setting in settings])
+    return table_noises(cases, from_truth, [rms(setting.bound(700)) for setting in settings])
 
 
 STUDY = Study(_SIZES, _work, _run)

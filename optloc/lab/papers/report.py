@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 S = TypeVar("S")
 
 Tick = Callable[[], None]
-"""Called after each piece of work."""
+"""Function that is called after each piece of work, to show progress."""
 
 Size = Literal["quick", "full"]
 """Size of the samples."""
@@ -113,7 +113,7 @@ class Study(Generic[S]):
 
 
 def tabulate(name: str, header: Iterable[str], rows: Iterable[tuple[str, ...]]) -> TextTable:
-    """Return a table; the page of its paper contains its title and note."""
+    """Return a table without title and note; `typeset` takes them from the page of the paper."""
     return TextTable(name, "", tuple(header), tuple(rows))
 
 
@@ -134,13 +134,13 @@ def typeset(name: str, sample: object, seed: int, tables: Sequence[TextTable], f
         Figures by the names of their files on the page.
     """
     made = f"optloc {version('optloc')}, {datetime.now(UTC):%Y-%m-%d}"
-    page = render(name, {each.name: each for each in tables}, made=made, seed=seed, sample=sample)
+    page = render(name, {table.name: table for table in tables}, made=made, seed=seed, sample=sample)
     pictures = []
     for file, figure in figures.items():
-        shown = re.search(rf"!\[(.*)\]\({file}\.png\)", page)
-        assert shown is not None, f"the page of {name} does not show {file}"
-        pictures.append(Picture(file, shown[1], figure))
-    return Report(page, tuple(_entitle(each, page) for each in tables), tuple(pictures))
+        image = re.search(rf"!\[(.*)\]\({file}\.png\)", page)
+        assert image is not None, f"the page of {name} does not show {file}"
+        pictures.append(Picture(file, image[1], figure))
+    return Report(page, tuple(_entitle(table, page) for table in tables), tuple(pictures))
 
 
 def render(name: str, tables: Mapping[str, TextTable], *, made: str, seed: int, sample: object) -> str:
@@ -160,32 +160,35 @@ def render(name: str, tables: Mapping[str, TextTable], *, made: str, seed: int, 
     import jinja2
 
     # Markdown needs no escapes of HTML. A misspelt name raises an error instead of leaving a gap in a sentence.
-    house = jinja2.Environment(undefined=jinja2.StrictUndefined, autoescape=False)  # noqa: S701
-    house.filters["digits"] = digits
-    house.globals.update(
+    environment = jinja2.Environment(undefined=jinja2.StrictUndefined, autoescape=False)  # noqa: S701
+    environment.filters["digits"] = digits
+    environment.globals.update(
         table=lambda key: tables[key].markdown(),
-        cell=lambda key, *place: tables[key].cell(*place),
-        value=lambda key, *place, part=0: tables[key].value(*place, part=part),
+        cell=lambda key, *key_path: tables[key].cell(*key_path),
+        value=lambda key, *key_path, part=0: tables[key].value(*key_path, part=part),
         scene=import_module(f"optloc.lab.papers.{name}"),
     )
     text = files("optloc.lab.papers").joinpath(f"{name}.md").read_text(encoding="utf-8")
-    return _wrap(house.from_string(text).render(made=made, seed=seed, sample=sample)) + "\n"
+    return _wrap(environment.from_string(text).render(made=made, seed=seed, sample=sample)) + "\n"
 
 
 def _wrap(page: str) -> str:
-    """Return a page whose paragraphs and items are wrapped at 120 characters after the numbers are inserted."""
-    out = []
+    """Return a page whose paragraphs and items are wrapped at 120 characters.
+
+    Lines change their length when the numbers are inserted.
+    """
+    blocks = []
     for block in page.strip().split("\n\n"):
         if block.startswith(("#", "|", "!")):
-            out.append(block)
+            blocks.append(block)
             continue
         items = []
         for item in re.split(r"\n(?=- |\d+\. )", block):
-            lead = re.match(r"- |\d+\. ", item)
-            indent = " " * len(lead[0]) if lead else ""
+            bullet = re.match(r"- |\d+\. ", item)
+            indent = " " * len(bullet[0]) if bullet else ""
             items.append(fill(" ".join(item.split()), 120, subsequent_indent=indent, break_on_hyphens=False))
-        out.append("\n".join(items))
-    return "\n\n".join(out)
+        blocks.append("\n".join(items))
+    return "\n\n".join(blocks)
 
 
 def digits(number: float, count: int = 3) -> str:
@@ -239,7 +242,7 @@ def scale(ax: Axes) -> None:
 
 
 def label(ax: Axes, across: str, up: str) -> None:
-    """Name both axes and draw a faint grid."""
+    """Label both axes and draw a faint grid; `across` is the label of the x axis, and `up` the label of the y axis."""
     ax.set_xlabel(across)
     ax.set_ylabel(up)
     ax.grid(visible=True, which="both", alpha=0.25)  # faint, so that the curves dominate
@@ -247,15 +250,15 @@ def label(ax: Axes, across: str, up: str) -> None:
 
 def explain(figure: Figure, columns: int | None = None) -> None:
     """Draw one legend for all panels below them; a label of several panels appears once."""
-    found = [ax.get_legend_handles_labels() for ax in figure.axes]
-    shown = {name: handle for handles, names in found for handle, name in zip(handles, names, strict=True)}
+    entries = [ax.get_legend_handles_labels() for ax in figure.axes]
+    by_name = {name: handle for handles, names in entries for handle, name in zip(handles, names, strict=True)}
     figure.legend(
-        list(shown.values()), list(shown), loc="outside lower center", ncols=columns or len(shown), frameon=False
+        list(by_name.values()), list(by_name), loc="outside lower center", ncols=columns or len(by_name), frameon=False
     )
 
 
 def percent(share: float) -> str:
-    """Return a share as per cent."""
+    """Return a share (0 to 1) as text in per cent."""
     return f"{100.0 * share:.1f} %"
 
 

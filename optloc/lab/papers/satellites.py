@@ -1,7 +1,8 @@
 """Ships by the time differences of three satellites and a known height: four Kalman filters.
 
 Each filter starts from fixes and from distant points, and runs with several kinds of height; the page is
-``satellites.md``.
+``satellites.md``. A step is one update of a filter, once a second. States and covariances are ordered position,
+velocity (6 numbers) in ECEF coordinates and SI units. The posterior bound is the Cramer-Rao bound of a filter.
 """
 
 from __future__ import annotations
@@ -179,30 +180,33 @@ class SatelliteRun:
 
     @property
     def relative(self) -> Array:
-        """Return the mean error (steps,) over the distance by which the paper divides."""
+        """Return the mean errors (steps,), divided by 100 km as in the paper."""
         return np.asarray(self.error.mean(0) / _DISTANCE)
 
 
 def root_trace(cov: Array) -> Array:
-    """Return the root of the trace of the position part (...,) of covariances (..., n, n)."""
+    """Return the roots of the traces (...) of the position part of covariances (..., n, n), metres."""
     return np.asarray(np.sqrt(np.trace(cov[..., :3, :3], axis1=-2, axis2=-1)))
 
 
 def score(track: Track, exact: Array) -> SatelliteRun:
-    """Return the errors of a track; its scans are the last of the true states (epochs, 6)."""
-    at = exact[len(exact) - len(track.times) :, :3]
-    return SatelliteRun(track.position, np.linalg.norm(track.position - at, axis=-1), root_trace(track.cov))
+    """Return the position errors of a track; its scans are the last of the true states `exact` (epochs, 6)."""
+    positions = exact[len(exact) - len(track.times) :, :3]
+    return SatelliteRun(track.position, np.linalg.norm(track.position - positions, axis=-1), root_trace(track.cov))
 
 
 def from_fixes(drawn: Problem) -> State:
     """Return the state at the second epoch from separate fixes of the first two epochs, without a guess."""
-    # filters need positions and covariances only, and proofs would take most of the time
+    # Filters need positions and covariances only, and proofs would take most of the time.
     one, two = (solve(replace(cut(drawn, k, k + 1), motions=(Motion(0),)), "searched") for k in (0, 1))
     return two_point(one, two, (float(drawn.times[0]), float(drawn.times[1])))
 
 
 def prior(at: Array, satellites: Array = SATELLITES) -> Array:
-    """Return the covariance (6, 6) of position and velocity from two efficient fixes, a second apart."""
+    """Return the covariance (6, 6) of position and velocity from two efficient fixes, a second apart, SI units.
+
+    `at` is the position (3,) of the target. The posterior bound of a filter that starts from fixes begins with it.
+    """
     # The position is the second fix, and the velocity its difference from the first: both share the error of the
     # second.
     one = crlb(problem(1, order=0, satellites=satellites), at)
@@ -210,21 +214,25 @@ def prior(at: Array, satellites: Array = SATELLITES) -> Array:
 
 
 def run_fixed(steps: int, trials: int, sequence: np.random.SeedSequence) -> tuple[dict[str, SatelliteRun], Array]:
-    """Return all filters started by the first two fixes, and the posterior bound (steps,), metres."""
+    """Return the errors of each filter that starts from the first two fixes, by name, and the posterior bound.
+
+    The bound (steps,) is a position error in metres. `sequence` is the seed.
+    """
     exact = truth(steps + 2)
     drawn = simulate(problem(steps + 2), exact[0], sequence, trials)
     start = from_fixes(drawn)
-    found = {name: score(followed(drawn, start, dynamics(), name), exact) for name in FILTERS}
+    runs = {name: score(followed(drawn, start, dynamics(), name), exact) for name in FILTERS}
     bound = posterior_bound(problem(steps + 2), exact, State(1.0, exact[1], prior(exact[1, :3])), dynamics())
-    return found, root_trace(bound)
+    return runs, root_trace(bound)
 
 
 def run_wild(
     width: float, steps: int, trials: int, sequence: np.random.SeedSequence
 ) -> tuple[dict[str, SatelliteRun], Array]:
-    """Return all filters from starts with errors of `width` metres in each coordinate, and the posterior bound.
+    """Return the errors of each filter from distant starts, by name, and the posterior bound (steps,) in metres.
 
-    The filter "quartic + ekf" tracks the same data from the first two fixes.
+    The starts have errors of `width` metres (standard deviation) in each coordinate. The filter "quartic + ekf" tracks
+    the same data from the first two fixes.
     """
     draws, errors = sequence.spawn(2)
     exact = truth(steps)
@@ -235,14 +243,17 @@ def run_wild(
     mean = exact[0] - np.concatenate([exact[0, 3:], np.zeros(3)])
     mean = mean + sigma * np.random.default_rng(errors).standard_normal((trials, 6))
     start = State(-1.0, mean, np.broadcast_to(np.diag(sigma**2), (trials, 6, 6)))
-    found = {name: score(followed(drawn, start, dynamics(), name), exact) for name in FILTERS}
-    found["quartic + ekf"] = score(followed(drawn, from_fixes(drawn), dynamics(), "ekf"), exact)
+    runs = {name: score(followed(drawn, start, dynamics(), name), exact) for name in FILTERS}
+    runs["quartic + ekf"] = score(followed(drawn, from_fixes(drawn), dynamics(), "ekf"), exact)
     bound = posterior_bound(problem(steps), exact, State(-1.0, exact[0], np.diag(sigma**2)), dynamics())
-    return found, root_trace(bound)
+    return runs, root_trace(bound)
 
 
 def run_moving(satellites: Array, trials: int, sequence: np.random.SeedSequence) -> tuple[SatelliteRun, Array]:
-    """Return the IEKF with moving satellites (epochs, 3, 3) from fixes, and the posterior bound (steps,), metres."""
+    """Return the errors of the IEKF with moving satellites (epochs, 3, 3), and the posterior bound (steps,) in metres.
+
+    The filter starts from the first two fixes.
+    """
     exact = truth(len(satellites))
     drawn = simulate(problem(len(satellites), satellites=satellites), exact[0], sequence, trials)
     start = from_fixes(drawn)
@@ -252,35 +263,38 @@ def run_moving(satellites: Array, trials: int, sequence: np.random.SeedSequence)
 
 
 def run_heights(steps: int, trials: int, sequence: np.random.SeedSequence) -> dict[str, SatelliteRun]:
-    """Return the IEKF on the same sea-level target with several kinds of height, by the height model of the filter."""
+    """Return the errors of the IEKF on a target at sea level, by the filter's model of the height."""
     exact, epochs = truth(steps + 2, surface_course()), steps + 2
     keys = sequence.spawn(5)
-    out = {}
+    runs = {}
     for key, (name, sigma) in zip(keys, {"white, 500 m": HEIGHT, "white, 10 m": 10.0}.items(), strict=False):
         drawn = simulate(problem(epochs, height=sigma), exact[0], key, trials)
-        out[name] = score(followed(drawn, from_fixes(drawn), dynamics()), exact)
-    level = simulate(problem(epochs, height=None), exact[0], keys[2], trials)
-    track = followed(with_height_rows(level), from_fixes(level), dynamics())
-    out["known: the ellipsoid itself"] = score(track, exact)
+        runs[name] = score(followed(drawn, from_fixes(drawn), dynamics()), exact)
+    known = simulate(problem(epochs, height=None), exact[0], keys[2], trials)
+    track = followed(with_height_rows(known), from_fixes(known), dynamics())
+    runs["known: the ellipsoid itself"] = score(track, exact)
     # Truth of the last two: a constant error of the height for the whole run, and a metre of noise.
     assumed = with_bias(problem(epochs, height=1.0), "height", per="kind", kind="height", sigma=HEIGHT)
-    wrong = HEIGHT * np.random.default_rng(keys[3]).standard_normal((trials, 1))
-    vectors = np.concatenate([np.broadcast_to(exact[0], (trials, 6)), wrong], axis=1)
+    height_error = HEIGHT * np.random.default_rng(keys[3]).standard_normal((trials, 1))
+    vectors = np.concatenate([np.broadcast_to(exact[0], (trials, 6)), height_error], axis=1)
     drawn = simulate(assumed, vectors, keys[4])
     white = problem(epochs).with_rows(z=drawn.z)
-    out["constant error of 500 m, taken for white"] = score(followed(white, from_fixes(white), dynamics()), exact)
+    runs["constant error of 500 m, taken for white"] = score(followed(white, from_fixes(white), dynamics()), exact)
     start = begun_with_constants(drawn, dynamics(), 2)
-    out["constant error of 500 m, as a state"] = score(followed_with_constants(drawn, start, dynamics()), exact)
-    return out
+    runs["constant error of 500 m, as a state"] = score(followed_with_constants(drawn, start, dynamics()), exact)
+    return runs
 
 
 def run_climbing(steps: int, trials: int, sequence: np.random.SeedSequence) -> SatelliteRun:
-    """Return the IEKF on the target as printed, which climbs, with heights that are measured as zero within 500 m."""
+    """Return the errors of the IEKF on the target as printed, which climbs.
+
+    The filter assumes a height of zero with a standard deviation of 500 m.
+    """
     exact, (draws, errors) = truth(steps + 2), sequence.spawn(2)
     drawn = simulate(problem(steps + 2), exact[0], draws, trials)
     # The measured heights are zero plus noise, although the target climbs.
-    level = HEIGHT * np.random.default_rng(errors).standard_normal((trials, steps + 2))
-    measured_zero = drawn.with_rows(z=np.concatenate([drawn.rows[0].z, level], axis=-1))
+    measured_height = HEIGHT * np.random.default_rng(errors).standard_normal((trials, steps + 2))
+    measured_zero = drawn.with_rows(z=np.concatenate([drawn.rows[0].z, measured_height], axis=-1))
     return score(followed(measured_zero, from_fixes(measured_zero), dynamics()), exact)
 
 
@@ -289,25 +303,25 @@ _EARTH = 6.37e6
 
 
 def far(angles: Sequence[float], bearings: int = 12) -> Array:
-    """Return the bound of a fix at a known height, metres (q,), root mean square over bearings, by distance.
+    """Return the bounds (q,) of a fix at a known height by distance, root mean square over bearings, metres.
 
     `angles` (q,) are the distances of the target from the point below the satellites, radians at the centre of the
-    Earth.
+    Earth. `bearings` is the number of directions from that point.
     """
     centre = SATELLITES.mean(0)
     up = centre / np.linalg.norm(centre)
     east, north, _ = ECEF.enu_axes(centre)
     # `up` belongs to a sphere, the axes to the ellipsoid: make the axes orthogonal to `up`.
     east, north = (v - (v @ up) * up for v in (east, north))
-    turn = 2.0 * np.pi * np.arange(bearings) / bearings
-    side = np.cos(turn)[:, None] * north + np.sin(turn)[:, None] * east
-    side /= np.linalg.norm(side, axis=-1, keepdims=True)
-    out = []
+    bearing = 2.0 * np.pi * np.arange(bearings) / bearings
+    sideways = np.cos(bearing)[:, None] * north + np.sin(bearing)[:, None] * east
+    sideways /= np.linalg.norm(sideways, axis=-1, keepdims=True)
+    errors = []
     for angle in angles:
-        lat, lon, _ = ecef_to_geodetic(_EARTH * (np.cos(angle) * up + np.sin(angle) * side))
-        at = geodetic_to_ecef(lat, lon, np.zeros(bearings))
-        out.append(np.sqrt((root_trace(crlb(problem(1, order=0, height=None), at)) ** 2).mean()))
-    return np.array(out)
+        lat, lon, _ = ecef_to_geodetic(_EARTH * (np.cos(angle) * up + np.sin(angle) * sideways))
+        targets = geodetic_to_ecef(lat, lon, np.zeros(bearings))
+        errors.append(np.sqrt((root_trace(crlb(problem(1, order=0, height=None), targets)) ** 2).mean()))
+    return np.array(errors)
 
 
 # The tables: the four filters from fixes and from distant starts, the effect of the height, and moving satellites.
@@ -340,7 +354,7 @@ def metres(value: float) -> str:
 
 
 def table_fixed(found: Mapping[str, SatelliteRun], bound: Array) -> TextTable:
-    """Return the table of filters started by fixes; the bound is (steps,), metres."""
+    """Return the table of filters that start from fixes; `bound` (steps,) is the posterior bound, metres."""
     steps = [step for step in _STEPS if step <= len(bound)]
     plain = found["ekf"].position
     lines = []
@@ -355,7 +369,10 @@ def table_fixed(found: Mapping[str, SatelliteRun], bound: Array) -> TextTable:
 
 
 def table_relative(panels: Mapping[str, tuple[Mapping[str, SatelliteRun], Array]]) -> TextTable:
-    """Return the values of the paper's figure, in its unit: mean errors over 100 km, by start and filter."""
+    """Return a table of the values of the paper's figure, in its unit: mean errors over 100 km, by start and filter.
+
+    `panels` has the runs by filter, and the bound (steps,), by the title of the start.
+    """
     longest = max(len(bound) for _, bound in panels.values())
     steps = [step for step in _STEPS if step <= longest]
     lines = []
@@ -369,7 +386,7 @@ def table_relative(panels: Mapping[str, tuple[Mapping[str, SatelliteRun], Array]
 
 
 def table_starts(found: Mapping[float, tuple[Mapping[str, SatelliteRun], Array]]) -> TextTable:
-    """Return the table of filters after distant starts, by the standard deviation of each coordinate, metres."""
+    """Return the table of filters after distant starts; `found` has runs and bounds by the start error in metres."""
     lines = []
     for width, (runs, bound) in found.items():
         for name, run in runs.items():
@@ -382,7 +399,7 @@ def table_starts(found: Mapping[float, tuple[Mapping[str, SatelliteRun], Array]]
 
 
 def table_pairs(found: Mapping[float, tuple[Mapping[str, SatelliteRun], Array]]) -> TextTable:
-    """Return the share of runs in which the modified covariance has a smaller final error than each other filter."""
+    """Return a table of the share of runs in which the MVEKF has a smaller final error than each other filter."""
     lines = []
     for width, (runs, _) in found.items():
         modified = runs["mvekf"].error[:, -1]
@@ -392,7 +409,7 @@ def table_pairs(found: Mapping[float, tuple[Mapping[str, SatelliteRun], Array]])
 
 
 def table_heights(found: Mapping[str, SatelliteRun]) -> TextTable:
-    """Return errors and claimed errors of the IEKF from fixes, by the knowledge of the height."""
+    """Return a table of errors and claimed errors of the IEKF from fixes, by the knowledge of the height."""
     steps = [step for step in _STEPS_HEIGHT if step <= len(next(iter(found.values())).rms)]
     lines = [
         (name, *(f"{metres(run.rms[s - 1])} ({metres(run.claimed[:, s - 1].mean())})" for s in steps))
@@ -402,7 +419,10 @@ def table_heights(found: Mapping[str, SatelliteRun]) -> TextTable:
 
 
 def table_moving(found: Mapping[str, tuple[SatelliteRun, Array]], still: Array) -> TextTable:
-    """Return errors and bounds with moving satellites, and the bound `still` (steps,) of fixed satellites."""
+    """Return a table of errors and bounds with moving satellites, by heading.
+
+    `still` (steps,) is the posterior bound with fixed satellites, metres.
+    """
     steps = [step for step in _STEPS_MOVING if step <= len(still)]
     lines = [("as printed: they stay", *(f"{ABSENT} ({metres(still[s - 1])})" for s in steps))]
     for name, (run, bound) in found.items():
@@ -415,7 +435,7 @@ _AWAY = (0.0, 5.0, 10.0, 20.0, 25.0)
 
 
 def table_one_shot() -> TextTable:
-    """Return the bounds of a single fix, by known values, and by distance from the point below the satellites."""
+    """Return a table of the bounds of a single fix, by known values, and by distance from the point below."""
     cases = {
         "50 ns each, height 500 m": problem(1, order=0),
         "50 ns each, height known": problem(1, order=0, height=None),
@@ -444,7 +464,7 @@ _STYLE_HEIGHT = ((Ink.BLUE, 1.8), (Ink.GREEN, 1.8), (Ink.SKY, 1.8), (Ink.RED, 4.
 
 
 def figure_filters(panels: Mapping[str, tuple[Mapping[str, SatelliteRun], Array]]) -> Figure:
-    """Return root mean square errors and the posterior bound against steps, one panel for each start.
+    """Return a figure of root mean square errors and the posterior bound against steps, one panel for each start.
 
     `panels` has the filters and the bound (steps,) by title.
     """
@@ -467,7 +487,7 @@ def figure_filters(panels: Mapping[str, tuple[Mapping[str, SatelliteRun], Array]
 
 
 def figure_heights(found: Mapping[str, SatelliteRun]) -> Figure:
-    """Return errors, and the claimed errors (dotted), against steps, by the knowledge of the height."""
+    """Return a figure of errors, and the claimed errors (dotted), against steps, by the knowledge of the height."""
     figure = canvas(8.0, 5.2)
     ax = figure.subplots()
     for (colour, width), (name, run) in zip(_STYLE_HEIGHT, found.items(), strict=True):
@@ -480,6 +500,7 @@ def figure_heights(found: Mapping[str, SatelliteRun]) -> Figure:
 
 
 def _against_steps(ax: Axes) -> None:
+    """Scale and label a panel of position errors against steps."""
     scale(ax)
     label(ax, "step, one a second", "position error, m (root mean square)")
 

@@ -1,4 +1,8 @@
-"""Figures of a study's report: one panel each, so that a phone shows them one below the other."""
+"""Figures of a study's report: one panel each, so that a phone shows them one below the other.
+
+`looks` are the colours, markers and lines of the methods by name; they are the same in all figures. `table` contains
+cells (`optloc.lab.study.summary.cells`), and `frame` contains judged rows.
+"""
 
 from __future__ import annotations
 
@@ -57,8 +61,8 @@ def success(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
         height = 1.35 + len(names) * max(0.26, 0.12 * len(levels))
         figure, axes = panel(str(case), (SIZE[0], height))
         for i, level in enumerate(levels):
-            some = part[part["noise_label"] == level].set_index("method").reindex(names)
-            right, trials = some["right"].to_numpy(dtype=float), some["trials"].to_numpy(dtype=float)
+            selected = part[part["noise_label"] == level].set_index("method").reindex(names)
+            right, trials = selected["right"].to_numpy(dtype=float), selected["trials"].to_numpy(dtype=float)
             share, (low, high) = right / trials, wilson(right, trials)
             colour, mark = _LEVELS[i % len(_LEVELS)]
             y = np.arange(len(names)) + step * (i - (len(levels) - 1) / 2)
@@ -84,11 +88,11 @@ def accuracy(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     """Yield one picture for each case: root mean square error over the bound against noise."""
     for number, (case, part) in enumerate(table.groupby("case", observed=True)):
         figure, axes = panel(str(case))
-        place, labels, name = _noise_axis(part)
+        positions, labels, name = _noise_axis(part)
         for mark in looks.values():
-            some = part[part["method"] == mark.name]
-            x = np.array([place[label] for label in some["noise_label"]])
-            ratio, half = some["ratio"].to_numpy(dtype=float), some["ratio_half"].to_numpy(dtype=float)
+            selected = part[part["method"] == mark.name]
+            x = np.array([positions[label] for label in selected["noise_label"]])
+            ratio, half = selected["ratio"].to_numpy(dtype=float), selected["ratio_half"].to_numpy(dtype=float)
             if not np.isfinite(ratio).any():
                 continue
             # On a logarithmic axis a bar must end above zero.
@@ -97,32 +101,33 @@ def accuracy(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
             axes.errorbar(x, ratio, yerr=[low, np.nan_to_num(half)], fmt="none", ecolor=mark.colour, lw=0.8, capsize=2)
         axes.axhline(1.0, color=BLACK, linewidth=1.0, zorder=1)
         _log(axes.yaxis, axes.set_yscale, *axes.get_ylim())
-        _ticks(axes, place, labels)
+        _ticks(axes, positions, labels)
         axes.set_xlabel(name)
         axes.set_ylabel("RMSE / CRLB")
         yield Picture(f"accuracy-{number + 1}", f"Error over the bound: {case}", figure)
 
 
 def _noise_axis(part: pd.DataFrame) -> tuple[dict[str, float], list[str], str]:
-    """Return the x coordinate of each noise level, the labels of the ticks, and the label of the axis.
+    """Return the x coordinate of each noise level by label, the labels of the ticks, and the label of the axis.
 
-    The coordinate is the logarithm of the noise if the levels have different positive values, else a running number.
+    The coordinate is the logarithm of the noise if the levels have different positive values. Otherwise it is a running
+    number.
     """
-    seen = part[["noise_label", "noise"]].drop_duplicates("noise_label")
-    labels = [str(label) for label in seen["noise_label"]]
+    levels = part[["noise_label", "noise"]].drop_duplicates("noise_label")
+    labels = [str(label) for label in levels["noise_label"]]
     unit = str(part["noise_unit"].iloc[0])
     name = "factor on the noise of the file" if unit == "x" else "standard deviation of a row"
-    values = seen["noise"].to_numpy(dtype=float)
+    values = levels["noise"].to_numpy(dtype=float)
     if len(set(values)) == len(values) and (values > 0).all():
-        place = dict(zip(labels, np.log10(values), strict=True))
+        positions = dict(zip(labels, np.log10(values), strict=True))
     else:
-        place = {label: float(i) for i, label in enumerate(labels)}
-    return place, [noise_text(label).replace(", ", "\n") for label in labels], name
+        positions = {label: float(i) for i, label in enumerate(labels)}
+    return positions, [noise_text(label).replace(", ", "\n") for label in labels], name
 
 
-def _ticks(axes: Axes, place: dict[str, float], labels: list[str]) -> None:
-    """Set the ticks of the noise levels, with a margin on both sides."""
-    x = np.array(list(place.values()))
+def _ticks(axes: Axes, positions: dict[str, float], labels: list[str]) -> None:
+    """Set the ticks of the noise levels, with a margin on both sides; `positions` are their x coordinates by label."""
+    x = np.array(list(positions.values()))
     axes.set_xticks(x, labels, fontsize=8)
     # An eighth of the axis on each side, for marks and their bars; a single level needs an axis too.
     margin = 0.12 * max(float(np.ptp(x)), 0.5)
@@ -130,7 +135,10 @@ def _ticks(axes: Axes, place: dict[str, float], labels: list[str]) -> None:
 
 
 def _log(axis: Any, scale: Any, low: float, high: float) -> None:
-    """Make an axis logarithmic; below a factor of 30 its labels are plain numbers."""
+    """Make an axis logarithmic; if it spans a factor below 30, its labels are plain numbers.
+
+    `scale` is the function that sets the scale of the axis; `low` and `high` are the ends of the axis.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
     scale("log")
@@ -143,7 +151,7 @@ def _log(axis: Any, scale: Any, low: float, high: float) -> None:
 
 
 def _line(axes: Axes, mark: Look, x: Array, y: Array, *, marker: bool, steps: bool = False, width: float = 1.5) -> None:
-    """Draw the curve of a method in its style."""
+    """Draw the curve of a method in its style; `width` is the width of the line in points."""
     (line,) = axes.plot(
         x,
         y,
@@ -160,19 +168,19 @@ def _line(axes: Axes, mark: Look, x: Array, y: Array, *, marker: bool, steps: bo
 
 def distributions(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     """Yield the distributions of errors in units of the bound: a picture for each noise level, or for each case."""
-    apart = len(frame[["case", "noise_label"]].drop_duplicates()) <= _MOST_PANELS
-    names = ["case", "noise", "noise_label"] if apart else ["case"]
+    separate = len(frame[["case", "noise_label"]].drop_duplicates()) <= _MOST_PANELS
+    names = ["case", "noise", "noise_label"] if separate else ["case"]
     from scipy.special import gammainc
 
     for number, (key, part) in enumerate(frame.groupby(names, observed=True)):
-        text = f"{key[0]}, {noise_text(str(key[-1]))}" if apart else f"{key[0]}, all noise levels"
+        text = f"{key[0]}, {noise_text(str(key[-1]))}" if separate else f"{key[0]}, all noise levels"
         figure, axes = panel(text)
         for mark in looks.values():
-            some = part[part["method"] == mark.name]
-            if len(some):
-                values = some["deviation"].to_numpy(dtype=float)[accuracy_rows(some)]
+            selected = part[part["method"] == mark.name]
+            if len(selected):
+                values = selected["deviation"].to_numpy(dtype=float)[accuracy_rows(selected)]
                 # Zero has no logarithm, and the axis begins at a tenth.
-                _line(axes, mark, *distribution(np.maximum(values, 1e-2), len(some)), marker=False, steps=True)
+                _line(axes, mark, *distribution(np.maximum(values, 1e-2), len(selected)), marker=False, steps=True)
         x = np.geomspace(0.1, 10.0, 120)
         # The squared error of an efficient estimate in units of its bound has a chi-square distribution.
         theory = gammainc(part["dimension"].iloc[0] / 2.0, x**2 / 2.0)
@@ -190,10 +198,12 @@ def gaps(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     for number, (case, part) in enumerate(frame.groupby("case", observed=True)):
         figure, axes = panel(str(case))
         for mark in looks.values():
-            some = part[part["method"] == mark.name]
-            values = some["above"].to_numpy(dtype=float)[some["located"].to_numpy(dtype=bool)]
+            selected = part[part["method"] == mark.name]
+            values = selected["above"].to_numpy(dtype=float)[selected["located"].to_numpy(dtype=bool)]
             if len(values):
-                _line(axes, mark, *distribution(np.maximum(values, _LEAST_COST), len(some)), marker=False, steps=True)
+                _line(
+                    axes, mark, *distribution(np.maximum(values, _LEAST_COST), len(selected)), marker=False, steps=True
+                )
         axes.set_xscale("log")
         axes.set_xlim(_LEAST_COST * 0.7, float(np.clip(axes.get_xlim()[1], 10.0, _LARGEST_COST)))
         axes.set_ylim(-0.02, 1.02)
@@ -202,52 +212,52 @@ def gaps(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
         yield Picture(f"gaps-{number + 1}", f"Cost above the best known: {case}", figure)
 
 
-def profiles(found: Profiles, looks: Looks) -> Iterator[Picture]:
+def profiles(result: Profiles, looks: Looks) -> Iterator[Picture]:
     """Yield the data profile and the performance profile over the trials that every method ran."""
     for name, title, draw in _PROFILES:
-        if found.solved.any():
+        if result.solved.any():
             figure, axes = panel("")
-            draw(axes, found, looks)
-            yield Picture(name, f"{title} over {found.spent.shape[1]} trials", figure)
+            draw(axes, result, looks)
+            yield Picture(name, f"{title} over {result.spent.shape[1]} trials", figure)
 
 
-def profile_picture(found: Profiles, looks: Looks) -> Figure:
+def profile_picture(result: Profiles, looks: Looks) -> Figure:
     """Return a figure of both profiles with a legend."""
     figure, axes = panels("", len(_PROFILES))
-    for one, (_, title, draw) in zip(axes, _PROFILES, strict=True):
-        one.set_title(title, fontsize=10)
-        if found.solved.any():
-            draw(one, found, looks)
+    for axis, (_, title, draw) in zip(axes, _PROFILES, strict=True):
+        axis.set_title(title, fontsize=10)
+        if result.solved.any():
+            draw(axis, result, looks)
     return with_legend(figure)
 
 
-def _data_profile(axes: Axes, found: Profiles, looks: Looks) -> None:
-    """Draw the share of trials that each method solves within budgets of work."""
-    needed = found.spent[found.solved]
-    budgets = np.geomspace(needed.min() / 1.5, 1.5 * needed.max(), _CURVE_POINTS)
-    _curves(axes, found, looks, budgets, found.data(budgets))
-    axes.set_xlabel(WORK[found.work])
+def _data_profile(axes: Axes, result: Profiles, looks: Looks) -> None:
+    """Draw the share of trials that each method solves against the work that it may use on each trial."""
+    work = result.spent[result.solved]
+    budgets = np.geomspace(work.min() / 1.5, 1.5 * work.max(), _CURVE_POINTS)
+    _curves(axes, result, looks, budgets, result.data(budgets))
+    axes.set_xlabel(WORK[result.work])
 
 
-def _performance_profile(axes: Axes, found: Profiles, looks: Looks) -> None:
-    """Draw the share of trials that each method solves within multiples of the least work."""
-    needed = np.where(found.solved, found.spent, np.inf)
+def _performance_profile(axes: Axes, result: Profiles, looks: Looks) -> None:
+    """Draw the share of trials that each method solves against the work as a multiple of the least work."""
+    work = np.where(result.solved, result.spent, np.inf)
     with np.errstate(invalid="ignore"):
-        slower = np.where(found.solved, needed / needed.min(0), 1.0)
+        slower = np.where(result.solved, work / work.min(0), 1.0)
     # To 1.5 times the last solved trial: no curve rises beyond.
     ratios = np.geomspace(1.0, max(10.0, 1.5 * float(slower.max())), _CURVE_POINTS)
-    _curves(axes, found, looks, ratios, found.performance(ratios))
-    axes.set_xlabel(f"{WORK[found.work].partition(' (')[0]} / least of any method")
+    _curves(axes, result, looks, ratios, result.performance(ratios))
+    axes.set_xlabel(f"{WORK[result.work].partition(' (')[0]} / least of any method")
 
 
-def _curves(axes: Axes, found: Profiles, looks: Looks, x: Array, shares: Array) -> None:
+def _curves(axes: Axes, result: Profiles, looks: Looks, x: Array, shares: Array) -> None:
     """Draw the stepped curves (methods, q) of shares over x (q,)."""
-    for method, share in zip(found.methods, shares, strict=True):
+    for method, share in zip(result.methods, shares, strict=True):
         _line(axes, looks[method], x, share, marker=False, steps=True)
     axes.set_xscale("log")
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(-0.02, 1.02)
-    axes.set_ylabel(f"share of trials solved to {found.tau:g}")
+    axes.set_ylabel(f"share of trials solved to {result.tau:g}")
 
 
 # Opacity of a band of quartiles: lines of other methods that cross the band stay visible.
@@ -256,17 +266,17 @@ _BAND = 0.15
 _WIDTHS = (3.5, 1.2)
 
 
-def history_picture(found: Histories, looks: Looks) -> Figure:
-    """Return the descent of the cost against evaluations and against iterations: medians over trials, and quartiles."""
-    trials = found.frame["trial"].nunique()
-    figure, both = panels(f"{found.title}: {trials} trial{'s' * (trials > 1)}", len(COUNTS))
-    for axes, (by, label) in zip(both, COUNTS.items(), strict=True):
-        for name, width in zip(found.methods, np.linspace(*_WIDTHS, len(found.methods)), strict=True):
-            counts = found.frame.loc[found.frame["method"] == name, by].to_numpy(dtype=float)
+def history_picture(result: Histories, looks: Looks) -> Figure:
+    """Return a figure of the cost against evaluations and against iterations: medians over trials, and quartiles."""
+    trials = result.frame["trial"].nunique()
+    figure, panel_axes = panels(f"{result.title}: {trials} trial{'s' * (trials > 1)}", len(COUNTS))
+    for axes, (by, label) in zip(panel_axes, COUNTS.items(), strict=True):
+        for name, width in zip(result.methods, np.linspace(*_WIDTHS, len(result.methods)), strict=True):
+            counts = result.frame.loc[result.frame["method"] == name, by].to_numpy(dtype=float)
             if np.isnan(counts).any():
                 continue
             at = np.unique(counts)
-            low, middle, high = np.maximum(band(found, name, by, at), _LEAST_COST)
+            low, middle, high = np.maximum(band(result, name, by, at), _LEAST_COST)
             # A logarithmic axis has no zero, so iterations are drawn from one on.
             x = at + 1.0 if by == "iterations" else at
             _line(
@@ -308,10 +318,10 @@ def timing(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
         step = 1.006 if len(sizes) == 1 else 1.012
         for mark in looks.values():
             grouped = part[part["method"] == mark.name].groupby("rows")["seconds"]
-            low, middle, high = (grouped.quantile(share) for share in (0.1, 0.5, 0.9))
+            low, median, high = (grouped.quantile(share) for share in (0.1, 0.5, 0.9))
             # Shifted, so that bars do not hide one another.
-            x = middle.index.to_numpy(dtype=float) * step ** (mark.number - (len(looks) - 1) / 2)
-            _line(axes, mark, x, middle.to_numpy(), marker=True)
+            x = median.index.to_numpy(dtype=float) * step ** (mark.number - (len(looks) - 1) / 2)
+            _line(axes, mark, x, median.to_numpy(), marker=True)
             axes.vlines(x, low.to_numpy(), high.to_numpy(), color=mark.colour, linewidth=0.8)
         axes.set_xscale("log")
         axes.set_yscale("log")

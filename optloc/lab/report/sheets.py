@@ -1,4 +1,8 @@
-"""Tables of a study's report: as numbers for programs, and as short text for people."""
+"""Tables of a study's report: as numbers for programs, and as short text for people.
+
+A `Sheet` contains a table twice: a frame of numbers and a table of text. The variable `columns` in this module is a
+list of headings, each with a function from a row of the frame to the text of a cell.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,7 @@ SHIFT = 1e-5
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Return a number with some significant digits; a dash if the number is not finite."""
+    """Return a number as text with `digits` significant digits; a dash if the number is not finite."""
     if not np.isfinite(value):
         return "–"
     # In this range a plain number is shorter than one with a power of ten.
@@ -45,7 +49,7 @@ def duration(seconds: float) -> str:
 
 
 def percent(share: float) -> str:
-    """Return a share in per cent; only the shares 0 and 1 are printed as 0 and 100."""
+    """Return a share (0 to 1) as text in per cent; only the shares 0 and 1 are printed as 0 and 100."""
     if not np.isfinite(share):
         return "–"
     text = f"{100 * share:.1f}"
@@ -62,7 +66,7 @@ def _interval(hits: float, count: float) -> str:
 
 
 def _at_most(hits: int, count: int) -> str:
-    """Return a count, and in brackets the upper end of the 95 % interval of its share."""
+    """Return a count as text, and in brackets the upper end of the 95 % interval of its share in per cent."""
     return f"{hits} (≤ {number(100 * float(clopper_pearson(hits, count)[1]), 2)} %)"
 
 
@@ -70,13 +74,16 @@ Column = tuple[str, Callable[[Any], str]]
 
 
 def _sheet(name: str, title: str, note: str, frame: pd.DataFrame, columns: list[Column], words: int) -> Sheet:
-    """Return a table of a frame: each column has a heading and a function from a row to text."""
+    """Return a frame with its table of text; each column has a heading and a function from a row to text.
+
+    `words` is the number of columns at the left that contain words.
+    """
     rows = tuple(tuple(show(row) for _, show in columns) for row in frame.itertuples(index=False))
     return Sheet(frame, TextTable(name, title, tuple(head for head, _ in columns), rows, note), words)
 
 
 def _case(words: tuple[str, ...] = ("case", "noise", "method")) -> list[Column]:
-    """Return the columns of case, noise level and method."""
+    """Return the columns that `words` names: case, noise (level) and method."""
     columns: dict[str, Column] = {
         "case": ("case", lambda r: str(r.case)),
         "noise": ("noise", lambda r: noise_text(r.noise_label)),
@@ -86,7 +93,7 @@ def _case(words: tuple[str, ...] = ("case", "noise", "method")) -> list[Column]:
 
 
 def best_first(frame: pd.DataFrame, order: list[str]) -> Sheet:
-    """Return the ranking of the methods, best first."""
+    """Return a table of the ranking of the methods, best first."""
     table = ranking(frame, order, SHIFT)
     sums = frame.groupby("method", observed=True)[["answered", "right", "wrong", "false"]].sum()
     # Over all rows; the times are over the trials that every method ran.
@@ -116,7 +123,7 @@ def best_first(frame: pd.DataFrame, order: list[str]) -> Sheet:
 
 
 def success(cells: pd.DataFrame) -> Sheet:
-    """Return the shares of right answers of each method, cell by cell."""
+    """Return a table of the shares of right answers of each method, cell by cell."""
     names = "case noise noise_unit noise_label method trials answered right wrong died".split()
     table = cells[names].copy()
     table["right_low"], table["right_high"] = wilson(table["right"].to_numpy(), table["trials"].to_numpy())
@@ -132,7 +139,7 @@ def success(cells: pd.DataFrame) -> Sheet:
 
 
 def statuses(frame: pd.DataFrame) -> Sheet:
-    """Return the statuses of the answers of each method, with the trials in which a lower cost is known."""
+    """Return a table of the statuses of the answers of each method, with the trials in which a lower cost is known."""
     columns: list[Column] = [
         ("method", lambda r: str(r.method)),
         ("status", lambda r: str(r.status)),
@@ -148,7 +155,7 @@ def statuses(frame: pd.DataFrame) -> Sheet:
 
 
 def accuracy(cells: pd.DataFrame) -> Sheet:
-    """Return the errors of the answers relative to the bound, cell by cell."""
+    """Return a table of the errors of the answers relative to the bound, cell by cell."""
     names = "case noise noise_unit noise_label method rmse bound ratio ratio_half deviation_median deviation_p95 nees"
     columns = [
         *_case(),
@@ -168,7 +175,7 @@ def accuracy(cells: pd.DataFrame) -> Sheet:
 
 
 def timing(cells: pd.DataFrame) -> Sheet:
-    """Return the times of a fix, cell by cell."""
+    """Return a table of the times of a fix, cell by cell."""
     names = "case noise noise_unit noise_label method rows seconds_median seconds_p10 seconds_p90 build iterations"
     columns = [
         *_case(),
@@ -186,31 +193,31 @@ def timing(cells: pd.DataFrame) -> Sheet:
     return _sheet("timing", "Times", note, cells[names.split()], columns, 3)
 
 
-def solved_within(found: Profiles) -> Sheet:
-    """Return the shares of trials that each method solves within multiples of the least work of any method."""
+def solved_within(profile: Profiles) -> Sheet:
+    """Return a table of the shares of trials that each method solves within multiples of the least work."""
     import pandas as pd
 
     rows = [
-        {"method": one.method, "trials": one.trials, "solved": one.solved}
-        | {f"within_{ratio:g}": one.within[ratio] for ratio in RATIOS}
-        | {f"median_{found.work}": one.median}
-        for one in shares(found)
+        {"method": method_share.method, "trials": method_share.trials, "solved": method_share.solved}
+        | {f"within_{ratio:g}": method_share.within[ratio] for ratio in RATIOS}
+        | {f"median_{profile.work}": method_share.median}
+        for method_share in shares(profile)
     ]
-    shown = duration if found.work == "processor" else number
+    as_text = duration if profile.work == "processor" else number
     columns: list[Column] = [
         ("method", lambda r: str(r.method)),
         ("trials", lambda r: str(r.trials)),
         ("solved, % (95 %)", lambda r: _interval(r.solved, r.trials)),
         *((f"within {ratio:g}×", partial(_within, ratio)) for ratio in RATIOS),
-        ("median when solved", lambda r: shown(getattr(r, f"median_{found.work}"))),
+        ("median when solved", lambda r: as_text(getattr(r, f"median_{profile.work}"))),
     ]
     note = (
-        f"Solved: the cost exceeds the least known cost by at most {found.tau:g}; the status does not matter. The next "
-        f"columns give the share, in per cent, that is solved within multiples of the {_LEAST[found.work]} that the "
-        "best method needs for the trial. Methods that know the truth are left out."
+        f"Solved: the cost exceeds the least known cost by at most {profile.tau:g}; the status does not matter. The "
+        f"next columns give the share, in per cent, that is solved within multiples of the {_LEAST[profile.work]} that "
+        "the best method needs for the trial. Methods that know the truth are left out."
     )
-    if found.silent:
-        note += f" Without a count of evaluations, and left out: {', '.join(found.silent)}."
+    if profile.silent:
+        note += f" Without a count of evaluations, and left out: {', '.join(profile.silent)}."
     return _sheet("profiles", "Solved within a given work", note, pd.DataFrame(rows), columns, 1)
 
 
@@ -218,6 +225,7 @@ _LEAST = {"processor": "processor time", "evaluations": "evaluations of the cost
 
 
 def _within(ratio: float, row: Any) -> str:
+    """Return the share of trials that a method solves within `ratio` times the least work, as text in per cent."""
     return percent(getattr(row, f"within_{ratio:g}"))
 
 
@@ -226,26 +234,29 @@ _PROOFS = (PROVEN, "region", "local")
 
 
 def _proven(kind: str, row: Any) -> str:
+    """Return the share of trials with a proof of this kind, as text in per cent."""
     return percent(getattr(row, f"proven_{kind}") / row.trials)
 
 
 def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
-    """Return the proofs of each method's answers, and the number of false ones."""
+    """Return a table of the proofs of each method's answers, and the number of false ones."""
     import pandas as pd
 
-    found = []
+    lines = []
     for name in order:
         part = frame[frame["method"] == name]
         proofs = part["proof"].astype(str).value_counts()
         share = {f"proven_{kind}": int(proofs.get(kind, 0)) for kind in _PROOFS}
         # Gap between the cost and its proven lower bound; NaN without a proof.
-        below = (part["cost"] - part["bound"]).to_numpy(dtype=float)
-        below = below[np.isfinite(below)]
-        by = ", ".join(sorted(set(part["certificate"].astype(str)) - {"none", "nan", ""}))
-        gap = float(np.median(below)) if len(below) else np.nan
-        found.append({"method": name, "by": by, "trials": len(part), **share, "false": int(part["false"].sum())})
-        found[-1] |= {"cost_less_bound_median": gap}
-    table = pd.DataFrame(found)
+        gaps = (part["cost"] - part["bound"]).to_numpy(dtype=float)
+        gaps = gaps[np.isfinite(gaps)]
+        certificates = ", ".join(sorted(set(part["certificate"].astype(str)) - {"none", "nan", ""}))
+        gap = float(np.median(gaps)) if len(gaps) else np.nan
+        lines.append(
+            {"method": name, "by": certificates, "trials": len(part), **share, "false": int(part["false"].sum())}
+        )
+        lines[-1] |= {"cost_less_bound_median": gap}
+    table = pd.DataFrame(lines)
     columns: list[Column] = [
         ("method", lambda r: str(r.method)),
         ("by", lambda r: r.by or "–"),
@@ -262,7 +273,7 @@ def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
 
 
 def made_with(frame: pd.DataFrame) -> Sheet:
-    """Return the machines and library versions that computed the rows."""
+    """Return a table of the machines and library versions that computed the rows."""
     names = ["machine", "versions"]
     table = frame.groupby(names, observed=True).size().rename("rows").reset_index()
     columns: list[Column] = [
@@ -276,7 +287,11 @@ def made_with(frame: pd.DataFrame) -> Sheet:
 def sheets(
     frame: pd.DataFrame, rivals: pd.DataFrame, cells: pd.DataFrame, order: list[str], found: Profiles | None
 ) -> Iterator[Sheet]:
-    """Yield all tables in reading order; `frame` are all judged rows, `rivals` the rows of the ranked methods."""
+    """Yield all tables in reading order.
+
+    `frame` are all judged rows, and `rivals` the rows of the ranked methods. `cells` are the statistics of the cells,
+    and `order` are the methods with the best first. `found` are the profiles; with None, their table is left out.
+    """
     yield best_first(rivals, [name for name in order if name in set(rivals["method"])])
     yield success(cells)
     yield statuses(frame)
@@ -309,18 +324,18 @@ _RAISED = dict(zip("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789", strict=True)
 
 
 def latex_text(text: str) -> str:
-    """Return text with LaTeX's special characters escaped."""
-    out, power = [], ""
+    """Return text with LaTeX's special characters escaped; superscript digits become powers."""
+    parts, power = [], ""
     # Consecutive superscript digits are one power.
-    for sign in [*text, ""]:
-        if sign in _RAISED and sign:
-            power += _RAISED[sign]
+    for character in [*text, ""]:
+        if character in _RAISED and character:
+            power += _RAISED[character]
             continue
         if power:
-            out.append(rf"\ensuremath{{^{{{power}}}}}")
+            parts.append(rf"\ensuremath{{^{{{power}}}}}")
             power = ""
-        out.append(_SPECIAL.get(sign, sign))
-    return "".join(out)
+        parts.append(_SPECIAL.get(character, character))
+    return "".join(parts)
 
 
 def latex(table: TextTable, words: int = 1) -> str:
@@ -331,7 +346,7 @@ def latex(table: TextTable, words: int = 1) -> str:
     table : TextTable
         Text cells.
     words : int
-        Number of columns at the left that hold words and are aligned left; the others are aligned right.
+        Number of columns at the left that contain words and are aligned left; the others are aligned right.
     """
     columns = "l" * words + "r" * (len(table.header) - words)
     head = " & ".join(map(latex_text, table.header)) + r" \\"

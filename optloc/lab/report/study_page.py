@@ -1,4 +1,8 @@
-"""Report of a study: the HTML page, its tables and its figures, made from the output folder."""
+"""Report of a study: the HTML page, its tables and its figures, made from the output folder.
+
+A section of the page shows the figures of one subject, and folded tables below them. Maps show the bound of the
+position error for cases whose stations are the same in all trials.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +58,7 @@ _MARGIN = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class BoundMapOfCase:
     """Map of the bound of a case.
 
     Parameters
@@ -75,10 +79,10 @@ class Place:
     off: Array
 
 
-def scenario_maps(design: StudyDesign, frame: pd.DataFrame) -> Iterator[Place]:
+def scenario_maps(design: StudyDesign, frame: pd.DataFrame) -> Iterator[BoundMapOfCase]:
     """Yield the map of each case whose stations are the same in all trials, at its first noise level.
 
-    Cases for which the bound has no map are left out.
+    `frame` are the judged rows. Cases for which the bound has no map are left out.
     """
     first: dict[str, Case | NetworkCase] = {}
     for cell in design.cells:
@@ -96,29 +100,29 @@ def scenario_maps(design: StudyDesign, frame: pd.DataFrame) -> Iterator[Place]:
             continue
 
 
-def _scenario_map(title: str, case: Case, rows: pd.DataFrame) -> Place:
+def _scenario_map(title: str, case: Case, rows: pd.DataFrame) -> BoundMapOfCase:
     """Return the map of a case at one noise level, with the true positions of its trials."""
-    # The stations are fixed, so the stations of one trial serve all trials.
-    one = draw(case, 0, 1)
-    problem, d = one.problem.take(np.zeros(1, dtype=int)), one.problem.dimension
+    # The stations are fixed, so the stations of one trial are the stations of all trials.
+    trial = draw(case, 0, 1)
+    problem, d = trial.problem.take(np.zeros(1, dtype=int)), trial.problem.dimension
     per_trial = rows.groupby("trial", sort=True).agg(
         off=("wrong", "any"), x=("truth_x", "first"), y=("truth_y", "first"), z=("truth_z", "first")
     )
     position = per_trial[["x", "y", "z"]].to_numpy(dtype=float)[:_MOST_DOTS, :d]
     earth = problem.frame.geodetic and d == 3
-    plain = map_coordinates(problem.frame, position, earth)
+    map_position = map_coordinates(problem.frame, position, earth)
     # Height of the middle trial, rounded to metres because the page prints it.
-    height = float(np.round(np.median(plain[:, 2]))) if d == 3 and len(plain) else 0.0
+    height = float(np.round(np.median(map_position[:, 2]))) if d == 3 and len(map_position) else 0.0
     west, east, south, north = extent(problem, position, widen=_MARGIN)
-    found = bound_map(
-        problem, one.truth[0], np.linspace(west, east, _POINTS), np.linspace(south, north, _POINTS), height
+    bounds = bound_map(
+        problem, trial.truth[0], np.linspace(west, east, _POINTS), np.linspace(south, north, _POINTS), height
     )
     off = per_trial["off"].to_numpy(dtype=bool)[:_MOST_DOTS]
-    return Place(f"{title}, {noise_text(case.label)}", found, plain[:, :2], off)
+    return BoundMapOfCase(f"{title}, {noise_text(case.label)}", bounds, map_position[:, :2], off)
 
 
 Tell = Callable[[str], None]
-"""Called with the name of each step of the report."""
+"""Function that is called with the name of each step of the report, to show progress."""
 
 # Pixels of an inch in PNG files: a figure of 5.2 inches has 1040, enough for screens of twice the usual density.
 _DPI = 200
@@ -126,20 +130,30 @@ _DPI = 200
 
 @dataclass(frozen=True, slots=True)
 class _StudyContent:
-    """Content of a report. `profiles` leaves out methods that start at the truth; it is None if no trial has a fix."""
+    """Content of a report.
+
+    `frame` are all judged rows, and `cells` their statistics (`summary.cells`). `looks` are the colours and marks of
+    the methods by name, `sheets` the tables by name, `places` the maps. `profiles` leaves out methods that start at the
+    truth; it is None if no trial has a fix.
+    """
 
     manifest: StudyManifest
     frame: pd.DataFrame
     cells: pd.DataFrame
     looks: dict[str, Look]
     sheets: dict[str, Sheet]
-    places: list[Place]
+    places: list[BoundMapOfCase]
     profiles: Profiles | None
 
 
 @dataclass(frozen=True, slots=True)
 class _Section:
-    """Section of the page: figures of one subject, and the text above them."""
+    """Section of the page: figures of one subject, and the text above them.
+
+    `name` is the anchor of the section in the page, and `make` makes the figures. `lines` is True if the figures show
+    the methods as lines or marks, and so need a legend in files. `wide` is True for figures of the full width. `tables`
+    are the names of the folded tables.
+    """
 
     name: str
     title: str
@@ -175,36 +189,38 @@ def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None
     figure_class()
     target_folder = folder / "report" if out is None else out
     target = target_folder / "report.html"
-    say = tell or (lambda _: None)
-    say("reading")
-    found = _study_content(folder)
+    tell_step = tell or (lambda _: None)
+    tell_step("reading")
+    content = _study_content(folder)
     make_folder(target_folder)
     claim(target)
     with replace_together():
         files = [
-            _table_file(target_folder, sheet, ending) for sheet in found.sheets.values() for ending in ("csv", "tex")
+            _table_file(target_folder, sheet, ending) for sheet in content.sheets.values() for ending in ("csv", "tex")
         ]
-        parts = [PagePart("ranking", "Ranking", tables=[found.sheets["ranking"]])]
+        parts = [PagePart("ranking", "Ranking", tables=[content.sheets["ranking"]])]
         for section in _SECTIONS:
-            say(section.title.lower())
-            pictures = section.make(found)
+            tell_step(section.title.lower())
+            pictures = section.make(content)
             if pictures:
-                parts.append(_part(section, found, pictures))
-                files += [path for one in pictures for path in _figure_files(target_folder, one, legend=section.lines)]
-        if found.places:
-            say("maps")
-            part, more = _maps(target_folder, found)
+                parts.append(_part(section, content, pictures))
+                files += [
+                    path for picture in pictures for path in _figure_files(target_folder, picture, legend=section.lines)
+                ]
+        if content.places:
+            tell_step("maps")
+            part, map_files = _maps(target_folder, content)
             parts.append(part)
-            files += more
-        source = found.manifest.text
+            files += map_files
+        source = content.manifest.text
         origin = "Machine, versions and study file"
-        parts.append(PagePart("made", origin, tables=[found.sheets["machine"]], source=source))
-        write_text(target, _page(found, parts))
+        parts.append(PagePart("made", origin, tables=[content.sheets["machine"]], source=source))
+        write_text(target, _page(content, parts))
     return [target, *files]
 
 
 def _study_content(folder: Path) -> _StudyContent:
-    """Return the content of the report from the output folder of a study."""
+    """Return the content of the report from the output folder; raise InvalidProblem without a finished part."""
     manifest = read_manifest(folder)
     rows = read_frame(folder, [*summary.COLUMNS])
     if not len(rows):
@@ -226,36 +242,43 @@ def _study_content(folder: Path) -> _StudyContent:
     return _StudyContent(manifest, frame, cells, marks(order), tables, places, profiled)
 
 
-def _page(found: _StudyContent, parts: list[PagePart]) -> str:
+def _page(content: _StudyContent, parts: list[PagePart]) -> str:
     """Return the HTML page of the report."""
-    m, rows = found.manifest, len(found.frame)
-    state = "complete" if rows == m.rows else f"{rows} of {m.rows} rows: not finished, so the results may change"
-    trials = found.frame[["data", "trial"]].drop_duplicates()
-    facts = (
-        f"{rows} fixes of {len(trials)} trials by {len(found.looks)} methods ({state}). optloc {m.version}, started "
-        f"{m.created[:10]}, seed {m.seed}, {m.machine}."
+    manifest, rows = content.manifest, len(content.frame)
+    state = (
+        "complete"
+        if rows == manifest.rows
+        else f"{rows} of {manifest.rows} rows: not finished, so the results may change"
     )
-    opening = [m.note] if m.note else []
-    return write_page(m.title or m.name, parts, opening=opening, facts=facts, methods=found.looks.values())
+    trials = content.frame[["data", "trial"]].drop_duplicates()
+    facts = (
+        f"{rows} fixes of {len(trials)} trials by {len(content.looks)} methods ({state}). optloc {manifest.version}, "
+        f"started {manifest.created[:10]}, seed {manifest.seed}, {manifest.machine}."
+    )
+    opening = [manifest.note] if manifest.note else []
+    return write_page(
+        manifest.title or manifest.name, parts, opening=opening, facts=facts, methods=content.looks.values()
+    )
 
 
-def _part(section: _Section, found: _StudyContent, pictures: list[Picture]) -> PagePart:
-    """Return a section of the page with its drawings and its folded tables."""
-    folded = [found.sheets[name] for name in section.tables]
+def _part(section: _Section, content: _StudyContent, pictures: list[Picture]) -> PagePart:
+    """Return a section of the page with its drawings and its folded tables; `pictures` are the figures."""
+    folded = [content.sheets[name] for name in section.tables]
     # Draw before the files are written: the files get a legend inside the figure, the page does not.
     drawings = [inline(picture) for picture in pictures]
     return PagePart(section.name, section.title, section.text, drawings=drawings, wide=section.wide, folded=folded)
 
 
-def _figure_files(place: Path, picture: Picture, *, legend: bool) -> list[Path]:
-    """Write a picture as PNG and SVG; with `legend`, draw a legend of the methods into the figure first.
+def _figure_files(folder: Path, picture: Picture, *, legend: bool) -> list[Path]:
+    """Write a picture as PNG and SVG into the folder of the report, and return the paths.
 
-    The legend changes the figure, so the page's copy must be drawn before.
+    With `legend`, draw a legend of the methods into the figure first. The legend changes the figure, so the page's copy
+    must be drawn before.
     """
     figure = picture.figure
     if legend:
         with_legend(figure)
-    paths = [place / "figures" / f"{picture.name}.{ending}" for ending in ("png", "svg")]
+    paths = [folder / "figures" / f"{picture.name}.{ending}" for ending in ("png", "svg")]
     make_folder(paths[0].parent)
     write_text(paths[1], svg_text(figure))
     with written(paths[0]) as file:
@@ -263,9 +286,9 @@ def _figure_files(place: Path, picture: Picture, *, legend: bool) -> list[Path]:
     return paths
 
 
-def _table_file(place: Path, sheet: Sheet, ending: str) -> Path:
-    """Write a table as .csv or .tex, and return its path."""
-    path = place / "tables" / f"{sheet.shown.name}.{ending}"
+def _table_file(folder: Path, sheet: Sheet, ending: str) -> Path:
+    """Write a table as .csv or .tex (`ending`) into the folder of the report, and return its path."""
+    path = folder / "tables" / f"{sheet.shown.name}.{ending}"
     make_folder(path.parent)
     if ending != "csv":
         write_text(path, latex(sheet.shown, sheet.words))
@@ -276,7 +299,7 @@ def _table_file(place: Path, sheet: Sheet, ending: str) -> Path:
     return path
 
 
-def _maps(place: Path, found: _StudyContent) -> tuple[PagePart, list[Path]]:
+def _maps(folder: Path, content: _StudyContent) -> tuple[PagePart, list[Path]]:
     """Return the section of maps and the files of its pictures; maps of places on Earth can be moved and zoomed."""
     text = (
         "Bound of the position error (root of its trace) for a target at each point of the map, at the height of the "
@@ -285,28 +308,28 @@ def _maps(place: Path, found: _StudyContent) -> tuple[PagePart, list[Path]]:
     )
     maps: list[Canvas | Drawing] = []
     files = []
-    for i, one in enumerate(found.places):
+    for i, case in enumerate(content.places):
         name = f"map-{i + 1}"
-        picture = Picture(name, f"Bound: {one.title}", plot_bound_map(one.found, one.title))
-        trials = (one.truths, one.off)
-        maps.append(map_element(one.found, name, one.title, trials) if one.found.geodetic else inline(picture))
-        files += _figure_files(place, picture, legend=False)
+        picture = Picture(name, f"Bound: {case.title}", plot_bound_map(case.found, case.title))
+        trials = (case.truths, case.off)
+        maps.append(map_element(case.found, name, case.title, trials) if case.found.geodetic else inline(picture))
+        files += _figure_files(folder, picture, legend=False)
     return PagePart("maps", "Maps of the bound", text, maps=maps, headings=True), files
 
 
-def _cell_pictures(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
-    """Return pictures of the cells of the study."""
-    return list(make(found.cells, found.looks))  # type: ignore[call-overload,no-any-return]
+def _cell_pictures(make: Callable[..., object], content: _StudyContent) -> list[Picture]:
+    """Return the pictures that `make` draws from the cells of the study."""
+    return list(make(content.cells, content.looks))  # type: ignore[call-overload,no-any-return]
 
 
-def _row_pictures(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
-    """Return pictures of the rows of the study."""
-    return list(make(found.frame, found.looks))  # type: ignore[call-overload,no-any-return]
+def _row_pictures(make: Callable[..., object], content: _StudyContent) -> list[Picture]:
+    """Return the pictures that `make` draws from the judged rows of the study."""
+    return list(make(content.frame, content.looks))  # type: ignore[call-overload,no-any-return]
 
 
-def _profile_pictures(found: _StudyContent) -> list[Picture]:
-    """Return the pictures of both profiles; empty without profiles."""
-    return [] if found.profiles is None else list(drawn.profiles(found.profiles, found.looks))
+def _profile_pictures(content: _StudyContent) -> list[Picture]:
+    """Return the pictures of the data profile and of the performance profile; empty without profiles."""
+    return [] if content.profiles is None else list(drawn.profiles(content.profiles, content.looks))
 
 
 _SECTIONS = (

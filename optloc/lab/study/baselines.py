@@ -2,6 +2,9 @@
 
 No baseline searches for another minimum, and some claim every result as an answer. A study judges their answers by the
 lowest cost that any method finds.
+
+Letters in shapes: N problems (trials), m rows, s stations, d coordinates. `size` is the length of a parameter vector:
+all unknowns of a problem in the order of its layout.
 """
 
 from __future__ import annotations
@@ -61,14 +64,14 @@ _EVALUATIONS = 200
 
 
 def start_of(kind: str, width: float, drawn: DrawnCase) -> Array:
-    """Return the starting vectors (n, size) of trials: "truth", "centre" of the stations, or "box" around the centre.
-
-    The centre is shifted at random by a tenth of the stations' spread, because ranges have no derivative at a station.
+    """Return the starting vectors (N, size) of trials: the truth, or a position near the stations and zeros elsewhere.
 
     Parameters
     ----------
     kind : str
-        Kind of guess.
+        "truth", "centre" of the stations, or "box": at random in a box around the centre. The centre is shifted at
+        random by at most a tenth of the stations' spread in each coordinate, because ranges have no derivative at a
+        station.
     width : float
         Width of the box, metres.
     drawn : DrawnCase
@@ -88,30 +91,26 @@ def start_of(kind: str, width: float, drawn: DrawnCase) -> Array:
 
 
 def single_step(problem: Problem, start: Array) -> Array:
-    """Return the vectors (N, size) after one Gauss-Newton step from `start` (N, size); NaN for singular equations.
-
-    `problem` is a flat batch of N problems.
-    """
+    """Return the vectors (N, size) after one Gauss-Newton step from `start` (N, size); NaN for singular equations."""
     with np.errstate(all="ignore"):
         return _full_step(problem, start)
 
 
 def recursion(problem: Problem, start: Array, *, iterations: int = 2) -> Array:
-    """Return the vectors (N, size) of the registration paper's recursion: undamped steps, epoch by epoch.
+    """Return the vectors (N, size) that the recursion of the paper on registration reaches.
 
-    Each step uses all data up to its epoch. The first steps use forty epochs, and every step is accepted.
-
-    `problem` is a flat batch of N runs, `start` are vectors (N, size), and `iterations` are the steps at each epoch.
-    The result is NaN if the steps diverge, or if the problem has unknowns of single epochs.
+    At each new epoch, the recursion makes `iterations` undamped Gauss-Newton steps with all data up to this epoch. The
+    first steps use forty epochs, and every step is accepted. `problem` is a flat batch of N runs, and `start` are
+    vectors (N, size). The result is NaN if the steps diverge, or if the problem has unknowns of single epochs.
     """
     if problem.layout.n_local or has_correlated_epochs(problem):
         return np.full_like(start, np.nan)
     x = start
     with np.errstate(all="ignore"):
         for last in range(min(_FIRST, problem.epochs), problem.epochs + 1):
-            so_far = window(problem, 0, last) if last < problem.epochs else problem
+            data_so_far = window(problem, 0, last) if last < problem.epochs else problem
             for _ in range(iterations):
-                x = _full_step(so_far, x)
+                x = _full_step(data_so_far, x)
     return x
 
 
@@ -138,14 +137,14 @@ def claim(problem: Problem, start: Array, x: Array) -> Fix:
 # Listeners for the costs that a method evaluates, trial by trial: a study counts them, a history stores them.
 
 Listener = Callable[[int, float], None]
-"""Called at each evaluation with the number of the trial in the call, and the cost."""
+"""Function that is called at each evaluation of a cost, with the number of the trial in the call, and the cost."""
 
 _LISTENER: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 
 @contextmanager
 def listening(by: Listener) -> Iterator[None]:
-    """Call a listener at each evaluation of a cost by an external method inside this context."""
+    """Register a listener that external methods call at each evaluation of a cost inside this context."""
     token = _LISTENER.set(by)
     try:
         yield
@@ -154,21 +153,22 @@ def listening(by: Listener) -> Iterator[None]:
 
 
 def teller(trial: int) -> Callable[[float], None]:
-    """Return a function that passes the costs of a trial to the current listener."""
+    """Return a function that passes each cost of a trial to the registered listener; without one, it does nothing."""
     listener = _LISTENER.get()
     return (lambda _: None) if listener is None else lambda cost: listener(trial, cost)
 
 
 def weighings(problem: Problem) -> int:
-    """Return the number of times that a trial is solved, each time with noise weights at the last solution.
+    """Return the number of times that a trial is solved: 1, or more if the noise depends on the position.
 
-    The number is 1 if the noise does not depend on the position.
+    Noise with errors of the stations depends on the position. Then the trial is solved again and again, each time with
+    the noise at the last solution.
     """
     return WEIGHINGS if depends_on_place(problem) else 1
 
 
 def weighed_at(problem: Problem, x: Array, start: Array) -> Problem:
-    """Return problems whose noise weights are those at the points (N, size), or at `start` if a point is not finite."""
+    """Return problems with the noise at the points `x` (N, size); at `start` (N, size) where a point is not finite."""
     return with_station_noise(problem, np.where(np.isfinite(x).all(-1, keepdims=True), x, start))
 
 
@@ -205,43 +205,50 @@ def least_squares(problem: Problem, start: Array, limit: int = _EVALUATIONS) -> 
 def whiten_one(
     one: Problem, tell: Callable[[float], None]
 ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """Return two functions for SciPy: residual (m,) and Jacobian (m, size) of one problem, in standard deviations.
+    """Return two functions of the vector (size,) for SciPy: residual (m,) and Jacobian (m, size) of one problem.
 
-    Each unknown with a prior adds a residual. The residual function passes its cost to `tell`.
+    Residuals are in standard deviations. Each unknown with a prior adds a residual, so m is the number of rows and of
+    these unknowns. The residual function passes its cost to `tell`.
     """
-    white, (slope, level) = whiten(one.noise, one.weight), _prior_rows(one)
+    whitening, (prior_matrix, prior_values) = whiten(one.noise, one.weight), _prior_rows(one)
 
     def residual(x: Array) -> Array:
         values = differentiate(one, x[None])[0][..., None]
-        found = np.concatenate([*(w.apply(values)[0, :, 0] for w in white), level - slope @ x])
-        tell(float(found @ found))
-        return found
+        residuals = np.concatenate(
+            [*(block.apply(values)[0, :, 0] for block in whitening), prior_values - prior_matrix @ x]
+        )
+        tell(float(residuals @ residuals))
+        return residuals
 
     def jacobian(x: Array) -> Array:
         H = differentiate(one, x[None])[1]
-        return -np.concatenate([*(w.apply(H)[0] for w in white), slope])
+        return -np.concatenate([*(block.apply(H)[0] for block in whitening), prior_matrix])
 
     return residual, jacobian
 
 
 def _prior_rows(one: Problem) -> tuple[Array, Array]:
-    """Return the rows A (r, size) and b (r,) of the priors of one problem, whose cost is |b - A x|^2."""
-    layout, rows, levels = one.layout, [np.zeros((0, one.layout.size))], [np.zeros(0)]
+    """Return the matrix A (r, size) and the values b (r,) of the priors of one problem, whose cost is |b - A x|^2.
+
+    r is the number of unknowns with a prior.
+    """
+    layout, rows, values = one.layout, [np.zeros((0, one.layout.size))], [np.zeros(0)]
     for name, mean, precision in prior_parts(one):
         slot, shared = layout.find(name)
         # There is one problem, so leading axes have length one.
-        middle, root = mean.reshape(slot.size), np.linalg.cholesky(precision.reshape(slot.size, slot.size))
+        prior_mean, root = mean.reshape(slot.size), np.linalg.cholesky(precision.reshape(slot.size, slot.size))
         for k in range(1 if shared else layout.epochs):
             first = slot.start + (0 if shared else layout.n_shared + k * layout.n_local)
             rows.append(root.T @ np.eye(layout.size)[first : first + slot.size])
-            levels.append(root.T @ middle)
-    return np.concatenate(rows), np.concatenate(levels)
+            values.append(root.T @ prior_mean)
+    return np.concatenate(rows), np.concatenate(values)
 
 
 def lifted_sdp(problem: Problem) -> Fix:
-    """Return the unrefined points of the order-1 lift of ranges; NaN points if rows are not sums of ranges.
+    """Return the unrefined points of the semidefinite relaxation of ranges of order 1.
 
-    `problem` is a flat batch of N problems of one epoch with one static target.
+    `problem` is a flat batch of N problems of one epoch with one static target. The points are NaN if rows are not sums
+    of ranges.
 
     References
     ----------
@@ -268,7 +275,10 @@ def lifted_sdp(problem: Problem) -> Fix:
 
 
 def _linear(one: Problem, scale: float) -> tuple[Array, Array]:
-    """Return the whitened rows K (m, s) and values (m,) of one problem whose rows are sums of ranges."""
+    """Return whitened rows K (m, s) and values z (m,) of one problem whose rows are sums of ranges.
+
+    The rows are linear in the ranges r (s,) from the stations, in units of `scale` (metres): K r = z.
+    """
     K, start = np.zeros((one.count, one.stations.count)), 0
     for rows in one.rows:
         ends = MODELS[rows.kind].ranges
@@ -287,37 +297,39 @@ def _linear(one: Problem, scale: float) -> tuple[Array, Array]:
 
 
 def at_random(count: int) -> Callable[[Network, int], NetworkResult]:
-    """Return a method that refines `count` networks of random positions, spread as the arrivals indicate."""
+    """Return a method for networks: the best result of least squares from `count` networks of random positions.
+
+    The spread of the positions is estimated from the arrivals.
+    """
     return lambda network, seed: refined(network, starts_of(likelihood(network), seed).random(count))
 
 
 def by_nuclear_norm(network: Network, seed: int) -> NetworkResult:
-    """Return the network refined from the emission times of least truncated nuclear norm, if the norm applies.
+    """Return the network that least squares reaches from the emission times of least truncated nuclear norm.
 
-    References
-    ----------
-    F. Jiang, Y. Kuang and K. Astrom (2013); see `formulations.nuclear_norm`.
+    This start needs one clock for all stations, no missing arrival, and enough stations and pulses. Otherwise the
+    result has no network. `seed` has no effect, because this start is not random.
     """
     from formulations.metric_upgrade import unknowns, upgrade
     from formulations.nuclear_norm import affine_network, nuclear_offsets
 
     m, n, d = network.stations, network.pulses, network.dimension
-    begun = starts_of(likelihood(network), seed)
-    starts = begun.random(0)
+    generator = starts_of(likelihood(network), seed)
+    starts = generator.random(0)
     if network.synchronised and network.given.all() and max(m, n) >= unknowns(d) and m > d + 1:
-        z = (begun.z - begun.shift[:, None]) / begun.spread
+        z = (generator.z - generator.shift[:, None]) / generator.spread
         found = nuclear_offsets(z, d)
         if np.isfinite(found.value):
-            stations, pulses, which = upgrade(affine_network(z, found.offset, d))
-            emission = np.repeat((begun.shift + begun.spread * found.offset)[None], len(which), axis=0)
+            stations, pulses, choices = upgrade(affine_network(z, found.offset, d))
+            emission = np.repeat((generator.shift + generator.spread * found.offset)[None], len(choices), axis=0)
             starts = NetworkEstimate(
-                begun.spread * stations, np.zeros((len(which), m)), begun.spread * pulses, emission
+                generator.spread * stations, np.zeros((len(choices), m)), generator.spread * pulses, emission
             )
     return refined(network, starts)
 
 
 def only_networks(drawn: DrawnCase, start: Array) -> Fix:
-    """Raise InvalidProblem: this baseline has no fixes."""
+    """Raise InvalidProblem: the function `run` of baselines that solve networks only."""
     raise InvalidProblem("this baseline solves networks only", "baseline", "give [[network]] tables")
 
 
@@ -331,7 +343,7 @@ class Baseline:
     Parameters
     ----------
     run : callable
-        ``(drawn, start) -> Fix``; start is an array (n, size).
+        ``(drawn, start) -> Fix``: solves n trials from the starting vectors (n, size).
     summary : str
         One line for listings.
     guess : bool
@@ -371,22 +383,30 @@ def _truth(drawn: DrawnCase, start: Array) -> Fix:
     return _iterate("lsr")(drawn, drawn.truth)
 
 
-def _printed(drawn: DrawnCase, start: Array) -> Fix:
-    """Return the undamped iteration with the sign of the residual as printed in the paper."""
+def _printed_sign(drawn: DrawnCase, start: Array) -> Fix:
+    """Return the fixes of the undamped iteration with the sign of the residual that the paper prints.
+
+    The paper is the source of `optloc.lab.papers.kinematic`.
+
+    The positions are NaN for problems with other unknowns than a position.
+    """
     from optloc.lab.papers.kinematic import taylor
 
-    size = drawn.problem.dimension
+    d = drawn.problem.dimension
     x = start.copy()
-    x[:, :size] = taylor(drawn.problem, start, sign=-1.0) if start.shape[-1] == size else np.nan
+    x[:, :d] = taylor(drawn.problem, start, sign=-1.0) if start.shape[-1] == d else np.nan
     return given(drawn.problem, x)
 
 
-def _original(steps: Callable[[Problem, Array], Array]) -> Callable[[DrawnCase, Array], Fix]:
-    """Return the method of a paper, which claims every finite point as an answer."""
+def _method_of_paper(steps: Callable[[Problem, Array], Array]) -> Callable[[DrawnCase, Array], Fix]:
+    """Return the method of a paper as a baseline function; it claims every finite point as an answer.
+
+    `steps` returns the final vectors (N, size) of problems from starting vectors (N, size).
+    """
     return lambda drawn, start: claim(drawn.problem, start, steps(drawn.problem, start))
 
 
-def _network(summary: str, refine: Callable[[Network, int], NetworkResult]) -> Baseline:
+def _network_baseline(summary: str, refine: Callable[[Network, int], NetworkResult]) -> Baseline:
     """Return a baseline for networks only, which refines them one by one."""
     return Baseline(only_networks, summary, guess=False, slow=True, networks=each(refine))
 
@@ -405,12 +425,13 @@ _OWN = {
         "undamped Taylor iteration from a guess (Foy 1976), as in the papers",
         method="taylor",
     ),
-    "taylor-printed": Baseline(_printed, "taylor with the sign of equations 8 and 15 of the paper `kinematic`"),
+    "taylor-printed": Baseline(_printed_sign, "taylor with the sign of equations 8 and 15 of the paper `kinematic`"),
     "single-step": Baseline(
-        _original(single_step), "one linearised step from a guess, as in the update of the paper `angles`"
+        _method_of_paper(single_step), "one linearised step from a guess, as in the update of the paper `angles`"
     ),
     "recursion": Baseline(
-        _original(recursion), "two undamped steps over all data at every new epoch, as in the paper `registration`"
+        _method_of_paper(recursion),
+        "two undamped steps over all data at every new epoch, as in the paper `registration`",
     ),
     "ipopt": Baseline(_iterate("nlp"), "IPOPT from a guess, or another nonlinear solver", slow=True, method="nlp"),
     "scipy": Baseline(
@@ -424,13 +445,13 @@ _OWN = {
         guess=False,
         slow=True,
     ),
-    "nuclear-norm": _network(
+    "nuclear-norm": _network_baseline(
         "times of emission by the truncated nuclear norm, metric upgrade, least squares: networks with one clock and "
         "no missing arrival",
         by_nuclear_norm,
     ),
-    "one-random": _network("networks: least squares from one network of random positions", at_random(1)),
-    "ten-random": _network(
+    "one-random": _network_baseline("networks: least squares from one network of random positions", at_random(1)),
+    "ten-random": _network_baseline(
         "networks: the best result of least squares from ten networks of random positions", at_random(10)
     ),
 }

@@ -1,6 +1,7 @@
-"""Experimental design of a study: a cell is a case with a method, and a chunk is some trials of a cell.
+"""Experimental design of a study: the list of all trials and methods, divided into tasks.
 
-A case is one geometry at one noise level with one set of swept values. A chunk is one task and one part file.
+A case is one geometry at one noise level with one set of swept values. A cell is a case with a method. A chunk is some
+consecutive trials of a cell: one task computes it, and one part file contains its rows.
 """
 
 from __future__ import annotations
@@ -8,9 +9,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import platform
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.resources import as_file, files
 from importlib.resources.abc import Traversable
 from itertools import combinations, product
@@ -22,7 +25,7 @@ import numpy as np
 
 from optloc.files import join, kind_model, parse_toml, read, read_text, validated, within
 from optloc.lab.study.document import Level, NetworkTable, ScenarioTable, StudyFile, sigma_of
-from optloc.lab.study.methods import StudyMethod, methods_of
+from optloc.lab.study.methods import StudyMethod, methods_of, version_of
 from optloc.lab.study.networks import NetworkCase, check_network, noise_of
 from optloc.lab.study.simulation import Case, add_injected_errors, check_truth, metres, place_stations
 from optloc.models import MODELS
@@ -72,12 +75,16 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """Return 16 hexadecimal digits that identify the cell."""
+        """Return 16 hexadecimal digits that identify the case and the settings of the method."""
         return hashlib.blake2b(f"{self.case.key} {self.method.identity}".encode(), digest_size=8).hexdigest()
 
     @property
     def stretch(self) -> int:
-        """Return the number of trials of a chunk: it takes seconds, and several workers can share the cell."""
+        """Return the number of trials of a chunk.
+
+        A chunk should take seconds, and several workers should be able to share the cell. A setting of the method
+        replaces the number.
+        """
         method, case = self.method, self.case
         if method.chunk is not None:
             return method.chunk
@@ -90,7 +97,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Some trials of a cell: one task computes them, and one part file holds them.
+    """Some consecutive trials of a cell: one task computes them, and one part file contains them.
 
     Parameters
     ----------
@@ -121,7 +128,7 @@ class StudyDesign:
     text : str
         Text of the study file.
     cells : tuple of Cell
-        In the order of the file.
+        Every case with every method, in the order of the file.
     folder : str
         Folder of the problem files.
     """
@@ -133,18 +140,18 @@ class StudyDesign:
 
     @property
     def chunks(self) -> Iterator[Chunk]:
-        """Yield the chunks: the first of every cell, then the second of every cell, and so on."""
-        cut = [
+        """Yield the chunks in the order of computation: the first of every cell, then the second of every cell, etc."""
+        by_cell = [
             [Chunk(cell, first, min(n, cell.case.trials - first)) for first in range(0, cell.case.trials, n)]
             for cell, n in ((cell, cell.stretch) for cell in self.cells)
         ]
         # If a study is stopped early, each cell has some trials, so the report shows all methods.
-        for turn in range(max(len(chunks) for chunks in cut)):
-            yield from (chunks[turn] for chunks in cut if turn < len(chunks))
+        for number in range(max(len(chunks) for chunks in by_cell)):
+            yield from (chunks[number] for chunks in by_cell if number < len(chunks))
 
     @property
     def rows(self) -> int:
-        """Return the number of rows of the table."""
+        """Return the number of rows of the finished table: the trials of all cells."""
         return sum(cell.case.trials for cell in self.cells)
 
     @property
@@ -160,6 +167,7 @@ class StudyDesign:
 
 
 def _digest(words: Iterable[str]) -> str:
+    """Return 32 hexadecimal digits that identify a sequence of texts."""
     return hashlib.blake2b(" ".join(words).encode(), digest_size=16).hexdigest()
 
 
@@ -221,7 +229,7 @@ def design_of_text(
     try:
         methods = [method for i, table in enumerate(study.method) for method in methods_of(table, i + 1)]
         methods += more
-        _one_kind(study, methods)
+        _check_methods_fit(study, methods)
         # Trials of the command line also replace the numbers of single scenarios.
         override = {} if trials is None else {"trials": None}
         cases: list[Case | NetworkCase] = []
@@ -238,16 +246,16 @@ def design_of_text(
     if parts > _PARTS:
         advice = "use fewer trials or cases, or a larger chunk in [[method]]"
         raise InvalidProblem(f"the study has {parts} parts, more than {_PARTS}", source, advice)
-    _distinct([method.name for method in methods], source, "method")
-    _distinct([table.name for table in study.scenario], source, "scenario")
-    _distinct([table.name for table in study.network], source, "network")
+    _check_names_differ([method.name for method in methods], source, "method")
+    _check_names_differ([table.name for table in study.scenario], source, "scenario")
+    _check_names_differ([table.name for table in study.network], source, "network")
     return StudyDesign(
         study, text, tuple(Cell(case, method) for case in cases for method in methods), str(folder.resolve())
     )
 
 
-def _one_kind(study: StudyFile, methods: list[StudyMethod]) -> None:
-    """Raise InvalidProblem unless there are either scenarios or networks, and every method can solve them."""
+def _check_methods_fit(study: StudyFile, methods: list[StudyMethod]) -> None:
+    """Raise InvalidProblem unless the study has either scenarios or networks, and every method can solve them."""
     if bool(study.scenario) == bool(study.network):
         what = "there are both scenarios and networks" if study.scenario else "there is no scenario and no network"
         raise InvalidProblem(what, "[[scenario]]", "give either [[scenario]] or [[network]] tables")
@@ -259,8 +267,8 @@ def _one_kind(study: StudyFile, methods: list[StudyMethod]) -> None:
             raise InvalidProblem("it solves networks only", f"method {method.name!r}", "give [[network]] tables")
 
 
-def _distinct(names: list[str], source: str, what: str) -> None:
-    """Raise InvalidProblem if two tables have the same name."""
+def _check_names_differ(names: list[str], source: str, what: str) -> None:
+    """Raise InvalidProblem if two of the names are equal; `what` is the type of the tables for the message."""
     twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
         raise InvalidProblem(f"there are two {what}s {twice[0]!r}", source, f"give each {what} a different name")
@@ -280,11 +288,11 @@ def cases_of(table: ScenarioTable, folder: Path, seed: int, trials: int) -> Iter
         base = _template(chosen, folder, where, seed)
         _check(base, chosen, where)
         for level in chosen.noise:
-            # The number is for axes and sorting, the label for people and for the key of the data.
+            # The number is for axes and sorting. The label is for people, and is part of the key of the data.
             noise, value, unit = _noise(base, level, chosen.layout is None, join(where, "noise"))
             label = level if isinstance(level, str) else json.dumps(level)
-            named = (json.dumps(swept, sort_keys=True), label, unit, value)
-            yield Case(chosen, *named, replace(base, noise=noise), seed, chosen.trials or trials)
+            level_columns = (json.dumps(swept, sort_keys=True), label, unit, value)
+            yield Case(chosen, *level_columns, replace(base, noise=noise), seed, chosen.trials or trials)
 
 
 def network_cases(table: NetworkTable, seed: int, trials: int) -> Iterator[NetworkCase]:
@@ -305,7 +313,7 @@ _Table = TypeVar("_Table", ScenarioTable, NetworkTable)
 
 
 def _sweep(table: _Table, where: str) -> Iterator[tuple[dict[str, Any], _Table]]:
-    """Yield the swept values and the table with these values, for each combination of the lists."""
+    """Yield the swept values by name and the table with these values, for each combination of the swept lists."""
     for name, values in table.sweep.items():
         if not values or name in ("name", "sweep", "noise", "trials"):
             what = "has no values" if not values else "cannot be swept"
@@ -335,7 +343,7 @@ def _template(table: ScenarioTable, folder: Path, where: str, seed: int) -> Prob
     if (table.problem is None) == (table.layout is None):
         raise InvalidProblem("a scenario has one geometry", where, "give either problem or [scenario.layout]")
     if table.layout is not None:
-        return _lay(table, where, seed)
+        return _problem_of_layout(table, where, seed)
     assert table.problem is not None
     shipped = files("optloc") / "scenarios"
     names = sorted(entry.name.removesuffix(".toml") for entry in shipped.iterdir() if entry.name.endswith(".toml"))
@@ -349,8 +357,12 @@ def _template(table: ScenarioTable, folder: Path, where: str, seed: int) -> Prob
     return read(path, values=False).problem
 
 
-def _lay(table: ScenarioTable, where: str, seed: int) -> Problem:
-    """Return the problem of a layout with noise of one; only random stations still have to be drawn for each trial."""
+def _problem_of_layout(table: ScenarioTable, where: str, seed: int) -> Problem:
+    """Return the problem of a layout: stations and rows, where each row or arrival has the standard deviation 1.
+
+    The levels of the study scale the noise later. Only random stations still have to be drawn for each trial. `seed` is
+    the seed of the study.
+    """
     layout = table.layout
     assert layout is not None
     where, s = join(where, "layout"), layout.stations
@@ -372,13 +384,13 @@ def _lay(table: ScenarioTable, where: str, seed: int) -> Problem:
         rows.append(measured(kind, a=a, b=b, arrival_sigma=1.0) if shared else measured(kind, a=a, b=b, sigma=1.0))
     survey = None if layout.survey is None else metres([layout.survey], join(where, "survey"))[0] ** 2
     spread = None if survey is None else np.tile(survey * np.eye(layout.dimension), (s, 1, 1))
-    place = place_stations(layout, where, rng, 1)
+    position = place_stations(layout, where, rng, 1)
     names = tuple(f"S{i + 1}" for i in range(s))
-    return assemble(Stations(np.array(place), names, covariance=spread, span="noise"), *rows)
+    return assemble(Stations(np.array(position), names, covariance=spread, span="noise"), *rows)
 
 
 def _check(problem: Problem, table: ScenarioTable, where: str) -> None:
-    """Raise InvalidProblem unless one position is sought, and truth, biases and errors fit the problem."""
+    """Raise InvalidProblem unless the problem has one unknown target, and truth, biases and errors fit the problem."""
     # A trial is one problem. Epochs that share no unknown would be separate trials without a number.
     if separable(problem):
         what = f"its {problem.epochs} epochs are separate problems"
@@ -399,7 +411,11 @@ def _check(problem: Problem, table: ScenarioTable, where: str) -> None:
 
 
 def _noise(problem: Problem, level: Level, from_file: bool, where: str) -> tuple[Noise, float, str]:
-    """Return the noise of a level, its number and its unit."""
+    """Return the noise of a problem at a level, the level as a number, and its unit.
+
+    `from_file` is True if the problem has its noise from a problem file. Then a bare number is a factor on this noise,
+    with the unit "x". Otherwise the number is the standard deviation of the first kind, in its SI unit.
+    """
     kinds = [rows.kind for rows in problem.rows]
     if isinstance(level, int | float):
         if not from_file:
@@ -411,18 +427,18 @@ def _noise(problem: Problem, level: Level, from_file: bool, where: str) -> tuple
     if isinstance(level, str):
         level = dict.fromkeys(kinds, level)
     if set(level) != set(kinds):
-        odd = min(set(level) ^ set(kinds))
-        raise InvalidProblem(f"the levels do not fit the kinds: {odd!r}", where, f"name {', '.join(kinds)}")
-    wanted = {kind: sigma_of(kind, amount, where) for kind, amount in level.items()}
+        unmatched = min(set(level) ^ set(kinds))
+        raise InvalidProblem(f"the levels do not fit the kinds: {unmatched!r}", where, f"name {', '.join(kinds)}")
+    sigmas = {kind: sigma_of(kind, amount, where) for kind, amount in level.items()}
     # Only standard deviations change: the correlations of the file or the layout stay.
-    present = np.sqrt(variances(problem.noise, problem.count))
-    sigma = np.concatenate([np.full(rows.count, wanted[rows.kind]) for rows in problem.rows])
+    before = np.sqrt(variances(problem.noise, problem.count))
+    sigma = np.concatenate([np.full(rows.count, sigmas[rows.kind]) for rows in problem.rows])
     unit = SI_UNIT[MODELS[kinds[0]].quantity]  # type: ignore[index]  # models hold known quantities only
-    return _scale(problem.noise, sigma / present), wanted[kinds[0]], unit
+    return _scale(problem.noise, sigma / before), sigmas[kinds[0]], unit
 
 
 def _scale(noise: Noise, factor: Array) -> Noise:
-    """Return noise whose standard deviations are multiplied by a factor (m,), one for each row."""
+    """Return noise whose standard deviations are multiplied by `factor` (m,), one factor for each of the m rows."""
     blocks = []
     for block in noise.blocks:
         size = factor[block.row]
@@ -434,3 +450,22 @@ def workers() -> int:
     """Return the number of processes that this machine can run at a time."""
     # Containers and schedulers may allow fewer processors than the machine has.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@cache
+def versions() -> str:
+    """Return the versions of optloc, Python and the libraries that affect numbers, as one line."""
+    names = ("optloc", "numpy", "scipy", "numba", "cvxpy", "clarabel", "casadi", "pyarrow")
+    return "; ".join([f"Python {platform.python_version()}", *(f"{name} {version_of(name)}" for name in names)])
+
+
+@cache
+def machine() -> str:
+    """Return the processor, the number of its cores and the system of this machine as one line."""
+    name = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
+    except OSError:
+        pass
+    return f"{name}, {os.cpu_count()} cores, {platform.system()}"

@@ -216,7 +216,10 @@ def study_schema() -> dict[str, Any]:
 
 
 def sigma_of(kind: str, amount: Amount, where: str) -> float:
-    """Return a standard deviation of rows of a kind in SI units; decibels are converted at a ratio of one."""
+    """Return a standard deviation of rows of a kind in SI units; raise InvalidProblem unless it is positive.
+
+    Decibels are converted at a ratio of one. `where` is the location for error messages.
+    """
     quantity = MODELS[kind].quantity
     units = Units(quantity)  # type: ignore[arg-type]  # models hold known quantities only
     number, unit = units.amount(amount, None if isinstance(amount, str) else units.conversion(None, where), where)

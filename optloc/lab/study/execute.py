@@ -2,6 +2,9 @@
 
 With every executor, each method runs in a separate worker process (`WorkerProcess`). The worker has limits of time and
 memory, its replies are checked, and it ends with the process that started it.
+
+A task is a chunk of the design, or a part of a chunk that has failed: failed chunks are halved, to find the failing
+trial.
 """
 
 from __future__ import annotations
@@ -61,7 +64,7 @@ class Executor:
 
 
 def executor(name: str, jobs: int | None = None, address: str | None = None, limit: float = TASK_LIMIT) -> Executor:
-    """Return an executor; raise InvalidProblem for an unknown name, a useless address or an invalid limit."""
+    """Return an executor; raise InvalidProblem for an unknown name, an address that it cannot use, or a wrong limit."""
     if name not in EXECUTORS:
         raise InvalidProblem(f"unknown executor {name!r}", "--executor", nearest(name, list(EXECUTORS)))
     if address is not None and not EXECUTORS[name].scheduler:
@@ -132,41 +135,41 @@ def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[TrialPart]:
         If the executor is not installed, its scheduler cannot be reached, or no process can be started.
     """
     work = _Work(chunks, by.limit)
-    if not work.left:
+    if not work.waiting:
         return
-    with EXECUTORS[by.name].begin(by) as begun, closing(WorkerPool(1)) as here:
-        while work.left:
+    with EXECUTORS[by.name].begin(by) as running, closing(WorkerPool(1)) as local:
+        while work.waiting:
             try:
-                for found in _parallel(work.hand_out(), begun):
-                    yield from work.take(found)
-            except begun.deaths:
+                for result in _parallel(work.hand_out(), running):
+                    yield from work.take(result)
+            except running.deaths:
                 # A cluster has lost several workers. The chunks that they had are computed here, the others on the
                 # cluster.
-                for task in list(work.out.values()):
-                    yield from work.take(here.compute(task.chunk, by.limit))
+                for task in list(work.running.values()):
+                    yield from work.take(local.compute(task.chunk, by.limit))
 
 
-def _parallel(tasks: Iterator[tuple[Chunk, float]], begun: Begun) -> Iterator[TrialPart | Lost]:
-    """Yield the results of tasks as joblib completes them."""
+def _parallel(tasks: Iterator[tuple[Chunk, float]], running: Begun) -> Iterator[TrialPart | Lost]:
+    """Yield the results of tasks as joblib completes them; each task is a chunk and its time limit in seconds."""
     from joblib import Parallel, delayed, parallel_config
 
-    with parallel_config(**begun.options), catch_warnings():
+    with parallel_config(**running.options), catch_warnings():
         # If a run is stopped, joblib warns about tasks without a receiver; they are computed again later.
         filterwarnings("ignore", "[0-9]+ tasks", UserWarning)
-        if begun.streams:
+        if running.streams:
             # One chunk a task, two tasks for each worker: no worker waits, and a stopped run loses few chunks.
             run = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")
-            yield from run(delayed(begun.work)(*task) for task in tasks)
+            yield from run(delayed(running.work)(*task) for task in tasks)
             return
-        while some := list(islice(tasks, 2 * begun.options["n_jobs"])):
-            yield from Parallel(batch_size=1)(delayed(begun.work)(*task) for task in some)
+        while batch := list(islice(tasks, 2 * running.options["n_jobs"])):
+            yield from Parallel(batch_size=1)(delayed(running.work)(*task) for task in batch)
 
 
 # Remaining chunks of a run, and the treatment of chunks that failed.
 
 # A cell may lose four time limits beyond its work, and a death counts as a sixteenth of one. This is enough to find
 # among ten thousand trials one trial at which a method hangs (3.1 limits), or four at which it dies. A method that
-# always fails is given up early.
+# always fails is abandoned early.
 _PATIENCE, _DEATH = 4.0, 1 / 16
 # A part of a chunk has its share of the time limit, but at least an eighth, and at least 10 s for compilation.
 _LEAST, _BUILD = 1 / 8, 10.0
@@ -174,7 +177,10 @@ _LEAST, _BUILD = 1 / 8, 10.0
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """Some trials of a chunk (`whole`) of the design; `again` is True after one death of its process."""
+    """Some trials (`chunk`) of a chunk of the design (`whole`).
+
+    `again` is True if one attempt at these trials has already failed.
+    """
 
     chunk: Chunk
     whole: Chunk
@@ -187,42 +193,51 @@ class _Task:
 
 
 class _Work:
-    """Waiting tasks, running tasks, parts of halved chunks, and the lost time of each cell."""
+    """Bookkeeping of a run: waiting and running tasks, parts of halved chunks, and abandoned cells.
+
+    `waiting` are the tasks to start, and `running` are the started tasks by the key of their chunk. `_parts` are the
+    parts of halved chunks by the key of the whole chunk. `_lost` is the time that failures of a cell cost, in time
+    limits, by the key of the cell. `_given_up` is the last failure of each abandoned cell.
+    """
 
     def __init__(self, chunks: Iterable[Chunk], limit: float) -> None:
-        self.left = deque(_Task(chunk, chunk) for chunk in chunks)
+        self.waiting = deque(_Task(chunk, chunk) for chunk in chunks)
         self._limit = limit
-        self.out: dict[str, _Task] = {}
+        self.running: dict[str, _Task] = {}
         self._parts: dict[str, list[TrialPart]] = {}
-        self._cost: dict[str, float] = {}
+        self._lost: dict[str, float] = {}
         self._given_up: dict[str, Lost] = {}
 
     def hand_out(self) -> Iterator[tuple[Chunk, float]]:
-        """Yield chunks with their time limits in seconds; the limit is 0 if their cell was given up."""
-        while self.left:
-            task = self.left.popleft()
-            self.out[task.chunk.key] = task
+        """Yield waiting chunks with their time limits in seconds; the limit is 0 if their cell was abandoned."""
+        while self.waiting:
+            task = self.waiting.popleft()
+            self.running[task.chunk.key] = task
             yield task.chunk, self._seconds(task)
 
-    def take(self, found: TrialPart | Lost) -> Iterator[TrialPart]:
-        """Yield the part of a chunk of the design if this result completes the chunk."""
-        task = self.out.pop(found.key)
-        part = self._judge(task, found) if isinstance(found, Lost) else found
+    def take(self, result: TrialPart | Lost) -> Iterator[TrialPart]:
+        """Record the result of a task, and yield the part of the whole chunk if all its trials are complete."""
+        task = self.running.pop(result.key)
+        part = self._part_of_failure(task, result) if isinstance(result, Lost) else result
         if part is None:
             return
         parts = self._parts.setdefault(task.whole.key, [])
         parts.append(part)
-        if sum(len(some.table) for some in parts) == task.whole.count:
+        if sum(len(piece.table) for piece in parts) == task.whole.count:
             del self._parts[task.whole.key]
             # Keys of parts sort in the order of their trials.
-            yield part if len(parts) == 1 else join_parts(task.whole, sorted(parts, key=lambda some: some.key))
+            yield part if len(parts) == 1 else join_parts(task.whole, sorted(parts, key=lambda piece: piece.key))
 
-    def _judge(self, task: _Task, lost: Lost) -> TrialPart | None:
-        """Return the part of a failed task, or put the task back, whole or in halves, and return None."""
+    def _part_of_failure(self, task: _Task, lost: Lost) -> TrialPart | None:
+        """Return the part of a failed task, with a failure in every row; None if the task is tried again.
+
+        After the first death of its process, the task is tried again. Otherwise it is divided into halves. A single
+        trial, and a task of an abandoned cell, gets the failure in its rows.
+        """
         chunk, cell = task.chunk, task.chunk.cell.key
         if cell not in self._given_up:
-            self._cost[cell] = self._cost.get(cell, 0.0) + (task.share if lost.status == LATE else _DEATH)
-            if self._cost[cell] >= _PATIENCE:
+            self._lost[cell] = self._lost.get(cell, 0.0) + (task.share if lost.status == LATE else _DEATH)
+            if self._lost[cell] >= _PATIENCE:
                 reason = f"given up after too many failures in this scenario; last failure: {lost.reason}"
                 self._given_up[cell] = replace(lost, reason=reason)
         if cell in self._given_up:
@@ -230,17 +245,17 @@ class _Work:
         if lost.status == DIED and not task.again:
             # The machine may have been short of memory, or a user killed the process. First the whole chunk is tried
             # again, because halves would be solved in other batches.
-            self.left.append(replace(task, again=True))
+            self.waiting.append(replace(task, again=True))
         elif chunk.count == 1:
             return part_of_lost(chunk, lost)
         else:
             half = chunk.count // 2
             for first, count in ((chunk.first, half), (chunk.first + half, chunk.count - half)):
-                self.left.append(_Task(replace(chunk, first=first, count=count), task.whole, again=True))
+                self.waiting.append(_Task(replace(chunk, first=first, count=count), task.whole, again=True))
         return None
 
     def _seconds(self, task: _Task) -> float:
-        """Return the time limit of a task in seconds; 0 if its cell was given up."""
+        """Return the time limit of a task in seconds; 0 if its cell was abandoned."""
         if task.chunk.cell.key in self._given_up:
             return 0.0
         return min(self._limit, max(task.share * self._limit, _BUILD))
@@ -258,11 +273,11 @@ class Begun:
     options : dict
         Options of joblib.
     work : callable
-        ``(chunk, seconds) -> TrialPart or Lost``: the function that workers run.
+        ``(chunk, seconds) -> TrialPart or Lost``: the function that workers run; `seconds` is its time limit.
     deaths : tuple of exception types
         Exceptions that report the death of a worker.
     streams : bool
-        Whether it returns each part when it is finished; otherwise it takes lists of a few chunks a processor.
+        Whether it returns each part when it is finished; otherwise it takes lists of a few chunks for each processor.
     """
 
     options: dict[str, Any]
@@ -272,13 +287,18 @@ class Begun:
 
 
 @cache
-def _pool() -> WorkerPool:
+def _local_workers() -> WorkerPool:
+    """Return the workers on the machine of a cluster's worker; they are started once for each process."""
     return WorkerPool(workers())
 
 
-def beside(names: Sequence[str], chunk: Chunk, seconds: float) -> TrialPart | Lost:
-    """Compute a chunk in a process next to a cluster's worker, with the plugins of the process that runs the study."""
-    return _pool().compute(chunk, seconds, names)
+def compute_next_to_worker(names: Sequence[str], chunk: Chunk, seconds: float) -> TrialPart | Lost:
+    """Return the part of a chunk, or its failure, from a process next to a cluster's worker.
+
+    A worker of a cluster has no limits of time and memory for a chunk; this process has them. `names` are the plugins
+    of the process that runs the study, and `seconds` is the time limit.
+    """
+    return _local_workers().compute(chunk, seconds, names)
 
 
 @contextmanager
@@ -299,25 +319,29 @@ def _dask(by: Executor) -> Iterator[Begun]:
         raise InvalidProblem("Dask is not installed", "--executor", "pip install 'optloc[dask]'") from None
     with ExitStack() as stack:
         try:
-            with _deaf():
-                place: Any = by.address
-                if place is None:
+            with _block_ctrl_c():
+                address: Any = by.address
+                if address is None:
                     # Without a page of statistics, and without warnings about workers that end with the cluster.
-                    own = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
-                    place = stack.enter_context(LocalCluster(n_workers=by.jobs or workers(), **own))
-                client = stack.enter_context(Client(place, timeout=CONNECT))
+                    options = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
+                    address = stack.enter_context(LocalCluster(n_workers=by.jobs or workers(), **options))
+                client = stack.enter_context(Client(address, timeout=CONNECT))
                 count = sum(client.ncores().values())
         except (OSError, TimeoutError, ValueError) as error:
             raise _unreachable(by, error) from None
         if not count:
             advice = "start one: dask worker ADDRESS --nthreads 1"
             raise InvalidProblem("the scheduler has no workers", by.address or "dask", advice)
-        yield Begun({"backend": "dask", "client": client, "n_jobs": -1}, partial(beside, plugins()), (KilledWorker,))
+        yield Begun(
+            {"backend": "dask", "client": client, "n_jobs": -1},
+            partial(compute_next_to_worker, plugins()),
+            (KilledWorker,),
+        )
 
 
 @contextmanager
-def _deaf() -> Iterator[None]:
-    """Block Ctrl-C in all processes that start inside this context: Ctrl-C is for this process only."""
+def _block_ctrl_c() -> Iterator[None]:
+    """Block Ctrl-C in all processes that start inside this context: only this process should receive Ctrl-C."""
     if not hasattr(signal, "pthread_sigmask"):  # a system where Ctrl-C does not reach child processes
         yield
         return
@@ -351,12 +375,15 @@ def _ray(by: Executor) -> Iterator[Begun]:
         register_ray()
         jobs = int(ray.cluster_resources().get("CPU", 1))
         deaths = (ray.exceptions.RayActorError, ray.exceptions.WorkerCrashedError)
-        yield Begun({"backend": "ray", "n_jobs": jobs}, partial(beside, plugins()), deaths, streams=False)
+        yield Begun(
+            {"backend": "ray", "n_jobs": jobs}, partial(compute_next_to_worker, plugins()), deaths, streams=False
+        )
     finally:
         ray.shutdown()
 
 
 def _unreachable(by: Executor, error: BaseException) -> InvalidProblem:
+    """Return the error for a scheduler that does not reply, with the first line of `error`."""
     first = (str(error) or type(error).__name__).splitlines()[0]
     what = f"the scheduler cannot be reached ({first})"
     return InvalidProblem(what, by.address or by.name, "start it, or check the address; finished parts are kept")

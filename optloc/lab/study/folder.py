@@ -19,9 +19,9 @@ import numpy as np
 
 from optloc.files import json_of, read_bytes, written
 from optloc.lab.study.baselines import BASELINES
-from optloc.lab.study.design import StudyDesign, design_of_text
+from optloc.lab.study.design import StudyDesign, design_of_text, machine, versions
 from optloc.lab.study.methods import version_of
-from optloc.lab.study.trial import COLUMNS, FAILED, GAP, TrialPart, arrow_schema, machine, versions
+from optloc.lab.study.trial import COLUMNS, FAILED, GAP, TrialPart, arrow_schema
 from optloc.problem import InvalidProblem, Status
 
 if TYPE_CHECKING:
@@ -114,17 +114,18 @@ def manifest_of(design: StudyDesign) -> StudyManifest:
     )
 
 
-def joined(found: StudyManifest, wanted: StudyManifest) -> StudyManifest | None:
+def joined(existing: StudyManifest, wanted: StudyManifest) -> StudyManifest | None:
     """Return the manifest of a folder with the methods of another design added; None if the data differ.
 
-    Existing parts are kept. But if the new design has a method of the same name, its parts replace the old parts.
+    `existing` is the manifest of the folder, and `wanted` is the manifest of the other design. Existing parts are kept.
+    But if the new design has a method of the same name, its parts replace the old parts.
     """
-    if not found.data or found.data != wanted.data:
+    if not existing.data or existing.data != wanted.data:
         return None
     names = set(wanted.methods.values())
-    kept = {key: name for key, name in found.methods.items() if name not in names}
-    chunks = {key: count for key, count in found.chunks.items() if key.partition("-")[0] in kept}
-    return replace(found, chunks=chunks | wanted.chunks, methods=kept | wanted.methods)
+    kept = {key: name for key, name in existing.methods.items() if name not in names}
+    chunks = {key: count for key, count in existing.chunks.items() if key.partition("-")[0] in kept}
+    return replace(existing, chunks=chunks | wanted.chunks, methods=kept | wanted.methods)
 
 
 def read_manifest(folder: Path) -> StudyManifest:
@@ -164,9 +165,10 @@ def references(design: StudyDesign | None) -> set[str]:
 
 
 def begin(design: StudyDesign, folder: Path) -> StudyManifest:
-    """Return the manifest of a folder for a design, and write it if it is new; call it while the folder is `locked`.
+    """Return the manifest of a folder for a design, and write it if it is new or has new methods.
 
-    If the folder has the same data with other methods, the methods of the design are added, see `joined`.
+    Call this function while the folder is `locked`. If the folder has the same data with other methods, the methods of
+    the design are added, see `joined`.
 
     Raises
     ------
@@ -174,50 +176,54 @@ def begin(design: StudyDesign, folder: Path) -> StudyManifest:
         If the folder cannot be written, or belongs to another study or another version of optloc.
     """
     wanted = manifest_of(design)
-    before, found = None, wanted
+    before, manifest = None, wanted
     if (folder / MANIFEST).exists():
         before = read_manifest(folder)
         same = before.fingerprint == wanted.fingerprint and wanted.chunks.keys() <= before.chunks.keys()
-        found = before if same else joined(before, wanted) or wanted
-        if found is wanted:
+        manifest = before if same else joined(before, wanted) or wanted
+        if manifest is wanted:
             what = f"the folder contains another study ({before.name!r}, or other trials, seed or settings)"
             raise InvalidProblem(what, str(folder), "choose another folder with --out")
-        if (found.version, found.columns) != (wanted.version, wanted.columns):
-            what = f"the folder was written by optloc {found.version}, and this is {wanted.version}"
+        if (manifest.version, manifest.columns) != (wanted.version, wanted.columns):
+            what = f"the folder was written by optloc {manifest.version}, and this is {wanted.version}"
             raise InvalidProblem(what, str(folder), "choose another folder with --out")
     try:
         (folder / "parts").mkdir(parents=True, exist_ok=True)
         _clean(folder)
     except OSError as error:
         raise _unwritable(folder, error) from None
-    if found != before:
-        data = {"format": FORMAT, **{name: getattr(found, name) for name in StudyManifest.__slots__}}
+    if manifest != before:
+        data = {"format": FORMAT, **{name: getattr(manifest, name) for name in StudyManifest.__slots__}}
         content = json.dumps(data, indent=1).encode()
         if before is None:
             _write(folder / MANIFEST, content)
         else:
             _renew(folder / MANIFEST, content)
-    return found
+    return manifest
 
 
-_KEPT = "free space or choose another folder; finished parts are kept, and the same command continues"
+_ADVICE = "free space or choose another folder; finished parts are kept, and the same command continues"
 
 
 def _unwritable(path: Path, error: OSError) -> InvalidProblem:
-    return InvalidProblem(f"the folder cannot be written ({error.strerror or error})", str(path), _KEPT)
+    """Return the error for a file or folder that cannot be written, with the reason of the system."""
+    return InvalidProblem(f"the folder cannot be written ({error.strerror or error})", str(path), _ADVICE)
 
 
 def _write(path: Path, content: bytes) -> None:
     """Write a file completely or not at all; raise InvalidProblem if this fails."""
     try:
-        with written(path) as place:
-            place.write_bytes(content)
+        with written(path) as scratch:
+            scratch.write_bytes(content)
     except InvalidProblem as error:
-        raise InvalidProblem(error.what, error.where, _KEPT) from None
+        raise InvalidProblem(error.what, error.where, _ADVICE) from None
 
 
 def _renew(path: Path, content: bytes) -> None:
-    """Replace a file that optloc wrote to the folder, so no option --force is needed."""
+    """Replace a file that optloc wrote to the folder, completely or not at all.
+
+    The function `written` would need the option --force to replace a file.
+    """
     scratch = path.with_name(f".optloc-{path.name}")
     _write(scratch, content)
     try:
@@ -233,7 +239,7 @@ def _clean(folder: Path) -> None:
 
 
 def store(folder: Path, part: TrialPart) -> None:
-    """Write a part; raise InvalidProblem if this fails."""
+    """Write the part file of a finished chunk; raise InvalidProblem if this fails."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -256,11 +262,16 @@ def part_files(folder: Path) -> dict[str, Path]:
 
 
 def read_part(path: Path, columns: Sequence[str] | None = None) -> Any:
-    """Return the Arrow table of a part file; raise InvalidProblem if its content has changed."""
+    """Return the Arrow table of a part file with the given columns (all for None).
+
+    Raise InvalidProblem if the content differs from the digest in the file name, or if a column is missing.
+    """
     from pyarrow import ArrowException, parquet
 
     try:
-        if path.name.split(".")[1:-1] == [_digest(read_bytes(path))] and _is_part(parquet.read_schema(path), columns):
+        if path.name.split(".")[1:-1] == [_digest(read_bytes(path))] and _has_columns(
+            parquet.read_schema(path), columns
+        ):
             # Not from bytes of Python: the process aborts if threads of Arrow free such bytes while the interpreter
             # ends.
             return parquet.read_table(path, columns=columns, partitioning=None)
@@ -269,21 +280,23 @@ def read_part(path: Path, columns: Sequence[str] | None = None) -> Any:
     raise InvalidProblem("the part is damaged", str(path), "run the study again to replace it")
 
 
-def _is_whole(path: Path, rows: int) -> bool:
-    """Return whether a part file has all columns and `rows` rows."""
+def _is_complete(path: Path, rows: int) -> bool:
+    """Return whether a part file is undamaged, and has all columns and `rows` rows."""
     from pyarrow import parquet
 
     try:
-        return bool(read_part(path, ["status"]).num_rows == rows and _is_part(parquet.read_schema(path), None))
+        return bool(read_part(path, ["status"]).num_rows == rows and _has_columns(parquet.read_schema(path), None))
     except InvalidProblem:
         return False
 
 
-def _is_part(found: Any, columns: Sequence[str] | None) -> bool:
-    """Return whether a file has these columns of a part (all for None), with their types."""
-    wanted = arrow_schema()
-    names = wanted.names if columns is None else columns
-    return all(found.get_field_index(name) >= 0 and found.field(name).type == wanted.field(name).type for name in names)
+def _has_columns(schema: Any, columns: Sequence[str] | None) -> bool:
+    """Return whether an Arrow schema has these columns of a part (all for None), with their types."""
+    expected = arrow_schema()
+    names = expected.names if columns is None else columns
+    return all(
+        schema.get_field_index(name) >= 0 and schema.field(name).type == expected.field(name).type for name in names
+    )
 
 
 def finished_parts(folder: Path, manifest: StudyManifest, say: Callable[[str], None]) -> dict[str, Path]:
@@ -293,7 +306,7 @@ def finished_parts(folder: Path, manifest: StudyManifest, say: Callable[[str], N
     """
     done = part_files(folder)
     for key, path in list(done.items()):
-        if not _is_whole(path, manifest.chunks[key]):
+        if not _is_complete(path, manifest.chunks[key]):
             del done[key]
             say(f"{path}: the part is damaged, and is computed again")
             try:
@@ -334,7 +347,9 @@ def note_data(known: dict[str, str], table: Any, folder: Path) -> None:
 
 
 def known_data(design: StudyDesign, folder: Path, done: dict[str, Path]) -> dict[str, str]:
-    """Return the digests of the blocks of finished chunks by their seeds; `done` are their part files.
+    """Return the digests of the blocks of finished chunks by their seeds; `done` are their part files by chunk key.
+
+    New parts must agree with these digests, so that all methods solve the same measurements.
 
     Raises
     ------
@@ -405,8 +420,7 @@ class Progress:
     methods : dict of (str, str) to int
         Number of rows by method and status.
     failures : dict of (str, str) to str
-        Reason of the first trial without a fix, by method and status. Reasons are given for failures of the study, of a
-        solver, or of a method that does not support the rows.
+        Reason of the first trial without a fix, by method and status, for the statuses `EXPLAINED`.
     """
 
     manifest: StudyManifest
@@ -477,20 +491,24 @@ def read_arrow(folder: Path, columns: Sequence[str] | None = None) -> Any:
     empty = pa.schema([schema.field(name) for name in read]).empty_table()
     table = pa.concat_tables([empty, *(part.cast(empty.schema) for part in parts)]).unify_dictionaries()
     # Sort by text, because its numbers in the dictionary depend on the order of parts.
-    plain = {name: pc.cast(table[name], pa.string()) if _text(table, name) else table[name] for name in SORTED}
+    plain = {name: pc.cast(table[name], pa.string()) if _is_text(table, name) else table[name] for name in SORTED}
     table = table.take(pc.sort_indices(pa.table(plain), [(name, "ascending") for name in SORTED]))
     table = table.select(wanted).combine_chunks()
     return with_gap(table) if {"data", "trial", "cost"} <= set(wanted) else table
 
 
-def _text(table: Any, name: str) -> bool:
+def _is_text(table: Any, name: str) -> bool:
+    """Return whether a column of an Arrow table contains text."""
     import pyarrow as pa
 
     return bool(pa.types.is_dictionary(table.schema.field(name).type))
 
 
 def with_gap(table: Any) -> Any:
-    """Return a table with the column `gap`: the cost less the lowest cost of the same data over all methods."""
+    """Return a table with the column `gap`: the cost less the lowest cost of the same trial over all methods.
+
+    The gap is NaN for rows without a cost.
+    """
     import pyarrow as pa
 
     cells = table["data"].combine_chunks()
@@ -512,9 +530,12 @@ def read_frame(folder: Path, columns: Sequence[str] | None = None) -> pd.DataFra
 
 
 def swept(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return a frame with one column for each swept parameter, named as in the study file, from the column `sweep`."""
-    found: dict[str, dict[str, Any]] = {text: json.loads(text) for text in frame["sweep"].unique()}
-    names = dict.fromkeys(name for values in found.values() for name in values)
+    """Return a frame with one more column for each swept parameter, from the column `sweep`.
+
+    A value is None where a row lacks the parameter. The columns have the names of the study file.
+    """
+    values_by_text: dict[str, dict[str, Any]] = {text: json.loads(text) for text in frame["sweep"].unique()}
+    parameters = dict.fromkeys(name for values in values_by_text.values() for name in values)
     return frame.assign(
-        **{name: frame["sweep"].astype(object).map(lambda t, n=name: found[t].get(n)) for name in names}
+        **{name: frame["sweep"].astype(object).map(lambda t, n=name: values_by_text[t].get(n)) for name in parameters}
     )

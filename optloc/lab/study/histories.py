@@ -4,6 +4,9 @@ Histories exist for two kinds of methods. An external minimizer calls the cost, 
 squares of optloc and nonlinear solvers of CasADi are run again and again, and stopped after 0, 1, 2 ... iterations.
 They repeat the same arithmetic from the same start, so the ends of the short runs are the points of the long run.
 Starts in closed form, proofs and machine code that does everything in one call have no history; a remark reports this.
+
+Letters in shapes: n trials, q points of a history, m candidates. A candidate is one starting point: a method may refine
+several candidates of a trial in parallel. A count is a number of evaluations or iterations.
 """
 
 from __future__ import annotations
@@ -61,9 +64,10 @@ class ConvergenceTrace(NamedTuple):
     Parameters
     ----------
     cost : array (q,)
-        Cost at each point; with several candidates the least.
+        Cost at each point; with several candidates the least of their costs.
     evaluations, iterations : array (q,)
-        Numbers up to the point: evaluations of all candidates, iterations of each. NaN if they are not counted.
+        Counts up to the point: evaluations of all candidates together, iterations of each candidate. NaN if they are
+        not counted.
     """
 
     cost: Array
@@ -73,7 +77,7 @@ class ConvergenceTrace(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Trials:
-    """Trials and methods of which histories are wanted.
+    """Trials and methods whose histories `histories` computes.
 
     Parameters
     ----------
@@ -118,7 +122,7 @@ class Histories:
     remarks: tuple[str, ...]
 
 
-def histories(asked: Trials) -> Histories:
+def histories(trials: Trials) -> Histories:
     """Return the histories of methods on trials.
 
     Raises
@@ -129,46 +133,50 @@ def histories(asked: Trials) -> Histories:
     """
     import pandas as pd
 
-    problem = asked.drawn.problem
+    problem = trials.drawn.problem
     if problem.constraints:
         what = "a cost does not show whether constraints are met"
-        raise InvalidProblem(what, asked.title, "remove the constraints")
+        raise InvalidProblem(what, trials.title, "remove the constraints")
     if depends_on_place(problem):
         what = "the noise weights depend on the position, so costs of a history cannot be compared"
-        raise InvalidProblem(what, asked.title, "remove the errors of the stations")
-    ways, remarks = {}, list(asked.remarks)
-    for method in asked.methods:
-        found, remark = trace_of(method, asked.drawn)
+        raise InvalidProblem(what, trials.title, "remove the errors of the stations")
+    traces, remarks = {}, list(trials.remarks)
+    for method in trials.methods:
+        of_method, remark = trace_of(method, trials.drawn)
         if remark:
             remarks.append(f"{method.name}: {remark}")
-        if any(len(way.cost) for way in found):
-            ways[method.name] = found
-    if not ways:
-        why = remarks[0] if remarks else "there is no method"
-        raise InvalidProblem(f"no method has a history ({why})", asked.title, "name a minimizer with --method")
-    least = np.array(asked.least, dtype=float)
-    for found in ways.values():
-        least = np.fmin(least, [np.min(way.cost, initial=np.inf) for way in found])
-    parts = [_rows(name, trial, way, least[trial]) for name, found in ways.items() for trial, way in enumerate(found)]
-    return Histories(asked.title, pd.concat(parts, ignore_index=True), tuple(ways), tuple(remarks))
+        if any(len(trace.cost) for trace in of_method):
+            traces[method.name] = of_method
+    if not traces:
+        reason = remarks[0] if remarks else "there is no method"
+        raise InvalidProblem(f"no method has a history ({reason})", trials.title, "name a minimizer with --method")
+    least = np.array(trials.least, dtype=float)
+    for of_method in traces.values():
+        least = np.fmin(least, [np.min(trace.cost, initial=np.inf) for trace in of_method])
+    parts = [
+        _table_rows(name, trial, trace, least[trial])
+        for name, of_method in traces.items()
+        for trial, trace in enumerate(of_method)
+    ]
+    return Histories(trials.title, pd.concat(parts, ignore_index=True), tuple(traces), tuple(remarks))
 
 
-def _rows(method: str, trial: int, way: ConvergenceTrace, least: float) -> pd.DataFrame:
-    """Return the history of one trial as rows of the table."""
+def _table_rows(method: str, trial: int, trace: ConvergenceTrace, least: float) -> pd.DataFrame:
+    """Return the history of one trial as rows of the table of `Histories`; `least` is its least known cost."""
     import pandas as pd
 
-    best = np.minimum.accumulate(way.cost)
+    best = np.minimum.accumulate(trace.cost)
     # A negative difference is a rounding error.
     above = np.maximum(best - least, 0.0)
-    counts = {"evaluations": way.evaluations, "iterations": way.iterations}
-    return pd.DataFrame({"method": method, "trial": trial, **counts, "cost": way.cost, "best": best, "above": above})
+    counts = {"evaluations": trace.evaluations, "iterations": trace.iterations}
+    return pd.DataFrame({"method": method, "trial": trial, **counts, "cost": trace.cost, "best": best, "above": above})
 
 
 # Medians and quartiles of histories over the trials.
 
 
 def band(found: Histories, method: str, by: str, at: Array) -> Array:
-    """Return the quartiles (3, q) over trials of the best cost so far, above the least known, at the counts `at`.
+    """Return the quartiles over trials of the cost that a method has reached after given counts.
 
     Parameters
     ----------
@@ -177,17 +185,22 @@ def band(found: Histories, method: str, by: str, at: Array) -> Array:
     method : str
         One of its methods.
     by : str
-        A key of `COUNTS`.
+        A key of `COUNTS`: evaluations or iterations.
     at : array (q,)
         Counts. A history keeps its last cost after its end, and is infinite before its start.
+
+    Returns
+    -------
+    array (3, q)
+        First quartile, median and third quartile of the best cost so far, less the least known cost of the trial.
     """
     rows = found.frame[found.frame["method"] == method]
-    levels = []
-    for _, way in rows.groupby("trial", sort=True):
-        reached = np.searchsorted(way[by].to_numpy(dtype=float), at, side="right")
-        levels.append(np.concatenate([[np.inf], way["above"].to_numpy(dtype=float)])[reached])
+    costs = []
+    for _, history in rows.groupby("trial", sort=True):
+        reached = np.searchsorted(history[by].to_numpy(dtype=float), at, side="right")
+        costs.append(np.concatenate([[np.inf], history["above"].to_numpy(dtype=float)])[reached])
     # Without interpolation, because costs before the start of a history are infinite.
-    return np.asarray(np.quantile(np.stack(levels), (0.25, 0.5, 0.75), axis=0, method="inverted_cdf"))
+    return np.asarray(np.quantile(np.stack(costs), (0.25, 0.5, 0.75), axis=0, method="inverted_cdf"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,10 +212,10 @@ class Reach:
     method : str
         The method.
     trials, reached : int
-        Number of trials, and number of those that come within the accuracy of the least known cost.
+        Number of trials, and number of trials in which the cost comes within the accuracy of the least known cost.
     evaluations, iterations : tuple of float, optional
-        Quartiles over all trials of the counts up to there; infinite for trials that do not reach it, None if not
-        counted.
+        Quartiles over all trials of the count at which the accuracy is reached. They are infinite for trials that do
+        not reach it, and None if the method does not count.
     """
 
     method: str
@@ -213,31 +226,37 @@ class Reach:
 
 
 def reach(found: Histories, tau: float) -> list[Reach]:
-    """Return for each method the number of trials within `tau` of the least known cost, and the work to get there."""
+    """Return for each method the number of trials within `tau` of the least known cost, and the work to get there.
+
+    `tau` is a difference of costs.
+    """
     check_accuracy(tau)
-    out = []
+    results = []
     for name in found.methods:
         rows = found.frame[found.frame["method"] == name]
         trials = rows["trial"].nunique()
         first = rows[rows["above"] <= tau].groupby("trial")[list(COUNTS)].first()
-        took = {by: np.full(trials, np.inf) for by in COUNTS}
+        work = {by: np.full(trials, np.inf) for by in COUNTS}
         for by in COUNTS:
-            took[by][: len(first)] = first[by]
+            work[by][: len(first)] = first[by]
         quartiles = {
             by: None
             if rows[by].isna().any()
             else tuple(np.quantile(values, (0.25, 0.5, 0.75), method="inverted_cdf").tolist())
-            for by, values in took.items()
+            for by, values in work.items()
         }
-        out.append(Reach(name, trials, len(first), quartiles["evaluations"], quartiles["iterations"]))
-    return out
+        results.append(Reach(name, trials, len(first), quartiles["evaluations"], quartiles["iterations"]))
+    return results
 
 
 # History of one method on some trials.
 
 
 def trace_of(method: StudyMethod, drawn: DrawnCase) -> tuple[list[ConvergenceTrace], str]:
-    """Return the history of a method on each trial, empty if it has no history, and a remark about missing parts."""
+    """Return the history of a method on each trial, and a remark about missing parts.
+
+    A method without a history has empty histories. The remark is empty if nothing is missing.
+    """
     if method.baseline is None:
         assert method.method is not None
         return _record_stopped_runs(Pipeline.parse(method.method), drawn.problem, None, _choice(method))
@@ -249,33 +268,40 @@ def trace_of(method: StudyMethod, drawn: DrawnCase) -> tuple[list[ConvergenceTra
 
 
 def _choice(method: StudyMethod) -> Choice:
-    """Return the nonlinear solver of a method; IPOPT is the default of the stages."""
+    """Return the nonlinear solver of a method, with its settings.
+
+    IPOPT is used if the method names no solver whose iterations can be limited.
+    """
     named = method.solver if method.solver and "max_iter" in SETTINGS.get(method.solver, {}) else "ipopt"
     return Choice("nonlinear", named, method.settings if named == method.solver else {})
 
 
 def _record_evaluations(baseline: Baseline, drawn: DrawnCase, start: Array) -> tuple[list[ConvergenceTrace], str]:
-    """Return the costs that an external minimizer evaluates, trial by trial, and a remark."""
-    ways, failed = [], ""
+    """Return the costs that an external minimizer evaluates, trial by trial, and a remark.
+
+    `start` are the starting vectors (n, size) of the trials.
+    """
+    traces, failed = [], ""
     for i in range(len(start)):
-        kept: list[float] = []
-        with listening(lambda _, cost, kept=kept: kept.append(cost)), np.errstate(all="ignore"):  # type: ignore[misc]
+        costs: list[float] = []
+        with listening(lambda _, cost, costs=costs: costs.append(cost)), np.errstate(all="ignore"):  # type: ignore[misc]
             try:
                 baseline.run(drawn.part(i, 1), start[i : i + 1])
             except (Exception, SystemExit) as error:  # noqa: BLE001  (the history ends before the error)
                 failed = f"{type(error).__name__}: {error}".splitlines()[0]
         # NaN counts as worse than every number.
-        cost = np.nan_to_num(np.array(kept), nan=np.inf)
-        ways.append(ConvergenceTrace(cost, np.arange(1.0, len(cost) + 1.0), np.full(len(cost), np.nan)))
-    if not any(len(way.cost) for way in ways):
-        return ways, "it evaluates no cost" + (f" ({failed})" if failed else "")
-    return ways, f"it ended with an error in at least one trial ({failed})" if failed else ""
+        cost = np.nan_to_num(np.array(costs), nan=np.inf)
+        traces.append(ConvergenceTrace(cost, np.arange(1.0, len(cost) + 1.0), np.full(len(cost), np.nan)))
+    if not any(len(trace.cost) for trace in traces):
+        return traces, "it evaluates no cost" + (f" ({failed})" if failed else "")
+    return traces, f"it ended with an error in at least one trial ({failed})" if failed else ""
 
 
 class _Steps(NamedTuple):
-    """Costs (q, m) of m candidates after the counts `at` (q,), and the iterations (m,) of each.
+    """Costs of m candidates after some numbers of iterations.
 
-    `counted` is True if each iteration is one evaluation of the cost.
+    `at` (q,) are the numbers of iterations, `cost` (q, m) are the costs, and `took` (m,) are the iterations of each
+    candidate until its end. `counted` is True if each iteration is one evaluation of the cost.
     """
 
     at: Array
@@ -287,68 +313,77 @@ class _Steps(NamedTuple):
 def _record_stopped_runs(
     method: Pipeline, problem: Problem, start: Array | None, choice: Choice
 ) -> tuple[list[ConvergenceTrace], str]:
-    """Return the costs of runs that stop after growing numbers of iterations, and a remark."""
-    words, n = list(method.words), problem.batch_shape[0]
+    """Return the costs of runs that stop after growing numbers of iterations, trial by trial, and a remark.
+
+    `start` are the starting vectors (n, size) of a baseline; with None, the first stage of the method makes the
+    candidates. `choice` is the nonlinear solver.
+    """
+    stages, n = list(method.words), problem.batch_shape[0]
     pool = None if start is None else begin(problem, start)
     known = {word for formulation in FORMULATIONS.values() for word in formulation.starts}
-    if pool is None and words[0] in known:
-        pool = SOLVERS[words[0]].run(problem, None)
-        words = words[1:]
+    if pool is None and stages[0] in known:
+        pool = SOLVERS[stages[0]].run(problem, None)
+        stages = stages[1:]
     if pool is None:
-        return [_empty_trace()] * n, f"{words[0]} has no history"
+        return [_empty_trace()] * n, f"{stages[0]} has no history"
     parts: list[list[ConvergenceTrace]] = []
-    while words and words[0] in _STAGES and (steps := _STAGES[words[0]](problem, pool, choice)) is not None:
+    while stages and stages[0] in _STAGES and (steps := _STAGES[stages[0]](problem, pool, choice)) is not None:
         parts.append(_traces(n, pool, steps))
-        pool = SOLVERS[words.pop(0)].run(problem, pool)
+        pool = SOLVERS[stages.pop(0)].run(problem, pool)
     if not parts and start is not None:
-        return [_empty_trace()] * n, f"{words[0]} has no history for this problem"
+        return [_empty_trace()] * n, f"{stages[0]} has no history for this problem"
     if not parts:  # a start in closed form
         parts.append(_traces(n, pool, _no_steps(problem, pool)))
-    ways = [_joined([part[i] for part in parts]) for i in range(n)]
-    rest = "+".join(words) + (" and its fallback" if words and method.then else "")
+    traces = [_joined([part[i] for part in parts]) for i in range(n)]
+    rest = "+".join(stages) + (" and its fallback" if stages and method.then else "")
     if rest:
-        return ways, f"shown until {rest}, which has no history"
+        return traces, f"shown until {rest}, which has no history"
     # In a study the same method is one call of machine code, which may choose another start.
-    return ways, "shown stage by stage; machine code that runs both stages at once has no history" * shortcut(method)
+    return traces, "shown stage by stage; machine code that runs both stages at once has no history" * shortcut(method)
 
 
 def _empty_trace() -> ConvergenceTrace:
-    """Return an empty history."""
+    """Return the history of a trial without points."""
     return ConvergenceTrace(*(np.zeros(0) for _ in ConvergenceTrace._fields))
 
 
 def _traces(n: int, pool: Pool, steps: _Steps) -> list[ConvergenceTrace]:
-    """Return the history of each trial: at each count, the best of its candidates, which run in parallel."""
+    """Return the history of each of n trials: after each iteration, the least cost of the candidates of the trial.
+
+    All candidates of a trial advance at the same time.
+    """
     item, _ = pool.occupied
-    out = []
+    traces = []
     for i in range(n):
         members = item == i
         if not members.any():
-            out.append(_empty_trace())
+            traces.append(_empty_trace())
             continue
-        most = steps.took[members].max()
-        last = int(np.searchsorted(steps.at, most)) + 1
-        at, cost = np.minimum(steps.at[:last], most), np.nan_to_num(steps.cost[:last, members], nan=np.inf)
+        longest = steps.took[members].max()
+        last = int(np.searchsorted(steps.at, longest)) + 1
+        at, cost = np.minimum(steps.at[:last], longest), np.nan_to_num(steps.cost[:last, members], nan=np.inf)
         # Each step is one evaluation, and so is the start of each candidate.
-        made = 1.0 + np.minimum(at[:, None], steps.took[members])
-        out.append(
-            ConvergenceTrace(cost.min(1), made.sum(1) if steps.counted else np.full(last, np.nan), at.astype(float))
+        evaluations = 1.0 + np.minimum(at[:, None], steps.took[members])
+        traces.append(
+            ConvergenceTrace(
+                cost.min(1), evaluations.sum(1) if steps.counted else np.full(last, np.nan), at.astype(float)
+            )
         )
-    return out
+    return traces
 
 
 def _joined(parts: Sequence[ConvergenceTrace]) -> ConvergenceTrace:
-    """Return consecutive histories joined to one."""
-    out = parts[0]
-    for more in parts[1:]:
-        before = [values[-1] if len(values) else 0.0 for values in out[1:]]
-        shifted = [values + last for values, last in zip(more[1:], before, strict=True)]
-        out = ConvergenceTrace(*(np.concatenate(pair) for pair in zip(out, (more.cost, *shifted), strict=True)))
-    return out
+    """Return consecutive histories of a trial as one history, with counts that continue."""
+    joined = parts[0]
+    for part in parts[1:]:
+        last_counts = [values[-1] if len(values) else 0.0 for values in joined[1:]]
+        shifted = [values + offset for values, offset in zip(part[1:], last_counts, strict=True)]
+        joined = ConvergenceTrace(*(np.concatenate(pair) for pair in zip(joined, (part.cost, *shifted), strict=True)))
+    return joined
 
 
 def _counts(most: int) -> Array:
-    """Return the counts after which a run is stopped; the last count is `most`."""
+    """Return the numbers of iterations after which a run is stopped, sorted; the last number is `most`."""
     later = _EVERY_ITERATION * _GROWTH ** np.arange(
         1, 2 + max(0, int(np.log(max(most, 1) / _EVERY_ITERATION) / np.log(_GROWTH)))
     )
@@ -357,19 +392,23 @@ def _counts(most: int) -> Array:
 
 
 def _no_steps(problem: Problem, pool: Pool) -> _Steps:
-    """Return the steps of candidates that do not move."""
+    """Return the costs of candidates that no iteration moves, as one point."""
     item, slot = pool.occupied
     cost = _cost(problem.take(item), pool.x[item, slot])
     return _Steps(np.zeros(1, dtype=int), cost[None], np.zeros(len(item), dtype=int), counted=True)
 
 
 def _cost(problem: Problem, x: Array) -> Array:
+    """Return the costs of problems (m,) at the vectors x (m, size)."""
     with np.errstate(all="ignore"):
         return np.asarray(equations_at(problem, x).cost)
 
 
 def _least_squares(problem: Problem, pool: Pool, choice: Choice, *, damped: bool, limit: int) -> _Steps:
-    """Return the history of damped or plain Gauss-Newton steps: each step is one evaluation with derivatives."""
+    """Return the costs along damped or plain Gauss-Newton steps; each step is one evaluation with derivatives.
+
+    `limit` is the greatest number of steps. `choice` is not used: all recorders of `_STAGES` have it.
+    """
     item, slot = pool.occupied
     x = pool.x[item, slot]
     run = partial(refine, problem, x, item=item, damped=damped)
@@ -380,27 +419,28 @@ def _least_squares(problem: Problem, pool: Pool, choice: Choice, *, damped: bool
 
 
 def _nonlinear(problem: Problem, pool: Pool, choice: Choice) -> _Steps | None:
-    """Return the history of IPOPT or another solver of CasADi, whose iteration may evaluate several points on a line.
+    """Return the costs along the iterations of IPOPT or of another solver of CasADi.
 
-    Return None for long runs: there it solves averages of blocks, whose costs differ.
+    One iteration may evaluate several points on a line. Return None for long runs: there the stage solves problems of
+    averaged blocks, whose costs are not comparable.
     """
     item, slot = pool.occupied
-    part = problem.take(item)
-    start = begin(part, pool.x[item, slot])
+    flat = problem.take(item)
+    start = begin(flat, pool.x[item, slot])
 
-    def stop(limit: int | None) -> tuple[Array, list[int]]:
+    def run_until(limit: int | None) -> tuple[Array, list[int]]:
         limited = choice.settings if limit is None else {**choice.settings, "max_iter": limit}
         with using(Choice("nonlinear", choice.name, limited)), counting() as tally:
-            x = SOLVERS["nlp"].run(part, start).x[:, 0]
+            x = SOLVERS["nlp"].run(flat, start).x[:, 0]
         # If least squares follows, the solver minimises the cost of another problem; evaluate the cost of this one.
-        return _cost(part, x), [count if name == choice.name else -1 for name, count in tally]
+        return _cost(flat, x), [count if name == choice.name else -1 for name, count in tally]
 
-    _, took = stop(None)
-    if len(took) != len(item) or min(took, default=0) < 0:
+    _, iterations = run_until(None)
+    if len(iterations) != len(item) or min(iterations, default=0) < 0:
         return None
-    at = _counts(max(took, default=0))
-    cost = [_cost(part, start.x[:, 0]), *(stop(int(k))[0] for k in at[1:])]
-    return _Steps(at, np.stack(cost), np.array(took), counted=False)
+    at = _counts(max(iterations, default=0))
+    cost = [_cost(flat, start.x[:, 0]), *(run_until(int(k))[0] for k in at[1:])]
+    return _Steps(at, np.stack(cost), np.array(iterations), counted=False)
 
 
 _Recorder = Callable[[Problem, Pool, Choice], _Steps | None]
@@ -436,11 +476,13 @@ def trials_of(
     InvalidProblem
         If a folder or a file cannot be read, or does not have the case.
     """
-    return _of_study(place, names, count, case, noise) if place.is_dir() else _of_file(place, names, count)
+    return (
+        _trials_of_study(place, names, count, case, noise) if place.is_dir() else _trials_of_file(place, names, count)
+    )
 
 
-def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, noise: str | None) -> Trials:
-    """Return trials and methods of a study for one case and noise level."""
+def _trials_of_study(folder: Path, names: Sequence[str], count: int, case: str | None, noise: str | None) -> Trials:
+    """Return trials and methods of a study for one case and noise level; arguments as `trials_of`."""
     manifest = read_manifest(folder)
     design = design_of_manifest(manifest)
     if design is None:
@@ -454,7 +496,7 @@ def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, 
     chosen = cells[title][level]
     if isinstance(chosen, NetworkCase):
         raise InvalidProblem(f"{title} has networks, which have no histories", str(folder), "choose another case")
-    drawn, least = _known(folder, chosen, count)
+    drawn, least = _finished_trials(folder, chosen, count)
     methods = {cell.method.name: cell.method for cell in design.cells if not cell.method.reference}
     methods |= {method.name: method for method in added(names)}
     known = {*methods, *(cell.method.name for cell in design.cells)}
@@ -466,18 +508,21 @@ def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, 
     return Trials(f"{title}, {level}", drawn, tuple(methods.values()), least, missing)
 
 
-def _chosen(word: str | None, known: Mapping[str, object], what: str) -> str:
-    """Return the wanted name, by default the first name; raise InvalidProblem if it is unknown."""
+def _chosen(wanted: str | None, known: Mapping[str, object], what: str) -> str:
+    """Return the name `wanted`, or the first known name if it is None; raise InvalidProblem if it is unknown.
+
+    `what` is the option of the command that selects the name.
+    """
     names = list(known)
-    if word is None:
+    if wanted is None:
         return names[0]
-    if word not in names:
-        raise InvalidProblem(f"there is no {what} {word!r}", f"--{what}", nearest(word, names))
-    return word
+    if wanted not in names:
+        raise InvalidProblem(f"there is no {what} {wanted!r}", f"--{what}", nearest(wanted, names))
+    return wanted
 
 
-def _known(folder: Path, case: Case, count: int) -> tuple[DrawnCase, Array]:
-    """Return the first trials of a case, and the least known cost of each in the study."""
+def _finished_trials(folder: Path, case: Case, count: int) -> tuple[DrawnCase, Array]:
+    """Return the first trials of a case, at most `count`, and the least known cost (n,) of each in the study."""
     rows = read_frame(folder, "scenario sweep noise_label trial data cost cost_truth".split())
     rows = rows[
         (rows["scenario"] == case.table.name) & (rows["sweep"] == case.sweep) & (rows["noise_label"] == case.label)
@@ -495,19 +540,19 @@ def _known(folder: Path, case: Case, count: int) -> tuple[DrawnCase, Array]:
     return drawn, by_trial["least"].to_numpy(dtype=float)
 
 
-def _of_file(file: Path, names: Sequence[str], count: int) -> Trials:
-    """Return the epochs of a problem file as trials, with the cost of their fixes as least known cost."""
+def _trials_of_file(file: Path, names: Sequence[str], count: int) -> Trials:
+    """Return the epochs of a problem file as trials; their least known costs are the costs of their fixes."""
     loaded = read(file)
     problem = by_epoch(loaded.problem).flat() if separable(loaded.problem) else loaded.problem.flat()
     kept = np.arange(min(count, problem.batch_shape[0]))
     problem, n = problem.take(kept), len(kept)
-    places = [slot.name for slot in problem.layout.shared if slot.name.partition("[")[0] == "position"]
-    if len(places) != 1:
-        what = f"it has {len(places)} unknown positions"
+    positions = [slot.name for slot in problem.layout.shared if slot.name.partition("[")[0] == "position"]
+    if len(positions) != 1:
+        what = f"it has {len(positions)} unknown positions"
         raise InvalidProblem(what, str(file), "give one target, static or with one motion for the whole run")
     # A fixed point near the stations' centre, for methods that need a start.
     wild = np.random.default_rng(0).uniform(-0.5, 0.5, (n, problem.dimension))
-    nothing = np.full((n, problem.layout.size), np.nan)
-    drawn = DrawnCase(problem, nothing, wild, ("",) * n, ("",) * n, np.zeros(n, dtype=int), places[0])
+    truth = np.full((n, problem.layout.size), np.nan)
+    drawn = DrawnCase(problem, truth, wild, ("",) * n, ("",) * n, np.zeros(n, dtype=int), positions[0])
     least = solve(problem).cost
     return Trials(loaded.title or file.name, drawn, tuple(added(names or _DEFAULT_METHODS)), np.asarray(least))

@@ -78,7 +78,7 @@ class StudyMethod:
 
     @property
     def identity(self) -> str:
-        """Return the settings that decide the answers, as text."""
+        """Return the settings that decide the answers, as one JSON text, the same for equal methods."""
         # Without the chunk: it divides the work, and is part of the fingerprint of the design.
         settings = json.dumps(self.settings, sort_keys=True)
         parts = (self.name, self.method, self.baseline, self.solver, settings, self.start, self.width, self.batch)
@@ -86,7 +86,7 @@ class StudyMethod:
 
     @property
     def slow(self) -> bool:
-        """Return whether fixes are solved one by one."""
+        """Return whether the method solves trials one by one; its chunks are then smaller."""
         if self.baseline is not None:
             return baseline_of(self.baseline).slow
         if self.method == CALIBRATE:
@@ -112,7 +112,10 @@ class StudyMethod:
 
     @property
     def reference(self) -> bool:
-        """Return whether the method knows the truth: it then judges the others and is not ranked."""
+        """Return whether the method starts at the truth.
+
+        The results of a reference judge the other methods, so it is not ranked.
+        """
         if self.baseline is None:
             return False
         known = baseline_of(self.baseline)
@@ -179,11 +182,12 @@ def added(names: Sequence[str]) -> list[StudyMethod]:
 
 
 def _list(value: str | list[str] | None) -> list[str]:
+    """Return a value of the file as a list: a text is a list of one, a missing value is empty."""
     return [] if value is None else [value] if isinstance(value, str) else value
 
 
 def _name(table: MethodTable, name: str, solver: str | None, count: int) -> str:
-    """Return the name of a method in tables."""
+    """Return the name of a method in tables; `count` is the number of methods that its table makes."""
     # The default name does not contain settings, so methods that differ only by settings need a name in the file.
     guess = table.baseline is not None and BASELINES[name].guess
     words = [name, *([f"from the {table.start}"] if guess else []), *([f"({solver})"] if solver else [])]
@@ -195,7 +199,7 @@ def _name(table: MethodTable, name: str, solver: str | None, count: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class MethodRun:
-    """Result of one call of a method.
+    """Result of one call of a method on n trials.
 
     Parameters
     ----------
@@ -208,7 +212,7 @@ class MethodRun:
     evaluations : array (n,)
         Evaluations of the cost of each trial; NaN if the method does not count them.
     iterations : float
-        Iterations of all its solvers and refinements; NaN if none are counted.
+        Iterations of all its solvers and refinements over all trials; NaN if none are counted.
     used : bool
         Whether the requested solver has solved a program; True if no solver was requested.
     """
@@ -226,43 +230,47 @@ class Nonsense(Exception):  # noqa: N818  (the name describes an answer)
 
 
 def run(method: StudyMethod, drawn: DrawnCase | Networks) -> MethodRun:
-    """Return the fixes of trials by a method, with its solver and settings; raise Nonsense for invalid fixes."""
+    """Return the fixes of trials by a method, with its solver and settings, the times and the counts of the call.
+
+    Raise Nonsense for invalid fixes.
+    """
     from optloc.solvers import Choice, counting, using
 
     choice = None
     if method.solver:
         choice = Choice(kind_of(method.solver), method.solver, method.settings)
     # A method may change the floating-point error handling; the context restores it.
-    asked = np.zeros(len(drawn.seed))
-    with using(choice), counting() as tally, listening(lambda trial, _: _add(asked, trial)), np.errstate():
-        began, busy = perf_counter(), process_time()
-        fix = _solved(method, drawn)
-        seconds, busy = perf_counter() - began, process_time() - busy
+    evaluations = np.zeros(len(drawn.seed))
+    with using(choice), counting() as tally, listening(lambda trial, _: _add(evaluations, trial)), np.errstate():
+        began, processor = perf_counter(), process_time()
+        fix = _results(method, drawn)
+        seconds, processor = perf_counter() - began, process_time() - processor
     if not isinstance(drawn, Networks):
-        _check(fix, drawn)
+        _check_fix(fix, drawn)
     used = choice is None or choice.name in {name for name, _ in tally}
     iterations = float(sum(n for _, n in tally)) if tally else np.nan
-    return MethodRun(fix, seconds, busy, np.where(asked > 0.0, asked, np.nan), iterations, used)
+    return MethodRun(fix, seconds, processor, np.where(evaluations > 0.0, evaluations, np.nan), iterations, used)
 
 
 def _add(counts: Array, trial: int) -> None:
+    """Count one evaluation of a trial in `counts` (n,)."""
     counts[trial] += 1.0
 
 
-def require_program(method: StudyMethod, found: MethodRun) -> None:
-    """Raise InvalidProblem if the requested solver has solved no program."""
+def require_program(method: StudyMethod, call: MethodRun) -> None:
+    """Raise InvalidProblem if the requested solver has solved no program in the call."""
     # Otherwise the study would report results of another solver under its name.
-    if not found.used:
+    if not call.used:
         what = f"{method.method or method.baseline} has no program that {method.solver} solves"
         raise InvalidProblem(what, f"method {method.name!r}", "remove the solver, or use a stage such as sdp or nlp")
 
 
-def _solved(method: StudyMethod, drawn: DrawnCase | Networks) -> Any:
+def _results(method: StudyMethod, drawn: DrawnCase | Networks) -> Any:
     """Return the fixes of drawn trials, or the results for drawn networks."""
     if isinstance(drawn, Networks):
-        finds = calibrated if method.baseline is None else baseline_of(method.baseline).networks
-        assert finds is not None  # `design_of_text` rejects other methods
-        return finds(drawn)
+        solve_networks = calibrated if method.baseline is None else baseline_of(method.baseline).networks
+        assert solve_networks is not None  # `design_of_text` rejects other methods
+        return solve_networks(drawn)
     if method.baseline is not None:
         return baseline_of(method.baseline).run(drawn, start_of(method.start, method.width, drawn))
     from optloc.solvers import solve
@@ -278,13 +286,13 @@ def _solved(method: StudyMethod, drawn: DrawnCase | Networks) -> Any:
 _ROUNDING = 1e-8
 
 
-def _check(fix: Any, drawn: DrawnCase) -> None:
-    """Raise Nonsense if a value is not a valid fix of the trials: type, shapes, kinds of numbers or answers."""
+def _check_fix(fix: Any, drawn: DrawnCase) -> None:
+    """Raise Nonsense if a value is not a valid fix of the trials: wrong type, shape, kind of numbers, or answers."""
     if not isinstance(fix, Fix):
         raise Nonsense(f"it returned {type(fix).__name__} instead of a fix")
     n, size = drawn.truth.shape
-    shared, others = drawn.problem.layout.n_shared, np.shape(fix.alternatives.gap)[-1:]
-    wanted: dict[str, tuple[Any, tuple[int, ...], str]] = {
+    shared, listed = drawn.problem.layout.n_shared, np.shape(fix.alternatives.gap)[-1:]
+    expected: dict[str, tuple[Any, tuple[int, ...], str]] = {
         "x": (fix.x, (n, size), "f"),
         "cov": (fix.cov, (n, shared, shared), "f"),
         "code": (fix.code, (n,), "iu"),
@@ -293,10 +301,10 @@ def _check(fix: Any, drawn: DrawnCase) -> None:
         "weights": (fix.weights, (n, drawn.problem.count), "f"),
         "reason": (fix.reason, (n,), "OU"),
         "proof": (getattr(fix.claims, "proof", None), (n,), "iu"),
-        "alternatives.x": (fix.alternatives.x, (n, *others, size), "f"),
-        "alternatives.gap": (fix.alternatives.gap, (n, *others), "f"),
+        "alternatives.x": (fix.alternatives.x, (n, *listed, size), "f"),
+        "alternatives.gap": (fix.alternatives.gap, (n, *listed), "f"),
     }
-    for name, (value, shape, kinds) in wanted.items():
+    for name, (value, shape, kinds) in expected.items():
         if not isinstance(value, np.ndarray) or value.shape != shape or value.dtype.kind not in kinds:
             what = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
             raise Nonsense(f"its {name} is {what}, not an array {shape} of kind {kinds!r}")
@@ -305,12 +313,15 @@ def _check(fix: Any, drawn: DrawnCase) -> None:
     if not all(0 <= code < len(Status) for code in fix.code):
         raise Nonsense("its status is unknown")
     # An unbounded answer has no finite position.
-    kept = np.isin(fix.code, [status for status in ANSWERED if status is not Status.UNBOUNDED])
-    _check_answers(fix.x[kept, :shared], fix.cov[kept])
+    answered = np.isin(fix.code, [status for status in ANSWERED if status is not Status.UNBOUNDED])
+    _check_answers(fix.x[answered, :shared], fix.cov[answered])
 
 
 def _check_answers(x: Array, cov: Array) -> None:
-    """Raise Nonsense if answers (n, p) are not finite, or their covariances (n, p, p) are invalid."""
+    """Raise Nonsense if answers (n, p) are not finite, or their covariances (n, p, p) are invalid.
+
+    p is the number of unknowns that all epochs share.
+    """
     if not np.isfinite(x).all():
         raise Nonsense("its status claims an answer, but its estimate is not finite")
     if not np.isfinite(cov).all():
@@ -407,7 +418,7 @@ SETTINGS: dict[str, dict[str, Setting]] = {
 
 
 def check_settings(solver: str, settings: dict[str, Any], where: str) -> None:
-    """Raise InvalidProblem for solver settings that a file may not make: unknown or out of range."""
+    """Raise InvalidProblem for solver settings that a file may not make: unknown names, or values out of range."""
     known = SETTINGS.get(solver, {})
     for name, value in settings.items():
         if name not in known:

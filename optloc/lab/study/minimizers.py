@@ -20,7 +20,7 @@ from optloc.lab.study.simulation import DrawnCase
 from optloc.problem import Array, Fix, InvalidProblem, Problem, load_plugin, nearest, plugin_module, whiten
 
 Cost = Callable[[Array], tuple[float, Array]]
-"""Function from a vector (size,) to the maximum-likelihood cost and its gradient (size,); SI units."""
+"""Function from a parameter vector (size,) to the maximum-likelihood cost and its gradient (size,); SI units."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,17 +36,23 @@ class Minimizer:
     function: Callable[[Cost, Array], Array]
 
     def __call__(self, drawn: DrawnCase, start: Array) -> Fix:
-        """Return the fixes: all finite ones claim to be answers, and the study judges them."""
+        """Return the fixes of all trials; `start` are vectors (n, size).
+
+        Every finite fix has the status ok, so that the study judges it as an answer.
+        """
         x = np.array(start, dtype=float)
         for _ in range(weighings(drawn.problem)):
-            plain = weighed_at(drawn.problem, x, start)
+            weighted = weighed_at(drawn.problem, x, start)
             for i in range(len(x)):
-                x[i] = self.function(cost_of(plain.take(np.array([i])), teller(i)), x[i].copy())
+                x[i] = self.function(cost_of(weighted.take(np.array([i])), teller(i)), x[i].copy())
         return claim(drawn.problem, start, x)
 
 
 def cost_of(one: Problem, tell: Callable[[float], None] = lambda _: None) -> Cost:
-    """Return the cost with gradient of a flat batch of one problem; `tell` is called with each cost."""
+    """Return a function from a parameter vector (size,) to the cost of a problem and its gradient (size,).
+
+    `one` is a flat batch with one problem. `tell` is called with each cost, to count evaluations.
+    """
     equations = _equations(one)
 
     def cost(x: Array) -> tuple[float, Array]:
@@ -67,12 +73,12 @@ def _equations(one: Problem) -> Callable[[Array], Normal]:
     """
     from optloc.engine import normal_at, normal_block
 
-    white, alone = whiten(one.noise, one.weight), np.zeros(1, dtype=np.int64)
+    whitening, item = whiten(one.noise, one.weight), np.zeros(1, dtype=np.int64)
     # A minimizer evaluates the cost many times, so it is worth waiting for the compiled code.
-    packed = pack(one, white) if may_use_code(normal_block, FEW + 1) and not walks(one) else None
+    packed = pack(one, whitening) if may_use_code(normal_block, FEW + 1) and not walks(one) else None
     if packed is None:
-        return lambda x: equations_at(one, x, white)
-    return lambda x: normal_at(packed, x, alone, priors=True)
+        return lambda x: equations_at(one, x, whitening)
+    return lambda x: normal_at(packed, x, item, priors=True)
 
 
 def load_minimizer(name: str) -> None:
@@ -92,14 +98,16 @@ def baseline_of(name: str) -> Baseline:
     """
     if name in BASELINES:
         return BASELINES[name]
-    place, _, word = name.rpartition(":")
+    place, _, function_name = name.rpartition(":")
     module = plugin_module(place) if place else None
     if module is None:
         raise InvalidProblem(f"unknown baseline {name!r}", "baseline", nearest(name, list(BASELINES)))
-    function = getattr(module, word, None)
+    function = getattr(module, function_name, None)
     if not callable(function):
-        known = [each for each, value in vars(module).items() if callable(value) and not each.startswith("_")]
-        raise InvalidProblem(f"there is no function {word!r}", place, nearest(word, known))
+        known = [
+            attribute for attribute, value in vars(module).items() if callable(value) and not attribute.startswith("_")
+        ]
+        raise InvalidProblem(f"there is no function {function_name!r}", place, nearest(function_name, known))
     if isinstance(function, Baseline):
         return function
     summary = (function.__doc__ or "a function of a plugin").partition("\n")[0]
@@ -109,7 +117,7 @@ def baseline_of(name: str) -> Baseline:
 def code_of(name: str) -> str:
     """Return a digest of the source file of a plugin's baseline; empty for optloc's baselines.
 
-    A method with a changed file is another method: results of the old file do not belong to it.
+    A method with a changed file counts as another method, because results of the old file do not belong to it.
     """
     run = baseline_of(name).run
     function = run.function if isinstance(run, Minimizer) else run
@@ -120,5 +128,6 @@ def code_of(name: str) -> str:
 
 
 def _digest(module: ModuleType) -> str:
+    """Return 16 hexadecimal digits that identify the source file of a module; empty without a file."""
     file = getattr(module, "__file__", None)
     return "" if file is None else hashlib.blake2b(Path(file).read_bytes(), digest_size=8).hexdigest()

@@ -1,6 +1,7 @@
 """Comparison of two methods on the same trials: right answers of only one method, differences of errors and times.
 
 All tests and intervals are exact: they assume that trials are independent, and make no assumption on distributions.
+McNemar's test compares the trials that only one method solves; the sign test compares errors and times.
 
 Sources: Q. McNemar, "Note on the sampling error of the difference between correlated proportions", Psychometrika 12
 (1947); H. A. David and H. N. Nagaraja, Order Statistics, 3rd ed., section 7.1 (2003), for the interval of a median.
@@ -19,13 +20,13 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LEVEL = 0.95
-"""Probability with which an interval contains its value."""
+"""Confidence of all intervals: probability with which an interval contains its value."""
 
 _TRIAL = ["data", "trial"]
 
 
 class Median(NamedTuple):
-    """Median of differences, its interval, and the p-value of the signs if both signs are equally likely."""
+    """Median of differences, ends of its interval, and p-value of the sign test (both signs are equally likely)."""
 
     value: float
     low: float
@@ -73,15 +74,18 @@ class Pair:
 
 
 def median_of(differences: Array) -> Median:
-    """Return the median of differences (n,) with its interval; the interval is infinite if there are too few."""
+    """Return the median of differences (n,), its interval and its p-value; NaN and infinity are left out.
+
+    With few differences the interval is infinite. Without differences, all values are NaN.
+    """
     from scipy.stats import binom, binomtest
 
     values = np.sort(differences[np.isfinite(differences)])
     n = len(values)
     if not n:
         return Median(*[float("nan")] * 4)
-    # The k-th smallest and the k-th largest enclose the median, except with twice the probability of fewer than k
-    # signs.
+    # The interval from the k-th smallest to the k-th largest difference can miss the median. The probability is twice
+    # the probability that fewer than k of the n differences are below the median.
     k = int(binom.ppf((1.0 - LEVEL) / 2.0, n, 0.5))
     low, high = (values[k - 1], values[n - k]) if k else (-np.inf, np.inf)
     above, below = int((values > 0.0).sum()), int((values < 0.0).sum())
@@ -109,7 +113,10 @@ def paired(frame: pd.DataFrame, against: str) -> list[Pair]:
 
 
 def _pair(both: pd.DataFrame, case: str, noise: str, method: str, against: str) -> Pair:
-    """Return the comparison of two methods over the trials that both have run."""
+    """Return the comparison of two methods over the trials that both have run.
+
+    `both` has one row for each trial: the columns of `method`, and the columns of `against` with the suffix "_other".
+    """
     from scipy.stats import binomtest
 
     right, other = (both[name].to_numpy(dtype=bool) for name in ("right", "right_other"))

@@ -1,5 +1,8 @@
 """Data and performance profiles of a study's methods: shares of trials solved to an accuracy within a given work.
 
+A data profile is a share of trials against work. A performance profile is a share of trials against work divided by the
+least work of any method on the same trial.
+
 Moré and Wild require a share of the descent from a start that all solvers have in common. Methods without a start have
 no descent. But the cost of a fix has a unit: one is the square of a standard deviation. So here a trial is solved if
 the cost exceeds the least known by at most tau. The point is then within sqrt(tau) standard deviations of the minimum.
@@ -25,7 +28,7 @@ if TYPE_CHECKING:
 
 
 TAU = 1e-3
-"""A trial is solved at this cost above the least known, or less: 0.03 standard deviations."""
+"""A trial is solved if its cost exceeds the least known by at most this: the square of 0.03 standard deviations."""
 
 RATIOS = (1.0, 2.0, 10.0)
 """Multiples of the least work of any method; tables give the share that is solved within each."""
@@ -46,15 +49,15 @@ class Profiles:
     Parameters
     ----------
     tau : float
-        A trial is solved at this cost above the least known, or less.
+        A trial is solved if its cost exceeds the least known by at most this value.
     work : str
-        A key of `WORK`.
+        A key of `WORK`, which states the unit.
     methods : tuple of str
-        Sorted by the number of solved trials, then by work.
+        Methods; the method with the most solved trials is first, then the method with the least work.
     silent : tuple of str
         Methods that do not count this work.
     spent : array (methods, n)
-        Work on each trial.
+        Work on each trial, in the unit of `work`; infinite if unknown.
     solved : bool array (methods, n)
         Whether the trial is solved.
     total : int
@@ -71,17 +74,23 @@ class Profiles:
 
     @property
     def budgets(self) -> Array:
-        """Return the work (q,) at which the data profile of some method rises, thinned out; the largest is kept."""
-        found = np.unique(self.spent[self.solved])
-        at = np.unique(np.linspace(0, len(found) - 1, min(_POINTS, len(found))).astype(int))
-        return np.asarray(found[at])
+        """Return the amounts of work (q,) at which the data profile of some method rises, sorted.
+
+        At most 200 of them are returned, with the least and the largest.
+        """
+        work = np.unique(self.spent[self.solved])
+        chosen = np.unique(np.linspace(0, len(work) - 1, min(_POINTS, len(work))).astype(int))
+        return np.asarray(work[chosen])
 
     def data(self, budgets: Array) -> Array:
-        """Return the share (methods, q) of the trials that each method solves within budgets (q,) of work."""
+        """Return the share (methods, q) of the trials that each method solves with at most the work `budgets` (q,)."""
         return data_profile(self.spent, self.solved, budgets)
 
     def performance(self, ratios: Array) -> Array:
-        """Return the share (methods, q) solved within multiples (q,) of the least work of any method on the trial."""
+        """Return the share (methods, q) of the trials that each method solves within multiples of the least work.
+
+        `ratios` (q,) are the multiples of the least work of any method on the trial.
+        """
         return performance_profile(self.spent, self.solved, ratios)
 
 
@@ -179,20 +188,21 @@ def data_profile(spent: Array, solved: Array, budgets: Array) -> Array:
     return np.stack([np.searchsorted(row, budgets, side="right") / len(row) for row in needed])
 
 
-def shares(found: Profiles) -> list[SolvedShare]:
-    """Return the shares that each method solves within multiples of the least work of any method."""
-    within = found.performance(np.array(RATIOS))
+def shares(profile: Profiles) -> list[SolvedShare]:
+    """Return the solved trials of each method, and the shares that it solves within the multiples `RATIOS`."""
+    within = profile.performance(np.array(RATIOS))
     return [
         SolvedShare(
             name,
-            found.spent.shape[1],
-            int(found.solved[i].sum()),
+            profile.spent.shape[1],
+            int(profile.solved[i].sum()),
             dict(zip(RATIOS, within[i].tolist(), strict=True)),
-            _median(found.spent[i][found.solved[i]]),
+            _median(profile.spent[i][profile.solved[i]]),
         )
-        for i, name in enumerate(found.methods)
+        for i, name in enumerate(profile.methods)
     ]
 
 
 def _median(values: Array) -> float:
+    """Return the median of values, infinite without values."""
     return float(np.median(values)) if len(values) else float("inf")

@@ -2,6 +2,9 @@
 
 Trials are drawn in blocks with one seed each. So a trial does not depend on other trials, on the machine or on the
 order of computation.
+
+Letters in shapes: n trials, m rows, s stations, d coordinates. `size` is the length of a parameter vector: all unknowns
+of a problem in the order of its layout. Positions are in metres in the frame of the problem.
 """
 
 from __future__ import annotations
@@ -21,10 +24,10 @@ from optloc.problem import Amount, Array, Bias, Frame, InvalidProblem, Problem, 
 
 Rng = np.random.Generator
 
-# Numbers and trials of a block at most. Both decide the seed of a trial: with other values the data differ, and earlier
-# studies could not continue. A block is large enough that NumPy draws it in one step. It is small enough (25 000
-# numbers, 200 kB) that a chunk with few of its trials draws little in vain. 500 trials are also the least of a chunk of
-# a fast method.
+# Most numbers and most trials of a block. Both decide the seed of a trial: with other values the data differ, and
+# earlier studies could not continue. A block is large enough that NumPy draws it in one step. It is small (25 000
+# numbers, 200 kB), so a chunk that needs a small part of a block draws few unused numbers. 500 trials are also the
+# least of a chunk of a fast method.
 _NUMBERS, _MOST = 25_000, 500
 
 
@@ -91,18 +94,18 @@ class Case:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Return the columns of the table that all trials share."""
+        """Return the columns of the table that all trials share, by name."""
         problem = self.template
         sizes = {"dimension": problem.dimension, "stations": problem.stations.count, "rows": problem.count}
         return {"kinds": "+".join(rows.kind for rows in problem.rows), **sizes, "epochs": problem.epochs}
 
     def draw(self, first: int, count: int) -> DrawnCase:
-        """Return trials `first` to ``first + count``."""
+        """Return `count` trials, from the trial `first` on."""
         return draw(self, first, count)
 
     @property
     def state(self) -> tuple[str, ...]:
-        """Return the names of position, velocity and acceleration of the unknown target."""
+        """Return the names of the target's position and, if it moves, of its velocity and acceleration."""
         motions = self.template.motions
         i = next(i for i, motion in enumerate(motions) if motion.known is None)
         return state_names(i, len(motions), motions[i].order)
@@ -119,7 +122,7 @@ class DrawnCase:
     truth : array (n, size)
         True parameter vectors in the order of the problem's layout.
     wild : array (n, d)
-        A random point of each trial in the unit cube around zero: the start of methods that need a guess.
+        A random point of each trial in the unit cube around zero, for the start of methods that need a guess.
     seed : tuple of n str
         Names of the seeds of the trials' blocks.
     digest : tuple of n str
@@ -127,7 +130,7 @@ class DrawnCase:
     bad : int array (n,)
         Number of stations with a gross error.
     position : str
-        Name of the unknown position.
+        Name of the unknown position in the layout.
     """
 
     problem: Problem
@@ -139,7 +142,7 @@ class DrawnCase:
     position: str = "position"
 
     def part(self, first: int, count: int) -> DrawnCase:
-        """Return `count` trials from the trial `first` on."""
+        """Return `count` trials, from the trial `first` on."""
         kept = slice(first, first + count)
         return replace(
             self,
@@ -149,23 +152,23 @@ class DrawnCase:
 
 
 def block_size(case: Case) -> int:
-    """Return the number of trials in a block, which share one seed."""
+    """Return the number of trials in a block; the trials of a block share one seed."""
     return int(np.clip(_NUMBERS // case.numbers, 1, _MOST))
 
 
 def draw(case: Case, first: int, count: int) -> DrawnCase:
-    """Return trials `first` to ``first + count`` of a case; they do not depend on other draws."""
-    size = block_size(case)
-    blocks = range(first // size, -(-(first + count) // size))
-    parts = [_block(case, number, size) for number in blocks]
-    kept = slice(first - blocks[0] * size, first - blocks[0] * size + count)
-    stations, truth, wild, z, bad = (np.concatenate(arrays)[kept] for arrays in zip(*parts, strict=True))
+    """Return `count` trials of a case, from the trial `first` on; they do not depend on other draws."""
+    per_block = block_size(case)
+    blocks = range(first // per_block, -(-(first + count) // per_block))
+    parts = [_block(case, number, per_block) for number in blocks]
+    wanted = slice(first - blocks[0] * per_block, first - blocks[0] * per_block + count)
+    stations, truth, wild, z, bad = (np.concatenate(arrays)[wanted] for arrays in zip(*parts, strict=True))
     # Stations of a file are the same in all trials, and are stored once.
-    problem = case.template if case.table.layout is None else _at(case.template, stations)
+    problem = case.template if case.table.layout is None else _with_stations(case.template, stations)
     names = [f"{case.seed}:{case.key}:{number}" for number in blocks]
     digests = [_digest(case, part) for part in parts]
-    of = [trial // size - blocks[0] for trial in range(first, first + count)]
-    seed, digest = (tuple(texts[block] for block in of) for texts in (names, digests))
+    block_of_trial = [trial // per_block - blocks[0] for trial in range(first, first + count)]
+    seed, digest = (tuple(texts[block] for block in block_of_trial) for texts in (names, digests))
     return DrawnCase(problem.with_rows(z=z), truth, wild, seed, digest, bad, case.state[0])
 
 
@@ -173,59 +176,67 @@ def _digest(case: Case, block: tuple[Array, ...]) -> str:
     """Return 16 hexadecimal digits that are equal for blocks whose drawn numbers are equal, bit for bit."""
     # The key covers noise, weights and frame, which are not drawn. Otherwise equal measurements of different noise
     # would have equal digests.
-    made = hashlib.blake2b(case.key.encode(), digest_size=8)
+    digest = hashlib.blake2b(case.key.encode(), digest_size=8)
     for array in block:
-        made.update(np.ascontiguousarray(array).tobytes())
-    return made.hexdigest()
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
-def _block(case: Case, number: int, size: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Return stations, truth, starting points, measurements and numbers of bad stations of a block of `size` trials."""
+def _block(case: Case, number: int, n: int) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the drawn numbers of the block `number` with n trials.
+
+    The arrays are: stations (n, s, d), metres; true parameter vectors (n, size); random points (n, d) for starts, see
+    `DrawnCase.wild`; measurements (n, m); number of stations with a gross error (n,).
+    """
     # A seed sequence mixes words of 32 bits.
     key = [int(case.key[:8], 16), int(case.key[8:], 16)]
     # Separate streams for geometry, noise, guesses and clock steps: a change of one does not shift the others.
     geometry, noise, guess, steps = np.random.SeedSequence([case.seed, *key], spawn_key=(number,)).spawn(4)
     rng, problem, table = np.random.default_rng(geometry), case.template, case.table
-    stations = np.broadcast_to(problem.stations.position.mean(0), (size, *problem.stations.position.shape[-2:]))
+    stations = np.broadcast_to(problem.stations.position.mean(0), (n, *problem.stations.position.shape[-2:]))
     if table.layout is not None:
         if table.layout.placement != "frozen":  # the template contains the frozen stations
-            stations = place_stations(table.layout, case.where, rng, size)
-        problem = _at(problem, stations)
-    real, flaws = add_injected_errors(problem, table, case.where)
-    where, names = join(case.where, "truth"), case.state
+            stations = place_stations(table.layout, case.where, rng, n)
+        problem = _with_stations(problem, stations)
+    true_problem, injected = add_injected_errors(problem, table, case.where)
+    place, names = join(case.where, "truth"), case.state
     # The order of these draws decides the data, like the seed.
-    values = {names[0]: place_targets(table.truth, problem.frame, stations, where, rng)}
+    values = {names[0]: place_targets(table.truth, problem.frame, stations, place, rng)}
     if len(names) > 1:
-        values[names[1]] = _velocities(table.truth, problem.dimension, where, rng, size)
-    values |= {bias.name: _biases(case, bias, rng, size) for bias in problem.biases}
-    errors = _draw_errors(flaws, {flaw.name: _length(real, flaw.name) for flaw in flaws}, rng, size)
+        values[names[1]] = _velocities(table.truth, problem.dimension, place, rng, n)
+    values |= {bias.name: _biases(case, bias, rng, n) for bias in problem.biases}
+    errors = _draw_errors(injected, {error.name: _size_of(true_problem, error.name) for error in injected}, rng, n)
     values |= errors
-    off = [errors[flaw.name] != 0.0 for flaw in flaws if flaw.share is not None]
-    bad = np.any(off, axis=0).sum(-1) if off else np.zeros(size, dtype=int)
-    z = np.broadcast_to(simulate(real, _vector(real, values, size, steps), noise).z, (size, problem.count))
-    wild = np.random.default_rng(guess).uniform(-0.5, 0.5, (size, problem.dimension))
-    return stations, _vector(problem, values, size, steps), wild, z, bad
+    is_gross = [errors[error.name] != 0.0 for error in injected if error.share is not None]
+    bad = np.any(is_gross, axis=0).sum(-1) if is_gross else np.zeros(n, dtype=int)
+    z = np.broadcast_to(
+        simulate(true_problem, _parameter_vectors(true_problem, values, n, steps), noise).z, (n, problem.count)
+    )
+    wild = np.random.default_rng(guess).uniform(-0.5, 0.5, (n, problem.dimension))
+    return stations, _parameter_vectors(problem, values, n, steps), wild, z, bad
 
 
-def _at(problem: Problem, stations: Array) -> Problem:
-    """Return the problem with stations (n, s, d), the same in all its epochs."""
+def _with_stations(problem: Problem, stations: Array) -> Problem:
+    """Return the problem with stations (n, s, d) in metres, the same in all its epochs."""
     return replace(problem, stations=replace(problem.stations, position=stations[:, None]))
 
 
-def _vector(problem: Problem, values: dict[str, Array], size: int, steps: np.random.SeedSequence) -> Array:
-    """Return parameter vectors (size, n) with the named values; other unknowns are zero, also unknowns of epochs.
+def _parameter_vectors(problem: Problem, values: dict[str, Array], n: int, steps: np.random.SeedSequence) -> Array:
+    """Return parameter vectors (n, size) with the named values; all other unknowns are zero.
 
-    Walks start at their values and add random steps.
+    `values` contains arrays with leading axis n by the name of the unknown. Unknowns that walk from epoch to epoch
+    start at their value, and add random steps from the seed `steps`.
     """
     layout = problem.layout
-    vectors = np.zeros((size, layout.size))
-    for base, slot in (*((0, slot) for slot in layout.shared), *((layout.n_shared, slot) for slot in layout.local)):
+    vectors = np.zeros((n, layout.size))
+    for offset, slot in (*((0, slot) for slot in layout.shared), *((layout.n_shared, slot) for slot in layout.local)):
         if slot.name in values:
-            vectors[:, base + slot.start : base + slot.start + slot.size] = values[slot.name]
+            vectors[:, offset + slot.start : offset + slot.start + slot.size] = values[slot.name]
     return simulate_walks(problem, vectors, steps) if walks(problem) else vectors
 
 
-def _length(problem: Problem, name: str) -> int:
+def _size_of(problem: Problem, name: str) -> int:
+    """Return the number of members of the unknown `name`."""
     return problem.layout.find(name)[0].size
 
 
@@ -250,11 +261,12 @@ def place_stations(layout: LayoutTable, where: str, rng: Rng, count: int) -> Arr
     box = metres(layout.box[:d], join(where, "box"), d)
     if layout.placement in ("random", "frozen"):
         return rng.uniform(-0.5, 0.5, (count, s, d)) * box
-    centre = int(layout.placement == "star")
-    angle = 2.0 * np.pi * np.arange(s - centre) / max(s - centre, 1)
-    # In three dimensions stations are alternately high and low: a plane ring would leave the sign of the height open.
-    unit = np.stack([arrays.cos(angle), arrays.sin(angle), 1.0 - 2.0 * (np.arange(s - centre) % 2)], -1)[:, :d]
-    ring = np.concatenate([np.zeros((centre, d)), 0.5 * unit * box])
+    central = int(layout.placement == "star")
+    angle = 2.0 * np.pi * np.arange(s - central) / max(s - central, 1)
+    # In three dimensions stations are alternately high and low. A plane ring would not determine the sign of the
+    # height.
+    circle = np.stack([arrays.cos(angle), arrays.sin(angle), 1.0 - 2.0 * (np.arange(s - central) % 2)], -1)[:, :d]
+    ring = np.concatenate([np.zeros((central, d)), 0.5 * circle * box])
     return np.broadcast_to(ring, (count, s, d))
 
 
@@ -285,21 +297,21 @@ def _fixed(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rn
 
 
 def _in_box(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
-    """Return uniform positions (n, d) in a box, metres."""
+    """Return positions (n, d) that are uniform in a box, metres; on Earth the box is along east, north and up."""
     (count, _, d), centre = stations.shape, stations.mean(1)
     assert truth.box is not None
     box = metres(truth.box, join(where, "box"), d)
     middle = centre if truth.centre is None else metres(truth.centre, join(where, "centre"), d)
-    return np.asarray(middle + _turn(frame, centre, rng.uniform(-0.5, 0.5, (count, d)) * box))
+    return np.asarray(middle + _from_enu(frame, centre, rng.uniform(-0.5, 0.5, (count, d)) * box))
 
 
 def _in_shell(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
-    """Return positions (n, d) in random directions and distances from the stations' centre, metres."""
+    """Return positions (n, d) in random directions from the stations' centre, metres; the distance is uniform."""
     (count, _, d), centre = stations.shape, stations.mean(1)
     assert truth.distance is not None
     low, high = metres(truth.distance, join(where, "distance"))
-    away = _directions(truth, d, count, rng) * rng.uniform(low, high, (count, 1))
-    return np.asarray(centre + _turn(frame, centre, away))
+    offset = _directions(truth, d, count, rng) * rng.uniform(low, high, (count, 1))
+    return np.asarray(centre + _from_enu(frame, centre, offset))
 
 
 def _in_hull(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
@@ -318,13 +330,16 @@ def _in_area(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: 
     return np.asarray(frame.from_geodetic(lat, lon, np.full(count, height)))
 
 
-def _turn(frame: Frame, at: Array, local: Array) -> Array:
-    """Return vectors (count, d) along east, north and up at the points `at` as vectors of the frame."""
-    return arrays.product(local, frame.enu_axes(at)) if frame.geodetic else local
+def _from_enu(frame: Frame, points: Array, local: Array) -> Array:
+    """Return vectors (n, d) in the frame, from vectors along the axes east, north and up at the points (n, d).
+
+    In a frame that is not on Earth, the vectors do not change.
+    """
+    return arrays.product(local, frame.enu_axes(points)) if frame.geodetic else local
 
 
 def _directions(truth: TruthTable, d: int, count: int, rng: Rng) -> Array:
-    """Return unit vectors (count, d), uniform on the circle, on the sphere or on a band of elevations."""
+    """Return unit vectors (count, d): uniform on the circle, on the sphere, or between the elevations of the truth."""
     azimuth = rng.uniform(0.0, 2.0 * np.pi, count)
     flat = np.stack([arrays.cos(azimuth), arrays.sin(azimuth)], axis=-1)
     if d == 2:
@@ -337,7 +352,10 @@ def _directions(truth: TruthTable, d: int, count: int, rng: Rng) -> Array:
 
 
 class _Truth(NamedTuple):
-    """A kind of truth: its required keys, its optional keys, and the function that draws its positions."""
+    """A kind of truth.
+
+    `needed` are its required keys, `more` are its optional keys, and `place` is the function that draws its positions.
+    """
 
     needed: tuple[str, ...]
     more: tuple[str, ...]
@@ -363,7 +381,10 @@ def place_targets(truth: TruthTable, frame: Frame, stations: Array, where: str, 
 
 
 def check_truth(truth: TruthTable, frame: Frame, dimension: int, where: str) -> None:
-    """Raise InvalidProblem if a truth has keys of another kind, or does not fit the frame."""
+    """Raise InvalidProblem if a truth has keys of another kind, has invalid amounts, or does not fit the frame.
+
+    `dimension` is the number of coordinates of the problem.
+    """
     needed, more, _ = _TRUTHS[truth.kind]
     foreign = sorted(truth.model_fields_set - _ANY - {*needed, *more})
     if foreign:
@@ -383,7 +404,7 @@ def check_truth(truth: TruthTable, frame: Frame, dimension: int, where: str) -> 
 
 
 def _check_spans(truth: TruthTable, where: str) -> None:
-    """Raise InvalidProblem if a least value exceeds its greatest value, or an angle is beyond the sphere."""
+    """Raise InvalidProblem if a least value exceeds its greatest value, or an angle is out of range."""
     degrees = {"elevation_deg": 90.0, "lat_deg": 90.0, "lon_deg": 360.0}
     for key, limit in {"distance": np.inf, **degrees}.items():
         given = getattr(truth, key)
@@ -405,32 +426,36 @@ def _velocities(truth: TruthTable, dimension: int, where: str, rng: Rng, count: 
             raise InvalidProblem(f"the velocity needs {dimension} components", join(where, "velocity"), "give each")
         given = [units.plain(value, "m/s", join(where, "velocity")) for value in truth.velocity]
         return np.broadcast_to(np.array(given), (count, dimension))
-    way = rng.standard_normal((count, dimension))
+    direction = rng.standard_normal((count, dimension))
     # The direction is drawn even for speed zero, so that a sweep of speeds does not change the other draws.
     speed = 0.0 if truth.speed is None else units.plain(truth.speed, "m/s", join(where, "speed"))
-    return np.asarray(speed * way / np.linalg.norm(way, axis=-1, keepdims=True))
+    return np.asarray(speed * direction / np.linalg.norm(direction, axis=-1, keepdims=True))
 
 
-# Errors: biases of the file, which methods may estimate, and injected errors, which no method has a model of.
+# Errors: biases of the problem file, which methods may estimate, and injected errors, which no method has a model of.
 
 
-def _biases(case: Case, bias: Bias, rng: Rng, size: int) -> Array:
-    """Return true values (size, q) of a bias of the file, in SI units."""
-    q = _length(case.template, bias.name)
-    mean = np.broadcast_to(np.ravel(bias.mean), (q,))
-    given = case.table.bias.get(bias.name)
-    if given is None:
-        return np.broadcast_to(mean, (size, q))
+def _biases(case: Case, bias: Bias, rng: Rng, n: int) -> Array:
+    """Return true values (n, q) of a bias with q members, in SI units.
+
+    By default they are the mean of the prior. A list in the study file gives the values; a number is the standard
+    deviation of a draw around the mean.
+    """
+    members = _size_of(case.template, bias.name)
+    mean = np.broadcast_to(np.ravel(bias.mean), (members,))
+    true = case.table.bias.get(bias.name)
+    if true is None:
+        return np.broadcast_to(mean, (n, members))
     where = join(case.where, f"bias {bias.name!r}")
-    if isinstance(given, list):
-        if len(given) != q:
-            raise InvalidProblem(f"{len(given)} values do not fit {q} members", where, "give one for each")
-        return np.broadcast_to(np.array([_amount(case, bias, value, where) for value in given]), (size, q))
-    return np.asarray(mean + _amount(case, bias, given, where) * rng.standard_normal((size, q)))
+    if isinstance(true, list):
+        if len(true) != members:
+            raise InvalidProblem(f"{len(true)} values do not fit {members} members", where, "give one for each")
+        return np.broadcast_to(np.array([_bias_value(case, bias, value, where) for value in true]), (n, members))
+    return np.asarray(mean + _bias_value(case, bias, true, where) * rng.standard_normal((n, members)))
 
 
-def _amount(case: Case, bias: Bias, value: Amount, where: str) -> float:
-    """Return a value of a bias in SI units: an offset has the unit of its rows, a boresight is an angle."""
+def _bias_value(case: Case, bias: Bias, value: Amount, where: str) -> float:
+    """Return a value of a bias in SI units; an offset has the unit of its rows, a boresight is an angle."""
     if isinstance(value, int | float):
         return float(value)
     form = form_of(bias)
@@ -450,13 +475,13 @@ class InjectedError:
     Parameters
     ----------
     name : str
-        Name of the unknown that holds them.
+        Name of the unknown that contains the errors in the true problem.
     size : float
         Standard deviation of constant errors, or size of gross errors, in SI units.
     share : float, optional
         Probability that a station has a gross error; None for constant errors.
     late : bool
-        Whether gross errors are positive.
+        Whether all gross errors are positive; otherwise their signs are random.
     """
 
     name: str
@@ -468,28 +493,29 @@ class InjectedError:
 def add_injected_errors(
     problem: Problem, table: ScenarioTable, where: str
 ) -> tuple[Problem, tuple[InjectedError, ...]]:
-    """Return the problem with errors that no method has a model of, and the list of these errors.
+    """Return the problem with unknowns for errors that no method has a model of, and the list of these errors.
 
-    `problem` is the problem that methods solve; `where` is the location of the scenario for error messages. Raise
-    InvalidProblem for a kind that the problem lacks, or a size that is not positive.
+    `problem` is the problem that methods solve. Only the simulation uses the returned problem. `where` is the location
+    of the scenario for error messages. Raise InvalidProblem for a kind that the problem lacks, or a size that is not
+    positive.
     """
-    place, found = join(where, "error"), []
+    place, errors = join(where, "error"), []
     offset, outliers = table.error.offset, table.error.outliers
     if offset is not None:
         sizes = _sizes(problem, offset, join(place, "offset"))
-        found += [(kind, InjectedError(f"unmodelled {kind}", size)) for kind, size in sizes.items()]
+        errors += [(kind, InjectedError(f"unmodelled {kind}", size)) for kind, size in sizes.items()]
     if outliers is not None:
         sizes = _sizes(problem, outliers.size, join(place, "outliers"))
-        found += [
+        errors += [
             (kind, InjectedError(f"gross {kind}", size, outliers.share, outliers.late)) for kind, size in sizes.items()
         ]
-    for kind, flaw in found:
-        problem = with_bias(problem, flaw.name, kind=kind)
-    return problem, tuple(flaw for _, flaw in found)
+    for kind, error in errors:
+        problem = with_bias(problem, error.name, kind=kind)
+    return problem, tuple(error for _, error in errors)
 
 
 def _sizes(problem: Problem, given: Amount | dict[str, Amount], where: str) -> dict[str, float]:
-    """Return sizes in SI units by kind."""
+    """Return the given sizes of errors in SI units, by kind; one size for all kinds is repeated."""
     kinds = [rows.kind for rows in problem.rows]
     named = given if isinstance(given, dict) else dict.fromkeys(kinds, given)
     for kind in named:
@@ -498,15 +524,20 @@ def _sizes(problem: Problem, given: Amount | dict[str, Amount], where: str) -> d
     return {kind: sigma_of(kind, amount, where) for kind, amount in named.items()}
 
 
-def _draw_errors(flaws: tuple[InjectedError, ...], lengths: dict[str, int], rng: Rng, size: int) -> dict[str, Array]:
-    """Return the injected errors (size, stations) by name, SI units; `lengths` are the numbers of stations by name."""
-    small = [flaw for flaw in flaws if flaw.share is None]
-    drawn: dict[str, Array] = {f.name: f.size * rng.standard_normal((size, lengths[f.name])) for f in small}
+def _draw_errors(injected: tuple[InjectedError, ...], lengths: dict[str, int], rng: Rng, n: int) -> dict[str, Array]:
+    """Return the errors of n trials (n, stations) by the name of their unknown, in SI units.
+
+    `lengths` are the numbers of stations by this name.
+    """
+    constant = [error for error in injected if error.share is None]
+    drawn: dict[str, Array] = {
+        error.name: error.size * rng.standard_normal((n, lengths[error.name])) for error in constant
+    }
     # One chance and one sign for each station: a bad station is bad in all kinds, and in the same direction.
     most = max(lengths.values(), default=0)
-    chance, sign = rng.random((size, most)), np.where(rng.random((size, most)) < 0.5, -1.0, 1.0)
-    for flaw in flaws:
-        if flaw.share is not None:
-            off = (chance < flaw.share) * (1.0 if flaw.late else sign) * flaw.size
-            drawn[flaw.name] = off[:, : lengths[flaw.name]]
+    chance, sign = rng.random((n, most)), np.where(rng.random((n, most)) < 0.5, -1.0, 1.0)
+    for error in injected:
+        if error.share is not None:
+            values = (chance < error.share) * (1.0 if error.late else sign) * error.size
+            drawn[error.name] = values[:, : lengths[error.name]]
     return drawn

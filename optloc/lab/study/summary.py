@@ -1,4 +1,9 @@
-"""Statistics of a finished study, cell by cell and method by method."""
+"""Statistics of a finished study, cell by cell and method by method.
+
+A case is a scenario with its swept values. A cell contains the trials of one case at one noise level by one method. An
+instance is one trial of one case at one noise level, which every method can solve. Judged rows are rows of the study's
+table with the additional columns of the function `judged`; most functions need them.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +24,13 @@ if TYPE_CHECKING:
 
 
 SLACK = 0.01
-"""Costs with a smaller difference are equal: a tenth of a standard deviation."""
+"""Costs with a smaller difference count as equal. A cost of 0.01 is the square of a tenth of a standard deviation."""
 
 # Costs of a million and more have rounding errors above SLACK; the relative error of their sums is smaller.
 _RELATIVE = 1e-9
 
 PROVEN = "global"
-"""Proof that no better point exists anywhere."""
+"""Value of the column `proof` if no better point exists anywhere."""
 
 COLUMNS = tuple(
     "key data scenario method solver noise noise_unit noise_label sweep kinds rows stations dimension trial status "
@@ -41,7 +46,7 @@ _PENALTY = 10.0
 
 
 def judged(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of a study with judgements.
+    """Return the rows of a study with five more columns, which judge the fixes by the lowest known cost of their trial.
 
     Parameters
     ----------
@@ -54,9 +59,9 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
         The rows with five more columns:
 
         - `above`: cost less the lowest known cost, of all methods and of the truth;
-        - `right`: answered, and no better point is known;
-        - `wrong`: status ok, but a better point is known;
-        - `false`: a global proof that a better point refutes;
+        - `right`: answered, with a cost, and no better point is known;
+        - `wrong`: status ok, but a better point is known, or the row has no cost;
+        - `false`: a global proof, but a better point is known, or the row has no cost;
         - `case`: scenario and swept values as text.
     """
     import pandas as pd
@@ -65,42 +70,49 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
     answered = frame["answered"].to_numpy(dtype=bool)
     with np.errstate(invalid="ignore"):
         # A row without a cost is not the best: NaN counts as worse.
-        better = ~(above <= SLACK + rounding)
+        better_known = ~(above <= SLACK + rounding)
     pairs = frame[list(CASE)].astype(str)
     names = {(a, b): case_label(a, b) for a, b in pairs.drop_duplicates().itertuples(index=False, name=None)}
     labels = [names[pair] for pair in zip(pairs["scenario"], pairs["sweep"], strict=True)]
     return frame.assign(
         above=above,
-        right=answered & ~better,
-        wrong=better & (frame["status"] == "ok").to_numpy(),
-        false=better & (frame["proof"] == PROVEN).to_numpy(),
-        case=pd.Categorical(labels, sorted(set(names.values()), key=_natural), ordered=True),
+        right=answered & ~better_known,
+        wrong=better_known & (frame["status"] == "ok").to_numpy(),
+        false=better_known & (frame["proof"] == PROVEN).to_numpy(),
+        case=pd.Categorical(labels, sorted(set(names.values()), key=_natural_key), ordered=True),
     )
 
 
 def above_least(frame: pd.DataFrame) -> tuple[Array, Array]:
-    """Return the costs less the lowest known (n,), and the possible rounding errors of these differences (n,)."""
+    """Return the costs less the lowest known cost of their trial (n,), and the possible rounding errors (n,).
+
+    The lowest known cost is the least of the costs of all methods and of the truth. Rows without a cost are NaN.
+    """
     cost, gap, truth = (frame[name].to_numpy(dtype=float) for name in ("cost", "gap", "cost_truth"))
     # The truth also counts: a point with a higher cost is not the minimum.
     best = np.fmin(cost - gap, truth)
     return cost - best, _RELATIVE * np.abs(best)
 
 
-def _natural(text: str) -> list[tuple[bool, float, str]]:
-    """Return a key that sorts numbers in texts by value: 8 before 25."""
+def _natural_key(text: str) -> list[tuple[bool, float, str]]:
+    """Return a sort key that compares the numbers in texts by value: 8 comes before 25."""
     # After the split, odd parts are numbers; 0.0 for text keeps the tuples comparable.
     parts = re.split(r"(\d+\.?\d*)", text)
     return [(i % 2 == 0, 0.0 if i % 2 == 0 else float(part), part) for i, part in enumerate(parts)]
 
 
 def case_label(scenario: str, sweep: str) -> str:
-    """Return a scenario with its swept values as text, for instance "inside, stations 5"."""
+    """Return a scenario with its swept values as text, for instance "inside, stations 5".
+
+    `sweep` is a JSON object of names and values, as in the column `sweep`.
+    """
     values: dict[str, Any] = json.loads(sweep)
     parts = [f"{name.rpartition('.')[2].replace('_', ' ')} {_text(value)}" for name, value in values.items()]
     return ", ".join([scenario, *parts])
 
 
 def _text(value: Any) -> str:
+    """Return a swept value as text: "5 to 10" for a pair, "a × b × c" for a longer list, "a 5 and b 7" for a table."""
     if isinstance(value, list):
         return " to ".join(map(_text, value)) if len(value) == 2 else " × ".join(map(_text, value))
     if isinstance(value, dict):
@@ -109,7 +121,11 @@ def _text(value: Any) -> str:
 
 
 def noise_text(label: str) -> str:
-    """Return a noise level as text: its label, without braces if it names kinds."""
+    """Return a noise level as text for titles: "10 m", "tdoa 10 m, azimuth 5 mrad" or "noise × 2".
+
+    `label` is the level as in the column `noise_label`: a text with its unit, a JSON object of levels by kind, or a
+    factor on the noise of the problem file.
+    """
     try:
         value = json.loads(label)
     except ValueError:
@@ -125,18 +141,27 @@ def cells(frame: pd.DataFrame) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        Columns: case, noise, noise_unit, noise_label, method, rows; counts trials, answered, right, wrong, proven,
-        false, died; rmse and bound (m), ratio and ratio_half; median and p95 of the deviation; nees over the dimension;
-        median, p10 and p90 of seconds; build (s), iterations.
+        Columns:
+
+        - case, noise, noise_unit, noise_label, method; rows: measurements of a trial;
+        - trials, answered, right, wrong, proven, false: numbers of trials; died: trials that failed (`FAILED`);
+        - rmse and bound: root mean square error and Cramer-Rao bound of the position, metres;
+        - ratio and ratio_half: rmse over bound, and the half width of its 95 % interval;
+        - deviation_median, deviation_p95: quantiles of the error in units of the bound;
+        - nees: mean of the normalised squared error over the dimension;
+        - seconds_median, seconds_p10, seconds_p90: quantiles of the time of a fix;
+        - build: longest time of a first fix, seconds; iterations: mean number.
+
+        Errors and bounds are computed over the rows `accuracy_rows`.
     """
     import pandas as pd
 
     names = ["case", "noise", "noise_unit", "noise_label", "method"]
-    found = [
+    rows = [
         dict(zip(names, key, strict=True)) | _cell(part)
         for key, part in frame.groupby(names, observed=True, sort=False)
     ]
-    table = pd.DataFrame(found)
+    table = pd.DataFrame(rows)
     table["case"] = pd.Categorical(table["case"], frame["case"].cat.categories, ordered=True)
     order = {name: i for i, name in enumerate(methods(frame))}
     return table.sort_values(
@@ -148,14 +173,14 @@ def cells(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _cell(part: pd.DataFrame) -> dict[str, Any]:
-    """Return the statistics of the rows of one cell."""
-    chosen = accuracy_rows(part)
-    error, bound, off = (part[n].to_numpy(dtype=float)[chosen] for n in ("error", "crlb", "deviation"))
+    """Return the statistics of the rows of one cell, by the column names of `cells`."""
+    accurate = accuracy_rows(part)
+    error, bound, deviation = (part[n].to_numpy(dtype=float)[accurate] for n in ("error", "crlb", "deviation"))
     ratio, half = over_bound(error, bound)
     seconds = part["seconds"].to_numpy(dtype=float)
-    nees = part["nees"].to_numpy(dtype=float)[chosen] / float(part["dimension"].iloc[0])
+    nees = part["nees"].to_numpy(dtype=float)[accurate] / float(part["dimension"].iloc[0])
     # With a singular bound no error is too large: such trials count for errors, not for bounds.
-    good = np.isfinite(bound)
+    bounded = np.isfinite(bound)
     return {
         "rows": int(part["rows"].iloc[0]),
         "trials": len(part),
@@ -163,11 +188,11 @@ def _cell(part: pd.DataFrame) -> dict[str, Any]:
         "proven": int((part["proof"] == PROVEN).sum()),
         "died": int(part["status"].isin(FAILED).sum()),
         "rmse": float(np.sqrt(np.mean(error**2))) if len(error) else np.nan,
-        "bound": float(np.sqrt(np.mean(bound[good] ** 2))) if good.any() else np.nan,
+        "bound": float(np.sqrt(np.mean(bound[bounded] ** 2))) if bounded.any() else np.nan,
         "ratio": ratio,
         "ratio_half": half,
-        "deviation_median": _quantile(off, 0.5),
-        "deviation_p95": _quantile(off, 0.95),
+        "deviation_median": _quantile(deviation, 0.5),
+        "deviation_p95": _quantile(deviation, 0.95),
         "nees": float(np.mean(nees[np.isfinite(nees)])) if np.isfinite(nees).any() else np.nan,
         "seconds_median": _quantile(seconds, 0.5),
         "seconds_p10": _quantile(seconds, 0.1),
@@ -194,9 +219,11 @@ def by_status(frame: pd.DataFrame) -> pd.DataFrame:
     """
     above, rounding = above_least(frame)
     with np.errstate(invalid="ignore"):
-        made = frame.assign(better=above > SLACK + rounding, trials=1)
-    pairs = {"method": made["method"].astype(str), "status": made["status"].astype(str)}
-    table = made.assign(**pairs).groupby(["method", "status"], sort=False)[["trials", "right", "better", "wrong"]].sum()
+        counted = frame.assign(better=above > SLACK + rounding, trials=1)
+    pairs = {"method": counted["method"].astype(str), "status": counted["status"].astype(str)}
+    table = (
+        counted.assign(**pairs).groupby(["method", "status"], sort=False)[["trials", "right", "better", "wrong"]].sum()
+    )
     table = table.astype(int).reset_index()
     order = {name: i for i, name in enumerate(methods(frame))}
     table = table.assign(_method=table["method"].map(order), _ok=table["status"] != "ok", _count=-table["trials"])
@@ -205,21 +232,25 @@ def by_status(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def accuracy_rows(part: pd.DataFrame) -> Array:
-    """Return a mask of the rows that measure a method's accuracy: its answers or, without any, all its positions."""
+    """Return the mask (n,) of the rows whose errors measure a method's accuracy.
+
+    These rows are the answers of the method. If the method answers no trial, they are all its positions.
+    """
     answered = part["answered"].to_numpy(dtype=bool)
     return answered if answered.any() else part["located"].to_numpy(dtype=bool)
 
 
 def _quantile(values: Array, share: float) -> float:
+    """Return the quantile `share` (0 to 1) of the finite values; NaN without finite values."""
     good = values[np.isfinite(values)]
     return float(np.quantile(good, share)) if len(good) else float("nan")
 
 
 def methods(frame: pd.DataFrame) -> list[str]:
-    """Return the methods, those with the most right answers first.
+    """Return the names of the methods; the method with the largest share of right answers is first.
 
     If shares are equal, a method without any position is last, so that a solver that fails at once is not the best.
-    Then the faster ones come first.
+    Then the faster methods come first.
     """
     grouped = frame.groupby("method", observed=True, sort=True)
     found = grouped.agg(right=("right", "mean"), located=("located", "any"), t=("seconds", "median"))
@@ -230,14 +261,16 @@ def methods(frame: pd.DataFrame) -> list[str]:
 def instances(
     frame: pd.DataFrame, order: list[str], work: str = "seconds", success: str = "right"
 ) -> tuple[Array, Array, int]:
-    """Return work and successes of the instances (one trial of one cell of data) that every method has run.
+    """Return work and success of every method on the instances that all methods have run.
+
+    The results compare the methods instance by instance. An instance is one trial of one case at one noise level.
 
     Parameters
     ----------
     frame : DataFrame
         Judged rows.
     order : list of str
-        Methods.
+        Methods, in the order of the result.
     work, success : str
         Columns of the work of a trial, and of its success.
 
@@ -250,25 +283,27 @@ def instances(
     total : int
         Number of all instances of the study, also of those that some method has not run.
     """
-    numbers, names = frame["data"].astype(str), frame["method"].astype(str)
-    wide = frame.assign(data=numbers, method=names).pivot_table(
+    data, names = frame["data"].astype(str), frame["method"].astype(str)
+    table = frame.assign(data=data, method=names).pivot_table(
         index=["data", "trial"], columns="method", values=[work, success], aggfunc="first"
     )
     # In an unfinished study, some methods have not run all trials yet.
-    common = wide.dropna()
-    times, solved = (np.stack([common[what][name] for name in order]) for what in (work, success))
-    return times.astype(float), solved.astype(bool), len(wide)
+    common = table.dropna()
+    times, solved = (np.stack([common[column][name] for name in order]) for column in (work, success))
+    return times.astype(float), solved.astype(bool), len(table)
 
 
 def ranking(frame: pd.DataFrame, order: list[str], shift: float) -> pd.DataFrame:
     """Return the methods ranked by the shifted geometric mean of their times, with a penalty for failures.
 
-    A failure counts as ten times the slowest time of any method, so that fast wrong answers are not rewarded.
+    A failure counts as ten times the slowest time of any method, so that fast wrong answers are not rewarded. `order`
+    are the methods, and `shift` is the shift of the mean in seconds, see `shifted_mean`.
 
     Returns
     -------
     DataFrame
-        Columns: method, instances, solved, mean (s), relative (to the best), fastest (share of instances).
+        Columns: method; instances: their number; solved: number of right answers; mean (s); relative: mean over the
+        best mean; fastest: share of instances on which the method is the fastest right one.
     """
     import pandas as pd
 
@@ -303,9 +338,9 @@ class Side:
     rows : int
         Number of trials.
     answered : float
-        Share with an answer.
+        Share of trials with an answer.
     rmse, bound : float
-        Root mean square error of the answers and of their Cramer-Rao bounds, metres.
+        Root mean square error of the answers, and root mean square Cramer-Rao bound of the answered trials, metres.
     seconds : float
         Median time of a fix.
     """
@@ -319,20 +354,21 @@ class Side:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A cell of two studies.
+    """Difference of two studies in one cell.
 
     Parameters
     ----------
     cell : tuple of str
         Scenario, swept values, noise level, method.
     one, two : Side
-        The studies.
+        Statistics of the first and of the second study.
     same_data : bool
         Whether both solved the same measurements, in the trials that both have.
     identical : bool
         Whether their values are equal bit for bit.
     z : float
-        Difference of the shares of answers in standard deviations; NaN if both shares are 0 or both are 1.
+        Share of answers of the second study less the share of the first, in standard deviations of this difference; NaN
+        if both shares are 0 or both are 1.
     """
 
     cell: tuple[str, ...]
@@ -344,7 +380,7 @@ class Difference:
 
 
 def compared(one: Path, two: Path) -> list[Difference]:
-    """Return the differences in the cells that two studies have in common, by their names.
+    """Return the differences in the cells that two studies have in common; cells with equal names are compared.
 
     Raise InvalidProblem if a folder has no study, or if there is no common cell.
     """
@@ -353,24 +389,24 @@ def compared(one: Path, two: Path) -> list[Difference]:
     if not common:
         advice = "compare studies with the same names of scenarios and methods, and the same noise levels"
         raise InvalidProblem("the studies have no cell in common", f"{one} and {two}", advice)
-    return [_difference(tuple(map(str, cell)), frames[0][cell], frames[1][cell]) for cell in common]
+    return [_cell_difference(tuple(map(str, cell)), frames[0][cell], frames[1][cell]) for cell in common]
 
 
-def _difference(cell: tuple[str, ...], a: pd.DataFrame, b: pd.DataFrame) -> Difference:
-    """Return the difference of two studies in a cell with the rows a and b."""
+def _cell_difference(cell: tuple[str, ...], a: pd.DataFrame, b: pd.DataFrame) -> Difference:
+    """Return the difference of two studies in a cell; `a` and `b` are the rows of the studies."""
     # Compare the digest of the drawn numbers, not the seed; only in the trials that both have.
     both = a[["trial", "data"]].merge(b[["trial", "data"]], on="trial")
     same_data = bool(len(both)) and bool((both["data_x"].astype(str) == both["data_y"].astype(str)).all())
-    one, two = _side(a), _side(b)
+    one, two = _cell_statistics(a), _cell_statistics(b)
     # Pooled variance of the two shares: the usual test of their difference.
     pooled = (one.answered * one.rows + two.answered * two.rows) / (one.rows + two.rows)
-    spread = np.sqrt(pooled * (1.0 - pooled) * (1.0 / one.rows + 1.0 / two.rows))
-    z = (two.answered - one.answered) / spread if spread > 0.0 else np.nan
+    deviation = np.sqrt(pooled * (1.0 - pooled) * (1.0 / one.rows + 1.0 / two.rows))
+    z = (two.answered - one.answered) / deviation if deviation > 0.0 else np.nan
     return Difference(cell, one, two, same_data, same_data and _identical(a, b), float(z))
 
 
 def _identical(a: pd.DataFrame, b: pd.DataFrame) -> bool:
-    """Return whether the columns of values are equal bit for bit."""
+    """Return whether the columns `VALUES` of two lists of trials are equal bit for bit."""
     if len(a) != len(b):
         return False
     names = list(VALUES)
@@ -379,12 +415,12 @@ def _identical(a: pd.DataFrame, b: pd.DataFrame) -> bool:
     return bool(left.equals(right))
 
 
-def _side(frame: pd.DataFrame) -> Side:
-    """Return the statistics of one study in a cell."""
+def _cell_statistics(frame: pd.DataFrame) -> Side:
+    """Return the statistics of one study in a cell from the rows of the cell."""
     answered = frame["answered"].to_numpy(dtype=bool)
     error, bound = (frame[name].to_numpy(dtype=float)[answered] for name in ("error", "crlb"))
-    rmse, limit = (float(np.sqrt(np.mean(v**2))) if len(v) else np.nan for v in (error, bound[np.isfinite(bound)]))
-    return Side(len(frame), float(answered.mean()), rmse, limit, float(frame["seconds"].median()))
+    rmse, bound_rms = (float(np.sqrt(np.mean(v**2))) if len(v) else np.nan for v in (error, bound[np.isfinite(bound)]))
+    return Side(len(frame), float(answered.mean()), rmse, bound_rms, float(frame["seconds"].median()))
 
 
 # Statistics of methods: shares with intervals, errors against the bound, profiles, shifted means.

@@ -1,15 +1,15 @@
 """One trial from simulated data to a row of the table: solution, errors against truth and bound, documented columns.
 
 The rows of a chunk are one Arrow table. The table depends on the chunk only, not on the machine.
+
+Letters in shapes: n trials, d coordinates, p unknowns that all epochs share. `size` is the length of a parameter
+vector: all unknowns of a problem in the order of its layout.
 """
 
 from __future__ import annotations
 
-import os
-import platform
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
 
@@ -17,8 +17,8 @@ import numpy as np
 
 from optloc.bounds import crlb
 from optloc.engine import TOLERANCE, covariance, eliminated, equations_at, exact, linalg, violation
-from optloc.lab.study.design import Cell, Chunk
-from optloc.lab.study.methods import Nonsense, require_program, run, version_of
+from optloc.lab.study.design import Cell, Chunk, machine, versions
+from optloc.lab.study.methods import Nonsense, require_program, run
 from optloc.lab.study.networks import (
     KnownNetworks,
     NetworkCase,
@@ -239,13 +239,14 @@ class Lost:
 
 
 Values = dict[str, Any]
-"""Columns of some trials: arrays (n,), or one value for all."""
+"""Columns of some trials by name: arrays (n,), or one value for all."""
 
-# Characters of a reason: every row has one, and the message of a library may contain a matrix.
-_WORDS = 200
+# Most characters of a reason: every row has one, and the message of a library may contain a matrix.
+_REASON_LENGTH = 200
 
-# Cells of which this process has solved a trial: compilation and canonicalisation are not timed with other trials.
-_warm: set[tuple[str, str]] = set()
+# Cases and methods of which this process has solved a trial. The time of the first trial includes compilation and
+# canonicalisation. So it is stored in the column `build`, and is not part of the times of other trials.
+_solved_before: set[tuple[str, str]] = set()
 
 
 def compute(chunk: Chunk) -> TrialPart:
@@ -274,31 +275,38 @@ def compute(chunk: Chunk) -> TrialPart:
             for part in _solve_in_halves(chunk.cell, known, first, min(size, chunk.count - first))
         ]
     # A failed trial lacks some columns, so only the columns of all parts are kept.
-    shared = [name for name in parts[0][1] if all(name in values for _, values in parts)]
-    found = {name: np.concatenate([_spread(values[name], count) for count, values in parts]) for name in shared}
-    return _part(chunk, known, found, build)
+    names = [name for name in parts[0][1] if all(name in values for _, values in parts)]
+    columns = {name: np.concatenate([_as_array(values[name], count) for count, values in parts]) for name in names}
+    return _part(chunk, known, columns, build)
 
 
 def _warm_up(cell: Cell, drawn: DrawnCase | Networks) -> float:
-    """Solve one trial if this process has not done so yet, and return the time in seconds."""
+    """Solve one trial of a cell that is new for this process, and return the time in seconds; 0 for other cells.
+
+    The time is also 0 if the method fails. Raise InvalidProblem if the requested solver has solved no program.
+    """
     key = (cell.case.key, cell.method.identity)
-    if key in _warm:
+    if key in _solved_before:
         return 0.0
     began = perf_counter()
     try:
-        found = run(cell.method, drawn.part(0, 1))
+        result = run(cell.method, drawn.part(0, 1))
     except (Exception, SystemExit):  # noqa: BLE001  (the row of the trial reports the error)
         return 0.0
-    require_program(cell.method, found)
+    require_program(cell.method, result)
     # Only after a success: a failure may come before the slow part.
-    _warm.add(key)
+    _solved_before.add(key)
     return perf_counter() - began
 
 
 def _solve_in_halves(
     cell: Cell, known: KnownTrials | KnownNetworks, first: int, count: int
 ) -> list[tuple[int, Values]]:
-    """Return the values of some trials; if the call fails, solve halves until only failing trials fail."""
+    """Return the values of `count` trials, from the trial `first` on, as pairs of a number of trials and their values.
+
+    If the call of the method fails, each half is solved separately, until only failing trials fail. These get the
+    status of their failure.
+    """
     try:
         return [(count, _solve(cell, known.part(first, count)))]
     except MemoryError:
@@ -315,30 +323,30 @@ def _solve_in_halves(
 
 
 def _solve(cell: Cell, known: KnownTrials | KnownNetworks) -> Values:
-    """Return the values of the trials, solved in one call."""
+    """Return the values of the trials that depend on the method; all trials are solved in one call."""
     count = len(known.drawn.seed)
-    found = run(cell.method, known.drawn)
-    values = fix_values(cell.case, known, found.fix)
-    work = {"seconds": found.seconds / count, "processor": found.processor / count, "evaluations": found.evaluations}
-    return values | work | {"iterations": found.iterations / count, "batch": count}
+    result = run(cell.method, known.drawn)
+    values = fix_values(cell.case, known, result.fix)
+    work = {"seconds": result.seconds / count, "processor": result.processor / count, "evaluations": result.evaluations}
+    return values | work | {"iterations": result.iterations / count, "batch": count}
 
 
 def _failure(status: str, reason: str) -> Values:
-    """Return the values of a failed trial."""
+    """Return the values of a failed trial: no position, and NaN for all numbers that the method would compute."""
     values: Values = {column.name: np.nan for column in COLUMNS if column.kind == "float"}
-    values |= {"status": status, "reason": reason[:_WORDS], "answered": False, "located": False}
+    values |= {"status": status, "reason": reason[:_REASON_LENGTH], "answered": False, "located": False}
     values |= dict.fromkeys(("dof", "alternatives", "rejected"), 0)
     return values | {"proof": "unknown", "certificate": "", "batch": 1}
 
 
 def part_of_lost(chunk: Chunk, lost: Lost) -> TrialPart:
-    """Return the part of a lost chunk: all its trials have the status of the loss."""
-    found = {name: _spread(value, chunk.count) for name, value in _failure(lost.status, lost.reason).items()}
-    return _part(chunk, known_of(chunk.cell.case.draw(chunk.first, chunk.count)), found, 0.0)
+    """Return the part of a chunk that was not computed: all its trials have the status and the reason of `lost`."""
+    columns = {name: _as_array(value, chunk.count) for name, value in _failure(lost.status, lost.reason).items()}
+    return _part(chunk, known_of(chunk.cell.case.draw(chunk.first, chunk.count)), columns, 0.0)
 
 
 def join_parts(chunk: Chunk, parts: list[TrialPart]) -> TrialPart:
-    """Return the parts of the pieces of a chunk joined to one part."""
+    """Return the part of a chunk from the parts of its pieces, in the order of their trials."""
     import pyarrow as pa
 
     table = pa.concat_tables([part.table for part in parts]).unify_dictionaries().combine_chunks()
@@ -351,23 +359,27 @@ def join_parts(chunk: Chunk, parts: list[TrialPart]) -> TrialPart:
     return TrialPart(chunk.key, table.set_column(name, table.schema.field(name), key), counts)
 
 
-def _spread(value: Any, count: int) -> Any:
-    """Return a value as an array (count,)."""
+def _as_array(value: Any, count: int) -> Any:
+    """Return a value as an array (count,): an array as it is, any other value repeated."""
     if isinstance(value, np.ndarray):
         return value
     # Assignment treats a list as one value for each trial, and a text as one value for all.
-    out = np.empty(count, dtype=object if isinstance(value, str | list) else None)
-    out[:] = value
-    return out
+    array = np.empty(count, dtype=object if isinstance(value, str | list) else None)
+    array[:] = value
+    return array
 
 
-def _part(chunk: Chunk, known: KnownTrials | KnownNetworks, found: Values, build: float) -> TrialPart:
-    """Return the part of a chunk as an Arrow table with the values `found`."""
+def _part(chunk: Chunk, known: KnownTrials | KnownNetworks, solved: Values, build: float) -> TrialPart:
+    """Return the part of a chunk as an Arrow table.
+
+    `solved` are the columns that the method decides; the function adds the columns of the case, the truth and the
+    machine. `build` is the time of the first fix in seconds.
+    """
     import pyarrow as pa
 
     case, method, n = chunk.cell.case, chunk.cell.method, chunk.count
     # In this order: a failed trial has NaN for all numbers, but its truth and its bound are known.
-    values = found | truth_values(case, known)
+    values = solved | truth_values(case, known)
     values |= {
         "key": chunk.cell.key,
         "data": list(known.drawn.digest),
@@ -387,8 +399,8 @@ def _part(chunk: Chunk, known: KnownTrials | KnownNetworks, found: Values, build
         "versions": versions(),
     }
     arrays = [_arrow(column, values[column.name], n) for column in COLUMNS]
-    status, times = np.unique(np.asarray(_spread(values["status"], n), dtype=str), return_counts=True)
-    counts = dict(zip(status.tolist(), times.tolist(), strict=True))
+    status, number = np.unique(np.asarray(_as_array(values["status"], n), dtype=str), return_counts=True)
+    counts = dict(zip(status.tolist(), number.tolist(), strict=True))
     return TrialPart(chunk.key, pa.Table.from_arrays(arrays, schema=arrow_schema()), counts)
 
 
@@ -419,11 +431,12 @@ class KnownTrials:
     Parameters
     ----------
     drawn : DrawnCase
-        The trials.
+        The n trials.
     bound : array (n, p, p)
-        Cramer-Rao bound of the shared unknowns at the truth; NaN where the geometry is singular.
+        Cramer-Rao bound of the shared unknowns at the truth, in squares of their SI units; NaN where the geometry is
+        singular.
     cost : array (n,)
-        Cost at the truth.
+        Cost at the truth; NaN if the truth violates a constraint.
     """
 
     drawn: DrawnCase
@@ -439,40 +452,40 @@ class KnownTrials:
 
 
 def known_of(drawn: DrawnCase | Networks) -> KnownTrials | KnownNetworks:
-    """Return bound and cost at the truth of trials."""
+    """Return the trials with their bounds and their costs at the truth."""
     if isinstance(drawn, Networks):
         return known_networks(drawn)
     problem, size = drawn.problem, len(drawn.truth)
     with np.errstate(all="ignore"):
         equations = equations_at(problem, drawn.truth)
         bound = crlb(problem, drawn.truth) if exact(problem) else covariance(equations)[0]
-        cost = _admitted(problem, drawn.truth, np.broadcast_to(eliminated(equations).cost, (size,)))
+        cost = _nan_if_violated(problem, drawn.truth, np.broadcast_to(eliminated(equations).cost, (size,)))
     return KnownTrials(drawn, np.broadcast_to(bound, (size, *bound.shape[-2:])), cost)
 
 
 def truth_values(case: Case | NetworkCase, known: KnownTrials | KnownNetworks) -> Values:
-    """Return the columns that do not depend on the method."""
+    """Return the columns of the truth and its bounds, which do not depend on the method."""
     if isinstance(case, NetworkCase) or isinstance(known, KnownNetworks):
         assert isinstance(known, KnownNetworks)
         return true_columns(known)
     problem, truth = known.drawn.problem, known.drawn.truth
     names = case.state
-    place = _take(problem, truth, names[0])
-    values: Values = {f"truth_{axis}": _component(place, i) for i, axis in enumerate("xyz")}
+    position = _values_of(problem, truth, names[0])
+    values: Values = {f"truth_{axis}": _component(position, i) for i, axis in enumerate("xyz")}
     values["outliers"] = known.drawn.bad
-    values |= {"crlb": _root_trace(_block(problem, known.bound, names[0])), "cost_truth": known.cost}
+    values |= {"crlb": _root_trace(_part_of_matrix(problem, known.bound, names[0])), "cost_truth": known.cost}
     moving = len(names) > 1
-    values["crlb_velocity"] = _root_trace(_block(problem, known.bound, names[1])) if moving else np.nan
-    entries = _lengths(problem)
-    variance = np.diagonal(known.bound, axis1=-2, axis2=-1)[:, entries]
-    values["crlb_bias"] = np.sqrt(variance.mean(-1)) if len(entries) else np.nan
+    values["crlb_velocity"] = _root_trace(_part_of_matrix(problem, known.bound, names[1])) if moving else np.nan
+    biases = _biases_in_metres(problem)
+    variance = np.diagonal(known.bound, axis1=-2, axis2=-1)[:, biases]
+    values["crlb_bias"] = np.sqrt(variance.mean(-1)) if len(biases) else np.nan
     return values
 
 
 def fix_values(
     case: Case | NetworkCase, known: KnownTrials | KnownNetworks, fix: Fix | tuple[NetworkResult, ...]
 ) -> Values:
-    """Return the columns of fixes (n,) of trials, or of networks."""
+    """Return the columns of the fixes of n trials, or of the results for n networks."""
     if isinstance(known, KnownNetworks):
         assert isinstance(fix, tuple)
         return found_columns(known, fix)
@@ -480,26 +493,26 @@ def fix_values(
     problem, truth, names = known.drawn.problem, known.drawn.truth, case.state
     size = len(truth)
     x = np.where(np.isfinite(fix.x).all(-1, keepdims=True), fix.x, np.nan)
-    error = _take(problem, x - truth, names[0])
-    claimed = _block(problem, fix.cov, names[0])
+    error = _values_of(problem, x - truth, names[0])
+    claimed = _part_of_matrix(problem, fix.cov, names[0])
     values: Values = {f"error_{axis}": _component(error, i) for i, axis in enumerate("xyz")}
     values |= {
         "answered": fix.answered,
         "located": np.asarray(np.isfinite(error).all(-1)),
         "error": np.linalg.norm(error, axis=-1),
-        "error_nearest": _nearest(problem, fix, truth, names[0], error),
-        "deviation": np.sqrt(_squared(error, _block(problem, known.bound, names[0]))),
+        "error_nearest": _least_error(problem, fix, truth, names[0], error),
+        "deviation": np.sqrt(_normalised_square(error, _part_of_matrix(problem, known.bound, names[0]))),
         "sigma": _root_trace(claimed),
-        "nees": _squared(error, claimed),
-        "cost": _cost(problem, fix, x),
+        "nees": _normalised_square(error, claimed),
+        "cost": _costs(problem, fix, x),
         "dof": np.broadcast_to(fix.dof, (size,)),
         "rejected": np.broadcast_to((fix.weights < _REJECTED * problem.weight).sum(-1), (size,)),
         "alternatives": np.isfinite(fix.alternatives.gap).sum(-1),
     }
     moving = len(names) > 1
-    values["error_velocity"] = np.linalg.norm(_take(problem, x - truth, names[1]), axis=-1) if moving else np.nan
-    entries = _lengths(problem)
-    values["error_bias"] = np.sqrt(((x - truth)[:, entries] ** 2).mean(-1)) if len(entries) else np.nan
+    values["error_velocity"] = np.linalg.norm(_values_of(problem, x - truth, names[1]), axis=-1) if moving else np.nan
+    biases = _biases_in_metres(problem)
+    values["error_bias"] = np.sqrt(((x - truth)[:, biases] ** 2).mean(-1)) if len(biases) else np.nan
     # Codes index the labels, because members of Status are numbered from zero.
     labels = np.array([status.label for status in Status], dtype=object)
     values |= {"status": labels[fix.code], "reason": fix.reason}
@@ -509,90 +522,76 @@ def fix_values(
     return values
 
 
-def _component(place: Array, i: int) -> Any:
-    return place[:, i] if i < place.shape[-1] else np.nan
+def _component(position: Array, i: int) -> Any:
+    """Return the coordinate `i` of positions (n, d); NaN in the plane, where there is no third coordinate."""
+    return position[:, i] if i < position.shape[-1] else np.nan
 
 
-def _take(problem: Problem, x: Array, name: str) -> Array:
+def _values_of(problem: Problem, x: Array, name: str) -> Array:
+    """Return the values (n, members) of the unknown `name` from parameter vectors (n, size)."""
     return problem.layout.take(x, name)
 
 
-def _block(problem: Problem, matrix: Array, name: str) -> Array:
+def _part_of_matrix(problem: Problem, matrix: Array, name: str) -> Array:
+    """Return the part (n, q, q) of matrices (n, p, p) that belongs to the unknown `name` with q members."""
     slot, _ = problem.layout.find(name)
-    part = slice(slot.start, slot.start + slot.size)
-    return np.asarray(matrix[:, part, part])
+    members = slice(slot.start, slot.start + slot.size)
+    return np.asarray(matrix[:, members, members])
 
 
-def _lengths(problem: Problem) -> Array:
-    """Return the indices of the shared unknowns that are biases in metres."""
-    # Clock offsets, not scales or boresights: errors of other units cannot be averaged with them.
-    found = [np.arange(s.start, s.start + s.size) for s in problem.layout.shared if s.members and s.unit == "m"]
-    return np.concatenate([*found, np.zeros(0, dtype=np.int64)])
+def _biases_in_metres(problem: Problem) -> Array:
+    """Return the indices of the shared unknowns that are biases in metres, such as clock offsets."""
+    # Scales and boresights are not included, because errors of other units cannot be averaged with metres.
+    biases = [np.arange(s.start, s.start + s.size) for s in problem.layout.shared if s.members and s.unit == "m"]
+    return np.concatenate([*biases, np.zeros(0, dtype=np.int64)])
 
 
 def _root_trace(matrix: Array) -> Array:
+    """Return the roots of the traces (n,) of covariances (n, q, q): the rms length of errors."""
     with np.errstate(invalid="ignore"):
         return np.asarray(np.sqrt(np.trace(matrix, axis1=-2, axis2=-1)))
 
 
-def _squared(error: Array, matrix: Array) -> Array:
-    """Return e' M^-1 e (n,); NaN if the error is missing or the matrix is singular."""
+def _normalised_square(error: Array, matrix: Array) -> Array:
+    """Return e' M^-1 e (n,) for errors e (n, d), matrices M (n, d, d); NaN for missing errors or singular matrices."""
     usable = np.asarray(np.isfinite(matrix).all((-1, -2)) & np.isfinite(error).all(-1))
-    # The batch is solved at once: items without a matrix get the identity, and their result is discarded.
-    kept = np.where(usable[:, None, None], matrix, np.eye(matrix.shape[-1]))
-    solved, ok = linalg.solve(kept, np.where(usable[:, None], error, 0.0)[..., None])
+    # All trials are solved at once: trials without a matrix get the identity, and their result is discarded.
+    solvable = np.where(usable[:, None, None], matrix, np.eye(matrix.shape[-1]))
+    solved, ok = linalg.solve(solvable, np.where(usable[:, None], error, 0.0)[..., None])
     return np.asarray(np.where(usable & ok, (error * solved[..., 0]).sum(-1), np.nan))
 
 
-def _nearest(problem: Problem, fix: Fix, truth: Array, name: str, error: Array) -> Array:
-    """Return the least error (n,) of each estimate and its alternatives, metres."""
-    best = np.linalg.norm(error, axis=-1)
+def _least_error(problem: Problem, fix: Fix, truth: Array, name: str, error: Array) -> Array:
+    """Return the least error (n,) of each estimate and its alternatives, metres.
+
+    `truth` are the true vectors (n, size), `name` is the unknown position, and `error` are the estimates' errors (n,
+    d).
+    """
+    least = np.linalg.norm(error, axis=-1)
     # If two minima fit, the list should contain the right one.
     for i in range(fix.alternatives.x.shape[1]):
         with np.errstate(invalid="ignore"):
-            best = np.fmin(best, np.linalg.norm(_take(problem, fix.alternatives.x[:, i] - truth, name), axis=-1))
-    return np.asarray(best)
+            least = np.fmin(least, np.linalg.norm(_values_of(problem, fix.alternatives.x[:, i] - truth, name), axis=-1))
+    return np.asarray(least)
 
 
-def _cost(problem: Problem, fix: Fix, x: Array) -> Array:
-    """Return the cost of every estimate; costs of unrefined estimates are computed here."""
+def _costs(problem: Problem, fix: Fix, x: Array) -> Array:
+    """Return the costs (n,) of the estimates `x` (n, size); costs that the fix lacks are computed here."""
     # Starts and relaxations have no cost, and only the cost of the likelihood makes methods comparable.
     cost = np.where(np.isfinite(fix.cost), fix.cost, np.nan)
-    items = np.flatnonzero(~np.isfinite(cost) & np.isfinite(x).all(-1))
-    if len(items):
+    rows = np.flatnonzero(~np.isfinite(cost) & np.isfinite(x).all(-1))
+    if len(rows):
         with np.errstate(all="ignore"):
-            found = eliminated(equations_at(problem.take(items), x[items])).cost
-        cost[items] = np.where(np.isfinite(found), found, np.nan)
-    return _admitted(problem, x, cost)
+            computed = eliminated(equations_at(problem.take(rows), x[rows])).cost
+        cost[rows] = np.where(np.isfinite(computed), computed, np.nan)
+    return _nan_if_violated(problem, x, cost)
 
 
-def _admitted(problem: Problem, x: Array, cost: Array) -> Array:
+def _nan_if_violated(problem: Problem, x: Array, cost: Array) -> Array:
     """Return costs (n,) at vectors x (n, size), with NaN where x violates a constraint: such points do not compete."""
     if not problem.constraints:
         return cost
-    items = np.flatnonzero(np.isfinite(x).all(-1))
-    out = np.array(cost)
-    out[items[violation(problem.take(items), x[items]) > TOLERANCE]] = np.nan
-    return out
-
-
-# Machine and versions.
-
-
-@cache
-def versions() -> str:
-    """Return the versions of optloc, Python and the libraries that affect numbers, as one line."""
-    names = ("optloc", "numpy", "scipy", "numba", "cvxpy", "clarabel", "casadi", "pyarrow")
-    return "; ".join([f"Python {platform.python_version()}", *(f"{name} {version_of(name)}" for name in names)])
-
-
-@cache
-def machine() -> str:
-    """Return the processor, the number of its cores and the system of this machine as one line."""
-    name = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
-    except OSError:
-        pass
-    return f"{name}, {os.cpu_count()} cores, {platform.system()}"
+    rows = np.flatnonzero(np.isfinite(x).all(-1))
+    result = np.array(cost)
+    result[rows[violation(problem.take(rows), x[rows]) > TOLERANCE]] = np.nan
+    return result

@@ -2,6 +2,9 @@
 
 The parent starts the worker without multiprocessing. multiprocessing would run the script of the caller again, and it
 does not let daemonic workers of a cluster start processes.
+
+Parent and worker exchange pickled messages through pipes: standard input and output of the worker. `WorkerProcess` and
+`WorkerPool` run in the parent, `serve` and the functions after it run in the worker.
 """
 
 from __future__ import annotations
@@ -23,13 +26,26 @@ from optloc.lab.study.design import Chunk
 from optloc.lab.study.trial import DIED, LATE, Lost, TrialPart, compute
 from optloc.problem import InvalidProblem, load_plugin, plugins
 
-# Seconds. To start a worker: half a second if a processor is free. Until an idle worker ends, because a cluster does
-# not signal the end of a study. Between the end of the pipe and the end of the process, which has the exit code.
+# Time limits, seconds. For the start of a worker: it takes half a second if a processor is free. Until an idle worker
+# ends: a cluster does not signal the end of a study. From the end of the pipe to the end of the process: only then is
+# there an exit code.
 _START, _IDLE, _END_WAIT = 120.0, 60.0, 0.2
-# Workers times threads would exceed the processors, and each thread of BLAS reserves memory.
-_ONE = ("OPTLOC", "OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM", "NUMEXPR_NUM", "NUMBA_NUM")
-# From the start on, the system kills the worker's group when the parent closes its end of the pipe or writes to it. A
-# thread that waits for this works on every system, but not while machine code holds the interpreter.
+# Variables that limit the threads of libraries. Workers times threads would exceed the processors, and each thread of
+# BLAS reserves memory.
+_THREAD_VARIABLES = (
+    "OPTLOC",
+    "OMP_NUM",
+    "OPENBLAS_NUM",
+    "MKL_NUM",
+    "BLIS_NUM",
+    "VECLIB_MAXIMUM",
+    "NUMEXPR_NUM",
+    "NUMBA_NUM",
+)
+# Code that the new process runs. Its function `die_with(file, on)` switches a signal of the pipe `file` on or off.
+# While the signal is on, the system kills the worker's group if the parent closes its end of the pipe or writes to it.
+# It is on while a chunk is computed. A thread that waits for the end of the pipe works on every system. But it does not
+# run while machine code holds the interpreter.
 _BEGIN = """
 import contextlib, os, pickle, select, signal, sys
 def die_with(file, on):
@@ -56,7 +72,7 @@ class WorkerProcess:
             [sys.executable, "-P", "-c", _BEGIN],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env=os.environ | {f"{name}_THREADS": "1" for name in _ONE},
+            env=os.environ | {f"{name}_THREADS": "1" for name in _THREAD_VARIABLES},
             start_new_session=True,
         )
         self._ended, self._pipes = Lock(), Lock()
@@ -66,28 +82,31 @@ class WorkerProcess:
         return self._process.poll() is None
 
     def ask(self, message: object, seconds: float) -> Any:
-        """Return the reply to a message; raise TimeoutError after `seconds`, or EOFError if the process ends."""
-        answer: SimpleQueue[Any] = SimpleQueue()
+        """Return the reply to a message; raise TimeoutError after `seconds`, or EOFError if the process ends.
+
+        In both cases the process has been killed.
+        """
+        replies: SimpleQueue[Any] = SimpleQueue()
 
         def exchange() -> None:
             # In a thread, because pipes have no time limit on some systems.
             assert self._process.stdin is not None
             assert self._process.stdout is not None
-            found = None
+            reply = None
             with self._pipes, suppress(Exception):  # a process that ends may leave an incomplete message
                 _send(self._process.stdin, message)
-                found = pickle.load(self._process.stdout)  # noqa: S301  (the sender is our worker)
-            answer.put(found)
+                reply = pickle.load(self._process.stdout)  # noqa: S301  (the sender is our worker)
+            replies.put(reply)
 
         Thread(target=exchange, daemon=True).start()
         try:
-            found = answer.get(timeout=seconds)
+            reply = replies.get(timeout=seconds)
         except Empty:
             self.end()
             raise TimeoutError from None
-        if found is None:
+        if reply is None:
             raise EOFError(self.end(_END_WAIT))
-        return found
+        return reply
 
     def end(self, seconds: float = 0.0) -> str:
         """Kill the process and its children, after at most `seconds`, and return its exit code as text."""
@@ -103,11 +122,12 @@ class WorkerProcess:
         if self._pipes.acquire(timeout=_END_WAIT):
             with suppress(OSError), self._process:
                 self._pipes.release()
-        how = f"exit code {code}" if code >= 0 else f"signal {-code} ({signal.strsignal(-code)})"
-        return f"its process ended with {how}"
+        ending = f"exit code {code}" if code >= 0 else f"signal {-code} ({signal.strsignal(-code)})"
+        return f"its process ended with {ending}"
 
 
 def _send(file: IO[bytes], message: object) -> None:
+    """Write a pickled message to a pipe."""
     pickle.dump(message, file)
     file.flush()
 
@@ -145,41 +165,44 @@ class WorkerPool:
         """
         if not seconds:
             return Lost(chunk.key, LATE, "not tried")
-        apart = self._take()
+        worker = self._take()
         try:
             # Pickled twice: the receiving thread need not import the modules of the chunk, and plugins are loaded
             # before the chunk.
             message = (chunk.key, tuple(plugins() if names is None else names), pickle.dumps(chunk))
-            found = apart.ask(pickle.dumps(message), seconds)
-            if isinstance(found, InvalidProblem):
-                raise found
-            if isinstance(found, TrialPart) and (found.key, len(found.table)) == (chunk.key, chunk.count):
-                return found
+            reply = worker.ask(pickle.dumps(message), seconds)
+            if isinstance(reply, InvalidProblem):
+                raise reply
+            if isinstance(reply, TrialPart) and (reply.key, len(reply.table)) == (chunk.key, chunk.count):
+                return reply
             # A process that is out of memory or sends an invalid reply is not used again.
-            apart.end()
-            return found if isinstance(found, Lost) else Lost(chunk.key, DIED, "its process sent an invalid reply")
+            worker.end()
+            return reply if isinstance(reply, Lost) else Lost(chunk.key, DIED, "its process sent an invalid reply")
         except TimeoutError:
             return Lost(chunk.key, LATE, f"it took more than {seconds:g} s")
         except EOFError as error:
             return Lost(chunk.key, DIED, str(error))
         finally:
             with self._lock:
-                (self._idle.append if apart.lives() else self._all.discard)(apart)
+                (self._idle.append if worker.lives() else self._all.discard)(worker)
 
     def close(self) -> None:
         """End all workers."""
         with self._lock:
             self._closed, processes = True, list(self._all)
-        for apart in processes:
-            apart.end()
+        for worker in processes:
+            worker.end()
 
     def _take(self, *, again: bool = True) -> WorkerProcess:
-        """Return an idle worker, or a new one."""
+        """Return an idle worker, or a new one. If `again` is true, a failed start is tried once more.
+
+        Raise InvalidProblem if no worker can be started.
+        """
         with self._lock:
             while self._idle:
-                if (apart := self._idle.pop()).lives():
-                    return apart
-                self._all.discard(apart)
+                if (worker := self._idle.pop()).lives():
+                    return worker
+                self._all.discard(worker)
         try:
             return self._begin()
         except (EOFError, TimeoutError) as error:
@@ -194,14 +217,14 @@ class WorkerPool:
         with self._lock:
             if self._closed:
                 raise InvalidProblem("the run was stopped", "study", "run the same command to continue")
-            self._all.add(apart := WorkerProcess())
+            self._all.add(worker := WorkerProcess())
         # With the path of this process the worker finds the same modules.
-        apart.ask(([str(place) for place in sys.path], pickle.dumps(partial(serve, self._memory))), _START)
-        return apart
+        worker.ask(([str(place) for place in sys.path], pickle.dumps(partial(serve, self._memory))), _START)
+        return worker
 
 
-# Share of the machine's memory that all workers may use together. Least bytes of each worker: libraries alone reserve
-# 2e9.
+# Share of the machine's memory that all workers may use together, and the least bytes of each worker: libraries alone
+# reserve 2e9.
 _MEMORY, _LEAST_MEMORY = 0.8, 4 << 30
 
 
@@ -212,7 +235,7 @@ def memory_of(count: int) -> int | None:
     return max(_LEAST_MEMORY, int(_MEMORY * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / count))
 
 
-def restrain(memory: int | None) -> None:
+def limit_memory(memory: int | None) -> None:
     """Limit the memory (bytes) of this process, which leaves no core file and ends first if memory is short."""
     with suppress(ImportError, OSError, ValueError):
         import resource
@@ -228,42 +251,46 @@ def restrain(memory: int | None) -> None:
 
 
 def serve(memory: int | None, die_with: Callable[[IO[bytes], bool], None]) -> NoReturn:
-    """Compute chunks from standard input one by one, and write replies to standard output, until the input closes."""
-    restrain(memory)
+    """Compute chunks from standard input one by one, and write replies to standard output, until the input closes.
+
+    `memory` is the limit of this process in bytes. `die_with` is the function of `_BEGIN`. The first reply is True, and
+    reports that the worker is ready.
+    """
+    limit_memory(memory)
     # A method may read and print, so standard streams go to the null device. This comes first: otherwise a copy of a
     # pipe could take the place of a closed standard error.
-    nowhere, own, line = os.open(os.devnull, os.O_RDWR), os.getpid(), SimpleQueue[bytes]()
-    tasks, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    null_device, pid, messages = os.open(os.devnull, os.O_RDWR), os.getpid(), SimpleQueue[bytes]()
+    tasks, replies = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     for number in range(3):
-        os.dup2(nowhere, number)
-    Thread(target=_listen, args=(tasks, line, die_with), daemon=True).start()
-    found: object = True
+        os.dup2(null_device, number)
+    Thread(target=_listen, args=(tasks, messages, die_with), daemon=True).start()
+    reply: object = True
     try:
         while True:
-            if os.getpid() != own:
+            if os.getpid() != pid:
                 os._exit(0)  # a method forked, and its copy has returned here too
             die_with(tasks, False)
-            _send(answers, found)
-            key, names, packed = pickle.loads(line.get(timeout=_IDLE))  # noqa: S301
+            _send(replies, reply)
+            key, names, packed = pickle.loads(messages.get(timeout=_IDLE))  # noqa: S301
             try:
                 for name in names:
                     load_plugin(name)
-                found = compute(pickle.loads(packed))  # noqa: S301
+                reply = compute(pickle.loads(packed))  # noqa: S301
             except InvalidProblem as error:
-                found = error
+                reply = error
             except Exception as error:  # noqa: BLE001  (most often out of memory)
-                found = Lost(key, DIED, f"{type(error).__name__}: {error}")
+                reply = Lost(key, DIED, f"{type(error).__name__}: {error}")
     finally:
         _end()
 
 
-def _listen(tasks: IO[bytes], line: SimpleQueue[bytes], die_with: Callable[[IO[bytes], bool], None]) -> None:
-    """Put incoming messages into the queue; if the pipe closes, the parent has ended, so end this process."""
+def _listen(tasks: IO[bytes], messages: SimpleQueue[bytes], die_with: Callable[[IO[bytes], bool], None]) -> None:
+    """Put incoming messages into a queue; end this process if the pipe closes, because the parent has ended."""
     try:
         while True:
             message = pickle.load(tasks)  # noqa: S301
             die_with(tasks, True)
-            line.put(message)
+            messages.put(message)
     finally:
         _end()
 

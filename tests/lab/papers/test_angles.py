@@ -126,7 +126,7 @@ def test_with_the_printed_arctangent_simulation_1_runs_away(limit):
 
 def test_fits_to_the_whole_track():
     assert angles.whole_track_bound() == pytest.approx([0.01129, 6.00e-4, 1.63e-5], rel=1e-3)
-    found = dict(angles.run_wholes(draw(STRAIGHT, 200, 1, 0), quiet))
+    found = dict(angles.whole_track_errors(draw(STRAIGHT, 200, 1, 0), quiet))
     assert found["plain"] == pytest.approx([0.0143, 7.9e-4, 2.2e-5], rel=0.10)
     assert found["maximum likelihood (optloc)"] == pytest.approx([0.0117, 6.1e-4, 1.64e-5], rel=0.08)
     assert found["instrumental variables"] == pytest.approx(found["maximum likelihood (optloc)"], rel=2e-3)

@@ -137,7 +137,7 @@ def test_right_and_wrong_models(drawn, index):
 
 
 def test_the_likelihood_chooses_the_right_model(drawn):
-    shares = {name: kinematic_tables._sides(own, ORDERS[name])[0] for name, own in drawn.items()}
+    shares = {name: kinematic_tables._chosen_models(own, ORDERS[name])[0] for name, own in drawn.items()}
     assert min(share[4:].min() for share in shares.values()) > 0.99
     third = [shares[name][2] for name in ORDERS]
     assert third == pytest.approx([0.999, 0.997, 0.46], abs=0.05)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from optloc.lab.papers.kinematic import KinematicScore
-from optloc.lab.papers.kinematic_tables import ERROR, TableLine, _size, km, table_errors, table_ratios
+from optloc.lab.papers.kinematic_tables import ERROR, TableLine, _three_digits, km, table_errors, table_ratios
 from optloc.show.sheet import ABSENT
 
 
@@ -12,7 +12,7 @@ def test_numbers_are_short():
 
 
 def test_large_errors_over_covariances_are_told_by_two_digits():
-    assert [_size(value) for value in (1.987, 99.99, 12345.0, -2.5e11)] == ["1.99", "99.99", "1.2e4", "-2.5e11"]
+    assert [_three_digits(value) for value in (1.987, 99.99, 12345.0, -2.5e11)] == ["1.99", "99.99", "1.2e4", "-2.5e11"]
 
 
 def uniform(error):

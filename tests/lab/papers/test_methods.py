@@ -21,8 +21,8 @@ def scenes():
         "satellites, exact height": (one, satellites.START),
         "satellites, measured height": (measured, satellites.START),
         "bistatic": (bistatic.problem(1), bistatic.truth(1)[0]),
-        "angles, two stations": (angles.still(2, 1e-3), angles.PLACE),
-        "angles, four stations": (angles.still(4, 1e-3), angles.PLACE),
+        "angles, two stations": (angles.fixed_target(2, 1e-3), angles.PLACE),
+        "angles, four stations": (angles.fixed_target(4, 1e-3), angles.PLACE),
         "registration": (run, registration.truth(registration.PRINTED, run)),
         "registration, prior": (plain, registration.truth(registration.PRINTED, plain)),
     }

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from optloc.lab.papers.registration import RegistrationScore
-from optloc.lab.papers.registration_tables import _chance, _mean, _single, accuracy, flatness, metres, separation
+from optloc.lab.papers.registration_tables import (
+    _chance,
+    _mean_accuracy,
+    _single_accuracy,
+    accuracy,
+    flatness,
+    metres,
+    separation,
+)
 
 
 def test_accuracies_and_cells():
@@ -18,9 +26,9 @@ def test_a_mean_error_and_the_error_of_one_run_leave_out_lost_trials():
     error = np.array([[0.0, 1.0], [0.0, -3.0], [0.0, 1e9]])
     score = RegistrationScore(error, np.array([False, False, True]))
     exact = np.array([0.0, 10.0])
-    assert _mean(score, 1, exact) == pytest.approx([90.0])  # of -1
-    assert _single(score, 1, exact) == pytest.approx([100.0 - 10.0 * np.sqrt(5.0)])  # of the root of 5
-    assert _mean(RegistrationScore(error, np.ones(3, dtype=bool)), 1, exact).size == 0
+    assert _mean_accuracy(score, 1, exact) == pytest.approx([90.0])  # of -1
+    assert _single_accuracy(score, 1, exact) == pytest.approx([100.0 - 10.0 * np.sqrt(5.0)])  # of the root of 5
+    assert _mean_accuracy(RegistrationScore(error, np.ones(3, dtype=bool)), 1, exact).size == 0
 
 
 def test_stations_one_metre_off_a_plane_are_flat_by_a_metre():
