@@ -130,8 +130,8 @@ def map_in_order(function: Callable[[_Item], _Result], items: Sequence[_Item]) -
     """Yield the results of a function for all items in their order, with several running in parallel.
 
     It is for large parts of a batch. Unlike `map_on_threads` it suits work in which Python takes as long as machine
-    code: the Python code of one part runs while the machine code of another runs. Results can be freed after each step: at
-    most one more than the number of threads is stored.
+    code: the Python code of one part runs while the machine code of another runs. The caller can free each result
+    before the next one: at most one more result than the number of threads is stored.
 
     Parameters
     ----------

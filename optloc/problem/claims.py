@@ -65,15 +65,17 @@ class Claims:
             getattr(self, each.name)[places] = getattr(other, each.name)
 
     def tell(self) -> Array:
-        """Return the certificates as a read-only object array (...); None where no proof was tried."""
+        """Return the certificates as a read-only object array (...) of `Certificate`; None where no proof was tried."""
         out = np.empty(self.proof.shape, dtype=object)
         names = [each.name for each in fields(self)]
         columns = (getattr(self, name).ravel().tolist() for name in names)
         for i, values in zip(np.ndindex(out.shape), zip(*columns, strict=True), strict=True):
-            own = dict(zip(names, values, strict=True))
+            entries = dict(zip(names, values, strict=True))
             # All missing bounds share one NaN object, so that certificates without a bound compare as equal.
-            none = {name: _NONE for name in ("bound", "gap") if isnan(own[name])}
-            out[i] = Certificate(**own | none | {"proof": PROOFS[own["proof"]]}) if own["proof"] else None
+            missing = {name: _NONE for name in ("bound", "gap") if isnan(entries[name])}
+            out[i] = (
+                Certificate(**entries | missing | {"proof": PROOFS[entries["proof"]]}) if entries["proof"] else None
+            )
         out.flags.writeable = False
         return out
 
@@ -100,6 +102,6 @@ def repeated_claims(one: Claims, shape: int | tuple[int, ...]) -> Claims:
 
 
 def merged_claims(chosen: Array, one: Claims, other: Claims) -> Claims:
-    """Return claims (N,): `one` where `chosen` is true, otherwise `other`; each has shape (N,) or ()."""
+    """Return claims (N,): `one` where `chosen` (N,) is true, otherwise `other`; each has shape (N,) or ()."""
     pairs = ((getattr(one, each.name), getattr(other, each.name)) for each in fields(one))
     return Claims(*(np.where(chosen, *pair) for pair in pairs))
