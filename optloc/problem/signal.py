@@ -85,12 +85,13 @@ class Signal:
 
     @property
     def _factor(self) -> Array:
-        """Return the variance of the log-amplitude of each station (s,), pi (1 + P) / (T W P rho)."""
+        """Return the variance of the log-amplitude of each station (s,), pi (1 + P) / (T W P rho), without a unit."""
         total = np.nansum(self.snr)
         return np.asarray(np.pi * (1.0 + total) / (self.duration * self._band * total * self.snr))
 
     @property
     def _band(self) -> float:
+        """Return the bandwidth W, radians per second."""
         return 2.0 * np.pi * self.bandwidth
 
     @property
@@ -105,9 +106,15 @@ class Signal:
         if self.reference is None:
             return levels
         # Inverse of the information without the reference station, by the Sherman-Morrison formula.
-        total, own = np.nansum(self.snr), self.snr[self.reference]
+        total, snr_of_reference = np.nansum(self.snr), self.snr[self.reference]
         ratio = (1.0 - total) / (1.0 + total) / total
-        levels -= np.pi * (1.0 + total) / (self.duration * self._band * total) * ratio / (1.0 + ratio * (total - own))
+        levels -= (
+            np.pi
+            * (1.0 + total)
+            / (self.duration * self._band * total)
+            * ratio
+            / (1.0 + ratio * (total - snr_of_reference))
+        )
         levels[self.reference] = levels[:, self.reference] = 0.0
         return levels
 
@@ -136,16 +143,16 @@ class Signal:
         # An error that all stations share must cancel: in the row, or in its unknown emission time.
         if not ratio and not model.emission and model.ranges != (1, -1):
             raise InvalidProblem(f"{kind} is neither a time difference nor a gain ratio", "signal", "give sigma")
-        own = self._levels if ratio else np.diag(self.arrival_sigma**2)
+        by_station = self._levels if ratio else np.diag(self.arrival_sigma**2)
         signs = _RATIO if model.ranges is None else model.ranges
         ends = [(index, sign) for index, sign in zip((a, b), signs, strict=True) if sign]
         covariance = np.zeros((*a.shape, a.shape[-1]))
         for one, first in ends:
             for two, second in ends:
-                covariance = covariance + first * second * own[one[..., :, None], two[..., None, :]]
+                covariance = covariance + first * second * by_station[one[..., :, None], two[..., None, :]]
         if ratio:
-            size = np.sqrt(self.snr[b] / self.snr[a])
-            covariance = covariance * size[..., :, None] * size[..., None, :]
+            amplitude_ratio = np.sqrt(self.snr[b] / self.snr[a])
+            covariance = covariance * amplitude_ratio[..., :, None] * amplitude_ratio[..., None, :]
         if not np.isfinite(covariance).all():
             raise InvalidProblem(f"a {kind} row names a station without a signal", "snr", "give its ratio")
         return covariance
