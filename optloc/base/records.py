@@ -1,8 +1,11 @@
 """Records: frozen dataclasses of arrays with common batch axes, and functions to slice, merge and join them.
 
 The annotation of each array field states its layout: the number of axes after the batch axes and the value of an empty
-entry. It also states whether the first of these axes counts slots, whose number can differ between records. The
-functions of this module use these annotations, so a new field of a `Fix` or a `Pool` is declared in one place.
+entry. It also states whether the first of these axes counts slots, whose number can differ between records. For
+example, alternatives of a fix are slots. The functions of this module use these annotations, so a new field of a `Fix`
+or a `Pool` is declared in one place.
+
+A batch has N entries. A flat batch has one batch axis (N, ...).
 """
 
 from __future__ import annotations
@@ -46,7 +49,7 @@ def change(record: Record, function: Callable[[Array, int], Array]) -> Record:
 
 
 def take(record: Record, items: Any) -> Record:
-    """Return the entries of a flat batch at an index or a slice."""
+    """Return the entries of a flat batch at `items`: an index, a slice or a mask."""
     return change(record, lambda array, core: array[items])
 
 
@@ -63,10 +66,10 @@ def overwrite(record: Record, items: Array, other: Record) -> Record:
         The q new entries.
     """
     changed: dict[str, Any] = {}
-    for (name, mine, layout), (_, theirs, _) in zip(_arrays(record), _arrays(other), strict=True):
-        if mine is None and theirs is None:
+    for (name, old_value, layout), (_, new_value, _) in zip(_arrays(record), _arrays(other), strict=True):
+        if old_value is None and new_value is None:
             continue
-        old, new = _filled(record, mine, theirs, layout), _filled(other, theirs, mine, layout)
+        old, new = _filled(record, old_value, new_value, layout), _filled(other, new_value, old_value, layout)
         width = max(old.shape[1], new.shape[1]) if layout.slots else 0
         changed[name] = np.array(_widen(old, layout, width))
         changed[name][items] = _widen(new, layout, width)
@@ -138,6 +141,7 @@ class _Column:
         self.lacking: list[slice] = []
 
     def put(self, place: slice, value: Array | None) -> None:
+        """Store the values of the entries at `place`; None if the part lacks this field: its entries are empty."""
         if value is None:
             self.lacking.append(place)
             return
@@ -149,11 +153,15 @@ class _Column:
         self.whole[place] = value
 
     def array(self) -> Array | None:
+        """Return the array of all entries; None if all parts lack the field.
+
+        If all entries share one row, the result is a view that repeats this row.
+        """
         if self.whole is None and self.parts:
             value = self.parts[0][1]
             if self._is_shared():
                 return np.broadcast_to(value[:1], (self.count, *value.shape[1:]))
-            width = max(own.shape[1] for _, own in self.parts) if self.layout.slots else 0
+            width = max(value_of_part.shape[1] for _, value_of_part in self.parts) if self.layout.slots else 0
             self._allocate(value, (width, *value.shape[2:]) if self.layout.slots else value.shape[1:])
         whole = self.whole
         if whole is not None:
@@ -173,6 +181,10 @@ class _Column:
         return not self.layout.slots or all(map(self._shares, own))
 
     def _allocate(self, like: Array, shape: tuple[int, ...]) -> None:
+        """Allocate the array of all entries with rows of this shape, and copy the waiting parts into it.
+
+        `like` gives the data type. Later calls do nothing.
+        """
         if self.whole is None:
             whole = (self.count, *shape)
             self.whole = _empty(whole, self.layout, like.dtype) if self.layout.slots else np.empty(whole, like.dtype)
@@ -183,6 +195,7 @@ class _Column:
 
 def _is_equal(a: Array, b: Array) -> bool:
     # NaN differs from itself, but arrays in the same memory are equal.
+    """Return whether two arrays have the same content; NaN counts as equal if both arrays use the same memory."""
     same = a.ctypes.data == b.ctypes.data and (a.shape, a.strides, a.dtype) == (b.shape, b.strides, b.dtype)
     return same or np.array_equal(a, b)
 
@@ -201,6 +214,7 @@ def _layouts(kind: Any) -> dict[str, Axes]:
 
 
 def _arrays(record: Any) -> Iterator[tuple[str, Array | None, Axes]]:
+    """Yield the name, the array (or None) and the layout of every array field of a record."""
     kind: Any = type(record)
     for name, layout in _layouts(kind).items():
         yield name, getattr(record, name), layout
@@ -211,8 +225,8 @@ def _parts(record: Any) -> Iterator[tuple[str, Any]]:
     kind: Any = type(record)
     for name in _others(kind):
         value = getattr(record, name)
-        own: Any = type(value)
-        if _is_record(own):
+        kind_of_value: Any = type(value)
+        if _is_record(kind_of_value):
             yield name, value
 
 
@@ -224,11 +238,13 @@ def _others(kind: Any) -> tuple[str, ...]:
 
 @cache
 def _is_record(kind: Any) -> bool:
-    own: Any = kind
-    return is_dataclass(kind) and bool(_layouts(own))
+    """Return whether a type is a dataclass with array fields."""
+    record_type: Any = kind
+    return is_dataclass(kind) and bool(_layouts(record_type))
 
 
 def _count(record: Any) -> int:
+    """Return the number of entries of a flat batch."""
     return next(len(value) for _, value, _ in _arrays(record) if value is not None)
 
 
@@ -249,6 +265,7 @@ def _widen(array: Array, layout: Axes, width: int) -> Array:
 
 
 def _empty(shape: tuple[int, ...], layout: Axes, dtype: Any) -> Array:
+    """Return a new array in which every entry has the empty value of the layout."""
     out = np.empty(shape, dtype=dtype)
     out.fill(layout.empty)
     return out
