@@ -78,7 +78,7 @@ class Atmosphere:
 
     @property
     def straight(self) -> float:
-        """Return the metres of a straight path per metre of a measurement, for starts without rays."""
+        """Return the metres of a straight path per metre of a measurement: 1, because refraction in air is small."""
         return 1.0
 
     def path(self, t: Point, a: Point) -> Any:
@@ -99,9 +99,9 @@ class Atmosphere:
         return at_t, at_a
 
     def _along(self, t: Point, a: Point) -> tuple[Any, Any, tuple[Any, Any, Any]]:
-        """Return the mean refractivity on the line, the length of the line, and the derivatives of the mean.
+        """Return the mean refractivity n - 1 on the line, the length of the line, metres, and derivatives of the mean.
 
-        The derivatives are with respect to both heights and to the length.
+        The derivatives are with respect to the heights of `t` and `a` and to the length, per metre.
         """
         assert t.ecef is not None
         assert a.ecef is not None
@@ -129,7 +129,10 @@ def path(t: Point, a: Point) -> Any:
 
 
 def arrival(t: Point, a: Point) -> Components:
-    """Return a vector from the station in the direction of the arriving wave, in the axes of the station."""
+    """Return a vector from the station in the direction of the arriving wave, in the axes of the station.
+
+    Its length is about `unit_speed` divided by the speed at the station.
+    """
     return within(tuple(-1.0 * v for v in t.medium.gradients(t, a)[1]), a)
 
 
