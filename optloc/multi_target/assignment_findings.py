@@ -48,13 +48,13 @@ class Assigned(NamedTuple):
 
 def verdict(found: Assigned, clean: str) -> tuple[Status, str]:
     """Return the status and the reason of an assignment; `clean` is the reason if there is no finding."""
-    against = objections(_FINDINGS, found)
-    if not against:
+    findings = objections(_FINDINGS, found)
+    if not findings:
         return Status.OK, clean
     # Without an assignment other findings are not relevant.
-    status = against[0][0]
+    status = findings[0][0]
     alone = status in (Status.INFEASIBLE, Status.TOO_FEW_ROWS) and not found.fixes
-    return status, against[0][1] if alone else "; ".join(words for _, words in against)
+    return status, findings[0][1] if alone else "; ".join(words for _, words in findings)
 
 
 def count_in_words(emitters: int) -> str:
@@ -65,16 +65,17 @@ def count_in_words(emitters: int) -> str:
 def _near(found: Assigned) -> list[str]:
     """Return sentences about other numbers of emitters, and other positions, within the ambiguity gap."""
     n = len(found.fixes)
-    words = [
+    sentences = [
         f"{count_in_words(k)} would cost only {found.costs[k] - found.cost:.1f} more"
         for k in (n - 1, n + 1)
         if found.wanted is None and k >= 0 and found.costs[k] - found.cost < AMBIGUOUS_GAP
     ]
     near = [gap for gap in found.gaps if gap < AMBIGUOUS_GAP]
-    return [*words, f"another position costs only {near[0]:.1f} more ({len(near)} in total)"] if near else words
+    return [*sentences, f"another position costs only {near[0]:.1f} more ({len(near)} in total)"] if near else sentences
 
 
 def _too_few(found: Assigned) -> list[str]:
+    """Return a sentence: the channels with rows are too few to separate an emitter from false rows."""
     what = "no emitter can have enough" if found.least > found.channels else f"an emitter needs {found.least}"
     return [f"rows in {found.present} channels cannot separate an emitter from false rows: {what}"]
 
