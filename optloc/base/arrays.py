@@ -87,7 +87,7 @@ def eye(n: int, like: Any) -> Any:
 
 
 def as_number(mask: Any, like: Any) -> Any:
-    """Return a mask as zeros and ones, in the float type of the array `like`."""
+    """Return a mask as zeros and ones, in the library and the float type of the array `like`."""
     xp = library(mask)
     return xp.where(mask, as_array_like(np.ones(()), like), as_array_like(np.zeros(()), like))
 
@@ -133,7 +133,10 @@ def as_integers(values: Any, name: str) -> Array | None:
 
 
 def as_deviations(values: Any, name: str, kind: str) -> Array | None:
-    """Return standard deviations as a float array, None for None; raise if one is not positive and finite."""
+    """Return standard deviations as a float array, None for None; raise if one is not positive and finite.
+
+    `name` is the argument and `kind` the measurement kind that the message names.
+    """
     array = numbers(values, name)
     if array is None:
         return None
@@ -280,7 +283,7 @@ def product(vector: Array, matrix: Array) -> Array:
     vector : array (..., r)
         Vectors of length r.
     matrix : array (..., r, q)
-        Matrices. Their leading axes broadcast against those of the vectors.
+        Matrices. The leading axes of vectors and matrices broadcast.
     """
     if not matrix.shape[-2]:
         return np.zeros((*np.broadcast_shapes(vector.shape[:-1], matrix.shape[:-2]), matrix.shape[-1]))

@@ -97,7 +97,7 @@ class Cache(Generic[Value]):
         return cast("Value", place.value)
 
     def call(self, make: Callable[..., Value], *values: Any) -> Value:
-        """Return ``make(*values)``, from the cache if the content of the values has a key."""
+        """Return ``make(*values)``, from the cache if the content of the values has a key, otherwise computed again."""
         key = key_of(*values)
         return make(*values) if key is None else self.find(key, lambda: make(*values))
 
@@ -144,7 +144,7 @@ def key_of(*values: Any) -> Hashable | None:
 
 
 def _content(value: Any) -> Any:
-    """Return a hashable object that is equal for equal type and content; raise _NoKeyError if there is none."""
+    """Return a hashable object that is equal for equal type and content; raise _NoKeyError for unsupported content."""
     kind = type(value)
     if kind in _ATOMS:
         return value

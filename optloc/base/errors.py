@@ -137,7 +137,10 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 def check_once(names: Iterable[str], what: str, where: str) -> None:
-    """Raise if a name occurs twice. `what` is the message, with "{!r}" for the name."""
+    """Raise if a name occurs twice. `what` is the message, with "{!r}" for the name.
+
+    `where` is the location that the message names.
+    """
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise InvalidProblem(what.format(twice), where, "rename one of them")
@@ -146,7 +149,10 @@ def check_once(names: Iterable[str], what: str, where: str) -> None:
 def no_station(
     name: object, where: str | None, known: Iterable[str], error: type[InvalidProblem] = InvalidProblem
 ) -> InvalidProblem:
-    """Return an error for a station name that does not exist, with the most similar station names as advice."""
+    """Return an error for a station name that does not exist, with the most similar station names as advice.
+
+    `error` is the class of the error.
+    """
     return error(f"there is no station {name!r}", where, nearest(str(name), known))
 
 
@@ -188,7 +194,7 @@ def whole_redundancy(redundancy: Any) -> int:
 def too_weak(fix: Any, weak: Any, wanted: int) -> str:
     """Return a sentence about the fixes of a batch that have too little redundancy.
 
-    `weak` (n,) are the numbers of these fixes in the batch, the first one is named. `wanted` is the required
+    `weak` (n,) are the numbers of these fixes in the batch; the sentence names the first. `wanted` is the required
     redundancy.
     """
     redundancy = int(np.ravel(fix.dof)[weak[0]])

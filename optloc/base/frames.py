@@ -67,7 +67,7 @@ class Frame:
 
     @property
     def geodetic(self) -> bool:
-        """Return whether positions have a latitude, a longitude and a height."""
+        """Return whether positions have a latitude, a longitude and a height; False for a Cartesian frame."""
         return self.kind != "cartesian"
 
     def rotation_to_ecef(self) -> Array:

@@ -131,7 +131,10 @@ def access(*, outside: bool | None = None, budget: Budget | None = None, anew: b
 
 
 def relax_budget(*, outside: bool | None = None, budget: Budget | None = None) -> None:
-    """Change the permissions for the rest of the open `access` block. A command line sets them option by option."""
+    """Change the permissions for the rest of the open `access` block; None leaves a permission unchanged.
+
+    A command line sets the permissions option by option.
+    """
     old = _current_access()
     more = {key: value for key, value in (("outside", outside), ("budget", budget)) if value is not None}
     _ACCESS.set(replace(old, **more))  # type: ignore[arg-type]  # each has the type of its field
@@ -312,7 +315,10 @@ def read_text(path: Path) -> str:
 
 
 def decoded(data: bytes, source: str) -> str:
-    """Return bytes as text; raise InvalidProblem with the line number if they are not UTF-8."""
+    """Return bytes as text; raise InvalidProblem with the line number if they are not UTF-8.
+
+    `source` is the name of the file in messages.
+    """
     try:
         # Editors on Windows write a byte order mark at the start of files.
         return data.decode("utf-8-sig")

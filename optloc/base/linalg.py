@@ -169,7 +169,10 @@ def solve(matrix: Array, right: Array, least: float = PIVOT) -> tuple[Array, Arr
 
 
 def inverse(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
-    """Return the inverses (..., n, n) of symmetric positive definite matrices, NaN where not ok, and ok (...)."""
+    """Return the inverses (..., n, n) of symmetric positive definite matrices, and whether each is valid (...).
+
+    Invalid inverses are NaN: the matrix is not numerically positive definite. `least` as for `solve`.
+    """
     xp = arrays.library(matrix)
     out, ok = solve(matrix, xp.broadcast_to(arrays.eye(matrix.shape[-1], matrix), matrix.shape), least)
     # The rounding of the two substitutions is not symmetric, but a covariance must be symmetric to the last bit.
@@ -411,7 +414,8 @@ def project_out(unknowns: Array, values: Array) -> Array:
 def span_of(unknowns: Array) -> Array:
     """Return orthonormal columns (..., q, n) of the span of unknowns (..., q, n); zero columns if some are dependent.
 
-    Columns are first scaled to unit length. Singular values below 1e-12 of the largest then count as dependent.
+    `unknowns` has one column for each linear unknown. Columns are first scaled to unit length. Singular values below
+    1e-12 of the largest then count as dependent.
     """
     length = np.sqrt((unknowns**2).sum(-2, keepdims=True))
     u, s, _ = np.linalg.svd(unknowns / np.where(length > 0.0, length, 1.0), full_matrices=False)

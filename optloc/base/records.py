@@ -110,7 +110,10 @@ def join(parts: Iterable[Record], count: int) -> Record:
 
 
 def _fill_gaps(pieces: list[tuple[int, Any]], count: int) -> Iterator[Any]:
-    """Yield the records in order, with records of empty entries between them, up to `count` entries in total."""
+    """Yield the records in order, with records of empty entries between them, up to `count` entries in total.
+
+    Each of the `pieces` has the number of its first entry and the record.
+    """
     end = 0
     for start, piece in [*pieces, (count, None)]:
         if start > end:
@@ -121,7 +124,7 @@ def _fill_gaps(pieces: list[tuple[int, Any]], count: int) -> Iterator[Any]:
 
 
 def _blank(record: Record, count: int) -> Record:
-    """Return a record with `count` empty entries and the fields of `record`."""
+    """Return a record with `count` empty entries and the same fields as `record`."""
     changed: dict[str, Any] = {
         name: _empty((count, *value.shape[1:]), layout, value.dtype)
         for name, value, layout in _arrays(record)
@@ -132,7 +135,11 @@ def _blank(record: Record, count: int) -> Record:
 
 
 class _Column:
-    """One array field of all entries, filled part by part."""
+    """One array field of all entries, filled part by part.
+
+    `parts` are arrays that wait for allocation, with their places. `whole` is the array of all entries, and `lacking`
+    are the places of parts without this field.
+    """
 
     def __init__(self, layout: Axes, count: int) -> None:
         self.layout, self.count = layout, count
@@ -249,7 +256,7 @@ def _count(record: Any) -> int:
 
 
 def _filled(record: Any, array: Array | None, like: Array | None, layout: Axes) -> Array:
-    """Return an array of a record or, if it is None, empty entries with the shape of `like`."""
+    """Return an array of a record or, if it is None, empty entries with the shape and type of `like`."""
     if array is not None:
         return array
     assert like is not None

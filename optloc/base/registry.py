@@ -82,7 +82,10 @@ class Registry(MutableMapping[str, T]):
         return self._found
 
     def _take(self, entry: EntryPoint, found: dict[str, T]) -> None:
-        """Add the object of an entry point to `found`, or warn why it is not added."""
+        """Add the object of an entry point to `found`, or warn why it is not added.
+
+        `found` are the valid entries of the packages that were read earlier.
+        """
         # A package cannot replace an entry of optloc, or of a package that was read earlier.
         if entry.name in self._own or entry.name in found:
             self._refuse(entry, f"the name {entry.name!r} is taken")
@@ -143,7 +146,7 @@ def load_plugin(name: str) -> None:
 
 
 def plugin_module(name: str) -> ModuleType | None:
-    """Return the module of a loaded plugin by its name on loading; None if it was not loaded."""
+    """Return the module of a loaded plugin; None if it was not loaded. `name` is as for `load_plugin`."""
     listed = _plugin_name(name)
     if listed not in _PLUGINS:
         return None

@@ -87,7 +87,10 @@ class Stations:
         return bool((np.abs(self.covariance - equal) <= 1e-9 * equal).all())
 
     def with_noise(self) -> Stations:
-        """Return the stations with errors of span "epoch" changed to noise, because no other epoch shares them."""
+        """Return the stations with errors of span "epoch" changed to noise, because no other epoch shares them.
+
+        The errors then need no unknowns.
+        """
         return replace(self, span="noise") if self.unknown_for == "epoch" else self
 
     @property

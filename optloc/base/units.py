@@ -170,7 +170,10 @@ class Conversion:
         return self.factor * np.asarray(values_si, dtype=np.float64)
 
     def sigma_to_si(self, sigma: ArrayLike, values_si: ArrayLike | None = None) -> NDArray[np.float64]:
-        """Return standard deviations (...) in SI, to first order at the measured values."""
+        """Return standard deviations (...) in SI, to first order at the measured values `values_si` (...).
+
+        Only logarithmic units need the measured values.
+        """
         scaled: NDArray[np.float64] = np.abs(self.slope(values_si)) * np.asarray(sigma, dtype=np.float64)
         return scaled
 
@@ -295,7 +298,7 @@ def split_amount(value: float | str, quantity: Quantity, where: str) -> tuple[fl
 
 
 def example_of(number: float, text: str, quantity: Quantity) -> str:
-    """Return an amount with its SI unit as an example, with the number of the user if it is valid."""
+    """Return an amount with its SI unit as an example for a message, with the number of the user if it is valid."""
     return f'"{text if abs(number) <= LARGEST else 1.5} {SI_UNIT[quantity]}"'
 
 

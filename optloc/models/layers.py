@@ -280,7 +280,7 @@ class _Legs(NamedTuple):
 
     @classmethod
     def of(cls, parts: tuple[Array, Array, Array], times: Array, top: Array, turn: Array, slope: Array) -> _Legs:
-        """Return legs from their heights and speeds."""
+        """Return legs from `parts`: their heights (L, n), metres, and the speeds at both ends (L, n)."""
         h, c1, c2 = parts
         short1, short2 = ((top - c) * (top + c) / top**2 for c in (c1, c2))
         return cls(h, c1, c2, times, short1, short2, top, turn, slope)
@@ -304,7 +304,7 @@ class _Legs(NamedTuple):
         return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
     def distance(self, sine: Array, cosine: Array) -> Array:
-        """Return the horizontal distances (n,), metres."""
+        """Return the horizontal distances (n,), metres, that rays with these angles reach."""
         w1, w2 = self.cosines(sine, cosine)
         p = sine / self.top
         distance = p * _sum(np.where(self.h > 0.0, self.times * (self.c1 + self.c2) * self.h / (w1 + w2), 0.0))
@@ -324,7 +324,9 @@ class _Legs(NamedTuple):
         return p * _sum(per_p) + 2.0 * w / (p * self.slope), derivative - 2.0 / (self.slope * p**2 * w)
 
     def time(self, sine: Array, cosine: Array, logarithm: _Function) -> Array:
-        """Return the travel times (n,), seconds: 2 / g asinh(g chord / (2 sqrt(c1 c2))) along an arc of a circle."""
+        """Return the travel times (n,), seconds."""
+        # Along an arc of a circle the time is 2 / g asinh(g chord / (2 sqrt(c1 c2))). g is the change of speed per
+        # metre, and chord the distance between the ends of the leg.
         p = sine / self.top
         w1, w2 = self.cosines(sine, cosine)
         h, mean = np.where(self.h > 0.0, self.h, 1.0), np.sqrt(self.c1 * self.c2)
@@ -435,10 +437,7 @@ def _speed(layers: _Layered, y: Array) -> tuple[Array, Array]:
 
 
 def _legs_between(layers: _Layered, high: Array, low: Array) -> tuple[Array, Array, Array]:
-    """Return the heights, and the speeds at both ends, each (L, n), of the legs between two depths (n,).
-
-    The height is zero in layers that are not between the depths `high` (the smaller depth) and `low`.
-    """
+    """Return the heights, and the speeds at both ends, each (L, n), of the legs between depths `high` < `low` (n,)."""
     y0, y1, c0, c1 = (part[:, None] for part in layers)
     upper, lower, slope = np.clip(high, y0, y1), np.clip(low, y0, y1), (c1 - c0) / (y1 - y0)
     h = np.where(lower > upper, lower - upper, 0.0)
@@ -485,14 +484,14 @@ def _direct_rays(layers: _Layered, across: Array, high: Array, low: Array) -> _F
 
 
 class _Bracket(NamedTuple):
-    """Turning rays (k,), each with an interval of the cotangent of its angle that contains one arrival (`_within`)."""
+    """Turning rays (k,) of pairs, each with the ends of an interval, and `rising`, as for `_solve_in_interval`."""
 
-    pair: Array
+    pair: Array  # numbers (k,)
     legs: _Legs
     low: Array
     high: Array
     rising: Array
-    turns: Array
+    turns: Array  # as in `_FoundRay`
 
 
 def _turning_rays(layers: _Layered, across: Array, high: Array, low: Array) -> _FoundRay | None:

@@ -20,6 +20,8 @@ from optloc.base.arrays import library
 def namespace(value: Any) -> Any:
     """Return the module with ``sqrt sin cos atan2 hypot`` for a value.
 
+    Measurement functions call it, so that one formula works for numbers, symbols and derivatives.
+
     Parameters
     ----------
     value : Jet, casadi.SX, casadi.MX, casadi.DM, float or array

@@ -84,7 +84,7 @@ class Emitters:
 
     @property
     def gap(self) -> float:
-        """Return the cost minus its lower bound."""
+        """Return the cost minus its lower bound: no assignment can cost less by more than this gap."""
         return self.cost - self.bound
 
     @property

@@ -61,7 +61,10 @@ class Prices:
 
 
 def incidence(tuples: Tuples, width: int) -> sparse.csc_array:
-    """Return the sparse incidence matrix (m * width, q): 1 if a row (channel * width + value) is in a set."""
+    """Return the sparse incidence matrix (m * width, q): 1 if a row (channel * width + value) is in a set.
+
+    `width` is the number of values of a channel.
+    """
     which, channel = np.nonzero(tuples.picks >= 0)
     row = channel * width + tuples.picks[which, channel]
     shape = (tuples.picks.shape[1] * width, len(tuples.cost))

@@ -95,7 +95,10 @@ class Scene:
 
     @property
     def least(self) -> int:
-        """Return the least number of rows that are evidence of an emitter; above the number of channels if none are."""
+        """Return the least number of rows that are evidence of an emitter.
+
+        It is above the number of channels if no number of rows is enough.
+        """
         # Worth of each row if it fits perfectly, the most informative first. The least number outweighs the penalty and
         # the missing rows.
         worth = np.sort(self.missed + self.gain - np.log(2.0 * np.pi * own_variance(self.R)))[::-1]
@@ -224,13 +227,13 @@ class Tuples:
 
 
 def of_picks(values: Array, picks: Array) -> Array:
-    """Return the values (q, m) that picks (q, m) select from values (..., m, c); zero for pick -1."""
+    """Return the values (q, m) that picks (q, m) select from values (m, c); zero for pick -1."""
     selected = values[np.arange(len(values)), np.maximum(picks, 0)]
     return np.asarray(np.where(picks >= 0, selected, 0.0))
 
 
 def merge(*parts: Tuples) -> Tuples:
-    """Return all sets, sorted by cost, each once with its cheapest position."""
+    """Return all sets of the parts, sorted by cost, each set once with its cheapest position."""
     picks, x, cost = (np.concatenate([getattr(part, name) for part in parts]) for name in ("picks", "x", "cost"))
     order = np.argsort(cost, kind="stable")
     # `np.unique` keeps the first of equal sets, which is the cheapest after sorting.
@@ -460,7 +463,7 @@ _ANGLES = {
 
 
 def value_width(problem: Problem, block: Rows) -> Array | None:
-    """Return the length of the interval of possible values of each row; None if it is unbounded."""
+    """Return the length of the interval of possible values of each row, metres or radians; None if it is unbounded."""
     if block.kind in _ANGLES:
         return np.asarray(_ANGLES[block.kind].width)
     if sum(MODELS[block.kind].ranges or (1,)):

@@ -52,6 +52,8 @@ def distance_and_direction(position: Array, centre: Array) -> tuple[Array, Array
 def basis(direction: Array) -> Array:
     """Return d - 1 orthonormal vectors (..., d, d - 1), in columns, orthogonal to unit vectors (..., d), d = 2 or 3.
 
+    They are the matrix B of this module.
+
     References
     ----------
     T. Duff et al., "Building an orthonormal basis, revisited", Journal of Computer Graphics Techniques 6 (2017).
@@ -90,14 +92,20 @@ def to_chart(points: Array, position: Array, centre: Array) -> Array:
 
 
 def to_position(y: Array, position: Array, centre: Array) -> Array:
-    """Return the positions (..., d), metres, of chart coordinates y (..., d); see `to_chart`."""
+    """Return the positions (..., d), metres, of chart coordinates y (..., d); the inverse of `to_chart`.
+
+    `position` and `centre` (..., d) are the fix and the mean of the stations, metres.
+    """
     r, u0 = distance_and_direction(position, centre)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(centre + (r / y[..., -1])[..., None] * _ray(y, u0))
 
 
 def jacobian(y: Array, position: Array, centre: Array) -> Array:
-    """Return the Jacobian dx/dy (..., d, d) at chart coordinates y (..., d); at the fix it is [r B, -r u0]."""
+    """Return the Jacobian dx/dy (..., d, d) at chart coordinates y (..., d); at the fix it is [r B, -r u0].
+
+    `position` and `centre` (..., d) are the fix and the mean of the stations, metres.
+    """
     r, u0 = distance_and_direction(position, centre)
     shape = np.broadcast_shapes(y.shape, u0.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -108,7 +116,11 @@ def jacobian(y: Array, position: Array, centre: Array) -> Array:
 
 
 def log_volume(y: Array, position: Array, centre: Array) -> Array:
-    """Return ``log |det dx/dy|`` (...) at chart coordinates y (..., d): ``d log r - (d + 1) log w``."""
+    """Return ``log |det dx/dy|`` (...) at chart coordinates y (..., d): ``d log r - (d + 1) log w``.
+
+    It converts a density in chart coordinates to a density in metres. `position` and `centre` (..., d) are the fix and
+    the mean of the stations, metres.
+    """
     r, d = distance_and_direction(position, centre)[0], y.shape[-1]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(d * np.log(r) - (d + 1) * np.log(y[..., -1]))
@@ -276,7 +288,7 @@ class Chart:
         return form
 
     def _is_singular(self) -> Array:
-        """Return a flag (...) for singular covariances: an equality constraint fixes the position in one direction."""
+        """Return a mask (...) of singular covariances: an equality constraint fixes the position in one direction."""
         finite = np.asarray(np.isfinite(self.covariance).all((-1, -2)))
         values = np.linalg.eigvalsh(np.where(finite[..., None, None], self.covariance, np.eye(self.position.shape[-1])))
         return np.asarray(values[..., 0] <= HELD * values[..., -1])
@@ -304,7 +316,7 @@ class Chart:
 
     @property
     def cut_off(self) -> Array:
-        """Return a flag (...) for each Cartesian fix whose distribution is truncated at bounds."""
+        """Return a mask (...) of the Cartesian fixes whose distribution is truncated at bounds."""
         if self.truncated is None:
             return np.zeros(self.kind.shape, dtype=bool)
         return np.asarray(self.truncated.cuts & (self.kind == CARTESIAN))

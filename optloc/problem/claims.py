@@ -59,7 +59,7 @@ class Claims:
         return np.asarray(self.proof != UNTRIED)
 
     def write(self, items: Array | int, other: Claims) -> None:
-        """Overwrite the entries at `items` (indices or a mask) with `other`: n claims (n,), or one () for all."""
+        """Overwrite the entries at `items` (indices or a mask) with `other`: n claims (n,), or one claim () for all."""
         places = np.atleast_1d(items)  # with a scalar index NumPy would store an array () as an object
         for each in fields(self):
             getattr(self, each.name)[places] = getattr(other, each.name)
@@ -81,7 +81,7 @@ class Claims:
 
 
 def claim(certificate: Certificate) -> Claims:
-    """Return a certificate as claims without batch axes."""
+    """Return a certificate as claims without batch axes, each field of shape ()."""
     out = empty_claims(1)
     out.proof[0] = PROOFS.index(certificate.proof)
     for each in fields(out)[1:]:
@@ -97,7 +97,7 @@ def empty_claims(count: int) -> Claims:
 
 
 def repeated_claims(one: Claims, shape: int | tuple[int, ...]) -> Claims:
-    """Return read-only claims of the given shape that are all equal to `one`."""
+    """Return read-only claims of the given shape that are all equal to `one`, which has no batch axes."""
     return Claims(*(np.broadcast_to(getattr(one, each.name), shape) for each in fields(one)))
 
 

@@ -36,7 +36,7 @@ def greville(bias: Bias) -> Array:
 
 
 def coefficients(knots: Array) -> int:
-    """Return the number of coefficients of a spline over knots (p,)."""
+    """Return the number c of coefficients of a spline over knots (p,): p + 2 for cubic polynomials."""
     return len(knots) + DEGREE - 1
 
 
@@ -66,9 +66,10 @@ def _padded(knots: Array) -> Array:
 
 
 def with_knots(bias: Bias, times: Array, where: str, knots: Any) -> Bias:
-    """Return the bias with the knots of a spline over a run. `knots` gives the times, seconds, or the number of knots.
+    """Return the bias with the knots of a spline over a run.
 
-    If it gives the number, the knots are evenly spaced.
+    `times` (k,) are the epochs, seconds. `knots` gives the times of the knots, seconds, or their number. If it gives
+    the number, the knots are evenly spaced. `where` is the location that messages name.
 
     Raises
     ------
@@ -108,7 +109,7 @@ def _check_knots(knots: Array, times: Array, place: str) -> None:
 
 
 def rate_name(name: str) -> str:
-    """Return the name of the rate of a walk."""
+    """Return the name of the unknown that is the rate of a walk, from the name of the walk."""
     return f"{name} rate"
 
 

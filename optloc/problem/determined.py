@@ -99,7 +99,7 @@ class Direction:
 
     @property
     def mixed(self) -> bool:
-        """Return whether the upper end of the range interval is finite."""
+        """Return whether the upper end of the range interval is finite, so that the data determine a range too."""
         return bool(np.isfinite(self.range[2]))
 
     def covers(self, vectors: Array) -> Array:

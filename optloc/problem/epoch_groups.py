@@ -205,7 +205,7 @@ class _RowTable:
         return cls(block, a, b, target, epoch, weight > 0.0, noise, order, problem.epochs)
 
     def alike(self) -> Iterator[tuple[Array, Array]]:
-        """Yield the epochs (n,) of each structure, and their rows (n, r)."""
+        """Yield the epochs (n,) of each structure, and the row numbers (n, r) of these epochs."""
         size = np.bincount(self.epoch, minlength=self.epochs)
         start = np.cumsum(size) - size
         for count in np.unique(size).tolist():

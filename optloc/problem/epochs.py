@@ -149,7 +149,7 @@ def _spread_constraint(c: Band | Polygon, rise: Array | None) -> Band | Polygon:
 
 
 def without_epoch_correlation(problem: Problem) -> Problem:
-    """Return the problem with noise blocks of one epoch each, without the correlation between epochs."""
+    """Return the problem with noise blocks of one epoch each; correlation between epochs is dropped."""
     epoch = problem.epoch
     if all((epoch[block.row] == epoch[block.row[:, :1]]).all() for block in problem.noise.blocks):
         return problem
@@ -349,7 +349,7 @@ class _Numbers:
         return cls(np.array(problem.starts), kept, np.cumsum([0, *counts[:-1]]))
 
     def epoch(self, problem: Problem, rows: Array) -> Array:
-        """Return the epochs of row numbers of the run."""
+        """Return the epochs of rows (any shape), given by their numbers in the run."""
         if len(self.kept) == 1:
             return problem.rows[0].epoch[rows]
         kind = np.searchsorted(self.start, rows, side="right") - 1
@@ -359,7 +359,7 @@ class _Numbers:
         return out
 
     def new(self, rows: Array) -> Array:
-        """Return the row numbers in the window of row numbers of the run that are in the window."""
+        """Return the numbers in the window of rows (any shape), given by their numbers in the run."""
         kind = np.searchsorted(self.start, rows, side="right") - 1
         out = np.empty(rows.shape, dtype=np.int64)
         for i, kept in enumerate(self.kept):
@@ -387,12 +387,12 @@ def cut(problem: Problem, first: int, last: int) -> Problem:
     """
     part = window(problem, first, last)
     if part.count == 0:
-        raise InvalidProblem(f"epochs {first} to {last} hold no rows", "cut", "take a longer stretch")
+        raise InvalidProblem(f"epochs {first} to {last} have no rows", "cut", "take a longer stretch")
     return _as_separate_run(problem, part, slice(first, last))
 
 
 def some_epochs(problem: Problem, epochs: Array) -> Problem:
-    """Return the epochs (n,) of a run as a separate run; otherwise like `cut`."""
+    """Return the epochs (n,) of a run, which must increase, as a separate run; otherwise like `cut`."""
     part = _with_rows_of(problem, lambda epoch: np.flatnonzero(np.isin(epoch, epochs)))
     return _as_separate_run(problem, part, epochs)
 

@@ -361,7 +361,7 @@ class Fix:
     def determined(self) -> Determined | None:
         """Return directions, ranges and curves of a single fix that the data determine, in every status.
 
-        They are computed when you read them. The result is None if the fix does not hold its problem, as in batches
+        They are computed when you read them. The result is None if the fix does not contain its problem, as in batches
         with many refused fixes. `optloc.model_checks.determined(problem, fix)` then computes them.
         """
         return cast("Determined | None", _RENDERER[0]().determined_of(self))
@@ -407,7 +407,8 @@ class Fix:
     def gaussian(self) -> tuple[Array, Array]:
         """Return the mean (..., n) and covariance (..., n, n) of the shared unknowns, for the start of a tracker.
 
-        The mean accounts for truncation at bounds.
+        The mean accounts for truncation at bounds. The covariance is multiplied by `Chart.inflation`, which is above 1
+        for fixes with the finding `tails`.
         """
         mean, cov = self.x[..., : self.layout.n_shared], self.cov
         if self.chart is not None and self.chart.truncated is not None:
@@ -506,7 +507,7 @@ class Fix:
         return self._gaussian_chart(level).interval(extent, level)
 
     def _gaussian_chart(self, level: float) -> Chart:
-        """Return the chart; raise if there is none, or if the finding `tails` forbids this probability level."""
+        """Return the chart; raise if it does not exist, or if the finding `tails` forbids this probability level."""
         if self.chart is None:
             raise InvalidProblem("only a fix of a single position has a chart", "fix", "use its covariance")
         if level > TOLD and bool((self.has(Status.TAILS) & (self.chart.kind == CARTESIAN)).any()):
@@ -550,7 +551,7 @@ class Fix:
         return self.reshape((self.code.size,))
 
     def reshape(self, shape: tuple[int, ...]) -> Fix:
-        """Return the fixes of a flat batch with these batch axes."""
+        """Return the fixes of a flat batch with the batch axes `shape`."""
         return change(self, lambda array, core: array.reshape((*shape, *array.shape[array.ndim - core :])))
 
     def __getitem__(self, index: Index) -> Fix:

@@ -109,7 +109,10 @@ class BiasForm:
         return {"turns": model.axes, "moves": model.stations > 0}.get(self.enters, True)
 
     def signs(self, model: Model) -> tuple[int, int]:
-        """Return the signs with which the errors of the first and the second station enter a row; 0 for no effect."""
+        """Return the signs with which the errors of the first and the second station enter a row; 0 for no effect.
+
+        They are the coefficients of a bias with one member for each station.
+        """
         if self.enters == "turns" or model.stations == 1:
             return (1, 0)
         # A coefficient of 1 moves the first station of the row along its course, -1 the second.
@@ -141,7 +144,7 @@ class BiasForm:
 
 
 def per_second(unit: str) -> str:
-    """Return the SI unit per second of a unit; empty for an empty unit."""
+    """Return the SI unit per second of a unit, for instance "m/s" for "m"; empty for an empty unit."""
     return {"": "", "m/s": "m/s^2"}.get(unit, f"{unit}/s")
 
 

@@ -42,7 +42,7 @@ class Slot:
 
     @property
     def entries(self) -> tuple[str, ...]:
-        """Return the names of the entries: a coordinate, a member, or a member and a coordinate."""
+        """Return the names of the entries (size,): a coordinate, a member, or a member and a coordinate."""
         per = self.size // max(len(self.members), 1)
         axes = tuple("xyz"[:per]) if per > 1 else ("",)
         return tuple(f"{member} {axis}".strip() for member in self.members or ("",) for axis in axes)

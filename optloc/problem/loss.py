@@ -69,7 +69,7 @@ class Loss:
     def slope(self) -> float:
         """Return the expectation of psi'(u) for a standard normal u.
 
-        It is computed as E u psi(u) (integration by parts), which is valid even if psi has steps.
+        It is computed as the expectation of u psi(u) (integration by parts), which is valid even if psi has steps.
         """
         return _moments(self)[1]
 
@@ -82,7 +82,7 @@ class Loss:
     def efficiency(self) -> float:
         """Return the mean square error of least squares over the error of this loss, for clean Gaussian data.
 
-        P. J. Huber, "Robust Statistics" (1981), eq. 3.2.13: (E psi')² / E psi².
+        It is (E psi')² / E psi², at most 1: P. J. Huber, "Robust Statistics" (1981), eq. 3.2.13.
         """
         return self.slope**2 / self.psi_squared
 
@@ -102,7 +102,10 @@ _NODES, _REACH = 60, 12.0
 
 @lru_cache
 def _moments(loss: Loss) -> tuple[float, float, float]:
-    """Return the expectations of psi², u psi and weight for a standard normal u, by quadrature between the kinks."""
+    """Return three expectations for a standard normal u: of psi(u)², of u psi(u) and of the weight.
+
+    They are computed by quadrature between the kinks of the loss.
+    """
     node, share = np.polynomial.legendre.leggauss(_NODES)
     # The integrand is smooth between the kinks at 0 and at the constant. The panel ends at 6 sigma make the nodes dense
     # where the density is large.
@@ -145,7 +148,7 @@ def _truncated_weight(u: Array, c: float) -> Array:
 
 
 def _late(u: Array, c: float) -> Array:
-    """Return the one-sided loss: Cauchy's loss for positive residuals, u² for negative ones."""
+    """Return the one-sided loss: Cauchy's loss for positive residuals, u² for negative residuals."""
     return np.where(u > 0.0, _cauchy(u, c), u**2)
 
 

@@ -103,7 +103,10 @@ def independent(variance: Array) -> Noise:
 
 
 def group_members(key: Array) -> list[Array]:
-    """Return the indices of equal keys (m,): one array (g, r) for each group size r, with one group in each row."""
+    """Return the indices of equal keys (m,): one array (g, r) for each group size r, with one group in each row.
+
+    For example, the keys (5, 7, 5) give the arrays [[1]] and [[0, 2]].
+    """
     # A stable sort keeps the order of the rows, in which the covariance is given.
     order = np.argsort(key, kind="stable")
     _, first, sizes = np.unique(key[order], return_index=True, return_counts=True)
@@ -235,7 +238,7 @@ def dense(noise: Noise, rows: Array) -> Array:
 
 
 def variances(noise: Noise, count: int) -> Array:
-    """Return the variances (..., m) of all `count` rows."""
+    """Return the variances (..., m) of all m = `count` rows, in the squared units of the rows."""
     shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in noise.blocks))
     out = np.zeros((*shape, count))
     for block in noise.blocks:
@@ -244,7 +247,10 @@ def variances(noise: Noise, count: int) -> Array:
 
 
 def whiten_rows(noise: tuple[Whitener, ...], values: Array) -> Array:
-    """Return whitened values (..., q, p) of values (..., m, p) of all rows, one block after the other."""
+    """Return whitened values (..., q, p) of values (..., m, p) of all rows, one block after the other.
+
+    The q rows of the result are sorted by block, not by row number.
+    """
     parts = [whitener.apply(values) for whitener in noise]
     shape = np.broadcast_shapes(*(part.shape[:-2] for part in parts))
     return np.concatenate([np.broadcast_to(part, (*shape, *part.shape[-2:])) for part in parts], axis=-2)

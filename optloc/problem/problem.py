@@ -92,14 +92,14 @@ class Problem:
 
     @property
     def emitting(self) -> tuple[int, ...]:
-        """Return the numbers of the targets whose emission times are unknown."""
+        """Return the numbers of the targets whose emission times are unknown, ascending; -1 for unlabelled rows."""
         # An unlabelled row (-1) has the emission time of a target that is identified later.
         targets = {t for block in self.rows if MODELS[block.kind].emission for t in set(block.target.tolist())}
         return tuple(sorted(targets))
 
     @cached_property
     def layout(self) -> Layout:
-        """Return the layout of the unknowns."""
+        """Return the layout of the unknowns: the place of each unknown in the parameter vector."""
         # A bias has the unit of the rows that it affects. `layout` has no access to the rows.
         units = [self._unit(bias.row) for bias in self.biases]
         return layout(self.stations, self.motions, self.biases, self.emitting, self.epochs, units)
@@ -237,7 +237,7 @@ class Problem:
         return taken
 
     def with_rows(self, z: Array | None = None, weight: Array | None = None) -> Problem:
-        """Return the problem with new measurements or weights of all rows, each (..., m)."""
+        """Return the problem with new measurements or weights of all rows, each (..., m); None keeps the old ones."""
         rows, cut = [], np.cumsum([block.count for block in self.rows])[:-1]
         zs = [block.z for block in self.rows] if z is None else np.split(z, cut, axis=-1)
         weights = [block.weight for block in self.rows] if weight is None else np.split(weight, cut, axis=-1)

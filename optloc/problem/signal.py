@@ -101,7 +101,10 @@ class Signal:
 
     @cached_property
     def _levels(self) -> Array:
-        """Return the covariance (s, s) of the log-amplitudes, without the error that all stations share."""
+        """Return the covariance (s, s) of the log-amplitudes, without the error that all stations share.
+
+        With a reference station, the row and the column of this station are zero.
+        """
         levels = np.diag(self._factor)
         if self.reference is None:
             return levels

@@ -81,7 +81,7 @@ class Truncated:
 
     @property
     def cuts(self) -> Array:
-        """Return a flag (...) for each distribution that a bound truncates."""
+        """Return a mask (...) of the distributions that a bound truncates."""
         return np.asarray(np.isfinite(self.slack).any(-1) & np.isfinite(self.covariance).all((-1, -2)))
 
     def moments(self) -> tuple[Array, Array]:
@@ -115,7 +115,8 @@ class Truncated:
     def distance_squared(self, points: Array) -> Array:
         """Return the chi-square value (...) of the highest-density region whose edge contains points (..., d).
 
-        For one distribution; points are in metres from the fix. The value is infinite for points that a bound excludes.
+        Call it for one distribution. Points are in metres from the fix. The value is infinite for points that a bound
+        excludes.
         """
         from scipy.special import gammaincinv
 
@@ -128,7 +129,7 @@ class Truncated:
         return np.where(self.admits(points) & is_along(rays.projector, points), value, np.inf)
 
     def admits(self, points: Array) -> Array:
-        """Return a flag (...) for points (..., d), metres from the fix of one distribution, that the bounds admit."""
+        """Return a mask (...) of the points (..., d), metres from the fix of one distribution, inside the bounds."""
         sigma = np.sqrt(np.maximum(np.einsum("hi,ij,hj->h", self.normal, self.covariance, self.normal), 0.0))
         beyond = points @ self.normal.T - np.where(np.isfinite(self.slack), self.slack, 0.0)
         outside = np.isfinite(self.slack) & (beyond > self.give + _ON * sigma)
@@ -174,8 +175,7 @@ class Truncated:
     def draw(self, n: int, seed: int) -> tuple[Array, Array]:
         """Return n random points (n, d) of one distribution, metres from the fix, and their excesses (n,).
 
-        The excess of a point is its squared deviation minus the squared deviation of the fix. The points are a
-        systematic resampling of nodes on the rays; `seed` determines its start.
+        The points are a systematic resampling of nodes on the rays; `seed` determines its start.
         """
         rays = self._rays()
         place, weight = rays.spread()
@@ -225,7 +225,10 @@ class Truncated:
         return _Rays(lean, length, rank, middle, whitener, factor @ whitener, place, tip, weight)
 
     def exits(self, step: Array) -> Array:
-        """Return the number (k,) of steps (k, d) from the fix to the first bound; infinite without a bound."""
+        """Return the number (k,) of steps (k, d), metres, from the fix to the first bound; infinite without a bound.
+
+        The number is not an integer: 2.5 means that the bound is 2.5 times the step away.
+        """
         rate, size = step @ self.normal.T, np.sqrt((step**2).sum(-1, keepdims=True))
         with np.errstate(divide="ignore", invalid="ignore"):
             length = np.where(rate > _EXACT * size, np.maximum(self.slack, 0.0) / rate, np.inf)
@@ -298,7 +301,7 @@ class _Rays(NamedTuple):
 
 
 def is_along(projector: Array, points: Array) -> Array:
-    """Return a flag (...) for points (..., d), metres from a fix, near the surface of its equality constraints.
+    """Return a mask (...) of the points (..., d), metres from a fix, near the surface of its equality constraints.
 
     `projector` (..., d, d) projects onto the tangent plane. The tolerance allows for a surface as curved as the Earth.
     """
@@ -308,7 +311,10 @@ def is_along(projector: Array, points: Array) -> Array:
 
 
 def _moments_behind_one_bound(distribution: Truncated) -> tuple[Array, Array]:
-    """Return mean minus fix (..., d) and covariance (..., d, d) of distributions truncated at their first bound."""
+    """Return mean minus fix (..., d) and covariance (..., d, d) of distributions truncated at their first bound.
+
+    The units are metres and square metres. Only the first bound of each distribution counts.
+    """
     from scipy.special import log_ndtr
 
     first = np.isfinite(distribution.slack).argmax(-1)[..., None]
@@ -327,7 +333,10 @@ def _moments_behind_one_bound(distribution: Truncated) -> tuple[Array, Array]:
 
 
 def factor_of(covariance: Array) -> Array:
-    """Return a matrix F (d, rank) with F F' = covariance (d, d), which may be singular."""
+    """Return a matrix F (d, rank) with F F' = covariance (d, d), which may be singular.
+
+    F converts `rank` independent standard normal numbers to a displacement in metres.
+    """
     lower = factor_semidefinite(covariance)
     return np.asarray(lower[:, np.diagonal(lower) ** 2 > HELD * np.trace(covariance)])
 

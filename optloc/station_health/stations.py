@@ -384,7 +384,10 @@ def offsets_of(made: Elements, tests: Tested) -> Offsets:
 
 
 def _sparse(values: Array, column: Array, count: int) -> sparse.csr_array:
-    """Return a sparse matrix (n, count) with values (n, c) at columns (n, c); column -1 means no entry."""
+    """Return a sparse matrix (n, count) with values (n, c) at columns (n, c); column -1 means no entry.
+
+    The argument `column` (n, c) gives the columns; equal columns of a row add up.
+    """
     kept = (column >= 0) & (values != 0.0)
     row = np.broadcast_to(np.arange(len(column))[:, None], column.shape)
     return sparse.csr_array((values[kept], (row[kept], column[kept])), shape=(len(column), count))

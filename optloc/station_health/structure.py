@@ -368,7 +368,10 @@ class _NoiseFixes:
     x: Array
 
     def levels(self, batch: Problem) -> NoiseLevels:
-        """Return the levels from stretches of the fixes, or from all fixes if the stretches lack some groups."""
+        """Return the levels from stretches of the fixes, or from all fixes if the stretches lack some groups.
+
+        A thousand fixes determine the levels well enough, in constant time; see `_stretches`.
+        """
         all_fixes, part = batch.take(self.kept), _stretches(len(self.kept))
         chosen = all_fixes.take(part)
         if _present_groups(chosen, self.by) != _present_groups(all_fixes, self.by):
@@ -383,7 +386,10 @@ def _present_groups(batch: Problem, by: By) -> set[str]:
 
 
 def _stretches(count: int) -> Array:
-    """Return the numbers of the fixes that determine the structure: all, or evenly spaced stretches."""
+    """Return the numbers of the fixes that determine the structure: all, or evenly spaced stretches.
+
+    Stretches contain successive epochs, which the correlation between epochs needs. `count` is the number of fixes.
+    """
     if count <= _MANY:
         return np.arange(count)
     first = np.linspace(0, count - _STRETCH, _MANY // _STRETCH).astype(int)
