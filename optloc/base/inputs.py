@@ -295,7 +295,7 @@ def _open(path: Path) -> int:
 def _similar_file(path: Path) -> str:
     """Return advice for a file that does not exist: a similar name in the same folder."""
     try:
-        names = sorted(found.name for found in islice(path.parent.iterdir(), _NAMES))
+        names = sorted(entry.name for entry in islice(path.parent.iterdir(), _NAMES))
     except OSError:
         names = []
     near = nearest(path.name, names)

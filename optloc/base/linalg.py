@@ -434,8 +434,8 @@ def spread_directions(count: int, d: int) -> Array:
     """Return evenly distributed unit vectors (count, d): on a circle, or on a golden-angle spiral on the sphere."""
     number = np.arange(count) + 0.5
     if d == 2:
-        turn = 2.0 * np.pi * number / count
-        return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    height, turn = 1.0 - 2.0 * number / count, np.pi * (1.0 + np.sqrt(5.0)) * number
-    across = np.sqrt(1.0 - height**2)
-    return np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=-1)
+        angle = 2.0 * np.pi * number / count
+        return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    height, angle = 1.0 - 2.0 * number / count, np.pi * (1.0 + np.sqrt(5.0)) * number
+    radius = np.sqrt(1.0 - height**2)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)

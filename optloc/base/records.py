@@ -93,19 +93,19 @@ def join(parts: Iterable[Record], count: int) -> Record:
     count : int
         Total number of entries.
     """
-    whole: dict[str, _Column] = {}
+    columns: dict[str, _Column] = {}
     pieces: dict[str, list[tuple[int, Any]]] = {}
     first, start = None, 0
     for part in parts:
         first, size = part if first is None else first, _count(part)
         for name, value, layout in _arrays(part):
-            whole.setdefault(name, _Column(layout, count)).put(slice(start, start + size), value)
+            columns.setdefault(name, _Column(layout, count)).put(slice(start, start + size), value)
         for name, piece in _parts(part):
             pieces.setdefault(name, []).append((start, piece))
         start += size
     assert first is not None
-    changed: dict[str, Any] = {name: column.array() for name, column in whole.items()}
-    changed |= {name: join(_fill_gaps(own, count), count) for name, own in pieces.items()}
+    changed: dict[str, Any] = {name: column.array() for name, column in columns.items()}
+    changed |= {name: join(_fill_gaps(records_of_field, count), count) for name, records_of_field in pieces.items()}
     return replace(first, **changed)  # type: ignore[type-var]
 
 
@@ -178,14 +178,14 @@ class _Column:
 
     def _shares(self, value: Array) -> bool:
         """Return whether a part is one row for all its entries, equal to the row of the earlier parts."""
-        return value.strides[0] == 0 and all(_is_equal(own[:1], value[:1]) for _, own in self.parts[:1])
+        return value.strides[0] == 0 and all(_is_equal(earlier[:1], value[:1]) for _, earlier in self.parts[:1])
 
     def _is_shared(self) -> bool:
         """Return whether all entries of all parts share one row."""
-        own = [value for _, value in self.parts]
-        if sum(map(len, own)) < self.count or len({value.shape[1:] for value in own}) > 1:
+        values = [value for _, value in self.parts]
+        if sum(map(len, values)) < self.count or len({value.shape[1:] for value in values}) > 1:
             return False
-        return not self.layout.slots or all(map(self._shares, own))
+        return not self.layout.slots or all(map(self._shares, values))
 
     def _allocate(self, like: Array, shape: tuple[int, ...]) -> None:
         """Allocate the array of all entries with rows of this shape, and copy the waiting parts into it.

@@ -362,7 +362,7 @@ class _DerivedKinds(dict[str, Model]):
     """Table of kinds that are not listed: kinds along rays, made from their names, and distances between stations."""
 
     def __missing__(self, name: str) -> Model:
-        """Return the kind with this name; raise KeyError if no such kind can be derived."""
+        """Return the kind with this name; raise KeyError if the name is not a derived kind."""
         if name == BETWEEN:
             return Model(lambda t, a, b: distance(a, b), "length", 2, "distance of two stations")
         if not name.startswith(RAY):
@@ -372,7 +372,7 @@ class _DerivedKinds(dict[str, Model]):
 
 @lru_cache(maxsize=64)
 def _along_rays(name: str) -> Model:
-    """Return the kind "ray_...", measured along the rays of a medium; raise KeyError if there is no such model."""
+    """Return the kind "ray_...", measured along the rays of a medium; raise KeyError without a model for bent rays."""
     kind = name.removeprefix(RAY)
     model = MODELS[kind]
     if model.ray is None:

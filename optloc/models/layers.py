@@ -292,7 +292,7 @@ class _Legs(NamedTuple):
     def cosines(self, sine: Array, cosine: Array) -> tuple[Array, Array]:
         """Return w at both ends of all legs, each (L, n), computed without a difference of nearly equal numbers.
 
-        `sine` and `cosine` (n,) belong to the angle from the vertical at the top speed, also in the other methods.
+        `sine` and `cosine` (n,) are of the angle from the vertical at the top speed, also in the other methods.
         """
         # By rounding, the top speed can be slightly below a speed that equals it.
         first, second = (np.sqrt(np.maximum(cosine**2 + sine**2 * v, 0.0)) for v in (self.short1, self.short2))
@@ -420,8 +420,8 @@ def first_arrival(table: Layers, across: Array, yt: Array, ya: Array, logarithm:
 def _keep_earlier(best: Array, index: Array, rays: Array) -> None:
     """Write rays that arrive earlier than the best rays so far into `best` (4, n).
 
-    `index` (k,) is the pair of each new ray. The four rows of `best` and of the new `rays` (4, k) are time, p, the
-    derivative of p with respect to the distance, and turns. A time of NaN means no ray.
+    `index` (k,) is the pair of each new ray. The rows of `best` and of the new `rays` (4, k) are time (NaN for no ray),
+    p, derivative of p with respect to the distance, and turns.
     """
     order = np.argsort(-rays[0], kind="stable")  # for several rays of a pair, the first arrival is written last
     order = order[rays[0, order] < best[0, index[order]]]
@@ -495,22 +495,23 @@ class _Bracket(NamedTuple):
 
 
 def _turning_rays(layers: _Layered, across: Array, high: Array, low: Array) -> _FoundRay | None:
-    """Return the rays that turn once, below both ends or above both; None if there are none."""
-    found: list[_Bracket] = []
+    """Return the rays that turn once, below both ends or above both; None if no pair has one."""
+    brackets: list[_Bracket] = []
     # A mirrored table converts rays that turn above to rays that turn below.
     mirrored = (-layers[1][::-1], -layers[0][::-1], layers[3][::-1], layers[2][::-1])
     for table_layers, upper, lower, turns in ((layers, high, low, 1.0), (mirrored, -low, -high, -1.0)):
         slope = (table_layers[3] - table_layers[2]) / (table_layers[1] - table_layers[0])
         for j in np.flatnonzero(slope > 0.0):
-            found += _turning_in(table_layers, int(j), slope[j], (across, upper, lower), turns)
-    if not found:
+            brackets += _turning_in(table_layers, int(j), slope[j], (across, upper, lower), turns)
+    if not brackets:
         return None
     index, low, high, rising, turn = (
-        np.concatenate([getattr(part, name) for part in found]) for name in ("pair", "low", "high", "rising", "turns")
+        np.concatenate([getattr(part, name) for part in brackets])
+        for name in ("pair", "low", "high", "rising", "turns")
     )
-    parts = [part.legs for part in found]
-    each = {name: np.concatenate([getattr(one, name) for one in parts], axis=-1) for name in _Legs._fields}
-    legs = _Legs(**(each | {"times": parts[0].times}))
+    parts = [part.legs for part in brackets]
+    joined = {name: np.concatenate([getattr(one, name) for one in parts], axis=-1) for name in _Legs._fields}
+    legs = _Legs(**(joined | {"times": parts[0].times}))
     return _FoundRay(index, legs, *_of_cotangent(_solve_in_interval(legs, across[index], low, high, rising)), turn)
 
 
@@ -523,19 +524,19 @@ def _turning_in(
     depths (n,). The rays turn below the pairs. `turns` is the number to store in the result.
     """
     across, high, low = pairs
-    begins = np.maximum(low, layers[0][j])
+    start = np.maximum(low, layers[0][j])
     h, c1, c2 = _legs_between(layers, high, low)
-    more, d1, d2 = _legs_between(layers, low, begins)
-    turn, leaves = layers[2][j] + slope * (begins - layers[0][j]), layers[3][j]
-    top = np.maximum(np.maximum(_fastest(h, c1, c2), _fastest(more, d1, d2)), turn)
-    index = np.flatnonzero((low < layers[1][j]) & (top < leaves) & (across > 0.0))
+    heights_below, d1, d2 = _legs_between(layers, low, start)
+    speed_at_start, speed_at_end = layers[2][j] + slope * (start - layers[0][j]), layers[3][j]
+    top = np.maximum(np.maximum(_fastest(h, c1, c2), _fastest(heights_below, d1, d2)), speed_at_start)
+    index = np.flatnonzero((low < layers[1][j]) & (top < speed_at_end) & (across > 0.0))
     if not len(index):
         return
     times = np.repeat([1.0, 2.0], len(h))[:, None]
-    both = (np.concatenate([h, more]), np.concatenate([c1, d1]), np.concatenate([c2, d2]))
-    legs = _Legs.of(both, times, top, turn, np.full(len(top), slope)).take(index)
+    both = (np.concatenate([h, heights_below]), np.concatenate([c1, d1]), np.concatenate([c2, d2]))
+    legs = _Legs.of(both, times, top, speed_at_start, np.full(len(top), slope)).take(index)
     # In terms of the cotangent of the angle at the top speed, the distance in the turning leg is linear.
-    most, distance = np.sqrt((leaves - legs.top) * (leaves + legs.top)) / legs.top, across[index]
+    most, distance = np.sqrt((speed_at_end - legs.top) * (speed_at_end + legs.top)) / legs.top, across[index]
     marks = [most * part / _PARTS for part in range(_PARTS + 1)]
     short = [legs.distance(*_of_cotangent(k)) <= distance for k in marks]
     for part in range(_PARTS):

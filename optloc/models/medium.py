@@ -112,10 +112,15 @@ class Atmosphere:
         for s, weight in _SHARES:
             # Stewart's theorem gives the distance of this point of the line from the centre of the Earth.
             radius = xp.sqrt((1.0 - s) * near * near + s * far * far - s * (1.0 - s) * squared)
-            here = 1e-6 * self.refractivity * weight * xp.exp((_RADIUS - radius) / self.scale_height)
-            falls = -1.0 * here / (self.scale_height * radius)
-            parts = (here, s * far * falls, (1.0 - s) * near * falls, -s * (1.0 - s) * length * falls)
-            total = [so_far + part for so_far, part in zip(total, parts, strict=True)]
+            weighted = 1e-6 * self.refractivity * weight * xp.exp((_RADIUS - radius) / self.scale_height)
+            slope_over_radius = -1.0 * weighted / (self.scale_height * radius)
+            parts = (
+                weighted,
+                s * far * slope_over_radius,
+                (1.0 - s) * near * slope_over_radius,
+                -s * (1.0 - s) * length * slope_over_radius,
+            )
+            total = [partial_sum + part for partial_sum, part in zip(total, parts, strict=True)]
         return total[0], length, (total[1], total[2], total[3])
 
 

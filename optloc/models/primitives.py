@@ -367,12 +367,12 @@ def _scale(partials: dict[int, Any], factor: Any) -> dict[int, Any]:
     return {k: v * factor for k, v in partials.items()}
 
 
-def _sum(left: dict[int, Any], right: dict[int, Any]) -> dict[int, Any]:
+def _sum(first: dict[int, Any], second: dict[int, Any]) -> dict[int, Any]:
     # Most operands are constants or single seeds. The dictionary is copied only if both operands have derivatives.
     """Return the sum of partial derivatives by seed."""
-    if not right:
-        return left
-    total = dict(left)
-    for k, v in right.items():
+    if not second:
+        return first
+    total = dict(first)
+    for k, v in second.items():
         total[k] = total[k] + v if k in total else v
     return total

@@ -173,7 +173,7 @@ def _solve_epoch(scene: Scene, region: PricedRegion, count: int | None, boxes: i
     most_emitters = int(np.isfinite(scene.z).sum()) // scene.least
     tuples, examined_boxes = _drop_expensive(propose_sets(scene), limit), 0
     new_sets, bound = without_one_row(scene, tuples.take(np.arange(min(_PROMISING, len(tuples.cost))))), -np.inf
-    for turn in range(_ROUNDS):
+    for iteration in range(_ROUNDS):
         tuples = _drop_expensive(merge(tuples, new_sets), limit)
         taken, cost = cheapest_sets(tuples, scene.z.shape[1], count)
         # At these prices no examined column has a negative reduced cost. The search checks all other columns.
@@ -183,7 +183,7 @@ def _solve_epoch(scene: Scene, region: PricedRegion, count: int | None, boxes: i
         # Every iteration gives a valid bound, so keep the best.
         bound = max(bound, prices.bound(count, most_emitters, result.floor))
         new_sets = _new_sets(scene, prices, result)
-        if not len(new_sets.cost) or (turn >= _HOPELESS and not np.isfinite(cost)):
+        if not len(new_sets.cost) or (iteration >= _HOPELESS and not np.isfinite(cost)):
             break
     return Solved(tuples, taken, prices, cost, min(bound, cost), examined_boxes)
 
@@ -267,7 +267,7 @@ def _ends(scene: Scene) -> list[tuple[int, int] | None]:
 def _form_tree(pairs: list[tuple[int, int] | None]) -> bool:
     """Return whether pairs of stations form one tree, which is necessary for a closed-form position.
 
-    None stands for a channel with one station, which does not matter.
+    The entry None is a channel with one station, which does not matter.
     """
     trees = [set(pair) for pair in pairs if pair is not None]
     while len(trees) > 1:

@@ -126,9 +126,9 @@ def _cheapest_at(scene: Scene, prices: Prices, x: Array) -> tuple[Array, Array]:
     s = scene.sigma[:, None]
     option = (apart / s) ** 2 + np.log(2.0 * np.pi * s**2) - scene.gain[:, None] + prices.row
     picks = cheapest_rows(scene, option)
-    used = picks >= 0
-    r = np.where(used, np.take_along_axis(apart, np.maximum(picks, 0)[..., None], axis=-1)[..., 0], 0.0)
-    chi2 = (_whiten(scene, used, r[..., None])[..., 0] ** 2).sum(-1)
+    in_set = picks >= 0
+    r = np.where(in_set, np.take_along_axis(apart, np.maximum(picks, 0)[..., None], axis=-1)[..., 0], 0.0)
+    chi2 = (_whiten(scene, in_set, r[..., None])[..., 0] ** 2).sum(-1)
     return chi2 + scene.constant(picks) + of_picks(prices.row, picks).sum(-1) - prices.emitter, picks
 
 
@@ -233,8 +233,8 @@ def _bound_jointly(scene: Scene, picks: Array, apart: Array, slope: Array, remai
     r is z - h at the centre, J the derivatives (`slope`), s the displacement, and q the remainders. Then |r - J s - q|
     >= min_s |r - J s| - |q|, all whitened. `picks` (q, m) are the sure values, and `apart` (q, m, c) all residuals.
     """
-    used = picks >= 0
-    known = used & np.isfinite(slope).all(-1) & np.isfinite(remainder)
+    in_set = picks >= 0
+    known = in_set & np.isfinite(slope).all(-1) & np.isfinite(remainder)
     r = np.where(known, np.take_along_axis(apart, np.maximum(picks, 0)[..., None], axis=-1)[..., 0], 0.0)
     J, q = np.where(known[..., None], slope, 0.0), np.where(known, remainder, 0.0)
     whitened = _whiten(scene, known, np.concatenate([J, r[..., None]], axis=-1))
@@ -245,9 +245,9 @@ def _bound_jointly(scene: Scene, picks: Array, apart: Array, slope: Array, remai
     return np.asarray(np.maximum(np.sqrt((unexplained**2).sum(-1)) - remainder_norm, 0.0) ** 2)
 
 
-def _whiten(scene: Scene, used: Array, columns: Array) -> Array:
-    """Return whitened columns (q, m, c) of the used rows; zero for other rows. `used` (q, m) is a mask."""
+def _whiten(scene: Scene, in_set: Array, columns: Array) -> Array:
+    """Return whitened columns (q, m, c) of the rows in each set; zero for other rows. `in_set` (q, m) is a mask."""
     if scene.independent:
-        return np.asarray(np.where(used[..., None], columns / scene.sigma[:, None], 0.0))
-    both = used[:, :, None] & used[:, None, :]
-    return np.asarray(linalg.whitening(np.where(both, scene.R, 0.0)) @ columns)
+        return np.asarray(np.where(in_set[..., None], columns / scene.sigma[:, None], 0.0))
+    both_in_set = in_set[:, :, None] & in_set[:, None, :]
+    return np.asarray(linalg.whitening(np.where(both_in_set, scene.R, 0.0)) @ columns)

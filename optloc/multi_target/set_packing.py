@@ -74,7 +74,7 @@ def incidence(tuples: Tuples, width: int) -> sparse.csc_array:
 def cheapest_sets(tuples: Tuples, width: int, count: int | None, forced: int | None = None) -> tuple[Array, float]:
     """Return the numbers (n,) of the sets of least total cost that share no row, and their total cost.
 
-    The cost is infinite if there is no such selection.
+    The cost is infinite if no sets meet the conditions.
 
     Parameters
     ----------

@@ -107,16 +107,16 @@ class Scene:
 
     def determinant(self, picks: Array) -> Array:
         """Return ln|2 pi R_T| (q,) of the sets with picks (q, m); R_T is the covariance of the rows of a set."""
-        used = picks >= 0
-        both = used[:, :, None] & used[:, None, :]
+        in_set = picks >= 0
+        both_in_set = in_set[:, :, None] & in_set[:, None, :]
         # Rows outside a set are replaced by ones on the diagonal, so that one call handles sets of all sizes.
-        matrix = np.where(both, 2.0 * np.pi * self.R, np.eye(len(self.R)))
+        matrix = np.where(both_in_set, 2.0 * np.pi * self.R, np.eye(len(self.R)))
         return np.asarray(np.linalg.slogdet(matrix)[1])
 
     def constant(self, picks: Array) -> Array:
         """Return the cost (q,) of sets with picks (q, m) without their chi-square."""
-        used = picks >= 0
-        rows = used @ -self.gain + self.missed * (~used).sum(-1)
+        in_set = picks >= 0
+        rows = in_set @ -self.gain + self.missed * (~in_set).sum(-1)
         return np.asarray(self.determinant(picks) + rows + self.penalty)
 
 

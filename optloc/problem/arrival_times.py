@@ -76,7 +76,7 @@ def as_arrivals(problem: Problem) -> Arrivals | None:
         A flat batch of problems. It omits rows that are absent in all problems.
     """
     numbers = [np.arange(start, start + r.count) for r, start in zip(problem.rows, problem.starts, strict=True)]
-    differences = [own for own, rows in zip(numbers, problem.rows, strict=True) if rows.kind == "tdoa"]
+    differences = [row_numbers for row_numbers, rows in zip(numbers, problem.rows, strict=True) if rows.kind == "tdoa"]
     if not differences or problem.biases or problem.emitting:
         return None
     weight = np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count))
@@ -193,10 +193,12 @@ def _keep_noise(noise: Noise, number: Array) -> Iterator[Block]:
     `number` (m,) is the new number of each original row, and -1 for range differences.
     """
     for block in noise.blocks:
-        kept = (number[block.row] >= 0).all(1)
-        if kept.any():
-            covariance = block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., kept, :, :]
-            yield Block(number[block.row[kept]], covariance)
+        has_number = (number[block.row] >= 0).all(1)
+        if has_number.any():
+            covariance = (
+                block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., has_number, :, :]
+            )
+            yield Block(number[block.row[has_number]], covariance)
 
 
 def restore_order(layout: Layout, other: Layout, x: Array) -> Array:

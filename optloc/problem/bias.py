@@ -117,9 +117,9 @@ def _quantity(problem: Problem, bias: Bias) -> Quantity:
     if form.quantity is not None:
         return form.quantity
     kinds = [rows.kind for rows in problem.rows for _ in range(rows.count)]
-    touched = MODELS[kinds[int(bias.row[0])]].quantity
+    measured = MODELS[kinds[int(bias.row[0])]].quantity
     rates: dict[str, Quantity] = {"length": "speed"}
-    return rates.get(touched, "plain") if form.rate else cast("Quantity", touched)
+    return rates.get(measured, "plain") if form.rate else cast("Quantity", measured)
 
 
 def family(
@@ -159,19 +159,19 @@ def family(
             raise InvalidProblem(f"unknown {what} {value!r}", where, nearest(str(value), known))
     # `per` decides the names of the members and the sign with which each row depends on them.
     bias_form = FORMS[form]
-    touched = _select_rows(rows, bias_form, kind, where)
+    blocks = _select_rows(rows, bias_form, kind, where)
     if not bias_form.of_readings and per != "station":
         raise InvalidProblem("a time along a course belongs to one station", where, "use per = 'station', or groups")
     if per == "kind":
         if members is not None:
             raise InvalidProblem("a kind has no members", where, "leave members out, or use per = 'station'")
-        names, entries = tuple(block.kind for block, _ in touched), _by_kind(touched)
+        names, entries = tuple(block.kind for block, _ in blocks), _by_kind(blocks)
     elif per == "pair":
-        names, entries = _by_pair(touched, stations, members, where)
+        names, entries = _by_pair(blocks, stations, members, where)
     elif per == "target":
-        names, entries = _by_target(touched, targets, members, where)
+        names, entries = _by_target(blocks, targets, members, where)
     else:
-        names, entries = _by_station(touched, bias_form, stations, members, where)
+        names, entries = _by_station(blocks, bias_form, stations, members, where)
     row, member, coefficient = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     # No measurement would determine a member without rows.
     unused = sorted(set(range(len(names))) - set(member.tolist()))
@@ -182,14 +182,14 @@ def family(
     return Bias(name, names, row, member, coefficient, form, np.zeros(1))
 
 
-def _sense(rows: Sequence[Rows], touched: Array) -> float:
+def _sense(rows: Sequence[Rows], affected: Array) -> float:
     """Return the sign of the bias: -1 if the rows contain azimuths and all were read clockwise, otherwise 1.
 
-    `touched` (n,) are the global numbers of the rows that the bias affects. Elevations among these rows do not affect
+    `affected` (n,) are the global numbers of the rows that the bias affects. Elevations among these rows do not affect
     the result.
     """
     ends = np.cumsum([block.count for block in rows])
-    blocks = [rows[i] for i in np.unique(np.searchsorted(ends, touched, side="right"))]
+    blocks = [rows[i] for i in np.unique(np.searchsorted(ends, affected, side="right"))]
     senses = {block.sense for block in blocks if block.kind == "azimuth"}
     return senses.pop() if len(senses) == 1 else 1.0
 
@@ -229,21 +229,21 @@ def _entries(row: Array, member: Array, sign: float) -> _Entries:
     return row[inside], member[inside], np.full(int(inside.sum()), sign)
 
 
-def _by_kind(touched: list[tuple[Rows, int]]) -> list[_Entries]:
-    """Return the entries of a family with one member for each kind; `touched` as returned by `_select_rows`."""
+def _by_kind(blocks: list[tuple[Rows, int]]) -> list[_Entries]:
+    """Return the entries of a family with one member for each kind; `blocks` are the result of `_select_rows`."""
     return [
         _entries(start + np.arange(block.count), np.full(block.count, i), 1.0)
-        for i, (block, start) in enumerate(touched)
+        for i, (block, start) in enumerate(blocks)
     ]
 
 
 def _by_pair(
-    touched: list[tuple[Rows, int]], stations: Sequence[str], members: Members, where: str
+    blocks: list[tuple[Rows, int]], stations: Sequence[str], members: Members, where: str
 ) -> tuple[tuple[str, ...], list[_Entries]]:
     """Return the member names and the entries of a family with one member for each pair of stations."""
     named = (*stations, "")  # the last entry is index -1, no station
     # Each pair has one number. A missing second station (-1) counts as an extra station with an empty name.
-    codes = [block.a * len(named) + block.b % len(named) for block, _ in touched]
+    codes = [block.a * len(named) + block.b % len(named) for block, _ in blocks]
     pairs = np.unique(np.concatenate(codes))
     present = tuple("-".join(filter(None, (named[i // len(named)], named[i % len(named)]))) for i in pairs.tolist())
     if isinstance(members, Mapping):
@@ -252,18 +252,18 @@ def _by_pair(
     member_of = np.array([names.index(label) if label in names else -1 for label in present])
     return names, [
         _entries(start + np.arange(block.count), member_of[np.searchsorted(pairs, code)], 1.0)
-        for (block, start), code in zip(touched, codes, strict=True)
+        for (block, start), code in zip(blocks, codes, strict=True)
     ]
 
 
 def _by_target(
-    touched: list[tuple[Rows, int]], targets: Sequence[str] | None, members: Members, where: str
+    blocks: list[tuple[Rows, int]], targets: Sequence[str] | None, members: Members, where: str
 ) -> tuple[tuple[str, ...], list[_Entries]]:
     """Return the member names and the entries of a family with one member for each target.
 
     `targets` are the names of the targets; without names, a target is named by its number.
     """
-    numbers = np.unique(np.concatenate([block.target for block, _ in touched]))
+    numbers = np.unique(np.concatenate([block.target for block, _ in blocks]))
     present = {int(i): str(i) if targets is None else targets[i] for i in numbers if i >= 0}
     if isinstance(members, Mapping) or not present:
         what = "no row has a target" if not present else "targets have no groups"
@@ -274,17 +274,17 @@ def _by_target(
     member_of = np.full(max(present, default=0) + 2, -1)
     for i, label in present.items():
         member_of[i] = names.index(label) if label in names else -1
-    return names, [_entries(start + np.arange(block.count), member_of[block.target], 1.0) for block, start in touched]
+    return names, [_entries(start + np.arange(block.count), member_of[block.target], 1.0) for block, start in blocks]
 
 
 def _by_station(
-    touched: list[tuple[Rows, int]], form: BiasForm, stations: Sequence[str], members: Members, where: str
+    blocks: list[tuple[Rows, int]], form: BiasForm, stations: Sequence[str], members: Members, where: str
 ) -> tuple[tuple[str, ...], list[_Entries]]:
     """Return the member names and the entries of a family with one member for each station or group of stations.
 
     A row with two stations gets two entries. The form of the bias gives the signs of both stations.
     """
-    measuring = np.unique(np.concatenate([index for block, _ in touched for index in (block.a, block.b)]))
+    measuring = np.unique(np.concatenate([index for block, _ in blocks for index in (block.a, block.b)]))
     if isinstance(members, Mapping):
         owner = dict(_owners(members, stations, where))
         names = tuple(members)
@@ -295,7 +295,7 @@ def _by_station(
     member_of = np.array([*(owner.get(name, -1) for name in stations), -1])  # the last entry is index -1, no station
     return names, [
         _entries(start + np.arange(block.count), member_of[index], float(sign))
-        for block, start in touched
+        for block, start in blocks
         for index, sign in zip((block.a, block.b), form.signs(MODELS[block.kind]), strict=True)
         if sign
     ]
@@ -515,11 +515,11 @@ def scale_of(speed: float, sigma: float, rows: Sequence[Array], place: str) -> B
     place : str
         Location that error messages name.
     """
-    touched = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *rows]))
-    if not len(touched):
+    affected = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *rows]))
+    if not len(affected):
         raise InvalidProblem("the speed has a sigma, but no measurement is a time", place, "leave the sigma out")
-    member, ones = np.zeros(len(touched), dtype=np.int64), np.ones(len(touched))
-    return Bias(SPEED, (f"{speed:g} m/s",), touched, member, ones, "scale", np.zeros(1), np.array([sigma / speed]))
+    member, ones = np.zeros(len(affected), dtype=np.int64), np.ones(len(affected))
+    return Bias(SPEED, (f"{speed:g} m/s",), affected, member, ones, "scale", np.zeros(1), np.array([sigma / speed]))
 
 
 def estimated_speed(name: str, member: str, value: float, sigma: float) -> tuple[float, float] | None:

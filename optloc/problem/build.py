@@ -413,9 +413,9 @@ def station_array(
             f"stations have shape {array.shape}", where="stations", advice="give an array (stations, 2 or 3) in metres"
         )
     labels = tuple(names) if names is not None else tuple(f"S{i}" for i in range(array.shape[-2]))
-    rates, own = (None if v is None else np.asarray(numbers(v, "stations")) for v in (velocity, axes))
+    rates, axes_array = (None if v is None else np.asarray(numbers(v, "stations")) for v in (velocity, axes))
     # For stations at rest the epoch axis has length one.
-    return Stations(_dated(array, 2), labels, _dated(rates, 2), _dated(own, 3))
+    return Stations(_dated(array, 2), labels, _dated(rates, 2), _dated(axes_array, 3))
 
 
 def _dated(array: Any, rank: int) -> Any:
@@ -460,7 +460,7 @@ def _arrival_blocks(m: Measured, start: int, variance: Array) -> list[noises.Blo
     """Return one noise block for each epoch and target, because its rows combine the same arrivals.
 
     The block is the covariance of the arrivals plus the independent variance of each row. `start` is the global number
-    of the first row. `variance` (..., s) is the variance of what each station measures.
+    of the first row. `variance` (..., s) is the variance of the arrival at each station.
     """
     rows, signs = m.rows, MODELS[m.rows.kind].signs
     if signs is None:

@@ -122,15 +122,15 @@ def epoch_groups(problem: Problem) -> tuple[EpochGroup, ...]:
         A separable run, without batch axes.
     """
     assert separable(problem)
-    whole = (EpochGroup(np.arange(problem.epochs), problem),)
+    one_group = (EpochGroup(np.arange(problem.epochs), problem),)
     # A plan contains the names of stations with unknown errors, and the axes of stations, so stations must not differ.
     if problem.batch_shape or problem.stations.unknown_for or problem.stations.axes is not None:
-        return whole
+        return one_group
     table = _RowTable.of(problem)
-    found = [_epoch_group(problem, table, epochs, rows) for epochs, rows in table.alike()]
-    layouts = [one.take(slice(1)).problem.layout if one.rows is not None and one.rows.size else None for one in found]
+    groups = [_epoch_group(problem, table, epochs, rows) for epochs, rows in table.alike()]
+    layouts = [one.take(slice(1)).problem.layout if one.rows is not None and one.rows.size else None for one in groups]
     # Epochs without rows, or without an unknown that other epochs have, fit into one common batch only.
-    return whole if any(layout != layouts[0] or layout is None for layout in layouts) else tuple(found)
+    return one_group if any(layout != layouts[0] or layout is None for layout in layouts) else tuple(groups)
 
 
 def problem_of(groups: Sequence[EpochGroup], epoch: int) -> Problem:
@@ -152,10 +152,10 @@ def explanations_by_epoch(problem: Problem, explanations: Array) -> Array:
 
     `explanations` (k,) is an object array with a tuple of explanations for each epoch.
     """
-    out, place = explanations.copy(), rows_by_epoch(problem)
+    out, batch_row = explanations.copy(), rows_by_epoch(problem)
     for one in epoch_groups(problem):
         if one.rows is not None:
-            for epoch, rows in zip(one.epochs, place[one.rows], strict=True):
+            for epoch, rows in zip(one.epochs, batch_row[one.rows], strict=True):
                 out[epoch] = tuple(_renumbered(each, rows) for each in out[epoch])
     return out
 
@@ -200,8 +200,8 @@ class _RowTable:
         for one in problem.noise.blocks:
             if one.row.shape[1] > 1:
                 noise[one.row] = one.row[:, :1]
-        _, place = first_rows(block, a + 1, b + 1, target + 1)  # -1 is no station
-        order = np.lexsort((place, block, epoch))
+        _, kind_of_row = first_rows(block, a + 1, b + 1, target + 1)  # -1 is no station
+        order = np.lexsort((kind_of_row, block, epoch))
         return cls(block, a, b, target, epoch, weight > 0.0, noise, order, problem.epochs)
 
     def alike(self) -> Iterator[tuple[Array, Array]]:

@@ -70,14 +70,14 @@ def by_epoch(problem: Problem) -> Problem:
     batch_row, size = _joined(parts)
     batch, k = problem.batch_shape, problem.epochs
     rows = []
-    for old, (keys, place) in zip(problem.rows, parts, strict=True):
+    for old, (keys, batch_rows) in zip(problem.rows, parts, strict=True):
         # A row of the batch is one (stations, target, occurrence): a pair measured twice in an epoch has two rows.
         a, b, target, _ = keys.T
 
-        def spread(values: Array, old: Rows = old, place: Array = place, size: int = len(keys)) -> Array:
+        def spread(values: Array, old: Rows = old, batch_rows: Array = batch_rows, size: int = len(keys)) -> Array:
             """Return values (..., m) of one kind at their rows of the batch, (..., k, size); zero for absent rows."""
             out = np.zeros((*batch, k, size))
-            out[..., old.epoch, place] = values
+            out[..., old.epoch, batch_rows] = values
             return out
 
         rows.append(
@@ -104,7 +104,9 @@ def rows_by_epoch(problem: Problem) -> Array:
 def _joined(parts: Sequence[tuple[Array, Array]]) -> tuple[Array, int]:
     """Return the row number in the batch of each row (m,) of all kinds, and the number of rows of the batch."""
     starts = np.cumsum([0, *(len(keys) for keys, _ in parts)])
-    return np.concatenate([start + place for (_, place), start in zip(parts, starts, strict=False)]), int(starts[-1])
+    return np.concatenate([start + row_in_kind for (_, row_in_kind), start in zip(parts, starts, strict=False)]), int(
+        starts[-1]
+    )
 
 
 def states_by_epoch(problem: Problem) -> Problem:
@@ -167,12 +169,12 @@ def _distinct_rows(rows: Rows) -> tuple[Array, Array]:
     named = np.ravel_multi_index(tuple(columns + 1), tuple(columns.max(axis=1, initial=0) + 2))
     occurrence = _occurrences(named * (1 + rows.epoch.max(initial=0)) + rows.epoch)
     each = named * (1 + occurrence.max(initial=0)) + occurrence
-    _, first, place = np.unique(each, return_index=True, return_inverse=True)
+    _, first, index = np.unique(each, return_index=True, return_inverse=True)
     order = np.argsort(first)
     number = np.empty_like(order)
     number[order] = np.arange(len(order))
     first = first[order]
-    return np.column_stack([columns[:, first].T, occurrence[first]]), number[place]
+    return np.column_stack([columns[:, first].T, occurrence[first]]), number[index]
 
 
 def _occurrences(values: Array) -> Array:
@@ -257,11 +259,11 @@ def _group_noise(blocks: tuple[Block, ...], batch_row: Array, epoch: Array, memb
         inside = np.flatnonzero(np.isin(batch_row[block.row[:, 0]], members))
         if not len(inside):
             continue
-        place = np.vectorize(slot.__getitem__)(batch_row[block.row[inside]])
+        slots = np.vectorize(slot.__getitem__)(batch_row[block.row[inside]])
         covariance = np.broadcast_to(
             block.covariance, (*block.covariance.shape[:-3], *block.row.shape, block.row.shape[1])
         )[..., inside, :, :]
-        out[..., epoch[block.row[inside, 0]][:, None, None], 0, place[:, :, None], place[:, None, :]] = covariance
+        out[..., epoch[block.row[inside, 0]][:, None, None], 0, slots[:, :, None], slots[:, None, :]] = covariance
     return Block(members[None], out)
 
 
@@ -400,22 +402,22 @@ def some_epochs(problem: Problem, epochs: Array) -> Problem:
 def _as_separate_run(problem: Problem, part: Problem, when: slice | Array) -> Problem:
     """Return `part`, the rows of some increasing epochs `when` of a run, as a run that has these epochs only."""
 
-    def own(values: Array | None, core: int) -> Array | None:
+    def select(values: Array | None, core: int) -> Array | None:
         if values is None or values.shape[-core] == 1:
             return values
         return np.moveaxis(np.moveaxis(values, -core, 0)[when], 0, -core)
 
     s, number = problem.stations, np.arange(problem.epochs)[when]
     # Station numbers, reference times and unknowns of the run stay. Only arrays with an epoch axis are cut.
-    position = own(s.position, 3)
+    position = select(s.position, 3)
     assert position is not None
     motions = tuple(
-        replace(m, known=own(m.known, 3), reference=_reference(problem, m), rise=own(m.rise, 2))
+        replace(m, known=select(m.known, 3), reference=_reference(problem, m), rise=select(m.rise, 2))
         for m in problem.motions
     )
     return replace(
         part,
-        stations=replace(s, position=position, velocity=own(s.velocity, 3), axes=own(s.axes, 4)),
+        stations=replace(s, position=position, velocity=select(s.velocity, 3), axes=select(s.axes, 4)),
         rows=tuple(replace(rows, epoch=np.searchsorted(number, rows.epoch)) for rows in part.rows),
         times=problem.times[when],
         motions=motions,

@@ -346,8 +346,8 @@ def map_numbers(problem: Problem, change: Any) -> Problem:
     """
 
     def changed(part: Any) -> Any:
-        found = [(name, array, change(array, core)) for name, array, core in _numbers(part)]
-        numbers = {name: new for name, old, new in found if new is not old}
+        arrays = [(name, array, change(array, core)) for name, array, core in _numbers(part)]
+        numbers = {name: new for name, old, new in arrays if new is not old}
         return replace(part, **numbers) if numbers else part
 
     def each(parts: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -178,11 +178,11 @@ class Truncated:
         The points are a systematic resampling of nodes on the rays; `seed` determines its start.
         """
         rays = self._rays()
-        place, weight = rays.spread()
+        nodes, weight = rays.spread()
         share = np.cumsum(weight.ravel())
         targets = (np.random.default_rng(seed).random() + np.arange(n)) / n * share[-1]
         chosen = np.searchsorted(share, targets).clip(max=share.size - 1)
-        points = place.reshape(-1, place.shape[-1])[chosen]
+        points = nodes.reshape(-1, nodes.shape[-1])[chosen]
         away = (points - self.shift) @ rays.whitener.T
         return points, (away**2).sum(-1) - (rays.middle**2).sum()
 

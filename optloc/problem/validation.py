@@ -151,8 +151,8 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
         raise InvalidProblem(f"{rows.kind} rows in ECEF need the stations' own axes", rows.kind, advice)
     if model.velocity and model.stations and problem.stations.velocity is None:
         # Stations without velocities count as fixed. Stations whose positions change do not.
-        place = problem.stations.position
-        moved = np.argwhere((place != place[..., :1, :, :]).any(-1))
+        position = problem.stations.position
+        moved = np.argwhere((position != position[..., :1, :, :]).any(-1))
         if len(moved):
             what = f"station {problem.stations.names[int(moved[0][-1])]!r} moves, but has no velocity for {rows.kind}"
             advice = "give velocities (vx, vy, vz in a file): differences of positions are too coarse for rates"
@@ -197,9 +197,9 @@ def check_values(rows: Rows) -> None:
     """
     large = np.abs(rows.z) > LARGEST
     if large.any():
-        place = tuple(np.argwhere(large)[0])
-        why = "infinite" if np.isinf(rows.z[place]) else f"beyond {LARGEST:g}"
-        what = f"{rows.kind} row {place[-1]} is {why}"
+        index = tuple(np.argwhere(large)[0])
+        why = "infinite" if np.isinf(rows.z[index]) else f"beyond {LARGEST:g}"
+        what = f"{rows.kind} row {index[-1]} is {why}"
         raise InvalidProblem(what, "z", "remove the row or give it weight zero")
 
 
@@ -244,8 +244,8 @@ def _check_times(problem: Problem) -> None:
     if times.ndim != 1 or _out_of_range(times)[0].any():
         raise InvalidProblem("times are not a list of finite seconds", "times", "give one number per epoch")
     if (np.diff(times) <= 0.0).any():
-        place = int(np.flatnonzero(np.diff(times) <= 0.0)[0]) + 1
-        raise InvalidProblem(f"epoch {place} is not later than epoch {place - 1}", "times", "sort the epochs")
+        epoch = int(np.flatnonzero(np.diff(times) <= 0.0)[0]) + 1
+        raise InvalidProblem(f"epoch {epoch} is not later than epoch {epoch - 1}", "times", "sort the epochs")
     if any(rows.epoch.max(initial=0) >= len(times) for rows in problem.rows):
         raise InvalidProblem(f"there are only {len(times)} times", "times", "give one for each epoch")
 

@@ -285,16 +285,16 @@ def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
     return fixed, flat.x[fixed]
 
 
-def levels_of(made: Elements, by: By, common: By | None = None, *, tails: bool = True) -> NoiseLevels:
+def levels_of(linearised: Elements, by: By, common: By | None = None, *, tails: bool = True) -> NoiseLevels:
     """Return the noise levels of linearised fixes.
 
     `by` is the grouping of errors, and `common` the grouping of shared errors of an epoch, if any. `tails` adds factors
     that bound the tails; see `noise_levels`.
     """
-    return replace(_report(made, by, *fitted(made, common), tails=tails), common=common)
+    return replace(_report(linearised, by, *fitted(linearised, common), tails=tails), common=common)
 
 
-def fitted(made: Elements, shared_by: By | None) -> tuple[VarianceFit, Array]:
+def fitted(linearised: Elements, shared_by: By | None) -> tuple[VarianceFit, Array]:
     """Return the fit of the variance factors, and a mask (G,) of the common errors without evidence.
 
     Common errors without evidence are zero. The fit is repeated without common errors whose interval includes zero; see
@@ -302,16 +302,16 @@ def fitted(made: Elements, shared_by: By | None) -> tuple[VarianceFit, Array]:
     """
     from threadpoolctl import threadpool_limits
 
-    common = made.common[:-1]
+    common = linearised.common[:-1]
     # Threads do not speed up products of small matrices. On a busy machine, waiting for them takes ten times as long.
     with threadpool_limits(1):
-        without_common = fit(made, common, common)
+        without_common = fit(linearised, common, common)
         # The problem states no noise for common errors, so without evidence they are zero.
-        evident = _all_or_none(visible(made, without_common, common), common, shared_by)
-        result = fit(made, common & ~evident, common) if evident.any() else without_common
+        evident = _all_or_none(visible(linearised, without_common, common), common, shared_by)
+        result = fit(linearised, common & ~evident, common) if evident.any() else without_common
         while (still_evident := _all_or_none(evident & (result.low > 0.0), common, shared_by)).sum() < evident.sum():
             evident = still_evident
-            result = fit(made, common & ~evident, common) if evident.any() else without_common
+            result = fit(linearised, common & ~evident, common) if evident.any() else without_common
     return result, common & ~evident
 
 
@@ -324,24 +324,26 @@ def _all_or_none(shown: Array, common: Array, by: By | None) -> Array:
     return shown if by == "kind" else common & shown.any()
 
 
-def _report(made: Elements, by: By, fit_result: VarianceFit, no_evidence: Array, *, tails: bool) -> NoiseLevels:
+def _report(linearised: Elements, by: By, fit_result: VarianceFit, no_evidence: Array, *, tails: bool) -> NoiseLevels:
     """Return the levels of all groups with errors, from a fit and the mask `no_evidence` (G,) of common errors."""
-    size = len(made.names)
-    count, gross = total(made.of_effect, size), total(made.of_effect, size, fit_result.gross)
+    size = len(linearised.names)
+    count, gross = total(linearised.of_effect, size), total(linearised.of_effect, size, fit_result.gross)
     with_errors = np.flatnonzero(count)
     # T_jj times the variance is the share of an error that the residuals show.
-    share = fit_result.tests.size[:, : fit_result.gross.shape[1]] * np.nan_to_num(fit_result.variance)[made.of_effect]
-    redundancy, factor = total(made.of_effect, size, share), np.sqrt(fit_result.variance)
+    share = (
+        fit_result.tests.size[:, : fit_result.gross.shape[1]] * np.nan_to_num(fit_result.variance)[linearised.of_effect]
+    )
+    redundancy, factor = total(linearised.of_effect, size, share), np.sqrt(fit_result.variance)
     # Errors that are gross for the fitted noise are left out of both ratios, so that the ratios are comparable.
-    is_zero = np.append(no_evidence, False)[made.of_effect]
-    stated = without(tested(made, np.where(is_zero, 0.0, 1.0)), fit_result.gross)
+    is_zero = np.append(no_evidence, False)[linearised.of_effect]
+    stated = without(tested(linearised, np.where(is_zero, 0.0, 1.0)), fit_result.gross)
     low, high = (np.where(no_evidence, np.nan, np.sqrt(end)) for end in (fit_result.low, fit_result.high))
-    names = np.array(made.names, dtype=object)
-    tail_factor = np.where(np.isnan(fit_result.low), 1.0, tail_factors(made, fit_result) if tails else 1.0)
+    names = np.array(linearised.names, dtype=object)
+    tail_factor = np.where(np.isnan(fit_result.low), 1.0, tail_factors(linearised, fit_result) if tails else 1.0)
     return NoiseLevels(
         by,
-        tuple(made.names[i] for i in with_errors),
-        np.sqrt(total(made.of_effect, size, made.sigma**2)[with_errors] / count[with_errors]),
+        tuple(linearised.names[i] for i in with_errors),
+        np.sqrt(total(linearised.of_effect, size, linearised.sigma**2)[with_errors] / count[with_errors]),
         factor[with_errors],
         (factor * fit_result.error)[with_errors],
         low[with_errors],
@@ -383,20 +385,20 @@ def _ratio(tests: Tested) -> float:
 _SCARCE = 2.0
 
 
-def _sentences(names: Array, found: VarianceFit, redundancy: Array, no_evidence: Array) -> tuple[str, ...]:
+def _sentences(names: Array, fit_result: VarianceFit, redundancy: Array, no_evidence: Array) -> tuple[str, ...]:
     """Return sentences about the levels that the data do not determine.
 
     `redundancy` (G,) is the number of errors of each group that the residuals show, as a sum of shares. `no_evidence`
     (G,) marks common errors without evidence.
     """
     sentences = []
-    if found.shared.any():
-        what = "it keeps the stated noise" if found.stay else "all of them share one factor"
-        apart = "" if found.stay else " separately"
-        sentences.append(f"the data do not determine the noise of {_list(names[found.shared])}{apart}: {what}")
-    if (maybe_zero := ~found.shared & (found.low == 0.0)).any():
+    if fit_result.shared.any():
+        what = "it keeps the stated noise" if fit_result.stay else "all of them share one factor"
+        apart = "" if fit_result.stay else " separately"
+        sentences.append(f"the data do not determine the noise of {_list(names[fit_result.shared])}{apart}: {what}")
+    if (maybe_zero := ~fit_result.shared & (fit_result.low == 0.0)).any():
         sentences.append(f"the noise of {_list(names[maybe_zero])} may be zero: the level used is a lower limit")
-    if (scarce := np.isfinite(found.low) & (redundancy < _SCARCE)).any():
+    if (scarce := np.isfinite(fit_result.low) & (redundancy < _SCARCE)).any():
         sentences.append(f"the redundancy of {_list(names[scarce])} is below two: its level is unreliable")
     if no_evidence.any():
         sentences.append(f"the data do not show that rows have an error in common: {_list(names[no_evidence])}")
@@ -457,8 +459,8 @@ def late_signals(problem: Problem, *, method: str = "cauchy", fix: Fix | None = 
     arrivals = as_arrivals(batch)
     batch, share = batch if arrivals is None else arrivals.problem, 1.0
     for _ in range(_ROUNDS):
-        found = late_signals_at(batch, *usable(batch, solve(batch, method)))
-        if not found.share or abs(np.log(found.share / share)) < _SAME:
+        late = late_signals_at(batch, *usable(batch, solve(batch, method)))
+        if not late.share or abs(np.log(late.share / share)) < _SAME:
             break
-        method, share = found.method, found.share
-    return found
+        method, share = late.method, late.share
+    return late

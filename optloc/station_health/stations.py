@@ -164,21 +164,23 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
         Explanations of all fixes, if suspects were searched for.
     """
     fixes, x = fixed
-    made = elements(batch.take(fixes), x, by)
-    _check_redundancy(made)
+    linearised = elements(batch.take(fixes), x, by)
+    _check_redundancy(linearised)
     # Gross errors are detected after noise and offsets are known. Otherwise a bias would be an outlier of every fix.
-    levels, offsets = _estimate_jointly(made, by)
+    levels, offsets = _estimate_jointly(linearised, by)
     tests = snooped(
-        tested(_subtract(made, offsets), _variance(made, levels)), slice(made.effect.shape[-1], None), OUTLIER
+        tested(_subtract(linearised, offsets), _variance(linearised, levels)),
+        slice(linearised.effect.shape[-1], None),
+        OUTLIER,
     )
-    item, column = np.nonzero(np.isfinite(tests.sigma) & (made.of_offset >= 0))
-    group = made.of_offset[item, column]
+    item, column = np.nonzero(np.isfinite(tests.sigma) & (linearised.of_offset >= 0))
+    group = linearised.of_offset[item, column]
     outlying = tests.gross[item, column]
-    count = np.bincount(group, minlength=len(made.names))
+    count = np.bincount(group, minlength=len(linearised.names))
     with_residuals = np.flatnonzero(count)
-    number = np.full(len(made.names), -1)
+    number = np.full(len(linearised.names), -1)
     number[with_residuals] = np.arange(len(with_residuals))
-    names = tuple(made.names[g] for g in with_residuals)
+    names = tuple(linearised.names[g] for g in with_residuals)
     level_of = [levels.names.index(name) if name in levels.names else -1 for name in names]
     noise, noise_error = (np.append(v, np.nan)[level_of] for v in (levels.sigma, levels.sigma_error))
     return Health(
@@ -192,7 +194,7 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
         scale_error=offsets.slope_error[with_residuals],
         noise=noise,
         noise_error=noise_error,
-        outliers=np.bincount(group, outlying, len(made.names))[with_residuals] / count[with_residuals],
+        outliers=np.bincount(group, outlying, len(linearised.names))[with_residuals] / count[with_residuals],
         suspect=_suspect_shares(batch, explained, by, names),
         levels=levels,
         epoch=fixes[item],
@@ -200,39 +202,39 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
         residual=tests.shift[item, column] + offsets.value[group],
         sigma=tests.sigma[item, column],
         outlying=outlying,
-        sentences=(*levels.sentences, *_sentences(offsets, made.names, with_residuals)),
+        sentences=(*levels.sentences, *_sentences(offsets, linearised.names, with_residuals)),
     )
 
 
-def _check_redundancy(made: Elements) -> None:
+def _check_redundancy(linearised: Elements) -> None:
     """Raise InvalidProblem if no measurement of any fix can be checked by the others."""
-    tests = tested(made, np.ones(()))
+    tests = tested(linearised, np.ones(()))
     size = np.diagonal(tests.matrix[:, tests.errors :, tests.errors :], axis1=-2, axis2=-1)
-    if not ((size > 0.0) & (made.of_offset >= 0)).any():
+    if not ((size > 0.0) & (linearised.of_offset >= 0)).any():
         what = "no fix has redundancy, so its measurements cannot be checked"
         raise InvalidProblem(what, "health", "add stations, or known values such as a height, a bias or a prior")
 
 
-def _estimate_jointly(made: Elements, by: By) -> tuple[NoiseLevels, Offsets]:
+def _estimate_jointly(linearised: Elements, by: By) -> tuple[NoiseLevels, Offsets]:
     """Return noise levels and offsets that are consistent: each is estimated with the other given."""
     # Offsets first, with the stated noise, because biases in the residuals would increase the estimated noise.
-    offsets = offsets_of(made, tested(made, np.ones(())))
+    offsets = offsets_of(linearised, tested(linearised, np.ones(())))
     for _ in range(_ROUNDS):
-        levels = levels_of(_subtract(made, offsets), by, tails=False)
-        offsets = offsets_of(made, tested(made, _variance(made, levels)))
+        levels = levels_of(_subtract(linearised, offsets), by, tails=False)
+        offsets = offsets_of(linearised, tested(linearised, _variance(linearised, levels)))
     return levels, offsets
 
 
-def _subtract(made: Elements, offsets: Offsets) -> Elements:
+def _subtract(linearised: Elements, offsets: Offsets) -> Elements:
     """Return the elements with the offsets subtracted from the residuals."""
-    value = np.append(np.nan_to_num(offsets.value), 0.0)[made.of_offset]
-    return replace(made, residual=made.residual - (made.offset @ value[..., None])[..., 0])
+    value = np.append(np.nan_to_num(offsets.value), 0.0)[linearised.of_offset]
+    return replace(linearised, residual=linearised.residual - (linearised.offset @ value[..., None])[..., 0])
 
 
-def _variance(made: Elements, levels: NoiseLevels) -> Array:
+def _variance(linearised: Elements, levels: NoiseLevels) -> Array:
     """Return the variance (N, q) of each error as a multiple of the stated variance; 1 for groups without a level."""
     factor = dict(zip(levels.names, levels.factor.tolist(), strict=True))
-    return np.array([*(factor.get(name, 1.0) for name in made.names), 1.0])[made.of_effect] ** 2
+    return np.array([*(factor.get(name, 1.0) for name in linearised.names), 1.0])[linearised.of_effect] ** 2
 
 
 def _units(batch: Problem, by: By, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -279,15 +281,15 @@ def _suspect_groups(name: str, group: str, ends: Array, by: By) -> set[str]:
     return {n for n in groups if n == station or n.startswith(f"{station} ")}
 
 
-def _sentences(offsets: Offsets, names: tuple[str, ...], used: Array) -> tuple[str, ...]:
+def _sentences(offsets: Offsets, names: tuple[str, ...], with_residuals: Array) -> tuple[str, ...]:
     """Return one sentence for each combination of offsets that the data do not determine.
 
-    `names` are the names of all groups. `used` (g,) are the numbers of the groups with residuals.
+    `names` are the names of all groups. `with_residuals` (g,) are the numbers of the groups with residuals.
     """
     sentences = []
     for direction in offsets.open:
-        involved = np.abs(direction[used]) > _PART * np.abs(direction).max()
-        involved_names = [names[g] for g in used[involved]]
+        involved = np.abs(direction[with_residuals]) > _PART * np.abs(direction).max()
+        involved_names = [names[g] for g in with_residuals[involved]]
         listed = ", ".join(involved_names[:6]) + (
             f" and {len(involved_names) - 6} more" if len(involved_names) > 6 else ""
         )
@@ -295,7 +297,7 @@ def _sentences(offsets: Offsets, names: tuple[str, ...], used: Array) -> tuple[s
             continue
         if len(involved_names) == 1:
             sentences.append(f"the data do not show a bias of {listed}")
-        elif np.ptp(direction[used][involved]) < _PART * np.abs(direction).max():
+        elif np.ptp(direction[with_residuals][involved]) < _PART * np.abs(direction).max():
             sentences.append(
                 f"biases of {listed} are relative to their mean over all rows: a common bias cannot be seen"
             )
@@ -330,7 +332,7 @@ class Offsets:
     open: Array
 
 
-def offsets_of(made: Elements, tests: Tested) -> Offsets:
+def offsets_of(linearised: Elements, tests: Tested) -> Offsets:
     """Return the offsets that many problems share.
 
     The test of group g in one problem is w_g = (t_g - sum_h T_gh b_h) / sqrt(T_gg): its left-out residual with the
@@ -344,7 +346,7 @@ def offsets_of(made: Elements, tests: Tested) -> Offsets:
 
     Parameters
     ----------
-    made : Elements
+    linearised : Elements
         N linearised problems.
     tests : Tested
         Tests of these problems.
@@ -353,19 +355,19 @@ def offsets_of(made: Elements, tests: Tested) -> Offsets:
     ----------
     P. J. Huber, "Robust Statistics" (1981), sections 7.3 to 7.6.
     """
-    count, q = len(made.names), tests.errors
+    count, q = len(linearised.names), tests.errors
     matrix, vector = tests.matrix[:, q:, q:], tests.vector[:, q:]
     size = np.diagonal(matrix, axis1=-2, axis2=-1)
-    item, column = np.nonzero((size > 0.0) & (made.of_offset >= 0))
+    item, column = np.nonzero((size > 0.0) & (linearised.of_offset >= 0))
     scale = np.sqrt(size[item, column])
     # One equation of unit variance for every valid test, in terms of its own offset and the offsets of the others.
     y = vector[item, column] / scale
-    other = made.of_offset[item]
+    other = linearised.of_offset[item]
     design = _sparse(matrix[item, column] / scale[:, None], other, count)
-    group = made.of_offset[item, column]
+    group = linearised.of_offset[item, column]
     number = np.bincount(group, minlength=count).astype(float)
     value, error, undetermined = _regress(design, y, item, number)
-    path_from_mean, spread = _centre(made, group, item, column, count)
+    path_from_mean, spread = _centre(linearised, group, item, column, count)
     has_growth = np.isfinite(spread) & (spread > 0.0) & (number >= _FEW)
     slope, slope_error = np.full(count, np.nan), np.full(count, np.nan)
     if has_growth.any():
@@ -393,17 +395,17 @@ def _sparse(values: Array, column: Array, count: int) -> sparse.csr_array:
     return sparse.csr_array((values[kept], (row[kept], column[kept])), shape=(len(column), count))
 
 
-def _centre(made: Elements, group: Array, item: Array, column: Array, count: int) -> tuple[Array, Array]:
+def _centre(linearised: Elements, group: Array, item: Array, column: Array, count: int) -> tuple[Array, Array]:
     """Return the paths (N, c) minus their mean over each group, and the standard deviation (G,) of each, metres.
 
     `group`, `item` and `column` (n,) are the group, the problem and the column of each valid offset. `count` is the
     number of groups G.
     """
-    path = made.path[item, column]
+    path = linearised.path[item, column]
     number = np.maximum(np.bincount(group, minlength=count), 1)
     mean = np.bincount(group, path, count) / number
     spread = np.sqrt(np.bincount(group, (path - mean[group]) ** 2, count) / number)
-    return made.path - np.append(mean, 0.0)[made.of_offset], spread
+    return linearised.path - np.append(mean, 0.0)[linearised.of_offset], spread
 
 
 def _regress(design: sparse.csr_array, y: Array, item: Array, number: Array) -> tuple[Array, Array, Array]:
@@ -452,13 +454,13 @@ def _pseudo_inverse(matrix: sparse.csr_array, number: Array) -> tuple[Array, Arr
     )
 
 
-def _split_by_groups(basis: Array, weigh: Array, used: Array) -> Array:
+def _split_by_groups(basis: Array, weigh: Array, has_rows: Array) -> Array:
     """Return unit vectors (r, p) that span an undetermined space (p, r), with few groups in each vector.
 
-    `weigh` (p,) is the scale of each coefficient, and `used` (p,) marks coefficients with rows.
+    `weigh` (p,) is the scale of each coefficient, and `has_rows` (p,) marks coefficients with rows.
     """
     # Every basis of the space is valid. Groups that the space does not connect get separate vectors.
-    projector = basis @ basis.T * np.outer(used, used)
+    projector = basis @ basis.T * np.outer(has_rows, has_rows)
     count, label = connected_components(np.abs(projector) > _TIED, directed=False)
     vectors_by_group = []
     # Restricted to connected groups, the projector has eigenvalue one on the undetermined combinations of these groups.

@@ -171,25 +171,25 @@ class _Candidate:
     """A structure with its elements, its fit, and a mask (G,) of the groups without evidence."""
 
     tried: Tried
-    made: Elements
+    linearised: Elements
     fit: VarianceFit
     absent: Array
 
     @property
     def seen(self) -> bool:
         """Return whether there is evidence of a common error."""
-        return bool((self.made.common[:-1] & ~self.absent).any())
+        return bool((self.linearised.common[:-1] & ~self.absent).any())
 
 
 def _fit_structure(batch: Problem, x: Array, by: By, common: By | None) -> _Candidate:
     """Return a structure fitted to the residuals of fixes x (N, size) of a flat batch."""
-    made = elements(batch, x, by, common)
-    fit, absent = fitted(made, common)
+    linearised = elements(batch, x, by, common)
+    fit, absent = fitted(linearised, common)
     known = np.isfinite(fit.low) & ~absent
     levels = int((known & ~fit.shared).sum()) + int((known & fit.shared).any())
-    redundancy = max(int(tested(made, np.ones(())).dof.sum()), 1)
+    redundancy = max(int(tested(linearised, np.ones(())).dof.sum()), 1)
     price = levels * float(np.log(redundancy))
-    return _Candidate(Tried(by, common, levels, deviance(made, fit), price), made, fit, absent)
+    return _Candidate(Tried(by, common, levels, deviance(linearised, fit), price), linearised, fit, absent)
 
 
 def _groupings(batch: Problem) -> Iterator[By]:
@@ -210,24 +210,24 @@ def _lasting(batch: Problem, x: Array, number: Array, best: _Candidate) -> dict[
     `number` (N,) is the epoch of each fix. `best` is the best structure without lasting errors; its levels weight the
     errors.
     """
-    made = elements(batch, x, "station", "kind" if best.tried.common else None)
-    level = dict(zip(best.made.names, np.nan_to_num(best.fit.variance, nan=1.0).tolist(), strict=True))
+    linearised = elements(batch, x, "station", "kind" if best.tried.common else None)
+    level = dict(zip(best.linearised.names, np.nan_to_num(best.fit.variance, nan=1.0).tolist(), strict=True))
     kinds = _kind_of(batch)
-    kind_of = np.array([kinds.get(name, name) for name in made.names], dtype=object)
+    kind_of = np.array([kinds.get(name, name) for name in linearised.names], dtype=object)
     level_of_group = [
-        level.get(name, level.get(str(kind), 1.0)) for name, kind in zip(made.names, kind_of, strict=True)
+        level.get(name, level.get(str(kind), 1.0)) for name, kind in zip(linearised.names, kind_of, strict=True)
     ]
     variance = np.array([*level_of_group, 0.0])
-    _, tests = cleaned(made, variance[made.of_effect])
+    _, tests = cleaned(linearised, variance[linearised.of_effect])
     follows = np.flatnonzero(np.diff(number) == 1)
     parts = [follows[i : i + _PART] for i in range(0, len(follows), _PART)]
     correlations, known = (
         {},
-        {name for name, low in zip(best.made.names, best.fit.low, strict=True) if np.isfinite(low)},
+        {name for name, low in zip(best.linearised.names, best.fit.low, strict=True) if np.isfinite(low)},
     )
     for kind in sorted(known & {*kind_of.tolist()}):
         groups = np.flatnonzero(kind_of == kind)
-        sums = [_products(tests, made.of_effect, groups, variance, part) for part in parts]
+        sums = [_products(tests, linearised.of_effect, groups, variance, part) for part in parts]
         product, share = (np.concatenate([one[i] for one in sums] or [np.zeros(0)]) for i in range(2))
         if np.count_nonzero(share) < _PAIRS:
             continue
@@ -293,13 +293,13 @@ def _words(structure: Tried) -> str:
 
 def _absorbed(candidate: _Candidate) -> dict[str, float]:
     """Return the share of each common error that fixes absorb, by name, if it is more than half."""
-    q = candidate.made.of_effect.shape[1]
+    q = candidate.linearised.of_effect.shape[1]
     shares = {}
-    for g in np.flatnonzero(candidate.made.common[:-1] & (np.nan_to_num(candidate.fit.low) > 0.0)):
-        in_group = candidate.made.of_effect == g
+    for g in np.flatnonzero(candidate.linearised.common[:-1] & (np.nan_to_num(candidate.fit.low) > 0.0)):
+        in_group = candidate.linearised.of_effect == g
         share = float((candidate.fit.tests.size[:, :q][in_group] * candidate.fit.variance[g]).mean())
         if share < _ABSORBED:
-            shares[candidate.made.names[g]] = 1.0 - share
+            shares[candidate.linearised.names[g]] = 1.0 - share
     return shares
 
 
@@ -413,15 +413,15 @@ def _alternate(
     # Iterations use some of the fixes, evenly spaced. Their levels are accurate enough to weight the next fixes.
     kept, sample, factor = before_kept, slice(None, None, max(len(before_kept) // _SOME, 1)), np.ones(1)
     # Better weights change the fixes, and the fixes change the residuals, so iterate until the levels are stable.
-    for turn in range(1 + _ROUNDS):
-        made = elements(batch.take(kept[sample]), x[sample], by, common)
+    for iteration in range(1 + _ROUNDS):
+        linearised = elements(batch.take(kept[sample]), x[sample], by, common)
         # Factors refer to the stated noise. A level that the data do not determine keeps the stated noise.
-        levels = levels_of(made, by, common, tails=False)
+        levels = levels_of(linearised, by, common, tails=False)
         if np.isnan(levels.low).all():
             advice = "state a sigma, or add rows, stations or epochs"
             raise InvalidProblem("the data do not determine the noise", "noise", advice)
         same = factor.shape == levels.factor.shape
-        if turn == _ROUNDS or (same and np.abs(levels.factor - factor).max() <= _CLOSE * levels.factor.max()):
+        if iteration == _ROUNDS or (same and np.abs(levels.factor - factor).max() <= _CLOSE * levels.factor.max()):
             break
         factor = levels.factor
         kept, x = _fix_again(batch_of(with_noise_levels(problem, levels)), method, kept, x)
