@@ -66,7 +66,6 @@ class Cache(Generic[Value]):
         held_by_forks(self._lock, self._begin_child)
 
     def _begin_child(self) -> None:
-        # The threads that compute missing values do not exist in a forked child, so the child computes them again.
         """Remove entries without a value.
 
         The threads that compute missing values do not exist in a forked child, so the child computes them again.

@@ -135,12 +135,10 @@ class Frame:
         Stations without stated axes use them. They convert the covariance C of a fix to ``A @ C @ A.T`` along east,
         north and up. In Cartesian frames, and in two dimensions, they are the axes of the frame.
 
-        d is 2 or 3.
-
         Parameters
         ----------
         position : array_like, shape (..., d)
-            Metres.
+            Metres; d is 2 or 3.
 
         Returns
         -------

@@ -201,8 +201,8 @@ class _Column:
 
 
 def _is_equal(a: Array, b: Array) -> bool:
-    # NaN differs from itself, but arrays in the same memory are equal.
     """Return whether two arrays have the same content; NaN counts as equal if both arrays use the same memory."""
+    # NaN differs from itself, but arrays in the same memory are equal.
     same = a.ctypes.data == b.ctypes.data and (a.shape, a.strides, a.dtype) == (b.shape, b.strides, b.dtype)
     return same or np.array_equal(a, b)
 

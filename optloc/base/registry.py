@@ -164,8 +164,8 @@ def _module_key(path: Path) -> str:
 
 
 def _run_file(path: Path) -> None:
-    # The key contains the path: two plugins can have the same file name, and neither hides a module with this name.
     """Run a Python file as a module, which stays in `sys.modules`; remove it if the file raises an error."""
+    # The key contains the path: two plugins can have the same file name, and neither hides a module with this name.
     key = _module_key(path)
     spec = importlib.util.spec_from_file_location(key, path)
     assert spec is not None

@@ -158,8 +158,8 @@ def _azimuth(line: Components) -> Any:
 
 
 def _elevation(line: Components) -> Any:
-    # By the arctangent, because the arcsine of a ratio loses digits near the zenith.
     """Return the elevation of a line of sight above the plane of the first two axes, radians."""
+    # By the arctangent, because the arcsine of a ratio loses digits near the zenith.
     xp = namespace(line[2])
     return xp.atan2(line[2], xp.hypot(line[0], line[1]))
 
@@ -418,12 +418,12 @@ _FOREIGN = {"adoa", "pdoa", "poa", "rtt", "rss", "rssi", "csi", "snr"}
 
 
 def _likely_kind(word: str, words: dict[str, str]) -> str:
-    # Only a likely typing error is corrected: one letter of four, not the first. Other similar words have other
-    # meanings.
     """Return advice for an unknown kind: a likely correction, and the known kinds.
 
     `words` maps each name and alias to the name of its kind.
     """
+    # Only a likely typing error is corrected: one letter of four, not the first. Other similar words have other
+    # meanings.
     alike = [known for known in words if known[:1] == word[:1]]
     close = [] if word in _FOREIGN else get_close_matches(word, alike, n=1, cutoff=0.75)
     known = f"known are {', '.join(sorted(MODELS))}; 'optloc list kinds' has their other names"

@@ -343,7 +343,6 @@ _Function = Callable[[Any], Any]
 
 
 def _sum(parts: Array) -> Array:
-    # Summed in order, so that the bits are the same on every processor.
     """Return the sum over the first axis, in order, so that the bits are the same on every processor."""
     total = np.zeros(parts.shape[1:])
     for part in parts:

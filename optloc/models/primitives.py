@@ -368,8 +368,8 @@ def _scale(partials: dict[int, Any], factor: Any) -> dict[int, Any]:
 
 
 def _sum(first: dict[int, Any], second: dict[int, Any]) -> dict[int, Any]:
-    # Most operands are constants or single seeds. The dictionary is copied only if both operands have derivatives.
     """Return the sum of partial derivatives by seed."""
+    # Most operands are constants or single seeds. The dictionary is copied only if both operands have derivatives.
     if not second:
         return first
     total = dict(first)

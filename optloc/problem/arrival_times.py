@@ -82,17 +82,15 @@ def as_arrivals(problem: Problem) -> Arrivals | None:
     weight = np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count))
     # The batch shares one set of arrivals, so each row must be present with weight 1 in all problems, or absent in all.
     present = weight[0] > 0.0
-    numbers_of_differences = np.concatenate(differences)
-    if ((weight > 0.0) != present).any() or (
-        weight[:, numbers_of_differences[present[numbers_of_differences]]] != 1.0
-    ).any():
+    tdoa_rows = np.concatenate(differences)
+    if ((weight > 0.0) != present).any() or (weight[:, tdoa_rows[present[tdoa_rows]]] != 1.0).any():
         return None
-    sets = list(_difference_sets(problem, numbers_of_differences[present[numbers_of_differences]]))
+    sets = list(_difference_sets(problem, tdoa_rows[present[tdoa_rows]]))
     arrivals = [_find_arrivals(problem, one) for one in sets]
     if (
         not arrivals
         or any(one is None for one in arrivals)
-        or not _are_uncorrelated(problem.noise, sets, numbers_of_differences[~present[numbers_of_differences]])
+        or not _are_uncorrelated(problem.noise, sets, tdoa_rows[~present[tdoa_rows]])
     ):
         return None
     z, variance = (np.concatenate([one[i] for one in arrivals if one is not None], axis=-1) for i in range(2))

@@ -354,8 +354,8 @@ def _key(problem: Problem, measurements: Sequence[Measured], joint: Array | None
 
 
 def _template(problem: Problem) -> _Template:
-    # Copied, because a covariance may be the caller's array.
     """Return the part of a complete problem that the cache stores."""
+    # Copied, because a covariance may be the caller's array.
     noise = noises.Noise(tuple(noises.Block(b.row, np.array(b.covariance)) for b in problem.noise.blocks))
     return _Template(noise, {name: getattr(problem, name) for name in _DERIVED})
 

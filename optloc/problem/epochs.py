@@ -39,7 +39,7 @@ def has_correlated_epochs(problem: Problem) -> bool:
     epoch = problem.epoch
     for block in problem.noise.blocks:
         epochs = epoch[block.row]
-        # One group can hold several epochs, for instance with a joint covariance. Only nonzero correlation counts.
+        # A group can contain several epochs, for instance with a joint covariance. Only nonzero correlation counts.
         different = epochs[:, :, None] != epochs[:, None, :]
         if different.any() and np.any(np.where(different, block.covariance, 0.0)):
             return True

@@ -447,8 +447,8 @@ class Fix:
 
     @property
     def _all_marks(self) -> Array:
-        # A fix of an external solver can have a status without marks.
         """Return all findings of each fix (...), one bit for each `Status`, including the note `unchecked`."""
+        # A fix of an external solver can have a status without marks.
         marks = np.left_shift(1, self.code.astype(np.int32)) if self.marks is None else self.marks
         return np.asarray(marks | np.where(self.unchecked, Status.UNCHECKED.mark, 0))
 

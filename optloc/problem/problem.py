@@ -107,7 +107,7 @@ class Problem:
     def _unit(self, numbers: Array) -> str:
         """Return the SI unit of the rows with these global numbers (n,); empty if they have several units."""
         units = {
-            SI_UNIT[MODELS[block.kind].quantity]  # type: ignore[index]  # the table holds known quantities only
+            SI_UNIT[MODELS[block.kind].quantity]  # type: ignore[index]  # the table has known quantities only
             for block, start in zip(self.rows, self.starts, strict=True)
             if np.any((numbers >= start) & (numbers < start + block.count))
         }

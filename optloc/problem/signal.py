@@ -1,9 +1,9 @@
 """Noise from signals: the accuracy of measured delays and gains at a given signal-to-noise ratio.
 
 A Gaussian signal with a flat spectrum from zero to W (rad/s) is recorded for T seconds at stations i. At each station
-the noise in the band is independent and white; rho_i is the ratio of signal power to noise power, and P is the sum of
-the rho_i. At each frequency the covariance of the stations is I + v v' with v_i = sqrt(rho_i) exp(-j w tau_i). The
-Fisher information of the delays is
+the noise in the band is independent and white. rho_i is the ratio of signal power to noise power, P the sum of the
+rho_i, and tau_i the delay in seconds. At each frequency w the covariance of the stations is I + v v' with
+v_i = sqrt(rho_i) exp(-j w tau_i), where j is the imaginary unit. The Fisher information of the delays is
 
     T W^3 / (3 pi (1 + P)) (P diag(rho) - rho rho').
 
@@ -13,9 +13,9 @@ The Fisher information of the logarithms of the amplitudes, which is independent
 
 An error that all stations share cancels in differences. The errors of the differences are therefore equal to
 differences of independent station errors. The variance of these errors is 3 pi (1 + P) / (T W^3 P rho_i) for delays and
-pi (1 + P) / (T W P rho_i) for log-amplitudes. At equal ratios the first is equation 31 of the registration paper
-(docs/papers/registration). Equation 38 of that paper is smaller, because it assumes that the level of the signal and
-the gain of the reference are known.
+pi (1 + P) / (T W P rho_i) for log-amplitudes. At equal ratios the first is equation 31 of "Error registration of
+multiple moving observers by TDOA and GROA", Journal of Electronics & Information Technology 39 (2017). Equation 38 of
+that paper is smaller, because it assumes that the level of the signal and the gain of the reference are known.
 
 Sources: W. R. Hahn, S. A. Tretter, "Optimum processing for delay-vector estimation in passive signal arrays", IEEE
 Trans. Information Theory 19 (1973); K. C. Ho, M. Sun, "Passive source localization using time differences of arrival

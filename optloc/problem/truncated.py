@@ -324,7 +324,7 @@ def _moments_behind_one_bound(distribution: Truncated) -> tuple[Array, Array]:
     with np.errstate(invalid="ignore", divide="ignore"):
         sigma = np.sqrt((across * normal).sum(-1))
         bound = (slack - (normal * distribution.shift).sum(-1)) / sigma
-        # Density divided by probability, of a standard normal variable below `away`.
+        # Density divided by probability, of a standard normal variable below `bound`.
         hazard = np.exp(-0.5 * bound**2 - 0.5 * np.log(2.0 * np.pi) - log_ndtr(bound))
         unit = across / sigma[..., None]
         mean = distribution.shift - hazard[..., None] * unit

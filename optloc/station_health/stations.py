@@ -242,7 +242,7 @@ def _units(batch: Problem, by: By, names: tuple[str, ...]) -> tuple[str, ...]:
     ends = ends_of(batch, by).name
     unit_of: dict[str, str] = {}
     for rows, start in zip(batch.rows, batch.starts, strict=True):
-        unit = SI_UNIT[MODELS[rows.kind].quantity]  # type: ignore[index]  # the table holds known quantities only
+        unit = SI_UNIT[MODELS[rows.kind].quantity]  # type: ignore[index]  # the table has known quantities only
         unit_of |= dict.fromkeys(ends[start : start + rows.count].ravel().tolist(), unit)
     return tuple(unit_of[name] for name in names)
 
