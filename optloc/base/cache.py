@@ -60,6 +60,7 @@ class Cache(Generic[Value]):
     __slots__ = ("_lock", "_most", "_places", "_total", "_weigh")
 
     def __init__(self, most: int, weigh: Callable[[Value], int] | None = None) -> None:
+        """Make an empty cache; a fork waits until its lock is free."""
         self._most, self._weigh = most, weigh
         self._lock, self._total = Lock(), 0
         self._places: dict[Hashable, _CachePlace] = {}  # in the order of their last use

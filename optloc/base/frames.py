@@ -51,6 +51,7 @@ class Frame:
     origin: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
+        """Check the kind and the origin."""
         if self.kind not in ("cartesian", "ecef", "enu"):
             raise InvalidProblem(f"unknown frame {self.kind!r}", "frame", "known are cartesian, ecef, enu")
         if (self.origin is not None) != (self.kind == "enu"):

@@ -142,6 +142,7 @@ class _Column:
     """
 
     def __init__(self, layout: Axes, count: int) -> None:
+        """Make an empty column for `count` entries."""
         self.layout, self.count = layout, count
         self.parts: list[tuple[slice, Array]] = []  # parts that cannot be copied yet: slots, or one row for all entries
         self.whole: Array | None = None

@@ -144,6 +144,7 @@ class Model:
     aliases: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        """Check the fields, and use `ranges` as the default of `signs`."""
         if self.quantity not in UNITS:
             raise InvalidProblem(f"unknown quantity {self.quantity!r}", "quantity", nearest(self.quantity, list(UNITS)))
         if self.stations not in (0, 1, 2):

@@ -354,8 +354,8 @@ def values_in_balls(scan: Problem, centre: Array, radius: Array) -> tuple[Array,
     """Return values, derivatives and remainders of the rows of a scan in balls.
 
     In the ball |h(x) - h - J (x - centre)| <= remainder. The remainder is half the squared radius times a bound of the
-    second derivatives. This bound is 1/r for a range, 1/r_h^2 for an azimuth and 1/(r r_h) for an elevation. Here r_h
-    is the distance from the vertical line through the station.
+    second derivatives. This bound is 1/r for a range, 1/r_h^2 for an azimuth and 1/(r r_h) for an elevation. Here r is
+    the distance from the station, and r_h the distance from the vertical line through the station.
 
     Parameters
     ----------

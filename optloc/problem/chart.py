@@ -457,6 +457,7 @@ def _coordinate(j: int) -> Callable[[Chart, float], tuple[Array, Array]]:
     """Return the function of a chart and z that returns the ends (...) of the interval of coordinate j, metres."""
 
     def ends(chart: Chart, z: float) -> tuple[Array, Array]:
+        """Return the ends (...) of the interval, metres; raise if a fix is not Gaussian in metres."""
         if (chart.kind != CARTESIAN).any():
             what = "a coordinate of a fix that is not Gaussian in metres has no interval"
             raise InvalidProblem(what, "extent", _ADVICE)

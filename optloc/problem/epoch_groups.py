@@ -272,6 +272,7 @@ def _stations_of(stations: Stations, numbers: Array) -> Stations:
     """
 
     def pick(array: Array | None) -> Array | None:
+        """Return the entries (n, 1, s, d) of the stations of each problem; None for None."""
         if array is None:
             return None
         if array.ndim == 3:  # all epochs have the same positions

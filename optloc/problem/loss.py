@@ -175,9 +175,9 @@ def late_loss(share: float, delay: float) -> Loss:
     """Return the loss for rows of which a share is late, with exponentially distributed delays.
 
     The residual of a row, in sigma, is normal. With probability p = `share` an exponential delay is added. Its density
-    is (1 - p) phi(u) + p g(u). Here g is the density of an exponential plus a normal variable (Grushka 1972, equation
-    5). The loss is twice the negative logarithm of this density, measured from its mode, which is some hundredths of
-    sigma above zero. Early rows cost u².
+    is (1 - p) phi(u) + p g(u). Here phi is the standard normal density, and g is the density of an exponential plus a
+    normal variable (Grushka 1972, equation 5). The loss is twice the negative logarithm of this density, measured from
+    its mode, which is some hundredths of sigma above zero. Early rows cost u².
 
     Parameters
     ----------
@@ -200,10 +200,12 @@ def late_loss(share: float, delay: float) -> Loss:
     curvature = float(_late_density(np.array(mode + _STEP), share, delay)[1]) / _STEP
 
     def cost(u: Array, _: float) -> Array:
+        """Return the loss of residuals u, in standard deviations."""
         log_density = _late_density(np.maximum(u, 0.0) + mode, share, delay)[0]
         return np.where(u > 0.0, np.maximum(2.0 * (log_density_at_mode - log_density), 0.0), u**2)
 
     def importance(u: Array, _: float) -> Array:
+        """Return the weights psi(u) / u of residuals u, between 0 and 1."""
         psi = _late_density(np.maximum(u, 0.0) + mode, share, delay)[1]
         with np.errstate(divide="ignore", invalid="ignore"):
             weight = np.where(u > _ZERO, psi / u, curvature)

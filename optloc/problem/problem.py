@@ -207,6 +207,7 @@ class Problem:
         size = int(np.prod(shape))
 
         def reshape(array: Array, core: int) -> Array:
+            """Return the array with one batch axis; unchanged if all problems share it."""
             if array.ndim == core:
                 return array
             inner = array.shape[array.ndim - core :]

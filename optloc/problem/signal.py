@@ -70,6 +70,7 @@ class Signal:
     speed: float = SPEED_OF_LIGHT
 
     def __post_init__(self) -> None:
+        """Check all fields, and store the ratios as a float array."""
         snr = np.array(self.snr, dtype=float)
         if snr.ndim != 1 or np.isfinite(snr).sum() < 2:
             raise InvalidProblem(f"snr has shape {snr.shape}", "snr", "give one for each station, two or more")
