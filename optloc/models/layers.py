@@ -483,11 +483,11 @@ def _direct_rays(layers: _Layered, across: Array, high: Array, low: Array) -> _F
 
 
 class _Bracket(NamedTuple):
-    """Turning rays (k,) of pairs, each with the ends of an interval, and `rising`, as for `_solve_in_interval`."""
+    """Intervals of the cotangent, each with one turning ray (k,); `rising` is as for `_solve_in_interval`."""
 
-    pair: Array  # numbers (k,)
+    pair: Array  # numbers of the pairs (k,)
     legs: _Legs
-    low: Array
+    low: Array  # ends of the interval
     high: Array
     rising: Array
     turns: Array  # as in `_FoundRay`

@@ -339,11 +339,11 @@ def _with_rows_of(problem: Problem, inside: Callable[[Array], slice | Array]) ->
 
 @dataclass(frozen=True, slots=True)
 class _Numbers:
-    """Row numbers by kind: first row in the run, selected rows (within the kind), and first row in the window."""
+    """Row numbers of a run and of its window, with one entry for each kind of rows."""
 
-    start: Array
-    kept: list[slice | Array]
-    taken: Array
+    start: Array  # first row in the run
+    kept: list[slice | Array]  # selected rows, counted within the kind
+    taken: Array  # first row in the window
 
     @classmethod
     def of(cls, problem: Problem, kept: list[slice | Array], counts: list[int]) -> _Numbers:

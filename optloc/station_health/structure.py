@@ -168,7 +168,11 @@ def structure_at(batch: Problem, x: Array, number: Array, *, ordered: bool) -> N
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """A structure with its elements, its fit, and a mask (G,) of the groups without evidence."""
+    """A structure that was fitted to the residuals.
+
+    `tried` is the structure with its likelihood. `linearised` are the fixes with the errors of this structure, and
+    `fit` are the factors of these errors. `absent` (G,) marks the common errors without evidence.
+    """
 
     tried: Tried
     linearised: Elements
