@@ -251,7 +251,7 @@ def to_si(
     convention: AzimuthConvention = "east-counterclockwise",
     where: str | None = None,
 ) -> NDArray[np.float64]:
-    """Return values of any shape in SI; the options are those of :func:`conversion`."""
+    """Return values of any shape in SI; the options are as for :func:`conversion`."""
     return conversion(
         unit, quantity, propagation_speed=propagation_speed, carrier=carrier, convention=convention, where=where
     ).to_si(values)
@@ -269,7 +269,7 @@ def sigma_to_si(
 ) -> NDArray[np.float64]:
     """Return standard deviations of any shape in SI.
 
-    The options are those of :func:`conversion`. Decibels also need the measured values in SI: to first order, a
+    The options are as for :func:`conversion`. Decibels also need the measured values in SI: to first order, a
     standard deviation of s dB is ``ratio * s * ln(10) / 20``.
     """
     return conversion(unit, quantity, propagation_speed=propagation_speed, carrier=carrier, where=where).sigma_to_si(

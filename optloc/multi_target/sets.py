@@ -443,7 +443,7 @@ class Angle:
         Length of the interval of its values, radians.
     bend : callable
         Returns a bound (q, m) of its second derivatives in balls, from values and slopes at the centres (q, m) and the
-        radii (q, 1). The slope of an azimuth is 1/r_h, that of an elevation 1/r.
+        radii (q, 1). The slope of an azimuth is 1/r_h, the slope of an elevation 1/r.
     """
 
     width: float

@@ -374,7 +374,7 @@ def with_known_bias(problem: Problem, name: str, values: ArrayLike | Mapping[str
     Raises
     ------
     InvalidProblem
-        If there is no such family or member, or if the values do not fit.
+        If the family or a member does not exist, or if the values do not fit.
     """
     names = [bias.name for bias in problem.biases]
     if name not in names:

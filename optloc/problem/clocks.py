@@ -175,7 +175,7 @@ def with_densities(bias: Bias, times: Array, where: str, density: Any, rate_dens
         Location that error messages name.
     density, rate_density : float or array (q,), optional
         Spectral densities of the white noise that drives the error (unit squared per second) and its rate (unit squared
-        per second cubed). None: no such noise.
+        per second cubed). None: this noise is absent.
     """
     members = len(bias.members)
     if density is None and rate_density is None:

@@ -37,7 +37,7 @@ def checked(problem: Problem) -> Problem:
     Raises
     ------
     InvalidProblem
-        The message names the station, row or argument, and what to do.
+        The message names the station, row or argument, and gives advice.
     """
     if not isinstance(problem.frame, Frame):
         raise InvalidProblem(f"{problem.frame!r} is not a frame", "frame", "give an optloc.Frame")

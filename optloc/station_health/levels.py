@@ -49,7 +49,7 @@ class NoiseLevels:
         an epoch.
     stated : array (G,)
         Standard deviation that the problem states, root mean square, SI units. For common errors, which the problem
-        does not state, it is that of the rows.
+        does not state, it is the value of the rows.
     factor : array (G,)
         Factors of the stated standard deviations. 1 if the data do not determine a factor; 0 for a common error without
         evidence.
@@ -428,8 +428,8 @@ def late_signals(problem: Problem, *, method: str = "cauchy", fix: Fix | None = 
     Parameters
     ----------
     problem : Problem
-        As for `noise_levels`. Differences of arrivals are converted to arrivals. The stated noise is that of rows that
-        are not late.
+        As for `noise_levels`. Differences of arrivals are converted to arrivals. The stated noise applies to rows
+        that are not late.
     method : str
         Method of the first fixes; see `solve`. It must treat both signs alike, because its fixes show whether errors
         are delays.
