@@ -25,8 +25,8 @@ def library(array: Any) -> Any:
     # PyTorch arrays have no `__array_namespace__`, but the module `torch` follows the standard well enough.
     if type(array).__module__ == "torch":
         return sys.modules["torch"]
-    own = getattr(array, "__array_namespace__", None)
-    return np if own is None else own()
+    get_module = getattr(array, "__array_namespace__", None)
+    return np if get_module is None else get_module()
 
 
 def is_other_library(array: Any) -> bool:
@@ -55,6 +55,8 @@ def as_array_like(numbers: Any, like: Any) -> Any:
 
 def gather(array: Any, index: Array, axis: int = -1) -> Any:
     """Return the entries of an array at an index table along one axis. The axes of the table replace this axis.
+
+    For an array (5, n) and a table (3, 2), the result is (5, 3, 2).
 
     Parameters
     ----------
@@ -85,7 +87,7 @@ def eye(n: int, like: Any) -> Any:
 
 
 def as_number(mask: Any, like: Any) -> Any:
-    """Return a mask as zeros and ones, in the float type of the array `like`."""
+    """Return a mask as zeros and ones, in the library and the float type of the array `like`."""
     xp = library(mask)
     return xp.where(mask, as_array_like(np.ones(()), like), as_array_like(np.zeros(()), like))
 
@@ -131,7 +133,10 @@ def as_integers(values: Any, name: str) -> Array | None:
 
 
 def as_deviations(values: Any, name: str, kind: str) -> Array | None:
-    """Return standard deviations as a float array, None for None; raise if one is not positive and finite."""
+    """Return standard deviations as a float array, None for None; raise if one is not positive and finite.
+
+    `name` is the argument and `kind` the measurement kind that the message names.
+    """
     array = numbers(values, name)
     if array is None:
         return None
@@ -181,6 +186,7 @@ _FAR = 1.6e6
 
 
 def _polynomial(x: Array, coefficients: tuple[float, ...]) -> Array:
+    """Return the values of a polynomial at x (...); the coefficients are in the order of increasing powers."""
     total = np.full(np.shape(x), coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         total = total * x + coefficient
@@ -188,35 +194,38 @@ def _polynomial(x: Array, coefficients: tuple[float, ...]) -> Array:
 
 
 def _sin_cos(angle: Array) -> tuple[Array, Array, Array]:
-    """Return sine and cosine of angles minus whole quarter turns, and the number of quarter turns modulo 4."""
+    """Return sine and cosine of angles minus whole quarter turns, and the number of quarter turns modulo 4, each (...).
+
+    `angle` is in radians. Angles beyond `_FAR` count as zero, because the callers replace their results.
+    """
     usable = np.abs(angle) < _FAR
     angle = np.where(usable, angle, 0.0)
     turns = np.rint(angle * (2.0 / math.pi))
-    left = ((angle - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]
-    square = left * left
+    rest = ((angle - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]
+    square = rest * rest
     half = 0.5 * square
-    near = 1.0 - half
+    one_minus_half = 1.0 - half
     # Add the rounding error of the subtraction from one.
-    cosine = near + (((1.0 - near) - half) + square * square * _polynomial(square, _COS))
-    return left + left * (square * _polynomial(square, _SIN)), cosine, turns.astype(np.int64) % 4
+    cosine = one_minus_half + (((1.0 - one_minus_half) - half) + square * square * _polynomial(square, _COS))
+    return rest + rest * (square * _polynomial(square, _SIN)), cosine, turns.astype(np.int64) % 4
 
 
 def sin(angle: Array) -> Array:
-    """Return the sines of angles in radians. Beyond 1.6e6 it uses NumPy's function."""
+    """Return the sines of angles (...) in radians. Beyond 1.6e6 it uses NumPy's function."""
     sine, cosine, quarter = _sin_cos(angle)
     value = np.where(quarter % 2 == 0, sine, cosine) * np.where(quarter < 2, 1.0, -1.0)
     return np.where(np.abs(angle) < _FAR, value, np.sin(angle))
 
 
 def cos(angle: Array) -> Array:
-    """Return the cosines of angles in radians. Beyond 1.6e6 it uses NumPy's function."""
+    """Return the cosines of angles (...) in radians. Beyond 1.6e6 it uses NumPy's function."""
     sine, cosine, quarter = _sin_cos(angle)
     value = np.where(quarter % 2 == 0, cosine, sine) * np.where((quarter == 1) | (quarter == 2), -1.0, 1.0)
     return np.where(np.abs(angle) < _FAR, value, np.cos(angle))
 
 
 def atan2(y: Array, x: Array) -> Array:
-    """Return the angles of vectors (x, y), radians from -pi to pi."""
+    """Return the angles (...) of vectors (x, y), radians from -pi to pi."""
     rise, run = np.abs(y), np.abs(x)
     large = np.maximum(rise, run)
     with np.errstate(invalid="ignore"):
@@ -224,9 +233,9 @@ def atan2(y: Array, x: Array) -> Array:
         slope = np.where(np.isinf(rise) & np.isinf(run), 1.0, np.minimum(rise, run) / np.where(large > 0.0, large, 1.0))
     eighth = np.rint(8.0 * np.where(np.isnan(slope), 0.0, slope))
     arc = _ARC[eighth.astype(np.int64)]
-    left = (slope - eighth / 8.0) / (1.0 + slope * (eighth / 8.0))
-    square = left * left
-    angle = arc[..., 0] + (left + (left * (square * _polynomial(square, _ATAN)) + arc[..., 1]))
+    rest = (slope - eighth / 8.0) / (1.0 + slope * (eighth / 8.0))
+    square = rest * rest
+    angle = arc[..., 0] + (rest + (rest * (square * _polynomial(square, _ATAN)) + arc[..., 1]))
     angle = np.where(rise > run, 0.5 * _PI[0] - (angle - 0.5 * _PI[1]), angle)
     angle = np.where(np.signbit(x), _PI[0] - (angle - _PI[1]), angle)
     return np.copysign(np.where(np.isnan(x), x, angle), y)
@@ -242,37 +251,39 @@ def hypot(x: Array, y: Array) -> Array:
 def log(x: Array) -> Array:
     """Return the natural logarithms of x."""
     usable = (x > 0.0) & np.isfinite(x)
-    part, exponent = np.frexp(np.where(usable, x, 1.0))
-    low = part < math.sqrt(0.5)
-    more, exponent = np.where(low, 2.0 * part, part) - 1.0, exponent - low
-    ratio = more / (2.0 + more)
-    square, half = ratio * ratio, 0.5 * more * more
+    mantissa, exponent = np.frexp(np.where(usable, x, 1.0))
+    is_low = mantissa < math.sqrt(0.5)
+    excess, exponent = np.where(is_low, 2.0 * mantissa, mantissa) - 1.0, exponent - is_low
+    ratio = excess / (2.0 + excess)
+    square, half = ratio * ratio, 0.5 * excess * excess
     series = square * _polynomial(square, _LOG)
     small = half - (ratio * (half + series) + exponent * _LOG_2[1])
     # Results for zero, infinity and invalid values are the same in every library.
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(usable, exponent * _LOG_2[0] - (small - more), np.log(np.where(usable, 1.0, x)))
+        return np.where(usable, exponent * _LOG_2[0] - (small - excess), np.log(np.where(usable, 1.0, x)))
 
 
 def exp(x: Array) -> Array:
     """Return the exponentials of x."""
     # Outside these limits doubles overflow, or underflow to zero.
     bounded = np.where(np.isnan(x), 0.0, np.clip(x, -750.0, 710.0))
-    times = np.rint(bounded / math.log(2.0))
-    left = (bounded - times * _LOG_2[0]) - times * _LOG_2[1]
-    value = 1.0 + (left + left * left * _polynomial(left, _EXP))
-    return np.where(np.isnan(x), x, np.ldexp(value, times.astype(np.int64)))
+    power = np.rint(bounded / math.log(2.0))
+    rest = (bounded - power * _LOG_2[0]) - power * _LOG_2[1]
+    value = 1.0 + (rest + rest * rest * _polynomial(rest, _EXP))
+    return np.where(np.isnan(x), x, np.ldexp(value, power.astype(np.int64)))
 
 
 def product(vector: Array, matrix: Array) -> Array:
-    """Return ``sum_k vector[..., k] * matrix[..., k, :]``, summed in the order of k.
+    """Return ``sum_k vector[..., k] * matrix[..., k, :]``, an array (..., q), summed in the order of k.
+
+    The fixed order gives the same bits on every processor, unlike the matrix product of NumPy.
 
     Parameters
     ----------
     vector : array (..., r)
         Vectors of length r.
     matrix : array (..., r, q)
-        Matrices. Their leading axes broadcast against those of the vectors.
+        Matrices. The leading axes of vectors and matrices broadcast.
     """
     if not matrix.shape[-2]:
         return np.zeros((*np.broadcast_shapes(vector.shape[:-1], matrix.shape[:-2]), matrix.shape[-1]))
@@ -284,7 +295,7 @@ def product(vector: Array, matrix: Array) -> Array:
 
 # Arrays for which NumPy calls use the functions above, in any code that receives them.
 
-_OWN: dict[Any, Any] = {np.sin: sin, np.cos: cos, np.arctan2: atan2, np.hypot: hypot, np.log: log, np.exp: exp}
+_FUNCTIONS: dict[Any, Any] = {np.sin: sin, np.cos: cos, np.arctan2: atan2, np.hypot: hypot, np.log: log, np.exp: exp}
 
 
 class Portable(np.ndarray):
@@ -295,20 +306,24 @@ class Portable(np.ndarray):
     """
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, out: Any = None, **options: Any) -> Any:
-        """Return the result of `ufunc`, computed by the function of this module if there is one, else by NumPy."""
+        """Return the result of `ufunc`, computed by the function of this module if there is one, else by NumPy.
+
+        NumPy calls this method for every function with an argument of this class. Results have this class too.
+        """
         plain = [_plain(value) for value in inputs]
-        own = _OWN.get(ufunc) if method == "__call__" and out is None and not options else None
-        if own is not None:
-            return np.asarray(own(*(np.asarray(value, dtype=float) for value in plain))).view(Portable)
+        function = _FUNCTIONS.get(ufunc) if method == "__call__" and out is None and not options else None
+        if function is not None:
+            return np.asarray(function(*(np.asarray(value, dtype=float) for value in plain))).view(Portable)
         if out is not None:
             options["out"] = tuple(_plain(value) for value in out)
-        found = getattr(ufunc, method)(*plain, **options)
-        if isinstance(found, tuple):
-            return tuple(np.asarray(value).view(Portable) for value in found)
-        return found if found is None else np.asarray(found).view(Portable)
+        result = getattr(ufunc, method)(*plain, **options)
+        if isinstance(result, tuple):
+            return tuple(np.asarray(value).view(Portable) for value in result)
+        return result if result is None else np.asarray(result).view(Portable)
 
 
 def _plain(value: Any) -> Any:
+    """Return the value as a plain NumPy array if it is a `Portable`, otherwise unchanged."""
     return value.view(np.ndarray) if isinstance(value, Portable) else value
 
 
@@ -318,17 +333,19 @@ def _plain(value: Any) -> Any:
 def first_rows(*numbers: Array) -> tuple[Array, Array]:
     """Return the index of the first row (n,) of each group of equal rows, and the group of each row (m,).
 
+    Groups are numbered in the order of their first rows. m is the number of rows, and n the number of groups.
+
     Parameters
     ----------
     *numbers : int array (m,)
         Columns of the table: integers from 0 to the number of rows.
     """
     code = np.zeros(len(numbers[0]), dtype=np.int64)
-    for own in numbers:
+    for column in numbers:
         # Codes stay below the square of the number of rows, which fits into 64 bits.
-        code = np.unique(code * (int(own.max(initial=0)) + 1) + own, return_inverse=True)[1].ravel()
+        code = np.unique(code * (int(column.max(initial=0)) + 1) + column, return_inverse=True)[1].ravel()
     _, first, inverse = np.unique(code, return_index=True, return_inverse=True)
     order = np.argsort(first)
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    return first[order], place[inverse.ravel()]
+    number = np.empty_like(order)
+    number[order] = np.arange(len(order))
+    return first[order], number[inverse.ravel()]

@@ -33,7 +33,7 @@ _NOTHING = object()
 
 @dataclass(slots=True, eq=False)
 class _CachePlace:
-    """Entry of one key. The thread that computes the value holds the lock."""
+    """Entry of one key: the value, its weight and a lock. The thread that computes the value acquires the lock."""
 
     value: object = _NOTHING
     weight: int = 0
@@ -60,16 +60,21 @@ class Cache(Generic[Value]):
     __slots__ = ("_lock", "_most", "_places", "_total", "_weigh")
 
     def __init__(self, most: int, weigh: Callable[[Value], int] | None = None) -> None:
+        """Make an empty cache; a fork waits until its lock is free."""
         self._most, self._weigh = most, weigh
         self._lock, self._total = Lock(), 0
         self._places: dict[Hashable, _CachePlace] = {}  # in the order of their last use
         held_by_forks(self._lock, self._begin_child)
 
     def _begin_child(self) -> None:
-        # The threads that compute missing values do not exist in a forked child, so the child computes them again.
+        """Remove entries without a value.
+
+        The threads that compute missing values do not exist in a forked child, so the child computes them again.
+        """
         self._places = {key: place for key, place in self._places.items() if place.value is not _NOTHING}
 
     def __len__(self) -> int:
+        """Return the number of entries, including values that a thread computes now."""
         return len(self._places)
 
     def clear(self) -> None:
@@ -92,11 +97,15 @@ class Cache(Generic[Value]):
         return cast("Value", place.value)
 
     def call(self, make: Callable[..., Value], *values: Any) -> Value:
-        """Return ``make(*values)``, from the cache if the content of the values has a key."""
+        """Return ``make(*values)``, from the cache if the content of the values has a key, otherwise computed again."""
         key = key_of(*values)
         return make(*values) if key is None else self.find(key, lambda: make(*values))
 
     def _fill(self, key: Hashable, place: _CachePlace, make: Callable[[], Value]) -> None:
+        """Compute the value of an entry and store it; then remove old values until the total weight fits.
+
+        The caller holds the lock of the entry `place`. If ``make()`` raises, the entry is removed.
+        """
         try:
             value = make()
         except BaseException:
@@ -135,6 +144,7 @@ def key_of(*values: Any) -> Hashable | None:
 
 
 def _content(value: Any) -> Any:
+    """Return a hashable object that is equal for equal type and content; raise _NoKeyError for unsupported content."""
     kind = type(value)
     if kind in _ATOMS:
         return value
@@ -155,6 +165,7 @@ def _content(value: Any) -> Any:
 
 @cache
 def _fields(kind: Any) -> tuple[str, ...]:
+    """Return the names of the fields of a dataclass; raise _NoKeyError for other types."""
     if not is_dataclass(kind):
         raise _NoKeyError
     return tuple(one.name for one in fields(kind))

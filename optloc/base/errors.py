@@ -129,15 +129,18 @@ def nearest(word: str, known: Iterable[str]) -> str:
     names = list(islice(known, _MANY))
     word = str(word)[:_SHOWN]
     folded = {name.lower(): name for name in names}
-    close = [repr(folded[name]) for name in _alike(word.lower(), folded)]
-    hint = f"did you mean {' or '.join(close)}?" if close else ""
-    more = f" and {len(names) - _FEW} more" if len(names) > 2 * _FEW else ""
-    listed = "" if close and len(names) > _FEW else f"known are {', '.join(names[:_FEW] if more else names)}{more}"
+    similar = [repr(folded[name]) for name in _similar_names(word.lower(), folded)]
+    hint = f"did you mean {' or '.join(similar)}?" if similar else ""
+    rest = f" and {len(names) - _FEW} more" if len(names) > 2 * _FEW else ""
+    listed = "" if similar and len(names) > _FEW else f"known are {', '.join(names[:_FEW] if rest else names)}{rest}"
     return " ".join(part for part in (hint, listed) if part)
 
 
 def check_once(names: Iterable[str], what: str, where: str) -> None:
-    """Raise if a name occurs twice. `what` is the message, with "{!r}" for the name."""
+    """Raise if a name occurs twice. `what` is the message, with "{!r}" for the name.
+
+    `where` is the location that the message names.
+    """
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise InvalidProblem(what.format(twice), where, "rename one of them")
@@ -146,20 +149,27 @@ def check_once(names: Iterable[str], what: str, where: str) -> None:
 def no_station(
     name: object, where: str | None, known: Iterable[str], error: type[InvalidProblem] = InvalidProblem
 ) -> InvalidProblem:
-    """Return an error for a station name that does not exist, with the most similar station names as advice."""
+    """Return an error for a station name that does not exist, with the most similar station names as advice.
+
+    `error` is the class of the error.
+    """
     return error(f"there is no station {name!r}", where, nearest(str(name), known))
 
 
-def _alike(word: str, known: Iterable[str]) -> list[str]:
+def _similar_names(word: str, known: Iterable[str]) -> list[str]:
     """Return up to two names similar to a word; none for a single letter, which could mean any name."""
     names = list(known)
     if word.strip() in names:  # the word differs only by case, or by blanks at its ends
         return [word.strip()]
-    begun = [name for name in names if len(word) > 2 and name.startswith(word)][:2]
+    with_prefix = [name for name in names if len(word) > 2 and name.startswith(word)][:2]
     # Agreement of half of the letters is chance, except for names of the same length, such as R5 and R6.
-    same = [name for name in names if len(name) == len(word)]
-    found = get_close_matches(word, names, n=2, cutoff=0.6) or begun or get_close_matches(word, same, n=2, cutoff=0.5)
-    return found if len(word) > 1 else []
+    of_same_length = [name for name in names if len(name) == len(word)]
+    similar = (
+        get_close_matches(word, names, n=2, cutoff=0.6)
+        or with_prefix
+        or get_close_matches(word, of_same_length, n=2, cutoff=0.5)
+    )
+    return similar if len(word) > 1 else []
 
 
 def status_named(label: str) -> Status:
@@ -182,12 +192,16 @@ def whole_redundancy(redundancy: Any) -> int:
 
 
 def too_weak(fix: Any, weak: Any, wanted: int) -> str:
-    """Return a sentence about the fixes of a batch, with numbers `weak`, that have too little redundancy."""
-    found = int(np.ravel(fix.dof)[weak[0]])
-    which = "The fix" if fix.shape == () else f"Fix {int(weak[0])} of {fix.code.size}"
+    """Return a sentence about the fixes of a batch that have too little redundancy.
+
+    `weak` (n,) are the numbers of these fixes in the batch; the sentence names the first. `wanted` is the required
+    redundancy.
+    """
+    redundancy = int(np.ravel(fix.dof)[weak[0]])
+    subject = "The fix" if fix.shape == () else f"Fix {int(weak[0])} of {fix.code.size}"
     more = f" ({len(weak)} fixes have less than {wanted})" if len(weak) > 1 else ""
-    means = "a wrong measurement would not be noticed" if found <= 0 else "a wrong measurement could not be named"
+    effect = "a wrong measurement would not be noticed" if redundancy <= 0 else "a wrong measurement could not be named"
     return (
-        f"{which} has a redundancy of {found}, and {wanted} is required{more}: {means}; "
+        f"{subject} has a redundancy of {redundancy}, and {wanted} is required{more}: {effect}; "
         "add a row, a station or a known value, such as a height."
     )

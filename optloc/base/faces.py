@@ -1,8 +1,7 @@
 """Lazy public names of a package: each name loads at its first use.
 
-The ``__init__`` of a package lists its public names once, as imports for type checkers. `exported` reads this list, so
-that
-``import optloc`` loads neither solvers nor tables.
+The ``__init__`` of a package lists its public names once, as imports for type checkers. `exported` reads this list.
+Therefore ``import optloc`` loads neither solvers nor tables.
 """
 
 from __future__ import annotations
@@ -25,21 +24,22 @@ def exported(package: str, file: str) -> Exported:
     package, file : str
         ``__name__`` and ``__file__`` of the package. All imports under ``if TYPE_CHECKING:`` of the file are exported.
     """
-    homes = dict(_imports(ast.parse(Path(file).read_text(encoding="utf-8"))))
-    names = sorted(homes)
+    origin_of = dict(_imports(ast.parse(Path(file).read_text(encoding="utf-8"))))
+    names = sorted(origin_of)
 
     def find(name: str) -> Any:
-        if name not in homes:
+        """Return the public object of this name and store it in the package; Python calls it for missing attributes."""
+        if name not in origin_of:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module, original = homes[name]
+        module, original = origin_of[name]
         if module == package:
             return import_module(f"{package}.{original}")
         try:
-            found = getattr(import_module(module), original)
+            value = getattr(import_module(module), original)
         except AttributeError:
-            found = import_module(f"{module}.{original}")
-        setattr(sys.modules[package], name, found)
-        return found
+            value = import_module(f"{module}.{original}")
+        setattr(sys.modules[package], name, value)
+        return value
 
     return find, lambda: names, names
 

@@ -51,6 +51,7 @@ class Frame:
     origin: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
+        """Check the kind and the origin."""
         if self.kind not in ("cartesian", "ecef", "enu"):
             raise InvalidProblem(f"unknown frame {self.kind!r}", "frame", "known are cartesian, ecef, enu")
         if (self.origin is not None) != (self.kind == "enu"):
@@ -67,7 +68,7 @@ class Frame:
 
     @property
     def geodetic(self) -> bool:
-        """Return whether positions have a latitude, a longitude and a height."""
+        """Return whether positions have a latitude, a longitude and a height; False for a Cartesian frame."""
         return self.kind != "cartesian"
 
     def rotation_to_ecef(self) -> Array:
@@ -78,11 +79,11 @@ class Frame:
         ndarray, shape (3, 3)
             The columns are the axes of this frame in ECEF.
         """
-        return _turn_at(self._place())
+        return _rotation_at(self._place())
 
     def origin_ecef(self) -> Array:
         """Return the origin o of ``p_ecef = R p + o`` in metres, shape (3,)."""
-        return _start_at(self._place())
+        return _origin_at(self._place())
 
     def to_ecef(self, position: ArrayLike) -> Array:
         """Return positions of this frame as ECEF positions.
@@ -138,7 +139,7 @@ class Frame:
         Parameters
         ----------
         position : array_like, shape (..., d)
-            Metres.
+            Metres; d is 2 or 3.
 
         Returns
         -------
@@ -153,7 +154,10 @@ class Frame:
         return product(_axes_in_ecef(*_directions(self.to_ecef(p))), self.rotation_to_ecef())
 
     def _place(self) -> tuple[float, float, float] | None:
-        """Return the origin, None for ECEF; raise for a Cartesian frame, which has no place on Earth."""
+        """Return the origin (latitude, longitude, height) in rad, rad, m; None for ECEF.
+
+        Raise InvalidProblem for a Cartesian frame, which has no place on Earth.
+        """
         if not self.geodetic:
             raise InvalidProblem(
                 "a cartesian frame has no place on Earth", "frame", "use the frame 'ecef', or 'enu' with its origin"
@@ -161,6 +165,7 @@ class Frame:
         return self.origin
 
     def _spatial(self, position: ArrayLike) -> Array:
+        """Return positions (..., 2 or 3) as positions (..., 3); the third coordinate of an ENU plane is zero."""
         p = _vectors(position, (2, 3) if self.kind == "enu" else (3,))
         return p if p.shape[-1] == 3 else np.concatenate([p, np.zeros_like(p[..., :1])], axis=-1)
 
@@ -198,29 +203,34 @@ def ecef_to_geodetic(position: ArrayLike) -> tuple[Array, Array, Array]:
     p = _vectors(position, (3,))
     (sine, cosine), (east, north) = _directions(p)
     height = (
-        np.sqrt(p[..., 0] ** 2 + p[..., 1] ** 2) * cosine + p[..., 2] * sine - _MAJOR * np.sqrt(1.0 - _FLAT * sine**2)
+        np.sqrt(p[..., 0] ** 2 + p[..., 1] ** 2) * cosine
+        + p[..., 2] * sine
+        - _MAJOR * np.sqrt(1.0 - _SQUARED_ECCENTRICITY * sine**2)
     )
     return np.asarray(atan2(sine, cosine)), np.asarray(atan2(east, north)), np.asarray(height)
 
 
 # Semi-axes of WGS 84, metres, and its squared eccentricity.
 _MAJOR, _MINOR = 6378137.0, 6356752.31424518
-_FLAT = 1.0 - (_MINOR / _MAJOR) ** 2
+_SQUARED_ECCENTRICITY = 1.0 - (_MINOR / _MAJOR) ** 2
 # Iterations of Bowring's method from the geocentric direction: only rounding error remains at all heights above -6000
 # km.
 _STEPS = 3
 
 
 def _directions(position: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return sine and cosine (...) of latitude, and of longitude, of ECEF positions (..., 3), without angles."""
+    """Return sine and cosine (...) of latitude, and of longitude, of ECEF positions (..., 3), without angles.
+
+    Heights and axes need the sines and cosines only, and square roots are faster than sines.
+    """
     x, y, z = np.moveaxis(position, -1, 0)
     axial = np.sqrt(x * x + y * y)
     rise, run = z, axial
     for _ in range(_STEPS):
         sine, cosine = _unit(_MINOR * rise, _MAJOR * run)
-        rise = z + _FLAT * _MAJOR**2 / _MINOR * (sine * sine * sine)
+        rise = z + _SQUARED_ECCENTRICITY * _MAJOR**2 / _MINOR * (sine * sine * sine)
         # Clipped at zero: within 43 km of the centre several latitudes are possible.
-        run = np.maximum(axial - _FLAT * _MAJOR * (cosine * cosine * cosine), 0.0)
+        run = np.maximum(axial - _SQUARED_ECCENTRICITY * _MAJOR * (cosine * cosine * cosine), 0.0)
     return _unit(rise, run), _unit(y, x)
 
 
@@ -271,6 +281,7 @@ def check_geodetic(
 
 
 def _row(where: str, row: np.intp, column: Array, first_row: int) -> str:
+    """Return the location for a message: `where` and, if the column has several entries, the row as users count it."""
     return where if column.size == 1 else f"{where}, row {row + first_row}"
 
 
@@ -278,19 +289,21 @@ def _row(where: str, row: np.intp, column: Array, first_row: int) -> str:
 
 
 @lru_cache(maxsize=64)
-def _turn_at(place: tuple[float, float, float] | None) -> Array:
+def _rotation_at(place: tuple[float, float, float] | None) -> Array:
+    """Return the rotation (3, 3) from the frame with this origin to ECEF; the unit matrix for None (ECEF)."""
     if place is None:
-        return _fixed(np.eye(3))
+        return _read_only(np.eye(3))
     lat, lon = np.array(place[0]), np.array(place[1])
-    return _fixed(_axes_in_ecef((sin(lat), cos(lat)), (sin(lon), cos(lon))).T)
+    return _read_only(_axes_in_ecef((sin(lat), cos(lat)), (sin(lon), cos(lon))).T)
 
 
 @lru_cache(maxsize=64)
-def _start_at(place: tuple[float, float, float] | None) -> Array:
-    return _fixed(np.zeros(3) if place is None else geodetic_to_ecef(*place))
+def _origin_at(place: tuple[float, float, float] | None) -> Array:
+    """Return the ECEF position (3,), metres, of an origin (rad, rad, m); zeros for None (ECEF)."""
+    return _read_only(np.zeros(3) if place is None else geodetic_to_ecef(*place))
 
 
-def _fixed(array: Array) -> Array:
+def _read_only(array: Array) -> Array:
     """Return the array as a read-only array, because the cache shares it."""
     array.flags.writeable = False
     return array
@@ -304,6 +317,7 @@ def _axes_in_ecef(lat: tuple[Array, Array], lon: tuple[Array, Array]) -> Array:
 
 
 def _vectors(position: ArrayLike, lengths: tuple[int, ...]) -> Array:
+    """Return positions as a float array (..., d); raise InvalidProblem if d is not among the allowed `lengths`."""
     p = np.asarray(position, dtype=np.float64)
     if p.ndim == 0 or p.shape[-1] not in lengths:
         allowed = " or ".join(str(n) for n in lengths)

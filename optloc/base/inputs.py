@@ -101,7 +101,8 @@ class Access:
 _ACCESS: ContextVar[Access | None] = ContextVar("access", default=None)
 
 
-def _now() -> Access:
+def _current_access() -> Access:
+    """Return the permissions of the open `access` block, or the defaults outside a block."""
     return _ACCESS.get() or Access()
 
 
@@ -118,7 +119,7 @@ def access(*, outside: bool | None = None, budget: Budget | None = None, anew: b
     anew : bool
         Whether to start with an empty record of read files, and with the defaults for arguments that are None.
     """
-    old = Access() if anew else _now()
+    old = Access() if anew else _current_access()
     new = replace(
         old, outside=old.outside if outside is None else outside, budget=old.budget if budget is None else budget
     )
@@ -130,16 +131,19 @@ def access(*, outside: bool | None = None, budget: Budget | None = None, anew: b
 
 
 def relax_budget(*, outside: bool | None = None, budget: Budget | None = None) -> None:
-    """Change the permissions for the rest of the open `access` block. A command line sets them option by option."""
-    old = _now()
+    """Change the permissions for the rest of the open `access` block; None leaves a permission unchanged.
+
+    A command line sets the permissions option by option.
+    """
+    old = _current_access()
     more = {key: value for key, value in (("outside", outside), ("budget", budget)) if value is not None}
     _ACCESS.set(replace(old, **more))  # type: ignore[arg-type]  # each has the type of its field
 
 
 def files_read() -> frozenset[Path]:
     """Return the resolved paths of all files that were read in the open `access` block; empty outside a block."""
-    found = _ACCESS.get()
-    return frozenset() if found is None else frozenset(found.read)
+    current = _ACCESS.get()
+    return frozenset() if current is None else frozenset(current.read)
 
 
 def budget_of(text: str, where: str) -> Budget:
@@ -153,7 +157,7 @@ def budget_of(text: str, where: str) -> Budget:
         Location that error messages name.
     """
     known = [entry.name for entry in fields(Budget)]
-    found = {}
+    limits = {}
     for part in text.split(","):
         name, _, number = (word.strip() for word in part.partition("="))
         if name not in known:
@@ -165,25 +169,32 @@ def budget_of(text: str, where: str) -> Budget:
         # Each limit is at least one. No file system can store more than 2^63 bytes.
         if not 1.0 <= value < 2.0**63:
             raise InvalidProblem(f"{number!r} is not a number of {name}", where, f"write {name}=1e8")
-        found[name] = int(value)
-    return Budget(**found)
+        limits[name] = int(value)
+    return Budget(**limits)
 
 
 def check_budget(what: str, count: int, where: str) -> None:
-    """Raise InvalidProblem if a count is above the limit with this name: "rows", "columns", "cells" ..."""
-    limit = getattr(_now().budget, what)
+    """Raise InvalidProblem if a count is above the limit with this name: "rows", "columns", "cells" ...
+
+    `what` is the name of a limit of the current `Budget`. `where` is the location that the message names.
+    """
+    limit = getattr(_current_access().budget, what)
     if count > limit:
-        raise _beyond(what, f"{count}", limit, where)
+        raise _too_large(what, f"{count}", limit, where)
 
 
-def _beyond(what: str, count: str, limit: int, where: str) -> InvalidProblem:
+def _too_large(what: str, count: str, limit: int, where: str) -> InvalidProblem:
+    """Return the error for a file that exceeds a limit.
+
+    `what` is the name of the limit in `Budget`. `count` is the number found, or "more" if reading stopped at the limit.
+    """
     name = {"text": "bytes of text", "nesting": "levels of nesting"}.get(what, what)
-    by = f"--budget {what}=NUMBER, in Python with budget=optloc.files.Budget({what}=NUMBER)"
-    advice = f"make it smaller, or raise the limit with {by}"
-    found = (
+    option = f"--budget {what}=NUMBER, in Python with budget=optloc.files.Budget({what}=NUMBER)"
+    advice = f"make it smaller, or raise the limit with {option}"
+    message = (
         f"there are {count} {name} than {limit}" if count == "more" else f"there are {count} {name}, {limit} at most"
     )
-    return InvalidProblem(found, where, advice)
+    return InvalidProblem(message, where, advice)
 
 
 def within(folder: Path, name: str, where: str) -> Path:
@@ -208,7 +219,7 @@ def within(folder: Path, name: str, where: str) -> Path:
         inside = Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
     except ValueError:  # a name with a zero character is not valid
         raise InvalidProblem(f"{name!r} is not a file name", where, "correct it") from None
-    if not (inside or _now().outside):
+    if not (inside or _current_access().outside):
         advice = "move it there, or allow it with --outside, in Python with outside=True"
         raise InvalidProblem(f"{name!r} is outside the folder of the file that names it", where, advice)
     return path
@@ -236,8 +247,12 @@ def read_bytes(path: Path, what: str = "bytes", *, lines: bool = False) -> bytes
 
 
 def _all_of(read: Callable[[int], bytes], what: str, where: str, *, lines: bool = False) -> bytes:
-    """Return all available bytes; raise InvalidProblem as soon as they exceed a limit."""
-    budget = _now().budget
+    """Return all available bytes of a stream; raise InvalidProblem as soon as they exceed a limit.
+
+    ``read(n)`` returns at most n bytes, and none at the end. `what` is the limit, "bytes" or "text". With `lines`, the
+    number of lines is limited too. `where` is the location that messages name.
+    """
+    budget = _current_access().budget
     limit = getattr(budget, what)
     buffer, size, rows = io.BytesIO(), 0, 0
     while piece := read(_PIECE):
@@ -245,18 +260,18 @@ def _all_of(read: Callable[[int], bytes], what: str, where: str, *, lines: bool 
         size += len(piece)
         rows += piece.count(b"\n") if lines else 0
         if size > limit:
-            raise _beyond(what, "more", limit, where)
+            raise _too_large(what, "more", limit, where)
         # The first line is the header.
         if rows > budget.rows + 1:
-            raise _beyond("rows", "more", budget.rows, where)
+            raise _too_large("rows", "more", budget.rows, where)
     return buffer.getvalue()
 
 
 def _open(path: Path) -> int:
-    """Return a file descriptor of a regular file; raise InvalidProblem for anything else."""
+    """Return a file descriptor of a regular file and record its path; raise InvalidProblem for anything else."""
     try:
         # Only opening the file is a reliable test. O_NONBLOCK: opening a pipe without a writer would wait for ever.
-        found = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except (FileNotFoundError, NotADirectoryError):
         raise InvalidProblem("there is no such file", str(path), _similar_file(path)) from None
     except OSError as error:
@@ -266,21 +281,21 @@ def _open(path: Path) -> int:
         raise InvalidProblem(what, str(path), "check its permissions and links") from None
     except ValueError:
         raise InvalidProblem("this is not a file name", repr(str(path)), "correct it") from None
-    mode = os.fstat(found).st_mode
+    mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
-        os.close(found)
+        os.close(descriptor)
         if stat.S_ISDIR(mode):
             raise InvalidProblem("this is a folder, not a file", str(path), "name a file in it")
         what = "this is a pipe, a device or a socket, not a regular file"
         raise InvalidProblem(what, str(path), "write its contents to a file")
-    _now().read.add(Path(os.path.realpath(path)))
-    return found
+    _current_access().read.add(Path(os.path.realpath(path)))
+    return descriptor
 
 
 def _similar_file(path: Path) -> str:
     """Return advice for a file that does not exist: a similar name in the same folder."""
     try:
-        names = sorted(found.name for found in islice(path.parent.iterdir(), _NAMES))
+        names = sorted(entry.name for entry in islice(path.parent.iterdir(), _NAMES))
     except OSError:
         names = []
     near = nearest(path.name, names)
@@ -300,7 +315,10 @@ def read_text(path: Path) -> str:
 
 
 def decoded(data: bytes, source: str) -> str:
-    """Return bytes as text; raise InvalidProblem with the line number if they are not UTF-8."""
+    """Return bytes as text; raise InvalidProblem with the line number if they are not UTF-8.
+
+    `source` is the name of the file in messages.
+    """
     try:
         # Editors on Windows write a byte order mark at the start of files.
         return data.decode("utf-8-sig")
@@ -326,7 +344,7 @@ def toml_of(text: str, source: str) -> dict[str, Any]:
         Location that error messages name.
     """
     if max(key.count(".") for key in _KEYS.split(text)) > _PARTS:
-        raise _beyond("nesting", "more", _now().budget.nesting, source)
+        raise _too_large("nesting", "more", _current_access().budget.nesting, source)
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -336,7 +354,7 @@ def toml_of(text: str, source: str) -> dict[str, Any]:
         where = ", ".join(part for part in (source, line) if part)
         raise InvalidProblem(f"this is not TOML: {what[0].lower()}{what[1:]}", where, "see toml.io") from None
     except (ValueError, RecursionError) as error:
-        raise _refused(error, "TOML", source) from None
+        raise _invalid_document(error, "TOML", source) from None
     _check_data(data, source)
     return data
 
@@ -353,14 +371,15 @@ def json_of(text: str, source: str, parse_float: Callable[[str], Any] | None = N
         what = f"this is not JSON: {error.msg.lower()}"
         raise InvalidProblem(what, f"{source}, line {error.lineno}", "write it again") from None
     except (ValueError, RecursionError) as error:
-        raise _refused(error, "JSON", source) from None
+        raise _invalid_document(error, "JSON", source) from None
     _check_data(data, source)
     return data
 
 
-def _refused(error: Exception, language: str, source: str) -> InvalidProblem:
+def _invalid_document(error: Exception, language: str, source: str) -> InvalidProblem:
+    """Return the error for a document that its parser refuses: nesting too deep, or a number with too many digits."""
     if isinstance(error, RecursionError):
-        return _beyond("nesting", "more", _now().budget.nesting, source)
+        return _too_large("nesting", "more", _current_access().budget.nesting, source)
     # The other cause is a whole number with more than 4300 digits, which Python refuses.
     what = f"this {language} contains a number with too many digits"
     return InvalidProblem(what, source, "write numbers with at most 17 digits")
@@ -379,7 +398,10 @@ def has_controls(text: str) -> bool:
 
 
 def _check_data(data: Any, source: str) -> None:
-    """Raise if data are nested too deeply, contain control characters, or contain numbers that are too large."""
+    """Raise if data are nested too deeply, contain control characters, or contain numbers that are too large.
+
+    `data` is the content of a document. `source` is the location that messages name.
+    """
     level, depth = [data], 0
     while level:
         check_budget("nesting", depth, source)

@@ -1,4 +1,8 @@
-"""Batched linear algebra for small symmetric positive definite systems. A singular item does not affect the others."""
+"""Batched linear algebra for small symmetric positive definite systems. A singular item does not affect the others.
+
+Letters: leading axes `...` or N count the systems of a batch. n is the number of unknowns, q of right sides or columns,
+r of rows, c of equalities, d of coordinates. The library of the array can be NumPy, JAX, PyTorch or another.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +42,7 @@ def factor(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
     n = matrix.shape[-1]
     if arrays.is_other_library(matrix):
         # Arrays of some libraries are read-only. NumPy is faster with writing column by column.
-        return _factor(matrix, least)
+        return _factor_read_only(matrix, least)
     lower = np.zeros(matrix.shape)
     ok = np.ones(matrix.shape[:-2], dtype=bool)
     for j in range(n):
@@ -52,7 +56,7 @@ def factor(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
     return lower, ok
 
 
-def _factor(matrix: Any, least: float) -> tuple[Any, Any]:
+def _factor_read_only(matrix: Any, least: float) -> tuple[Any, Any]:
     """Return the result of `factor` for arrays that are read-only: column by column, from the remaining matrix."""
     xp, n = arrays.library(matrix), matrix.shape[-1]
     below = arrays.as_array_like(np.tril(np.ones((n, n))), matrix)
@@ -95,18 +99,22 @@ def factor_semidefinite(covariance: Array) -> Array:
 
 
 def _substitute(lower: Any, right: Any, order: range) -> Array:
-    """Return the solution of a triangular system; `order` is the order of the rows. It writes into no array."""
+    """Return the solution (..., n, q) of a triangular system; `order` is the order of the rows.
+
+    `lower` (..., n, n) is the triangular matrix and `right` (..., n, q) the right side. No array is changed.
+    """
     xp, rows = arrays.library(lower), dict[int, Any]()
     for j in order:
-        left = right[..., j, :]
+        rest = right[..., j, :]
         for i, row in rows.items():
-            left = left - lower[..., j, i, None] * row
-        rows[j] = left / lower[..., j, j, None]
+            rest = rest - lower[..., j, i, None] * row
+        rows[j] = rest / lower[..., j, j, None]
     solved: Array = xp.stack([rows[j] for j in range(len(order))], axis=-2)
     return solved
 
 
 def _forward(lower: Array, right: Array) -> Array:
+    """Return the solution (..., n, q) of ``lower @ x = right`` for lower triangular matrices (..., n, n)."""
     if arrays.is_other_library(lower):
         return _substitute(lower, right, range(lower.shape[-1]))
     out = np.empty(np.broadcast_shapes(lower.shape[:-2], right.shape[:-2]) + right.shape[-2:])
@@ -117,6 +125,7 @@ def _forward(lower: Array, right: Array) -> Array:
 
 
 def _backward(lower: Array, right: Array) -> Array:
+    """Return the solution (..., n, q) of ``lower.T @ x = right`` for lower triangular matrices (..., n, n)."""
     if arrays.is_other_library(lower):
         return _substitute(lower.mT, right, range(lower.shape[-1])[::-1])
     out = np.empty(right.shape)
@@ -160,7 +169,10 @@ def solve(matrix: Array, right: Array, least: float = PIVOT) -> tuple[Array, Arr
 
 
 def inverse(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
-    """Return the inverses (..., n, n) of symmetric positive definite matrices, NaN where not ok, and ok (...)."""
+    """Return the inverses (..., n, n) of symmetric positive definite matrices, and whether each is valid (...).
+
+    Invalid inverses are NaN: the matrix is not numerically positive definite. `least` as for `solve`.
+    """
     xp = arrays.library(matrix)
     out, ok = solve(matrix, xp.broadcast_to(arrays.eye(matrix.shape[-1], matrix), matrix.shape), least)
     # The rounding of the two substitutions is not symmetric, but a covariance must be symmetric to the last bit.
@@ -246,15 +258,18 @@ def whitening(covariance: Array) -> Array:
 
 
 def _whitening_of_present(covariance: Array, absent: Array, most: int) -> Array:
-    """Return the result of `whitening`, computed from the present rows only, of which each item has at most `most`."""
+    """Return the result of `whitening`, computed from the present rows only.
+
+    `absent` (..., r) marks absent rows. Each item has at most `most` present rows.
+    """
     # A stable sort keeps the order of the rows, so that the matrix stays triangular.
-    kept = np.argsort(absent, axis=-1, kind="stable")[..., :most]
-    rows, columns = kept[..., :, None], kept[..., None, :]
-    own = np.take_along_axis(np.take_along_axis(covariance, rows, -2), columns, -1)
-    across = np.zeros((*own.shape[:-1], covariance.shape[-1]))
-    np.put_along_axis(across, np.broadcast_to(columns, own.shape), whitening(own), -1)
+    chosen = np.argsort(absent, axis=-1, kind="stable")[..., :most]
+    rows, columns = chosen[..., :, None], chosen[..., None, :]
+    submatrix = np.take_along_axis(np.take_along_axis(covariance, rows, -2), columns, -1)
+    rows_of_result = np.zeros((*submatrix.shape[:-1], covariance.shape[-1]))
+    np.put_along_axis(rows_of_result, np.broadcast_to(columns, submatrix.shape), whitening(submatrix), -1)
     out = np.zeros(covariance.shape)
-    np.put_along_axis(out, np.broadcast_to(rows, across.shape), across, -2)
+    np.put_along_axis(out, np.broadcast_to(rows, rows_of_result.shape), rows_of_result, -2)
     return out
 
 
@@ -263,14 +278,14 @@ def _whitening_of_present(covariance: Array, absent: Array, most: int) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Tangent:
-    """Directions along which equalities hold to first order (tangent), and directions across them.
+    """Directions along which equalities are satisfied to first order (tangent), and directions across them.
 
     Parameters
     ----------
     along : array (N, n, n - c)
         Basis of the tangent space.
     across : array (N, n, c)
-        ``across @ g`` is the shortest step that restores the equalities.
+        ``across @ g`` is the shortest step that restores the equalities; g (N, c) are their values with opposite sign.
     """
 
     along: Array
@@ -306,7 +321,10 @@ def tangent(gradients: Array, scale: Array) -> Tangent:
 
 
 def solve_within(information: Array, vector: Array, along: Array) -> tuple[Array, Array]:
-    """Return the step (..., n) along a basis (..., n, q) that solves normal equations, and whether it exists (...)."""
+    """Return the step (..., n) along a basis (..., n, q) that solves normal equations, and whether it exists (...).
+
+    `information` (..., n, n) and `vector` (..., n) are the normal matrix and the right side.
+    """
     if along.shape[-1] == 0:
         # If the number of equalities equals the number of unknowns, the step is zero, which is a valid result.
         return np.zeros_like(vector), np.ones(vector.shape[:-1], dtype=bool)
@@ -316,7 +334,10 @@ def solve_within(information: Array, vector: Array, along: Array) -> tuple[Array
 
 
 def inverse_within(information: Array, along: Array) -> tuple[Array, Array]:
-    """Return the covariance (N, n, n) along a basis (N, n, q), zero across it, and whether it exists (N,)."""
+    """Return the covariance (N, n, n) along a basis (N, n, q), zero across it, and whether it exists (N,).
+
+    `information` (N, n, n) is the normal matrix.
+    """
     if along.shape[-1] == 0:
         return np.zeros_like(information), np.ones(len(information), dtype=bool)
     transposed = np.swapaxes(along, -1, -2)
@@ -378,7 +399,10 @@ def error_ellipse(covariance: Array, probability: float = 0.95) -> tuple[Array, 
 
 
 def project_out(unknowns: Array, values: Array) -> Array:
-    """Return values (..., q, p) minus their projection onto the span of unknowns (..., q, n)."""
+    """Return values (..., q, p) minus their projection onto the span of unknowns (..., q, n).
+
+    The result is the part of the values that no choice of the n linear unknowns can explain.
+    """
     if not unknowns.shape[-1]:
         return values
     basis = span_of(unknowns)
@@ -390,7 +414,8 @@ def project_out(unknowns: Array, values: Array) -> Array:
 def span_of(unknowns: Array) -> Array:
     """Return orthonormal columns (..., q, n) of the span of unknowns (..., q, n); zero columns if some are dependent.
 
-    Columns are first scaled to unit length. Singular values below 1e-12 of the largest then count as dependent.
+    `unknowns` has one column for each linear unknown. Columns are first scaled to unit length. Singular values below
+    1e-12 of the largest then count as dependent.
     """
     length = np.sqrt((unknowns**2).sum(-2, keepdims=True))
     u, s, _ = np.linalg.svd(unknowns / np.where(length > 0.0, length, 1.0), full_matrices=False)
@@ -409,8 +434,8 @@ def spread_directions(count: int, d: int) -> Array:
     """Return evenly distributed unit vectors (count, d): on a circle, or on a golden-angle spiral on the sphere."""
     number = np.arange(count) + 0.5
     if d == 2:
-        turn = 2.0 * np.pi * number / count
-        return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    height, turn = 1.0 - 2.0 * number / count, np.pi * (1.0 + np.sqrt(5.0)) * number
-    across = np.sqrt(1.0 - height**2)
-    return np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=-1)
+        angle = 2.0 * np.pi * number / count
+        return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    height, angle = 1.0 - 2.0 * number / count, np.pi * (1.0 + np.sqrt(5.0)) * number
+    radius = np.sqrt(1.0 - height**2)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)

@@ -75,6 +75,7 @@ def moved(name: str) -> Any:
 
 
 def _warn(old: str, new: str, level: int) -> None:
+    """Warn that a name is old; `level` is the number of calls between this function and the code of the user."""
     warnings.warn(f"{old} is {new} now; version 0.2 removes the old name", DeprecationWarning, stacklevel=level)
 
 
@@ -82,6 +83,7 @@ class _Alias(Loader):
     """Loader that replaces a module with an old name by the module with the new name."""
 
     def __init__(self, place: str) -> None:
+        """Store the new name of the module."""
         self._place = place
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:

@@ -22,7 +22,7 @@ _REPLACES: ContextVar[bool] = ContextVar("_REPLACES", default=True)
 # Temporary file, final path and requested path of files that wait until all files of a group are complete.
 _WAITING: ContextVar[list[tuple[Path, Path, Path]] | None] = ContextVar("_WAITING", default=None)
 # Temporary files of this process. Code that ends the process immediately removes them first.
-_UNNAMED: set[Path] = set()
+_TEMPORARY: set[Path] = set()
 # Names of open streams. The stream can be a file, which must not be replaced.
 _OPEN = ("/dev/stdout", "/dev/stderr", "/dev/fd/", "/proc/")
 
@@ -91,7 +91,10 @@ def claim(*paths: Path | None, inputs: Iterable[Path] = ()) -> None:
 
 
 def _place(path: Path, inputs: Iterable[Path] = ()) -> Path:
-    """Return the path to write, with links resolved; raise InvalidProblem if it is not allowed."""
+    """Return the path to write, with links resolved; raise InvalidProblem if it is not allowed.
+
+    `inputs` are files that must not be replaced.
+    """
     try:
         place = Path(os.path.realpath(path))
         if place.name != place.name.encode(errors="replace").decode():
@@ -112,7 +115,7 @@ def _place(path: Path, inputs: Iterable[Path] = ()) -> Path:
 
 
 def _refuse(path: Path, place: Path, inputs: Iterable[Path]) -> None:
-    """Raise InvalidProblem if an existing file must not be replaced."""
+    """Raise InvalidProblem if an existing file must not be replaced; `place` is `path` with links resolved."""
     if not place.is_file():
         raise InvalidProblem("it is not a file that can be replaced", str(path), "choose another name")
     for one in (*inputs, *files_read()):
@@ -142,15 +145,15 @@ def written(path: Path) -> Iterator[Path]:
         As for `claim`, and if the system refuses, for instance because the disk is full.
     """
     if is_stream(path):
-        with _sentence(path):
+        with _invalid_if_unwritable(path):
             yield path
         return
     place = _place(path)
     temporary = place.with_name(f".optloc-{secrets.token_hex(8)}{path.suffix}")
     waiting = _WAITING.get()
-    _UNNAMED.add(temporary)
+    _TEMPORARY.add(temporary)
     try:
-        with _sentence(path):
+        with _invalid_if_unwritable(path):
             # Permissions of a new file, or of the file that it replaces.
             os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
             if place.exists():
@@ -186,17 +189,21 @@ def replace_together() -> Iterator[None]:
 
 
 def _give_names(waiting: list[tuple[Path, Path, Path]]) -> None:
-    """Rename temporary files to their final paths, and remove them from the list."""
+    """Rename temporary files to their final paths, and remove them from the list.
+
+    Each entry has the temporary path, the final path, and the path that the caller requested.
+    """
     while waiting:
         temporary, place, path = waiting[0]
-        with _sentence(path):
+        with _invalid_if_unwritable(path):
             os.replace(temporary, place)  # noqa: PTH105  (as everywhere, and easier to replace in tests)
-        _UNNAMED.discard(temporary)
+        _TEMPORARY.discard(temporary)
         del waiting[0]
 
 
 @contextmanager
-def _sentence(path: Path) -> Iterator[None]:
+def _invalid_if_unwritable(path: Path) -> Iterator[None]:
+    """Convert errors of the operating system in the block to InvalidProblem; a closed pipe stays a BrokenPipeError."""
     try:
         yield
     except BrokenPipeError:
@@ -206,13 +213,14 @@ def _sentence(path: Path) -> Iterator[None]:
 
 
 def _remove(temporary: Path) -> None:
+    """Remove a temporary file, and its entry in the set of temporary files."""
     temporary.unlink(missing_ok=True)
-    _UNNAMED.discard(temporary)
+    _TEMPORARY.discard(temporary)
 
 
 def remove_unnamed() -> None:
     """Remove all temporary files, because the process is about to end."""
-    for temporary in tuple(_UNNAMED):
+    for temporary in tuple(_TEMPORARY):
         _remove(temporary)
 
 
@@ -231,16 +239,17 @@ class GrowingFile:
     """
 
     def __init__(self, path: Path) -> None:
+        """Check the final path and the temporary path. No file is made before the first `append`."""
         self.path, self.partial = path, partial_of(path)
         claim(path, self.partial)
         self._begun = self._whole = False
 
     def append(self, data: bytes) -> None:
         """Append data immediately; raise InvalidProblem if this fails."""
-        how = "ab" if self._begun else "wb" if _REPLACES.get() else "xb"
+        mode = "ab" if self._begun else "wb" if _REPLACES.get() else "xb"
         self._begun, self._whole = True, False
         # One write without a buffer, so that an interrupted run leaves complete lines.
-        with _sentence(self.partial), self.partial.open(how, buffering=0) as file:
+        with _invalid_if_unwritable(self.partial), self.partial.open(mode, buffering=0) as file:
             while data:
                 data = data[file.write(data) :]
         self._whole = True

@@ -43,6 +43,7 @@ class Registry(MutableMapping[str, T]):
         own: dict[str, T],
         derived: Callable[[], Mapping[str, T]] | None = None,
     ) -> None:
+        """Store the entries of optloc. Entry points are not read yet."""
         self._group, self._fits, self._own, self._derived = group, fits, own, derived or dict
         self._found: dict[str, T] | None = None
 
@@ -73,6 +74,7 @@ class Registry(MutableMapping[str, T]):
 
     @property
     def _added(self) -> dict[str, T]:
+        """Return the entries of installed packages; entry points are read at the first use."""
         if self._found is None:
             self._found = {}  # set first, because a package may use the table while it loads
             for entry in entry_points(group=self._group):
@@ -80,7 +82,10 @@ class Registry(MutableMapping[str, T]):
         return self._found
 
     def _take(self, entry: EntryPoint, found: dict[str, T]) -> None:
-        """Add the object of an entry point to `found`, or warn why it is not added."""
+        """Add the object of an entry point to `found`, or warn why it is not added.
+
+        `found` are the valid entries of the packages that were read earlier.
+        """
         # A package cannot replace an entry of optloc, or of a package that was read earlier.
         if entry.name in self._own or entry.name in found:
             self._refuse(entry, f"the name {entry.name!r} is taken")
@@ -96,6 +101,7 @@ class Registry(MutableMapping[str, T]):
             self._refuse(entry, f"{entry.value} is {type(value).__name__}, which is not valid there")
 
     def _refuse(self, entry: EntryPoint, why: str) -> None:
+        """Warn that an entry point is ignored; `why` is the reason."""
         package = "an unnamed package" if entry.dist is None else f"the package {entry.dist.name!r}"
         what = f"{package} adds nothing to {self._group} as {entry.name!r}: {why}"
         warnings.warn(what, RuntimeWarning, stacklevel=2)
@@ -125,8 +131,8 @@ def load_plugin(name: str) -> None:
     InvalidProblem
         If it does not exist, or if it raises an error; the message contains this error.
     """
-    path, known = Path(name), _known(name)
-    if known in _PLUGINS:
+    path, listed = Path(name), _plugin_name(name)
+    if listed in _PLUGINS:
         return
     try:
         if path.suffix == ".py":
@@ -136,35 +142,38 @@ def load_plugin(name: str) -> None:
     except Exception as error:
         what = f"the plugin cannot be loaded ({type(error).__name__}: {error})"
         raise InvalidProblem(what, name, "give a file that ends in .py, or the name of an installed module") from error
-    _PLUGINS.append(known)
+    _PLUGINS.append(listed)
 
 
 def plugin_module(name: str) -> ModuleType | None:
-    """Return the module of a loaded plugin by its name on loading; None if it was not loaded."""
-    known = _known(name)
-    if known not in _PLUGINS:
+    """Return the module of a loaded plugin; None if it was not loaded. `name` is as for `load_plugin`."""
+    listed = _plugin_name(name)
+    if listed not in _PLUGINS:
         return None
-    return sys.modules.get(_key(Path(known)) if known.endswith(".py") else known)
+    return sys.modules.get(_module_key(Path(listed)) if listed.endswith(".py") else listed)
 
 
-def _known(name: str) -> str:
+def _plugin_name(name: str) -> str:
+    """Return the name under which a plugin is listed: the absolute path of a file, or the name of a module."""
     return str(Path(name).resolve()) if name.endswith(".py") else name
 
 
-def _key(path: Path) -> str:
+def _module_key(path: Path) -> str:
+    """Return the key in `sys.modules` of a plugin that is a file."""
     return f"optloc plugin {path}"
 
 
 def _run_file(path: Path) -> None:
+    """Run a Python file as a module, which stays in `sys.modules`; remove it if the file raises an error."""
     # The key contains the path: two plugins can have the same file name, and neither hides a module with this name.
-    key = _key(path)
-    found = importlib.util.spec_from_file_location(key, path)
-    assert found is not None
-    assert found.loader is not None
-    module = importlib.util.module_from_spec(found)
+    key = _module_key(path)
+    spec = importlib.util.spec_from_file_location(key, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
     sys.modules[key] = module  # so that its classes can be pickled by name
     try:
-        found.loader.exec_module(module)
+        spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[key]
         raise

@@ -53,6 +53,8 @@ def thread_count() -> int:
 def held_by_forks(lock: LockType, begin: Callable[[], None] = lambda: None) -> LockType:
     """Register a lock so that it is free in a forked child, and return it. A fork first acquires the lock.
 
+    Without it, a child that forks while another thread holds the lock could wait for ever.
+
     Parameters
     ----------
     lock : threading.Lock
@@ -99,14 +101,15 @@ def map_on_threads(
         return [function(item) for item in work]
     if least > 0.0:
         # Two items, because the first call may build values that the others share. The faster one counts.
-        begun, seconds = _time(function, work[:2])
-        some = map_on_threads(function, work[2:], 1 if seconds < least else count)
-        return begun + some
+        first_results, seconds = _time(function, work[:2])
+        other_results = map_on_threads(function, work[2:], 1 if seconds < least else count)
+        return first_results + other_results
     results: dict[int, _Result] = {}
     errors: dict[int, BaseException] = {}
     queue = iter(range(len(work)))  # shared by all threads, because one task per item costs 40 us
 
     def run() -> None:
+        """Compute items from the queue until it is empty or an item fails."""
         for i in queue:
             try:
                 results[i] = function(work[i])
@@ -130,8 +133,15 @@ def map_in_order(function: Callable[[_Item], _Result], items: Sequence[_Item]) -
     """Yield the results of a function for all items in their order, with several running in parallel.
 
     It is for large parts of a batch. Unlike `map_on_threads` it suits work in which Python takes as long as machine
-    code: the Python code of one part runs while the machine code of another runs. Results can be freed after each
-    step: at most one more than the number of threads is stored.
+    code: the Python code of one part runs while the machine code of another runs. The caller can free each result
+    before the next one: at most one more result than the number of threads is stored.
+
+    Parameters
+    ----------
+    function : callable
+        Function of one item, as for `map_on_threads`. Its own calls of `thread_count` return its share of the threads.
+    items : sequence
+        The parts.
     """
     threads = thread_count()
     count = min(threads, len(items))
@@ -158,7 +168,10 @@ def map_in_order(function: Callable[[_Item], _Result], items: Sequence[_Item]) -
 
 
 def _time(function: Callable[[_Item], _Result], work: list[_Item]) -> tuple[list[_Result], float]:
-    """Return the results of a few items, and the time of the fastest, because the first may build shared values."""
+    """Return the results of a few items, and the duration of the fastest, seconds.
+
+    The fastest counts, because the first item may build shared values.
+    """
     results, times = [], []
     for item in work:
         began = perf_counter()
@@ -169,8 +182,8 @@ def _time(function: Callable[[_Item], _Result], work: list[_Item]) -> tuple[list
 
 def _processors() -> int:
     """Return the number of processors that this process may use, by os.process_cpu_count in Python 3.13 and later."""
-    own = getattr(os, "process_cpu_count", None)
-    if own is not None:
-        return own() or 1
+    process_cpu_count = getattr(os, "process_cpu_count", None)
+    if process_cpu_count is not None:
+        return process_cpu_count() or 1
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1

@@ -1,4 +1,8 @@
-"""Data types of a problem, its status and its certificate: frozen, in SI units and radians, batch axes first."""
+"""Data types of a problem, its status and its certificate: frozen, in SI units and radians, batch axes first.
+
+Letters: s stations, k epochs, m rows, d coordinates, q members of a bias, n entries of a named part. Leading axes `...`
+count the problems of a batch.
+"""
 
 from __future__ import annotations
 
@@ -83,7 +87,10 @@ class Stations:
         return bool((np.abs(self.covariance - equal) <= 1e-9 * equal).all())
 
     def with_noise(self) -> Stations:
-        """Return the stations with errors of span "epoch" changed to noise, because no other epoch shares them."""
+        """Return the stations with errors of span "epoch" changed to noise, because no other epoch shares them.
+
+        The errors then need no unknowns.
+        """
         return replace(self, span="noise") if self.unknown_for == "epoch" else self
 
     @property
@@ -140,7 +147,7 @@ class Rows:
 
     @property
     def sense(self) -> float:
-        """Return the sign of errors of `z` in reports: -1 for compass bearings (clockwise errors), else 1."""
+        """Return the sign of errors of `z` in reports: -1 for compass bearings, whose errors count clockwise, or 1."""
         return 1.0
 
     def clockwise(self) -> Rows:
@@ -154,7 +161,7 @@ class CompassRows(Rows):
 
     @property
     def sense(self) -> float:
-        """Return -1."""
+        """Return -1, because errors of compass bearings count clockwise in reports and `z` counts anticlockwise."""
         return -1.0
 
 
@@ -444,7 +451,10 @@ HAS_ANSWER = np.isin(np.arange(1 + max(Status)), ANSWERED)
 
 
 def first_status(marks: Array) -> Array:
-    """Return the status numbers (...) of findings `marks` (...); `ok` if the marks contain notes only."""
+    """Return the status numbers (...) of findings `marks` (...); `ok` if the marks contain notes only.
+
+    The marks of a fix are the sum of `Status.mark` over its findings. The status is the first of them in `PRECEDENCE`.
+    """
     marks = np.asarray(marks)
     code = np.full(marks.shape, int(Status.OK), dtype=np.int8)
     anywhere = int(np.bitwise_or.reduce(marks, axis=None))  # a batch has few different statuses

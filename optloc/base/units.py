@@ -170,7 +170,10 @@ class Conversion:
         return self.factor * np.asarray(values_si, dtype=np.float64)
 
     def sigma_to_si(self, sigma: ArrayLike, values_si: ArrayLike | None = None) -> NDArray[np.float64]:
-        """Return standard deviations (...) in SI, to first order at the measured values."""
+        """Return standard deviations (...) in SI, to first order at the measured values `values_si` (...).
+
+        Only logarithmic units need the measured values.
+        """
         scaled: NDArray[np.float64] = np.abs(self.slope(values_si)) * np.asarray(sigma, dtype=np.float64)
         return scaled
 
@@ -248,7 +251,7 @@ def to_si(
     convention: AzimuthConvention = "east-counterclockwise",
     where: str | None = None,
 ) -> NDArray[np.float64]:
-    """Return values of any shape in SI; the options are those of :func:`conversion`."""
+    """Return values of any shape in SI; the options are as for :func:`conversion`."""
     return conversion(
         unit, quantity, propagation_speed=propagation_speed, carrier=carrier, convention=convention, where=where
     ).to_si(values)
@@ -266,7 +269,7 @@ def sigma_to_si(
 ) -> NDArray[np.float64]:
     """Return standard deviations of any shape in SI.
 
-    The options are those of :func:`conversion`. Decibels also need the measured values in SI: to first order, a
+    The options are as for :func:`conversion`. Decibels also need the measured values in SI: to first order, a
     standard deviation of s dB is ``ratio * s * ln(10) / 20``.
     """
     return conversion(unit, quantity, propagation_speed=propagation_speed, carrier=carrier, where=where).sigma_to_si(
@@ -295,13 +298,13 @@ def split_amount(value: float | str, quantity: Quantity, where: str) -> tuple[fl
 
 
 def example_of(number: float, text: str, quantity: Quantity) -> str:
-    """Return an amount with its SI unit as an example, with the number of the user if it is valid."""
+    """Return an amount with its SI unit as an example for a message, with the number of the user if it is valid."""
     return f'"{text if abs(number) <= LARGEST else 1.5} {SI_UNIT[quantity]}"'
 
 
-def _holds_text(value: Any) -> bool:
+def _contains_text(value: Any) -> bool:
     """Return whether a list, or a nested list, contains text."""
-    return isinstance(value, list | tuple) and any(isinstance(each, str) or _holds_text(each) for each in value)
+    return isinstance(value, list | tuple) and any(isinstance(each, str) or _contains_text(each) for each in value)
 
 
 def in_si(value: Any, quantity: Quantity, where: str, *, deviation: bool = False, place: bool = False) -> Any:
@@ -338,9 +341,9 @@ def in_si(value: Any, quantity: Quantity, where: str, *, deviation: bool = False
             raise InvalidProblem(f"{value!r} has no unit", where, f"write it with its unit, such as {example}")
         if place and unit in _TIME:
             raise InvalidProblem(f"{value!r} is a time", where, 'give a length, such as "1.5 km"')
-        found = conversion(unit, quantity, where=where)
-        return float(found.sigma_to_si(number) if deviation else found.to_si(number))
-    if _holds_text(value):
+        unit_conversion = conversion(unit, quantity, where=where)
+        return float(unit_conversion.sigma_to_si(number) if deviation else unit_conversion.to_si(number))
+    if _contains_text(value):
         numbers = [in_si(each, quantity, where, deviation=deviation, place=place) for each in value]
         try:
             return np.array(numbers, dtype=float)
@@ -366,7 +369,7 @@ def sound_in_air(celsius: float) -> float:
     InvalidProblem
         For a temperature outside -60 to 60 deg C.
     """
-    _within("the temperature of air", celsius, _AIR, "deg C")
+    _check_range("the temperature of air", celsius, _AIR, "deg C")
     return 331.3 * math.sqrt(1.0 + celsius / 273.15)
 
 
@@ -391,20 +394,22 @@ def sound_in_water(celsius: float, salinity: float = 35.0, depth: float = 0.0) -
     ----------
     H. Medwin, "Speed of sound in water: a simple equation for realistic parameters", J. Acoust. Soc. Am. 58 (1975).
     """
-    _within("the temperature of water", celsius, _WATER, "deg C")
-    _within("the salinity", salinity, _SALT, "g/kg")
-    _within("the depth", depth, _DEEP, "m")
+    _check_range("the temperature of water", celsius, _WATER, "deg C")
+    _check_range("the salinity", salinity, _SALT, "g/kg")
+    _check_range("the depth", depth, _DEEP, "m")
     pure = 1449.2 + 4.6 * celsius - 0.055 * celsius**2 + 0.00029 * celsius**3
     return pure + (1.34 - 0.010 * celsius) * (salinity - 35.0) + 0.016 * depth
 
 
-def _within(name: str, value: float, ends: tuple[float, float], unit: str) -> None:
+def _check_range(name: str, value: float, ends: tuple[float, float], unit: str) -> None:
+    """Raise if a value is outside the range of validity of a formula; `name` and `unit` describe it in the message."""
     if not ends[0] <= value <= ends[1]:
         what = f"{name} is {value:g} {unit}, outside {ends[0]:g} to {ends[1]:g}"
         raise InvalidProblem(what, "propagation speed", "give the speed as a number, in metres per second")
 
 
 def _check_options(unit: str, quantity: str, propagation_speed: float, convention: str, where: str | None) -> None:
+    """Raise if an argument of `conversion` is unknown or out of range; `where` is the location that messages name."""
     if quantity not in UNITS:
         raise InvalidProblem(f"unknown quantity {quantity!r}", where, nearest(quantity, list(UNITS)))
     if unit not in UNITS[quantity]:  # type: ignore[index]  # just checked

@@ -2,6 +2,10 @@
 
 The same function works on numbers (NumPy), on symbols (CasADi) and on derivatives (Jet). To add a kind, add an entry to
 the table, or declare an entry point of the group ``optloc.models`` in another package.
+
+In all functions, `t` is the target and `a` and `b` are the first and the second station of a row. r_a and r_b are their
+ranges to the target, metres, and r'_a and r'_b the range rates, metres per second. A node is one scalar function of the
+position of which rows are sums, for instance a range.
 """
 
 from __future__ import annotations
@@ -51,10 +55,12 @@ __all__ = [
 class LiftedRow:
     """A measurement as an equation linear in position and ranges: ``x.position + ra r_a + rb r_b + constant = 0``.
 
+    Closed-form starts solve such equations.
+
     Parameters
     ----------
     x : tuple of d numbers, or None
-        Coefficients of the target's position (1); None if the equation has ranges only.
+        Coefficients of the target's position, without a unit; None if the equation has ranges only.
     ra, rb : number
         Coefficients of the ranges to the first and second station.
     constant : number
@@ -138,6 +144,7 @@ class Model:
     aliases: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        """Check the fields, and use `ranges` as the default of `signs`."""
         if self.quantity not in UNITS:
             raise InvalidProblem(f"unknown quantity {self.quantity!r}", "quantity", nearest(self.quantity, list(UNITS)))
         if self.stations not in (0, 1, 2):
@@ -147,16 +154,19 @@ class Model:
 
 
 def _azimuth(line: Components) -> Any:
+    """Return the azimuth of a line of sight, radians from the first axis towards the second."""
     return namespace(line[1]).atan2(line[1], line[0])
 
 
 def _elevation(line: Components) -> Any:
+    """Return the elevation of a line of sight above the plane of the first two axes, radians."""
     # By the arctangent, because the arcsine of a ratio loses digits near the zenith.
     xp = namespace(line[2])
     return xp.atan2(line[2], xp.hypot(line[0], line[1]))
 
 
 def _height(t: Point, a: Point, b: Point) -> Any:
+    """Return the height of the target above the WGS 84 ellipsoid, metres."""
     assert t.ecef is not None
     return geodetic_height(t.ecef)
 
@@ -182,10 +192,12 @@ def rss_difference(exponent: float = 2.0) -> Model:
     decibels = 10.0 * exponent / log(10.0)
 
     def h(t: Point, a: Point, b: Point) -> Any:
+        """Return the measurement, decibels."""
         ratio = distance(t, b) / distance(t, a)
         return decibels * namespace(ratio).log(ratio)
 
     def lifted(m: Any, a: Point, b: Point) -> LiftedRow:
+        """Return the equation ``r_a - ratio r_b = 0`` of a measured value m, decibels."""
         ratio = namespace(m).exp(m / -decibels)
         return LiftedRow(None, 1.0, -1.0 * ratio, 0.0, lambda t, a, b: ratio / decibels * distance(t, b))
 
@@ -194,7 +206,8 @@ def rss_difference(exponent: float = 2.0) -> Model:
     return Model(h, "level", 2, summary, signs=(1, -1), nodes=nodes, lifted=lifted, aliases=("rssd", "drss"))
 
 
-def _basis(a: Point) -> tuple[Components, ...]:
+def _axes_of(a: Point) -> tuple[Components, ...]:
+    """Return the axes of a station: d unit vectors in the problem's frame; the axes of the frame if none are stated."""
     if a.axes is not None:
         return a.axes
     d = len(a.position)
@@ -202,12 +215,14 @@ def _basis(a: Point) -> tuple[Components, ...]:
 
 
 def _lifted_azimuth(m: Any, a: Point, b: Point) -> LiftedRow:
+    """Return the equation of a measured azimuth m, radians: the target is in a vertical plane through the station."""
     xp = namespace(m)
-    basis = _basis(a)
+    axes = _axes_of(a)
     # Normal of the vertical plane through the station at this azimuth. The target is in this plane.
-    across = tuple(xp.cos(m) * v - xp.sin(m) * u for u, v in zip(basis[0], basis[1], strict=True))
+    across = tuple(xp.cos(m) * v - xp.sin(m) * u for u, v in zip(axes[0], axes[1], strict=True))
 
     def horizontal(t: Point, a: Point, b: Point) -> Any:
+        """Return the derivative of the equation with respect to the azimuth: minus the horizontal range, metres."""
         line = local(t, a)
         # An error of the angle changes the equation by error times horizontal range.
         return -1.0 * namespace(line[0]).hypot(line[0], line[1])
@@ -216,8 +231,9 @@ def _lifted_azimuth(m: Any, a: Point, b: Point) -> LiftedRow:
 
 
 def _lifted_elevation(m: Any, a: Point, b: Point) -> LiftedRow:
+    """Return the equation of a measured elevation m, radians: height above the station = sin(m) times range."""
     xp = namespace(m)
-    up = _basis(a)[2]
+    up = _axes_of(a)[2]
     return LiftedRow(
         up, -1.0 * xp.sin(m), 0.0, -1.0 * dot(up, a.position), lambda t, a, b: -1.0 * distance(t, a) * xp.cos(m)
     )
@@ -347,6 +363,7 @@ class _DerivedKinds(dict[str, Model]):
     """Table of kinds that are not listed: kinds along rays, made from their names, and distances between stations."""
 
     def __missing__(self, name: str) -> Model:
+        """Return the kind with this name; raise KeyError if the name is not a derived kind."""
         if name == BETWEEN:
             return Model(lambda t, a, b: distance(a, b), "length", 2, "distance of two stations")
         if not name.startswith(RAY):
@@ -356,6 +373,7 @@ class _DerivedKinds(dict[str, Model]):
 
 @lru_cache(maxsize=64)
 def _along_rays(name: str) -> Model:
+    """Return the kind "ray_...", measured along the rays of a medium; raise KeyError without a model for bent rays."""
     kind = name.removeprefix(RAY)
     model = MODELS[kind]
     if model.ray is None:
@@ -401,6 +419,10 @@ _FOREIGN = {"adoa", "pdoa", "poa", "rtt", "rss", "rssi", "csi", "snr"}
 
 
 def _likely_kind(word: str, words: dict[str, str]) -> str:
+    """Return advice for an unknown kind: a likely correction, and the known kinds.
+
+    `words` maps each name and alias to the name of its kind.
+    """
     # Only a likely typing error is corrected: one letter of four, not the first. Other similar words have other
     # meanings.
     alike = [known for known in words if known[:1] == word[:1]]

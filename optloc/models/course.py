@@ -51,15 +51,15 @@ def carry(start: Components, straight: Components, rise: Any) -> Components:
     e2 = WGS84_F * (2.0 - WGS84_F)
     up, height = geodetic_normal(start), geodetic_height(start)
     xp = namespace(height)
-    way = subtract(straight, start)
-    climb = dot(way, up)
-    level = tuple(w - climb * u for w, u in zip(way, up, strict=True))
+    displacement = subtract(straight, start)
+    climb = dot(displacement, up)
+    horizontal = tuple(w - climb * u for w, u in zip(displacement, up, strict=True))
     radius = WGS84_A * (1.0 - e2) ** 0.5 / (1.0 - e2 * up[2] * up[2]) + height
-    squared = dot(level, level)
-    half = 0.5 * xp.sqrt(squared / (radius * radius) + _STILL)
-    share = xp.sin(half) / half
+    squared = dot(horizontal, horizontal)
+    half_angle = 0.5 * xp.sqrt(squared / (radius * radius) + _STILL)
+    sinc = xp.sin(half_angle) / half_angle
     # With the angle w: sin w / w of the displacement, and downwards (1 - cos w) / w^2 of its square over the radius.
-    along, drop = share * xp.cos(half), 0.5 * share * share * squared / radius
-    place = tuple(s + along * v - drop * u for s, v, u in zip(start, level, up, strict=True))
-    short = height + climb + rise - geodetic_height(place)
-    return tuple(p + short * u for p, u in zip(place, geodetic_normal(place), strict=True))
+    along, drop = sinc * xp.cos(half_angle), 0.5 * sinc * sinc * squared / radius
+    place = tuple(s + along * v - drop * u for s, v, u in zip(start, horizontal, up, strict=True))
+    missing_height = height + climb + rise - geodetic_height(place)
+    return tuple(p + missing_height * u for p, u in zip(place, geodetic_normal(place), strict=True))

@@ -1,4 +1,8 @@
-"""Layered media: speed as a function of depth (constant or linear in each layer), and first arrivals of the rays."""
+"""Layered media: speed as a function of depth (constant or linear in each layer), and first arrivals of the rays.
+
+Letters: n pairs of points, L layers, k rays that were found. y is a depth and c a speed; y0, y1, c0, c1 are the depths
+and the speeds at the top and the bottom of a layer.
+"""
 
 from __future__ import annotations
 
@@ -117,29 +121,33 @@ class Layers:
         # Derivatives of the ray parameter. For a vertical ray it is zero and has no direction.
         grows = [(dx, ray.by_across * x / away), (dy, ray.by_across * y / away), (zt, ray.by_t), (za, ray.by_a)]
         # The quotient of horizontal slowness and horizontal distance is smooth, also for a vertical ray.
-        own = [(end, slope / away) for end, slope in grows]
-        own += [(d, -ray.share * v / away**2) for d, v in ((dx, x), (dy, y))]
-        share = differential(c * ray.share, [(end, np.where(ray.across > 0.0, c * slope, 0.0)) for end, slope in own])
+        dependences = [(end, slope / away) for end, slope in grows]
+        dependences += [(d, -ray.share * v / away**2) for d, v in ((dx, x), (dy, y))]
+        share = differential(
+            c * ray.share, [(end, np.where(ray.across > 0.0, c * slope, 0.0)) for end, slope in dependences]
+        )
         ups = []
         for end, at, bends in ((zt, ray.at_t, ray.bends_t), (za, ray.at_a, ray.bends_a)):
             # at^2 = 1 / c^2 - p^2
             with np.errstate(all="ignore"):  # a ray horizontal at an end has no derivative of its slope
-                pulls = [*((other, -ray.p * slope / at) for other, slope in grows), (end, bends / at)]
-            ups.append(differential(c * at, [(other, c * slope) for other, slope in pulls]))
+                dependences_of_slope = [*((other, -ray.p * slope / at) for other, slope in grows), (end, bends / at)]
+            ups.append(differential(c * at, [(other, c * slope) for other, slope in dependences_of_slope]))
         return (share * dx, share * dy, ups[0]), (-1.0 * share * dx, -1.0 * share * dy, ups[1])
 
     def _ray(self, t: Point, a: Point) -> Ray:
+        """Return the first arrivals between targets `t` and stations `a`, in the shape of their coordinates."""
         given = [_value(v) for v in (*t.position, *a.position)]
-        own = any(isinstance(v, Portable) for v in given)
+        portable = any(isinstance(v, Portable) for v in given)
         values = np.broadcast_arrays(*(np.asarray(v, dtype=float) for v in given))
         x, y, zt, u, v, za = (np.ravel(value) for value in values)
         across = np.sqrt((x - u) ** 2 + (y - v) ** 2)
-        ray = first_arrival(self, across, self.surface - zt, self.surface - za, log if own else np.log)
-        kind = Portable if own else np.ndarray
+        ray = first_arrival(self, across, self.surface - zt, self.surface - za, log if portable else np.log)
+        kind = Portable if portable else np.ndarray
         return Ray(*(part.reshape(values[0].shape).view(kind) for part in ray))
 
 
 def _value(component: Any) -> Any:
+    """Return the value of a component without its derivatives; raise InvalidProblem for symbols."""
     value = component.value if isinstance(component, Jet) else component
     if not isinstance(value, np.ndarray | float | int | np.number):
         # CasADi symbols and arrays of other libraries end here. No machine code is made for these rows.
@@ -157,6 +165,7 @@ def as_number(given: Any) -> float:
 
 
 def _numbers(given: Any, name: str) -> tuple[float, ...]:
+    """Return the numbers of a table as a tuple; raise InvalidProblem, with the argument `name`, for other content."""
     try:
         return tuple(float(v) for v in given)
     except (TypeError, ValueError):
@@ -164,6 +173,7 @@ def _numbers(given: Any, name: str) -> tuple[float, ...]:
 
 
 def _check(table: Layers) -> None:
+    """Raise InvalidProblem if the depths, the speeds or the other fields of a table are invalid."""
     depth, speed = np.array(table.depth), np.array(table.speed)
     if table.between not in ("linear", "constant"):
         raise InvalidProblem(f"unknown shape {table.between!r} of speeds", "between", "use 'linear' or 'constant'")
@@ -195,7 +205,7 @@ def _mean(table: Layers) -> float:
 
 @lru_cache(maxsize=64)
 def _layers(table: Layers) -> tuple[Array, Array, Array, Array]:
-    """Return the top, the bottom, and the speeds at both, of each layer (L,)."""
+    """Return y0, y1, c0, c1, each (L,): the top and the bottom of each layer, metres, and the speeds at both, m/s."""
     depth, speed = np.array(table.depth), np.array(table.speed)
     if table.between == "linear":
         return depth[:-1], depth[1:], speed[:-1], speed[1:]
@@ -208,7 +218,7 @@ def _layers(table: Layers) -> tuple[Array, Array, Array, Array]:
 
 
 class Ray(NamedTuple):
-    """First arrivals. All arrays have the same shape. The time is NaN if there is no ray.
+    """First arrivals of n pairs of a target t and a station a, as arrays of one shape. Without a ray the time is NaN.
 
     Parameters
     ----------
@@ -270,7 +280,7 @@ class _Legs(NamedTuple):
 
     @classmethod
     def of(cls, parts: tuple[Array, Array, Array], times: Array, top: Array, turn: Array, slope: Array) -> _Legs:
-        """Return legs from their heights and speeds."""
+        """Return legs from `parts`: their heights (L, n), metres, and the speeds at both ends (L, n)."""
         h, c1, c2 = parts
         short1, short2 = ((top - c) * (top + c) / top**2 for c in (c1, c2))
         return cls(h, c1, c2, times, short1, short2, top, turn, slope)
@@ -280,18 +290,21 @@ class _Legs(NamedTuple):
         return _Legs(*(part if part is self.times else part[..., index] for part in self))
 
     def cosines(self, sine: Array, cosine: Array) -> tuple[Array, Array]:
-        """Return w at both ends of all legs, computed without a difference of nearly equal numbers."""
+        """Return w at both ends of all legs, each (L, n), computed without a difference of nearly equal numbers.
+
+        `sine` and `cosine` (n,) are of the angle from the vertical at the top speed, also in the other methods.
+        """
         # By rounding, the top speed can be slightly below a speed that equals it.
         first, second = (np.sqrt(np.maximum(cosine**2 + sine**2 * v, 0.0)) for v in (self.short1, self.short2))
         return first, second
 
     def turning(self, sine: Array, cosine: Array) -> Array:
-        """Return w at the start of the turning leg."""
+        """Return w (n,) at the start of the turning leg."""
         square = cosine**2 + sine**2 * (self.top - self.turn) * (self.top + self.turn) / self.top**2
         return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
     def distance(self, sine: Array, cosine: Array) -> Array:
-        """Return the horizontal distances (n,), metres."""
+        """Return the horizontal distances (n,), metres, that rays with these angles reach."""
         w1, w2 = self.cosines(sine, cosine)
         p = sine / self.top
         distance = p * _sum(np.where(self.h > 0.0, self.times * (self.c1 + self.c2) * self.h / (w1 + w2), 0.0))
@@ -300,18 +313,20 @@ class _Legs(NamedTuple):
         return np.asarray(distance + 2.0 * self.turning(sine, cosine) / (p * self.slope))
 
     def across(self, sine: Array, cosine: Array) -> tuple[Array, Array]:
-        """Return the horizontal distances (n,) and their derivatives with respect to p."""
+        """Return the horizontal distances (n,), metres, and their derivatives with respect to p, m^2/s."""
         w1, w2 = self.cosines(sine, cosine)
-        p, own = sine / self.top, np.where(self.h > 0.0, self.times * (self.c1 + self.c2) * self.h / (w1 + w2), 0.0)
+        p, per_p = sine / self.top, np.where(self.h > 0.0, self.times * (self.c1 + self.c2) * self.h / (w1 + w2), 0.0)
         bends = ((1.0 - self.short1) / w1 + (1.0 - self.short2) / w2) / (w1 + w2)
-        derivative = _sum(np.where(self.h > 0.0, own * (1.0 + sine**2 * bends), 0.0))
+        derivative = _sum(np.where(self.h > 0.0, per_p * (1.0 + sine**2 * bends), 0.0))
         if np.isnan(self.turn).all():
-            return p * _sum(own), derivative
+            return p * _sum(per_p), derivative
         w = self.turning(sine, cosine)
-        return p * _sum(own) + 2.0 * w / (p * self.slope), derivative - 2.0 / (self.slope * p**2 * w)
+        return p * _sum(per_p) + 2.0 * w / (p * self.slope), derivative - 2.0 / (self.slope * p**2 * w)
 
     def time(self, sine: Array, cosine: Array, logarithm: _Function) -> Array:
-        """Return the travel times (n,), seconds: 2 / g asinh(g chord / (2 sqrt(c1 c2))) along an arc of a circle."""
+        """Return the travel times (n,), seconds."""
+        # Along an arc of a circle the time is 2 / g asinh(g chord / (2 sqrt(c1 c2))). g is the change of speed per
+        # metre, and chord the distance between the ends of the leg.
         p = sine / self.top
         w1, w2 = self.cosines(sine, cosine)
         h, mean = np.where(self.h > 0.0, self.h, 1.0), np.sqrt(self.c1 * self.c2)
@@ -328,7 +343,7 @@ _Function = Callable[[Any], Any]
 
 
 def _sum(parts: Array) -> Array:
-    # Summed in order, so that the bits are the same on every processor.
+    """Return the sum over the first axis, in order, so that the bits are the same on every processor."""
     total = np.zeros(parts.shape[1:])
     for part in parts:
         total = total + part
@@ -336,7 +351,7 @@ def _sum(parts: Array) -> Array:
 
 
 def _asinh_over(u: Array, logarithm: _Function) -> Array:
-    """Return asinh(u) / u for u >= 0."""
+    """Return asinh(u) / u for u >= 0 (any shape)."""
     v, small = u * u, u < _SMALL
     series = 1.0 - v / 6.0 * (1.0 - v * 9.0 / 20.0 * (1.0 - v * 25.0 / 42.0 * (1.0 - v * 49.0 / 72.0)))
     large = np.where(small, 1.0, u)
@@ -345,7 +360,11 @@ def _asinh_over(u: Array, logarithm: _Function) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _FoundRay:
-    """Rays (k,) that reach their targets: pair numbers, sine and cosine of the angle at the top speed, and turns."""
+    """Rays (k,) that connect their points.
+
+    `index` (k,) is the number of the pair. `sine` and `cosine` (k,) belong to the angle at the top speed. `turns` (k,)
+    is 0 without a turn, 1 for a turn below both ends, and -1 for a turn above both ends.
+    """
 
     index: Array
     legs: _Legs
@@ -360,7 +379,10 @@ _Layered = tuple[Array, Array, Array, Array]
 
 @np.errstate(all="ignore")  # rays that do not exist give NaN
 def first_arrival(table: Layers, across: Array, yt: Array, ya: Array, logarithm: _Function = np.log) -> Ray:
-    """Return the first arrivals between pairs of points.
+    """Return the first arrivals between n pairs of points; the time is NaN if no direct ray connects a pair.
+
+    All candidate rays of a pair are computed: a horizontal ray, a ray without a turn, and rays with one turn. The
+    fastest is kept.
 
     Parameters
     ----------
@@ -377,40 +399,44 @@ def first_arrival(table: Layers, across: Array, yt: Array, ya: Array, logarithm:
     known = np.isfinite(across)
     for y in (yt, ya):
         known = known & (y >= layers[0][0]) & (y <= layers[1][-1])
-    which = np.flatnonzero(known)
-    distance, high, low = across[which], np.minimum(yt, ya)[which], np.maximum(yt, ya)[which]
+    pairs = np.flatnonzero(known)
+    distance, high, low = across[pairs], np.minimum(yt, ya)[pairs], np.maximum(yt, ya)[pairs]
     best = np.full((4, len(across)), np.nan)
     best[0] = np.inf
-    _offer(best, which, _level(layers, distance, high, low))
-    for found in (_direct(layers, distance, high, low), _turning(layers, distance, high, low)):
-        if found is None:
+    _keep_earlier(best, pairs, _horizontal_rays(layers, distance, high, low))
+    for rays in (_direct_rays(layers, distance, high, low), _turning_rays(layers, distance, high, low)):
+        if rays is None:
             continue
-        reached, rate = found.legs.across(found.sine, found.cosine)
-        p, own = found.sine / found.legs.top, distance[found.index]
+        reached, rate = rays.legs.across(rays.sine, rays.cosine)
+        p, wanted = rays.sine / rays.legs.top, distance[rays.index]
         # Correct the time to first order for the error of the distance: its derivative is p.
-        time = found.legs.time(found.sine, found.cosine, logarithm) + p * (own - reached)
-        good = np.abs(own - reached) <= _MISSED * own
-        _offer(best, which[found.index], np.stack([np.where(good, time, np.nan), p, 1.0 / rate, found.turns]))
-    return _ends(layers, across, yt, ya, best)
+        time = rays.legs.time(rays.sine, rays.cosine, logarithm) + p * (wanted - reached)
+        good = np.abs(wanted - reached) <= _MISSED * wanted
+        _keep_earlier(best, pairs[rays.index], np.stack([np.where(good, time, np.nan), p, 1.0 / rate, rays.turns]))
+    return _derivatives_at_ends(layers, across, yt, ya, best)
 
 
-def _offer(best: Array, index: Array, found: Array) -> None:
-    """Write the rays `found` (4, k), as time, p, dp / dX and turns, into `best` if they arrive earlier."""
-    order = np.argsort(-found[0], kind="stable")  # for several rays of a pair, the first arrival is written last
-    order = order[found[0, order] < best[0, index[order]]]
-    best[:, index[order]] = found[:, order]
+def _keep_earlier(best: Array, index: Array, rays: Array) -> None:
+    """Write rays that arrive earlier than the best rays so far into `best` (4, n).
+
+    `index` (k,) is the pair of each new ray. The rows of `best` and of the new `rays` (4, k) are time (NaN for no ray),
+    p, derivative of p with respect to the distance, and turns.
+    """
+    order = np.argsort(-rays[0], kind="stable")  # for several rays of a pair, the first arrival is written last
+    order = order[rays[0, order] < best[0, index[order]]]
+    best[:, index[order]] = rays[:, order]
 
 
 def _speed(layers: _Layered, y: Array) -> tuple[Array, Array]:
-    """Return the speeds at depths (n,) within the table, and their increase per metre of depth."""
+    """Return the speeds at depths (n,) within the table, m/s, and their increase per metre of depth, 1/s."""
     y0, y1, c0, c1 = layers
     j = np.clip(np.searchsorted(y0, y, side="right") - 1, 0, len(y0) - 1)
     slope = (c1[j] - c0[j]) / (y1[j] - y0[j])
     return np.where(slope == 0.0, c0[j], c0[j] + slope * (y - y0[j])), slope
 
 
-def _between(layers: _Layered, high: Array, low: Array) -> tuple[Array, Array, Array]:
-    """Return the heights, and the speeds at both ends, (L, n), of the legs between two depths."""
+def _legs_between(layers: _Layered, high: Array, low: Array) -> tuple[Array, Array, Array]:
+    """Return the heights, and the speeds at both ends, each (L, n), of the legs between depths `high` < `low` (n,)."""
     y0, y1, c0, c1 = (part[:, None] for part in layers)
     upper, lower, slope = np.clip(high, y0, y1), np.clip(low, y0, y1), (c1 - c0) / (y1 - y0)
     h = np.where(lower > upper, lower - upper, 0.0)
@@ -419,19 +445,20 @@ def _between(layers: _Layered, high: Array, low: Array) -> tuple[Array, Array, A
 
 
 def _fastest(h: Array, c1: Array, c2: Array) -> Array:
+    """Return the greatest speed (n,) of the legs with a height above zero; zero without such a leg."""
     return np.asarray(np.where(h > 0.0, np.maximum(c1, c2), 0.0).max(0))
 
 
-def _level(layers: _Layered, across: Array, high: Array, low: Array) -> Array:
-    """Return the rays (4, n), as for `_offer`, that stay at one depth: both ends are in a layer of constant speed."""
+def _horizontal_rays(layers: _Layered, across: Array, high: Array, low: Array) -> Array:
+    """Return the rays (4, n), as for `_keep_earlier`, that stay at one depth, in a layer of constant speed."""
     c, slope = _speed(layers, high)
     time = np.where((high == low) & (slope == 0.0), across / c, np.nan)
     return np.stack([time, 1.0 / c, np.zeros_like(c), np.zeros_like(c)])
 
 
-def _direct(layers: _Layered, across: Array, high: Array, low: Array) -> _FoundRay | None:
-    """Return the rays that only go up or only go down; each pair has at most one."""
-    h, c1, c2 = _between(layers, high, low)
+def _direct_rays(layers: _Layered, across: Array, high: Array, low: Array) -> _FoundRay | None:
+    """Return the rays that only go up or only go down; each pair has at most one. None if no pair has one."""
+    h, c1, c2 = _legs_between(layers, high, low)
     top = _fastest(h, c1, c2)
     index = np.flatnonzero(top > 0.0)
     if not len(index):
@@ -441,69 +468,74 @@ def _direct(layers: _Layered, across: Array, high: Array, low: Array) -> _FoundR
     # As a function of the tangent t of the angle at the top speed, the distance is concave. Newton steps from below
     # stay below.
     t = distance * legs.top / legs.across(np.zeros(len(index)), np.ones(len(index)))[1]
-    left, own = np.arange(len(index)), legs
+    remaining, remaining_legs = np.arange(len(index)), legs
     for _ in range(_STEPS):
-        cosine = 1.0 / np.sqrt(1.0 + t[left] * t[left])
-        reached, rate = own.across(t[left] * cosine, cosine)
-        move = (distance[left] - reached) * own.top / (rate * cosine**3)
-        t[left] += np.where(np.isfinite(move), move, 0.0)
-        still = np.flatnonzero(np.abs(move) > _ARRIVED * t[left])
-        if not len(still):
+        cosine = 1.0 / np.sqrt(1.0 + t[remaining] * t[remaining])
+        reached, rate = remaining_legs.across(t[remaining] * cosine, cosine)
+        step = (distance[remaining] - reached) * remaining_legs.top / (rate * cosine**3)
+        t[remaining] += np.where(np.isfinite(step), step, 0.0)
+        unfinished = np.flatnonzero(np.abs(step) > _ARRIVED * t[remaining])
+        if not len(unfinished):
             break
-        left, own = left[still], own.take(still)
+        remaining, remaining_legs = remaining[unfinished], remaining_legs.take(unfinished)
     cosine = 1.0 / np.sqrt(1.0 + t * t)
     return _FoundRay(index, legs, t * cosine, cosine, np.zeros(len(index)))
 
 
 class _Bracket(NamedTuple):
-    """Turning rays (k,), each with an interval of the cotangent of its angle that contains one arrival (`_within`)."""
+    """Intervals of the cotangent, each with one turning ray (k,); `rising` is as for `_solve_in_interval`."""
 
-    pair: Array
+    pair: Array  # numbers of the pairs (k,)
     legs: _Legs
-    low: Array
+    low: Array  # ends of the interval
     high: Array
     rising: Array
-    turns: Array
+    turns: Array  # as in `_FoundRay`
 
 
-def _turning(layers: _Layered, across: Array, high: Array, low: Array) -> _FoundRay | None:
-    """Return the rays that turn once, below both ends or above both."""
-    found: list[_Bracket] = []
+def _turning_rays(layers: _Layered, across: Array, high: Array, low: Array) -> _FoundRay | None:
+    """Return the rays that turn once, below both ends or above both; None if no pair has one."""
+    brackets: list[_Bracket] = []
     # A mirrored table converts rays that turn above to rays that turn below.
     mirrored = (-layers[1][::-1], -layers[0][::-1], layers[3][::-1], layers[2][::-1])
-    for own, upper, lower, turns in ((layers, high, low, 1.0), (mirrored, -low, -high, -1.0)):
-        slope = (own[3] - own[2]) / (own[1] - own[0])
+    for table_layers, upper, lower, turns in ((layers, high, low, 1.0), (mirrored, -low, -high, -1.0)):
+        slope = (table_layers[3] - table_layers[2]) / (table_layers[1] - table_layers[0])
         for j in np.flatnonzero(slope > 0.0):
-            found += _turning_in(own, int(j), slope[j], (across, upper, lower), turns)
-    if not found:
+            brackets += _turning_in(table_layers, int(j), slope[j], (across, upper, lower), turns)
+    if not brackets:
         return None
     index, low, high, rising, turn = (
-        np.concatenate([getattr(part, name) for part in found]) for name in ("pair", "low", "high", "rising", "turns")
+        np.concatenate([getattr(part, name) for part in brackets])
+        for name in ("pair", "low", "high", "rising", "turns")
     )
-    parts = [part.legs for part in found]
-    each = {name: np.concatenate([getattr(one, name) for one in parts], axis=-1) for name in _Legs._fields}
-    legs = _Legs(**(each | {"times": parts[0].times}))
-    return _FoundRay(index, legs, *_of_cotangent(_within(legs, across[index], low, high, rising)), turn)
+    parts = [part.legs for part in brackets]
+    joined = {name: np.concatenate([getattr(one, name) for one in parts], axis=-1) for name in _Legs._fields}
+    legs = _Legs(**(joined | {"times": parts[0].times}))
+    return _FoundRay(index, legs, *_of_cotangent(_solve_in_interval(legs, across[index], low, high, rising)), turn)
 
 
 def _turning_in(
     layers: _Layered, j: int, slope: float, pairs: tuple[Array, Array, Array], turns: float
 ) -> Iterator[_Bracket]:
-    """Yield intervals that contain rays which turn in layer j, below pairs of given distance, upper and lower depth."""
+    """Yield intervals that contain rays which turn in layer j.
+
+    `slope` is the increase of the speed per metre in this layer. `pairs` are the distances, upper depths and lower
+    depths (n,). The rays turn below the pairs. `turns` is the number to store in the result.
+    """
     across, high, low = pairs
-    begins = np.maximum(low, layers[0][j])
-    h, c1, c2 = _between(layers, high, low)
-    more, d1, d2 = _between(layers, low, begins)
-    turn, leaves = layers[2][j] + slope * (begins - layers[0][j]), layers[3][j]
-    top = np.maximum(np.maximum(_fastest(h, c1, c2), _fastest(more, d1, d2)), turn)
-    index = np.flatnonzero((low < layers[1][j]) & (top < leaves) & (across > 0.0))
+    start = np.maximum(low, layers[0][j])
+    h, c1, c2 = _legs_between(layers, high, low)
+    heights_below, d1, d2 = _legs_between(layers, low, start)
+    speed_at_start, speed_at_end = layers[2][j] + slope * (start - layers[0][j]), layers[3][j]
+    top = np.maximum(np.maximum(_fastest(h, c1, c2), _fastest(heights_below, d1, d2)), speed_at_start)
+    index = np.flatnonzero((low < layers[1][j]) & (top < speed_at_end) & (across > 0.0))
     if not len(index):
         return
     times = np.repeat([1.0, 2.0], len(h))[:, None]
-    both = (np.concatenate([h, more]), np.concatenate([c1, d1]), np.concatenate([c2, d2]))
-    legs = _Legs.of(both, times, top, turn, np.full(len(top), slope)).take(index)
+    both = (np.concatenate([h, heights_below]), np.concatenate([c1, d1]), np.concatenate([c2, d2]))
+    legs = _Legs.of(both, times, top, speed_at_start, np.full(len(top), slope)).take(index)
     # In terms of the cotangent of the angle at the top speed, the distance in the turning leg is linear.
-    most, distance = np.sqrt((leaves - legs.top) * (leaves + legs.top)) / legs.top, across[index]
+    most, distance = np.sqrt((speed_at_end - legs.top) * (speed_at_end + legs.top)) / legs.top, across[index]
     marks = [most * part / _PARTS for part in range(_PARTS + 1)]
     short = [legs.distance(*_of_cotangent(k)) <= distance for k in marks]
     for part in range(_PARTS):
@@ -514,41 +546,51 @@ def _turning_in(
 
 
 def _of_cotangent(k: Array) -> tuple[Array, Array]:
+    """Return sine and cosine of the angles (n,) with cotangents k (n,)."""
     sine = 1.0 / np.sqrt(1.0 + k * k)
     return sine, k * sine
 
 
-def _within(legs: _Legs, distance: Array, low: Array, high: Array, rising: Array) -> Array:
-    """Return the cotangents (n,) of arriving rays in intervals, by Newton steps, or bisection outside the interval."""
-    k, left = 0.5 * (low + high), np.arange(len(low))
+def _solve_in_interval(legs: _Legs, distance: Array, low: Array, high: Array, rising: Array) -> Array:
+    """Return the cotangents (n,) of arriving rays in intervals, by Newton steps, or bisection outside the interval.
+
+    `low` and `high` (n,) are the ends of the intervals; they are changed. `rising` (n,) is whether the ray at the lower
+    end reaches at most the wanted `distance` (n,), metres.
+    """
+    k, remaining = 0.5 * (low + high), np.arange(len(low))
     for _ in range(_STEPS):
-        here = k[left]
-        sine, cosine = _of_cotangent(here)
+        current = k[remaining]
+        sine, cosine = _of_cotangent(current)
         reached, rate = legs.across(sine, cosine)
-        before = (reached <= distance[left]) == rising[left]
-        low[left], high[left] = np.where(before, here, low[left]), np.where(before, high[left], here)
-        new = here - (distance[left] - reached) * legs.top / (rate * cosine * sine**2)
-        new = np.where((new > low[left]) & (new < high[left]), new, 0.5 * (low[left] + high[left]))
-        k[left] = new
-        still = np.flatnonzero(np.abs(new - here) > _ARRIVED * here)
-        if not len(still):
+        before = (reached <= distance[remaining]) == rising[remaining]
+        low[remaining], high[remaining] = (
+            np.where(before, current, low[remaining]),
+            np.where(before, high[remaining], current),
+        )
+        new = current - (distance[remaining] - reached) * legs.top / (rate * cosine * sine**2)
+        new = np.where((new > low[remaining]) & (new < high[remaining]), new, 0.5 * (low[remaining] + high[remaining]))
+        k[remaining] = new
+        unfinished = np.flatnonzero(np.abs(new - current) > _ARRIVED * current)
+        if not len(unfinished):
             break
-        left, legs = left[still], legs.take(still)
+        remaining, legs = remaining[unfinished], legs.take(unfinished)
     return k
 
 
-def _ends(layers: _Layered, across: Array, yt: Array, ya: Array, best: Array) -> Ray:
-    """Return the rays with their derivatives at both ends."""
+def _derivatives_at_ends(layers: _Layered, across: Array, yt: Array, ya: Array, best: Array) -> Ray:
+    """Return the first arrivals `best` (4, n), as for `_keep_earlier`, with their derivatives at both ends."""
     time, p, by_across, turns = best
     time = np.where(np.isfinite(time), time, np.nan)
     parts = []
-    for own, other in ((yt, ya), (ya, yt)):
-        c, slope = _speed(layers, own)
+    for depth, other_depth in ((yt, ya), (ya, yt)):
+        c, slope = _speed(layers, depth)
         # The path grows if its end moves away along the ray. Upward motion of the deeper end shortens it.
-        sign = np.where(turns == 0.0, np.where(own > other, -1.0, np.where(own < other, 1.0, 0.0)), turns)
-        at = sign * np.sqrt(np.maximum((1.0 / c - p) * (1.0 / c + p), 0.0))
-        by = np.where((p == 0.0) | (sign == 0.0), 0.0, -p / at * by_across)
-        parts.append((at, by, slope / c**3))
+        sign = np.where(
+            turns == 0.0, np.where(depth > other_depth, -1.0, np.where(depth < other_depth, 1.0, 0.0)), turns
+        )
+        slowness = sign * np.sqrt(np.maximum((1.0 / c - p) * (1.0 / c + p), 0.0))
+        change_of_p = np.where((p == 0.0) | (sign == 0.0), 0.0, -p / slowness * by_across)
+        parts.append((slowness, change_of_p, slope / c**3))
     share = np.where(across > 0.0, p / np.where(across > 0.0, across, 1.0), by_across)
     (at_t, by_t, bends_t), (at_a, by_a, bends_a) = parts
     slopes = (p, share, at_t, at_a, by_across, by_t, by_a, bends_t, bends_a)

@@ -78,7 +78,7 @@ class Atmosphere:
 
     @property
     def straight(self) -> float:
-        """Return the metres of a straight path per metre of a measurement, for starts without rays."""
+        """Return the metres of a straight path per metre of a measurement: 1, because refraction in air is small."""
         return 1.0
 
     def path(self, t: Point, a: Point) -> Any:
@@ -99,9 +99,9 @@ class Atmosphere:
         return at_t, at_a
 
     def _along(self, t: Point, a: Point) -> tuple[Any, Any, tuple[Any, Any, Any]]:
-        """Return the mean refractivity on the line, the length of the line, and the derivatives of the mean.
+        """Return the mean refractivity n - 1 on the line, the length of the line, metres, and derivatives of the mean.
 
-        The derivatives are with respect to both heights and to the length.
+        The derivatives are with respect to the heights of `t` and `a` and to the length, per metre.
         """
         assert t.ecef is not None
         assert a.ecef is not None
@@ -112,10 +112,15 @@ class Atmosphere:
         for s, weight in _SHARES:
             # Stewart's theorem gives the distance of this point of the line from the centre of the Earth.
             radius = xp.sqrt((1.0 - s) * near * near + s * far * far - s * (1.0 - s) * squared)
-            here = 1e-6 * self.refractivity * weight * xp.exp((_RADIUS - radius) / self.scale_height)
-            falls = -1.0 * here / (self.scale_height * radius)
-            parts = (here, s * far * falls, (1.0 - s) * near * falls, -s * (1.0 - s) * length * falls)
-            total = [so_far + part for so_far, part in zip(total, parts, strict=True)]
+            weighted = 1e-6 * self.refractivity * weight * xp.exp((_RADIUS - radius) / self.scale_height)
+            slope_over_radius = -1.0 * weighted / (self.scale_height * radius)
+            parts = (
+                weighted,
+                s * far * slope_over_radius,
+                (1.0 - s) * near * slope_over_radius,
+                -s * (1.0 - s) * length * slope_over_radius,
+            )
+            total = [partial_sum + part for partial_sum, part in zip(total, parts, strict=True)]
         return total[0], length, (total[1], total[2], total[3])
 
 
@@ -129,7 +134,10 @@ def path(t: Point, a: Point) -> Any:
 
 
 def arrival(t: Point, a: Point) -> Components:
-    """Return a vector from the station in the direction of the arriving wave, in the axes of the station."""
+    """Return a vector from the station in the direction of the arriving wave, in the axes of the station.
+
+    Its length is about `unit_speed` divided by the speed at the station.
+    """
     return within(tuple(-1.0 * v for v in t.medium.gradients(t, a)[1]), a)
 
 

@@ -1,4 +1,8 @@
-"""Elements of measurement functions: components of points, elementary functions, and forward-mode derivatives."""
+"""Elements of measurement functions: components of points, elementary functions, and forward-mode derivatives.
+
+A point is a tuple of components. Each component is a number, an array, a symbol or a Jet, so one formula serves all
+uses. The letter t is a target and a is a station.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,8 @@ from optloc.base.arrays import library
 def namespace(value: Any) -> Any:
     """Return the module with ``sqrt sin cos atan2 hypot`` for a value.
 
+    Measurement functions call it, so that one formula works for numbers, symbols and derivatives.
+
     Parameters
     ----------
     value : Jet, casadi.SX, casadi.MX, casadi.DM, float or array
@@ -26,9 +32,9 @@ def namespace(value: Any) -> Any:
     module
         A namespace with the array-API names of the elementary functions.
     """
-    own = getattr(value, "__elementary__", None)
-    if own is not None:
-        return own()
+    get_namespace = getattr(value, "__elementary__", None)
+    if get_namespace is not None:
+        return get_namespace()
     if type(value).__module__.startswith("casadi"):
         return sys.modules["casadi"]
     return library(value)
@@ -177,32 +183,35 @@ def geodetic_normal(ecef: Components) -> Components:
     """
     if (place := _values(ecef)) is not None:
         normal = geodetic_normal(place)
-        slopes = _turning(place)
+        slopes = _normal_derivatives(place)
         return tuple(differential(n, list(zip(ecef, row, strict=True))) for n, row in zip(normal, slopes, strict=True))
     p, sin_phi, cos_phi = _latitude(ecef)
     return ecef[0] / p * cos_phi, ecef[1] / p * cos_phi, sin_phi
 
 
-def _turning(ecef: Components) -> tuple[Components, ...]:
-    """Return the derivatives of the normal with respect to the position, one row per component, also on the axis."""
+def _normal_derivatives(ecef: Components) -> tuple[Components, ...]:
+    """Return the derivatives of the normal with respect to the position, one row per component, also on the axis.
+
+    The unit is 1/m. `ecef` is a position in metres.
+    """
     x, y, _ = ecef
     p, sin_phi, cos_phi = _latitude(ecef)
-    left = 1.0 - _E2 * sin_phi * sin_phi
+    squared_factor = 1.0 - _E2 * sin_phi * sin_phi
     # Derivative of the latitude along the meridian: one over the meridian radius of curvature plus the height.
-    north = 1.0 / (WGS84_A * (1.0 - _E2) / (left * namespace(p).sqrt(left)) + geodetic_height(ecef))
+    north = 1.0 / (WGS84_A * (1.0 - _E2) / (squared_factor * namespace(p).sqrt(squared_factor)) + geodetic_height(ecef))
     around = cos_phi / p
     # The latitude decreases with the distance from the axis, and so does `around`.
     bend = (sin_phi * sin_phi * north - around) / (p * p)
-    side = -sin_phi * cos_phi * north / p
+    mixed = -sin_phi * cos_phi * north / p
     return (
-        (around + x * x * bend, x * y * bend, x * side),
-        (x * y * bend, around + y * y * bend, y * side),
-        (x * side, y * side, cos_phi * cos_phi * north),
+        (around + x * x * bend, x * y * bend, x * mixed),
+        (x * y * bend, around + y * y * bend, y * mixed),
+        (x * mixed, y * mixed, cos_phi * cos_phi * north),
     )
 
 
 def _latitude(ecef: Components) -> tuple[Any, Any, Any]:
-    """Return the distance from the axis, and sine and cosine of the geodetic latitude."""
+    """Return the distance from the axis, metres, and sine and cosine of the geodetic latitude, of an ECEF position."""
     x, y, z = ecef
     xp = namespace(x)
     b = WGS84_A * (1.0 - WGS84_F)
@@ -218,6 +227,7 @@ def _latitude(ecef: Components) -> tuple[Any, Any, Any]:
 
 
 def _direction(rise: Any, run: Any) -> tuple[Any, Any]:
+    """Return sine and cosine of the angle of the vector (run, rise)."""
     length = namespace(rise).hypot(rise, run)
     return rise / length, run / length
 
@@ -243,6 +253,7 @@ class Jet:
     __array_ufunc__ = None  # numpy hands arithmetic with a Jet on the right to the Jet
 
     def __elementary__(self) -> ModuleType:
+        """Return the module with the elementary functions of jets, for `namespace`."""
         return sys.modules[__name__]
 
     def __add__(self, other: Any) -> Jet:
@@ -268,6 +279,7 @@ class Jet:
     __rmul__ = __mul__
 
     def __truediv__(self, other: Any) -> Jet:
+        """Return the quotient and its derivatives."""
         value, theirs = _parts(other)
         ratio = self.value / value
         inverse = 1.0 / value
@@ -346,18 +358,21 @@ def _values(numbers: Components) -> Components | None:
 
 
 def _parts(other: Any) -> tuple[Any, dict[int, Any]]:
+    """Return the value and the partial derivatives of a number or Jet; a number has no derivatives."""
     return (other.value, other.partials) if isinstance(other, Jet) else (other, {})
 
 
 def _scale(partials: dict[int, Any], factor: Any) -> dict[int, Any]:
+    """Return partial derivatives multiplied by a factor."""
     return {k: v * factor for k, v in partials.items()}
 
 
-def _sum(left: dict[int, Any], right: dict[int, Any]) -> dict[int, Any]:
+def _sum(first: dict[int, Any], second: dict[int, Any]) -> dict[int, Any]:
+    """Return the sum of partial derivatives by seed."""
     # Most operands are constants or single seeds. The dictionary is copied only if both operands have derivatives.
-    if not right:
-        return left
-    total = dict(left)
-    for k, v in right.items():
+    if not second:
+        return first
+    total = dict(first)
+    for k, v in second.items():
         total[k] = total[k] + v if k in total else v
     return total

@@ -36,11 +36,13 @@ class Surface:
 
 
 def _height(t: Point, c: Components) -> Any:
+    """Return the height of the target above the WGS 84 ellipsoid, metres."""
     assert t.ecef is not None
     return geodetic_height(t.ecef)
 
 
 def _visible(t: Point, c: Components) -> Any:
+    """Return the sine of the elevation of a point `c`, ECEF in metres, above the horizon of the target."""
     assert t.ecef is not None
     line = subtract(c, t.ecef)
     # The sine instead of the angle, because it is smooth and increases with the angle from nadir to zenith.
@@ -48,6 +50,7 @@ def _visible(t: Point, c: Components) -> Any:
 
 
 def _speed(t: Point, c: Components) -> Any:
+    """Return the speed of the target, metres per second."""
     assert t.velocity is not None
     return norm(t.velocity)
 

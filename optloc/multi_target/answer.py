@@ -1,4 +1,7 @@
-"""The result for the emitters of one epoch, and a model of evenly distributed false rows."""
+"""The result for the emitters of one epoch, and a model of evenly distributed false rows.
+
+Letters: n emitters, m rows of the problem, d coordinates.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +24,11 @@ class Ghost:
     Parameters
     ----------
     position : array (d,)
-        Metres.
+        Metres, in the frame of the problem.
     rows : int array (n,)
         Global numbers of the rows that this emitter would have.
     gap : float
-        Cost of the best assignment with this emitter minus the cost of the best assignment.
+        Cost of the best assignment with this emitter minus the cost of the best assignment, in units of chi-square.
     """
 
     position: Array
@@ -81,7 +84,7 @@ class Emitters:
 
     @property
     def gap(self) -> float:
-        """Return the cost minus its lower bound."""
+        """Return the cost minus its lower bound: no assignment can cost less by more than this gap."""
         return self.cost - self.bound
 
     @property

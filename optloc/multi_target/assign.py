@@ -1,4 +1,11 @@
-"""Assignment of rows to several emitters by column generation: columns are sets of rows."""
+"""Assignment of rows to several emitters by column generation: columns are sets of rows.
+
+The cheapest selection of the known sets gives prices of rows. A search over all positions then finds new sets that are
+worthwhile at these prices. Both steps alternate until there is no new set.
+
+Letters: m channels of a scene, q sets, n emitters, d coordinates. The picks (q, m) of sets are the numbers of the
+values that they take from each channel; -1 for none.
+"""
 
 from __future__ import annotations
 
@@ -107,21 +114,21 @@ def separate(
         raise InvalidProblem(f"the count is {count}", "count", "give the number of emitters, or None")
     if penalty is not None and not np.isfinite(penalty):
         raise InvalidProblem(f"the penalty is {penalty}", "penalty", "give a finite number, or None")
-    within = _region(problem, region)
+    search_region = _region(problem, region)
     return tuple(
-        emitters_of(problem, scene, _solve_epoch(scene, within, count, boxes), count)
+        emitters_of(problem, scene, _solve_epoch(scene, search_region, count, boxes), count)
         for scene in scenes(problem, clutter, penalty)
     )
 
 
-def _region(problem: Problem, given: Sequence[Any] | None) -> PricedRegion:
-    """Return the given region, or a region around the stations."""
-    if given is None:
+def _region(problem: Problem, corners: Sequence[Any] | None) -> PricedRegion:
+    """Return the given region, or the box of the stations extended on every side by its longest side."""
+    if corners is None:
         position = problem.stations.position.reshape(-1, problem.dimension)
         lower, upper = position.min(0), position.max(0)
-        reach = float((upper - lower).max())
-        return PricedRegion(lower - reach, upper + reach)
-    lower, upper = (np.asarray(corner, dtype=float) for corner in given)
+        longest_side = float((upper - lower).max())
+        return PricedRegion(lower - longest_side, upper + longest_side)
+    lower, upper = (np.asarray(corner, dtype=float) for corner in corners)
     good = lower.shape == upper.shape == (problem.dimension,) and np.isfinite(lower).all() and np.isfinite(upper).all()
     if not good or not (lower < upper).all():
         advice = f"give two corners of {problem.dimension} finite coordinates, the lower one first"
@@ -156,44 +163,51 @@ class Solved:
 
 
 def _solve_epoch(scene: Scene, region: PricedRegion, count: int | None, boxes: int) -> Solved:
-    """Return the best assignment. Columns are added while the search finds one with a negative reduced cost."""
+    """Return the best assignment. Columns are added while the search finds one with a negative reduced cost.
+
+    `count` is the required number of emitters, or None. `boxes` is the maximum number of boxes in each search.
+    """
     # Sets with a positive cost are kept if the assignment may need them, or if they may be listed as ghosts.
     limit = AMBIGUOUS_GAP + (scene.penalty if count is not None else 0.0)
     # Upper limit of the number of emitters, from the number of rows.
-    most = int(np.isfinite(scene.z).sum()) // scene.least
-    tuples, total = _drop_expensive(propose_sets(scene), limit), 0
-    fresh, bound = without_one_row(scene, tuples.take(np.arange(min(_PROMISING, len(tuples.cost))))), -np.inf
-    for turn in range(_ROUNDS):
-        tuples = _drop_expensive(merge(tuples, fresh), limit)
+    most_emitters = int(np.isfinite(scene.z).sum()) // scene.least
+    tuples, examined_boxes = _drop_expensive(propose_sets(scene), limit), 0
+    new_sets, bound = without_one_row(scene, tuples.take(np.arange(min(_PROMISING, len(tuples.cost))))), -np.inf
+    for iteration in range(_ROUNDS):
+        tuples = _drop_expensive(merge(tuples, new_sets), limit)
         taken, cost = cheapest_sets(tuples, scene.z.shape[1], count)
         # At these prices no examined column has a negative reduced cost. The search checks all other columns.
         prices = price_rows(tuples, taken, row_worth(scene, tuples.take(taken)), count)
-        found = search(scene, prices, region, boxes)
-        total += found.boxes
+        result = search(scene, prices, region, boxes)
+        examined_boxes += result.boxes
         # Every iteration gives a valid bound, so keep the best.
-        bound = max(bound, prices.bound(count, most, found.floor))
-        fresh = _fresh_sets(scene, prices, found)
-        if not len(fresh.cost) or (turn >= _HOPELESS and not np.isfinite(cost)):
+        bound = max(bound, prices.bound(count, most_emitters, result.floor))
+        new_sets = _new_sets(scene, prices, result)
+        if not len(new_sets.cost) or (iteration >= _HOPELESS and not np.isfinite(cost)):
             break
-    return Solved(tuples, taken, prices, cost, min(bound, cost), total)
+    return Solved(tuples, taken, prices, cost, min(bound, cost), examined_boxes)
 
 
-def _fresh_sets(scene: Scene, prices: Prices, found: PricingResult) -> Tuples:
-    """Return the sets that the search found, and others near their positions, that have a negative reduced cost."""
-    if not len(found.places):
+def _new_sets(scene: Scene, prices: Prices, result: PricingResult) -> Tuples:
+    """Return the sets that the search found, and others near their positions, that have a negative reduced cost.
+
+    `prices` are the current prices of the rows, and `result` is the result of the search with them.
+    """
+    if not len(result.places):
         return no_sets(scene)
     d = scene.scan.dimension
-    more = sets_near(scene, found.places, np.zeros((len(found.places), d, d)), prices.row)
+    nearby = sets_near(scene, result.places, np.zeros((len(result.places), d, d)), prices.row)
     # The rows were chosen one by one for a position. With fewer than d rows they do not determine a position.
-    enough = (found.picks >= 0).sum(-1) >= d
-    own = refine_sets(scene, found.picks[enough], found.places[enough])[0]
-    sets = merge(own, more)
-    fresh = sets.take(prices.reduced(sets) < -0.5 * TOLERANCE)
+    enough = (result.picks >= 0).sum(-1) >= d
+    refined = refine_sets(scene, result.picks[enough], result.places[enough])[0]
+    sets = merge(refined, nearby)
+    cheaper = sets.take(prices.reduced(sets) < -0.5 * TOLERANCE)
     # If the price of a set is too high, the prices of its neighbours probably are too.
-    return merge(fresh, without_one_row(scene, fresh))
+    return merge(cheaper, without_one_row(scene, cheaper))
 
 
 def _drop_expensive(tuples: Tuples, limit: float) -> Tuples:
+    """Return the sets that cost less than `limit`."""
     return tuples.take(np.flatnonzero(tuples.cost < limit))
 
 
@@ -201,7 +215,10 @@ def _drop_expensive(tuples: Tuples, limit: float) -> Tuples:
 
 
 def propose_sets(scene: Scene, seed: int = 0) -> Tuples:
-    """Return sets of rows near the closed-form fixes of d rows each: all, or a seeded sample if there are many."""
+    """Return sets of rows near the closed-form fixes of d rows each: all, or a seeded sample if there are many.
+
+    `seed` determines the sample. The sets have costs and refined positions.
+    """
     picks = _combinations(scene, np.random.default_rng(seed))
     if not len(picks):
         return no_sets(scene)
@@ -209,16 +226,16 @@ def propose_sets(scene: Scene, seed: int = 0) -> Tuples:
     fix = solve(problem, "roots", refine=False)
     # All roots of the closed form, because d rows can have several common positions.
     x = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
-    which, slot = np.nonzero(np.isfinite(x).all(-1))
+    item, slot = np.nonzero(np.isfinite(x).all(-1))
     with np.errstate(all="ignore"):  # some points of the closed form coincide with stations
-        equations = equations_at(problem.take(which), x[which, slot])
+        equations = equations_at(problem.take(item), x[item, slot])
         cov = covariance(equations)[0]
     good = np.flatnonzero(np.isfinite(cov).all((-1, -2)) & (equations.cost < _FITS))[:_FOLLOWED]
-    return sets_near(scene, x[which, slot][good], cov[good], np.zeros_like(scene.z))
+    return sets_near(scene, x[item, slot][good], cov[good], np.zeros_like(scene.z))
 
 
 def _combinations(scene: Scene, rng: np.random.Generator) -> Array:
-    """Return sets of d rows (q, m) that determine a position."""
+    """Return the picks (q, m) of sets of d rows that determine a position."""
     d, count = scene.scan.dimension, scene.scan.count
     ends = _ends(scene)
     values = [np.flatnonzero(np.isfinite(channel)) for channel in scene.z]
@@ -230,31 +247,34 @@ def _combinations(scene: Scene, rng: np.random.Generator) -> Array:
         subset = subsets[number]
         # All combinations of one value from each channel of the subset, because rows are unlabelled.
         for chosen in product(*(values[i] for i in subset)):
-            one = np.full(count, -1)
-            one[list(subset)] = chosen
-            picks.append(one)
+            picks_of_set = np.full(count, -1)
+            picks_of_set[list(subset)] = chosen
+            picks.append(picks_of_set)
         if len(picks) >= _TRIED:
             break
     return np.array(picks).reshape(-1, count)
 
 
 def _ends(scene: Scene) -> list[tuple[int, int] | None]:
-    """Return the two stations of each channel; None for channels with one station."""
-    found: list[tuple[int, int] | None] = []
+    """Return the two stations of each channel (m,); None for channels with one station."""
+    ends: list[tuple[int, int] | None] = []
     for block in scene.scan.rows:
-        two = MODELS[block.kind].stations > 1
-        found += [(int(a), int(b)) if two else None for a, b in zip(block.a, block.b, strict=True)]
-    return found
+        has_two = MODELS[block.kind].stations > 1
+        ends += [(int(a), int(b)) if has_two else None for a, b in zip(block.a, block.b, strict=True)]
+    return ends
 
 
 def _form_tree(pairs: list[tuple[int, int] | None]) -> bool:
-    """Return whether pairs of stations form one tree, which is necessary for a closed-form position."""
-    own = [set(pair) for pair in pairs if pair is not None]
-    while len(own) > 1:
-        joined = next((other for other in own[1:] if own[0] & other), None)
-        if joined is None or len(own[0] & joined) > 1:
+    """Return whether pairs of stations form one tree, which is necessary for a closed-form position.
+
+    The entry None is a channel with one station, which does not matter.
+    """
+    trees = [set(pair) for pair in pairs if pair is not None]
+    while len(trees) > 1:
+        joined = next((other for other in trees[1:] if trees[0] & other), None)
+        if joined is None or len(trees[0] & joined) > 1:
             return False
-        own = [own[0] | joined, *(other for other in own[1:] if other is not joined)]
+        trees = [trees[0] | joined, *(other for other in trees[1:] if other is not joined)]
     return True
 
 
@@ -262,15 +282,15 @@ def _form_tree(pairs: list[tuple[int, int] | None]) -> bool:
 
 
 def emitters_of(problem: Problem, scene: Scene, solved: Solved, count: int | None) -> Emitters:
-    """Return the emitters of an assignment of one epoch."""
+    """Return the emitters of an assignment of one epoch; `count` is the required number of emitters, or None."""
     # Sort the emitters by evidence: the lowest cost first.
     taken = solved.taken[np.argsort(solved.tuples.cost[solved.taken], kind="stable")]
     best, width = solved.tuples.take(taken), scene.z.shape[1]
     fixes = fix_sets(scene, best.picks)
     assignment = np.full(problem.count, -1)
     for number, picks in enumerate(best.picks):
-        used = np.flatnonzero(picks >= 0)
-        assignment[scene.row[used, picks[used]]] = number
+        channels = np.flatnonzero(picks >= 0)
+        assignment[scene.row[channels, picks[channels]]] = number
     costs = np.array([cheapest_sets(solved.tuples, width, k)[1] for k in range(len(taken) + 2)])
     ghosts = _ghosts(scene, solved, fixes, width, count)
     numbers = [] if count is not None else [costs[k] - solved.cost for k in (len(taken) - 1, len(taken) + 1) if k >= 0]
@@ -280,7 +300,7 @@ def emitters_of(problem: Problem, scene: Scene, solved: Solved, count: int | Non
 
 
 def fix_sets(scene: Scene, picks: Array) -> tuple[Fix, ...]:
-    """Return the fixes of sets of rows with picks (n, m)."""
+    """Return the fix of each of n sets of rows with picks (n, m)."""
     if not len(picks):
         return ()
     fix = solve(scene.scan.with_rows(z=of_picks(scene.z, picks), weight=(picks >= 0).astype(float)))
@@ -288,38 +308,48 @@ def fix_sets(scene: Scene, picks: Array) -> tuple[Fix, ...]:
 
 
 def _ghosts(scene: Scene, solved: Solved, fixes: tuple[Fix, ...], width: int, count: int | None) -> tuple[Ghost, ...]:
-    """Return the positions of other sets that belong to an assignment with nearly the least cost."""
-    tuples, found = solved.tuples, list[Ghost]()
+    """Return the positions of other sets that belong to an assignment with nearly the least cost, the best first.
+
+    `fixes` are the fixes of the best assignment. `width` is the number of values of a channel. `count` is the required
+    number of emitters, or None.
+    """
+    tuples, ghosts = solved.tuples, list[Ghost]()
     known = [(fix.position, _information(fix.covariance())) for fix in fixes]
     # The reduced cost is a lower bound of the additional cost of an assignment with this set.
     lowest = solved.prices.reduced(tuples)
     for i in np.argsort(lowest, kind="stable"):
-        if len(found) == _LISTED or lowest[i] >= LISTED_GAP:
+        if len(ghosts) == _LISTED or lowest[i] >= LISTED_GAP:
             break
-        if any((tuples.x[i] - at) @ weight @ (tuples.x[i] - at) < _APART for at, weight in known):
+        if any(
+            (tuples.x[i] - known_position) @ weight @ (tuples.x[i] - known_position) < _APART
+            for known_position, weight in known
+        ):
             continue
         gap = cheapest_sets(tuples, width, count, forced=int(i))[1] - solved.cost
         if not gap < LISTED_GAP:
             continue
-        used = np.flatnonzero(tuples.picks[i] >= 0)
-        found.append(Ghost(tuples.x[i], scene.row[used, tuples.picks[i][used]], float(gap)))
-        own = fix_sets(scene, tuples.picks[i : i + 1])[0]
-        known.append((tuples.x[i], _information(own.covariance())))
-    return tuple(sorted(found, key=lambda ghost: ghost.gap))
+        channels = np.flatnonzero(tuples.picks[i] >= 0)
+        ghosts.append(Ghost(tuples.x[i], scene.row[channels, tuples.picks[i][channels]], float(gap)))
+        ghost_fix = fix_sets(scene, tuples.picks[i : i + 1])[0]
+        known.append((tuples.x[i], _information(ghost_fix.covariance())))
+    return tuple(sorted(ghosts, key=lambda ghost: ghost.gap))
 
 
 def _information(cov: Array) -> Array:
-    """Return the inverse of a covariance; zero if it is not finite, so that all positions count as near."""
+    """Return the inverse (d, d) of a covariance; zero if it is not finite, so that all positions count as near."""
     return np.linalg.pinv(cov) if np.isfinite(cov).all() else np.zeros_like(cov)
 
 
 def _verdict(
     scene: Scene, solved: Solved, fixes: tuple[Fix, ...], ghosts: tuple[Ghost, ...], costs: Array, count: int | None
 ) -> tuple[Status, str]:
-    """Return the status and the reason of an assignment."""
+    """Return the status and the reason of an assignment.
+
+    `costs` (n + 2,) is the least cost for each number of emitters. `count` is the required number, or None.
+    """
     measured = np.isfinite(scene.z)
     gaps = tuple(ghost.gap for ghost in ghosts)
     size = int(measured.any(1).sum()), len(scene.z), scene.least
     false = int(measured.sum()) - int((solved.tuples.picks[solved.taken] >= 0).sum())
-    found = Assigned(fixes, gaps, costs, solved.cost, solved.bound, count, *size)
-    return verdict(found, f"{count_in_words(len(fixes))}; false rows: {false}")
+    assigned = Assigned(fixes, gaps, costs, solved.cost, solved.bound, count, *size)
+    return verdict(assigned, f"{count_in_words(len(fixes))}; false rows: {false}")

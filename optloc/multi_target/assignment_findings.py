@@ -46,15 +46,15 @@ class Assigned(NamedTuple):
     least: int
 
 
-def verdict(found: Assigned, clean: str) -> tuple[Status, str]:
+def verdict(assigned: Assigned, clean: str) -> tuple[Status, str]:
     """Return the status and the reason of an assignment; `clean` is the reason if there is no finding."""
-    against = objections(_FINDINGS, found)
-    if not against:
+    findings = objections(_FINDINGS, assigned)
+    if not findings:
         return Status.OK, clean
     # Without an assignment other findings are not relevant.
-    status = against[0][0]
-    alone = status in (Status.INFEASIBLE, Status.TOO_FEW_ROWS) and not found.fixes
-    return status, against[0][1] if alone else "; ".join(words for _, words in against)
+    status = findings[0][0]
+    alone = status in (Status.INFEASIBLE, Status.TOO_FEW_ROWS) and not assigned.fixes
+    return status, findings[0][1] if alone else "; ".join(words for _, words in findings)
 
 
 def count_in_words(emitters: int) -> str:
@@ -62,45 +62,48 @@ def count_in_words(emitters: int) -> str:
     return {0: "no emitter", 1: "one emitter"}.get(emitters, f"{emitters} emitters")
 
 
-def _near(found: Assigned) -> list[str]:
+def _near(assigned: Assigned) -> list[str]:
     """Return sentences about other numbers of emitters, and other positions, within the ambiguity gap."""
-    n = len(found.fixes)
-    words = [
-        f"{count_in_words(k)} would cost only {found.costs[k] - found.cost:.1f} more"
+    n = len(assigned.fixes)
+    sentences = [
+        f"{count_in_words(k)} would cost only {assigned.costs[k] - assigned.cost:.1f} more"
         for k in (n - 1, n + 1)
-        if found.wanted is None and k >= 0 and found.costs[k] - found.cost < AMBIGUOUS_GAP
+        if assigned.wanted is None and k >= 0 and assigned.costs[k] - assigned.cost < AMBIGUOUS_GAP
     ]
-    near = [gap for gap in found.gaps if gap < AMBIGUOUS_GAP]
-    return [*words, f"another position costs only {near[0]:.1f} more ({len(near)} in total)"] if near else words
+    near = [gap for gap in assigned.gaps if gap < AMBIGUOUS_GAP]
+    return [*sentences, f"another position costs only {near[0]:.1f} more ({len(near)} in total)"] if near else sentences
 
 
-def _too_few(found: Assigned) -> list[str]:
-    what = "no emitter can have enough" if found.least > found.channels else f"an emitter needs {found.least}"
-    return [f"rows in {found.present} channels cannot separate an emitter from false rows: {what}"]
+def _too_few(assigned: Assigned) -> list[str]:
+    """Return a sentence: the channels with rows are too few to separate an emitter from false rows."""
+    what = "no emitter can have enough" if assigned.least > assigned.channels else f"an emitter needs {assigned.least}"
+    return [f"rows in {assigned.present} channels cannot separate an emitter from false rows: {what}"]
 
 
 def _of_emitters(status: Status) -> Finding:
     """Return the finding that an emitter has this status, which then applies to all emitters together."""
     return Finding(
         status,
-        lambda found: any(fix.status == status for fix in found.fixes),
-        lambda found: [f"emitter {i}: {fix.status.label}" for i, fix in enumerate(found.fixes) if fix.status == status],
+        lambda assigned: any(fix.status == status for fix in assigned.fixes),
+        lambda assigned: [
+            f"emitter {i}: {fix.status.label}" for i, fix in enumerate(assigned.fixes) if fix.status == status
+        ],
     )
 
 
 _FINDINGS = (
     Finding(
         Status.INFEASIBLE,
-        lambda found: found.wanted is not None and not np.isfinite(found.cost),
-        lambda found: [f"no {found.wanted} emitters were found that share no row"],
+        lambda assigned: assigned.wanted is not None and not np.isfinite(assigned.cost),
+        lambda assigned: [f"no {assigned.wanted} emitters were found that share no row"],
     ),
-    Finding(Status.TOO_FEW_ROWS, lambda found: not found.fixes and found.present < found.least, _too_few),
-    Finding(Status.AMBIGUOUS, lambda found: bool(_near(found)), _near),
+    Finding(Status.TOO_FEW_ROWS, lambda assigned: not assigned.fixes and assigned.present < assigned.least, _too_few),
+    Finding(Status.AMBIGUOUS, lambda assigned: bool(_near(assigned)), _near),
     *(_of_emitters(status) for status in PRECEDENCE if status is not Status.OK),
     Finding(
         Status.UNPROVEN,
-        lambda found: found.cost - found.bound > _PROVEN,
-        lambda found: [f"not proven: another assignment may cost {found.cost - found.bound:.1f} less"],
+        lambda assigned: assigned.cost - assigned.bound > _PROVEN,
+        lambda assigned: [f"not proven: another assignment may cost {assigned.cost - assigned.bound:.1f} less"],
     ),
 )
 """All findings about an assignment."""

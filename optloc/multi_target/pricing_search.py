@@ -1,4 +1,9 @@
-"""Branch and bound over positions in a region: find all sets of rows with a negative reduced cost."""
+"""Branch and bound over positions in a region: find all sets of rows with a negative reduced cost.
+
+Letters: q boxes or positions, m channels with up to c values each, d coordinates. `centre` and `half` (q, d) are the
+centres and half-widths of boxes, metres. `option` (q, m, c) is the cost of each value, and `picks` (q, m) the number of
+the chosen value in each channel, or -1.
+"""
 
 from __future__ import annotations
 
@@ -72,12 +77,15 @@ class PricingResult:
 def search(scene: Scene, prices: Prices, region: PricedRegion, most: int) -> PricingResult:
     """Return sets of rows with a negative reduced cost, or a lower bound of all reduced costs.
 
-    At a position x the best set of independent rows takes the cheapest option in each channel. Its reduced cost is
-    f(x) = penalty - v + sum_i min(missed, min_j (z_ij - h_i(x))^2 / s_i^2 + ln 2 pi s_i^2 - gain_i + u_ij): truncated
-    least squares with several values. In a box the change of each h_i is limited by its enclosure, which bounds every
-    term. A term is sure if one value is the cheapest everywhere in the box. Sure terms are bounded together by their
-    linear least squares. With correlated errors chi2 >= (r/s)'(r/s) / (largest eigenvalue of their correlation). A
-    determinant is at least the product of the conditional variances of the rows.
+    At a position x the best set of independent rows takes the cheapest option in each channel. Its reduced cost is f(x)
+    = penalty - v + sum_i min(missed, min_j (z_ij - h_i(x))^2 / s_i^2 + ln 2 pi s_i^2 - gain_i + u_ij): truncated least
+    squares with several values. v is the price of an emitter and u_ij the price of value j in channel i. s_i is the
+    standard deviation of the channel. The penalty, gain_i and missed are fields of `Scene`.
+
+    In a box the change of each h_i is limited by its enclosure, which bounds every term. A term is sure if one value is
+    the cheapest everywhere in the box. Sure terms are bounded together by their linear least squares. With correlated
+    errors chi2 >= (r/s)'(r/s) / (largest eigenvalue of their correlation), where r are the residuals. A determinant is
+    at least the product of the conditional variances of the rows.
 
     Parameters
     ----------
@@ -95,37 +103,37 @@ def search(scene: Scene, prices: Prices, region: PricedRegion, most: int) -> Pri
     boxes, floor = 0, -TOLERANCE
     # All open boxes of one size at a time. Searching the best first has no advantage, because no box may stay open.
     while len(centre):
-        found = _bound_all(scene, prices, centre, half)
+        bounds = _bound_all(scene, prices, centre, half)
         boxes += len(centre)
-        open_ = found.low < -TOLERANCE
+        open_ = bounds.low < -TOLERANCE
         # First evaluate centres: a set found there ends the search, and new prices exclude most boxes.
-        first = centre[np.argsort(found.at, kind="stable")[:_SHOWN]]
-        value, picks = _cheapest_at(scene, prices, first)
+        centres_to_try = centre[np.argsort(bounds.at, kind="stable")[:_SHOWN]]
+        value, picks = _cheapest_at(scene, prices, centres_to_try)
         if value.min() < -TOLERANCE:
-            worth = value < -TOLERANCE
-            return PricingResult(-np.inf, first[worth], picks[worth], boxes)
+            cheap = value < -TOLERANCE
+            return PricingResult(-np.inf, centres_to_try[cheap], picks[cheap], boxes)
         # The limit is reached: the floor is the least bound of the open boxes, and their centres are returned.
         if boxes + 2 * open_.sum() > most:
-            lowest = centre[np.argsort(found.low, kind="stable")[:_SHOWN]]
-            return PricingResult(float(found.low.min()), lowest, _cheapest_at(scene, prices, lowest)[1], boxes)
-        centre, half = _halve(centre[open_], half[open_], found.side[open_])
+            lowest = centre[np.argsort(bounds.low, kind="stable")[:_SHOWN]]
+            return PricingResult(float(bounds.low.min()), lowest, _cheapest_at(scene, prices, lowest)[1], boxes)
+        centre, half = _halve(centre[open_], half[open_], bounds.side[open_])
     return PricingResult(floor, centre, np.zeros((0, scene.scan.count), dtype=np.int64), boxes)
 
 
 def _cheapest_at(scene: Scene, prices: Prices, x: Array) -> tuple[Array, Array]:
-    """Return the reduced costs (q,) of the sets (q, m) of the cheapest rows of all channels at positions (q, d)."""
+    """Return the reduced costs (q,) and the picks (q, m) of the cheapest rows at positions (q, d), metres."""
     apart = misfits(scene.scan, scene.z, predict(scene.scan, x))
     s = scene.sigma[:, None]
     option = (apart / s) ** 2 + np.log(2.0 * np.pi * s**2) - scene.gain[:, None] + prices.row
     picks = cheapest_rows(scene, option)
-    used = picks >= 0
-    r = np.where(used, np.take_along_axis(apart, np.maximum(picks, 0)[..., None], axis=-1)[..., 0], 0.0)
-    chi2 = (_whiten(scene, used, r[..., None])[..., 0] ** 2).sum(-1)
+    in_set = picks >= 0
+    r = np.where(in_set, np.take_along_axis(apart, np.maximum(picks, 0)[..., None], axis=-1)[..., 0], 0.0)
+    chi2 = (_whiten(scene, in_set, r[..., None])[..., 0] ** 2).sum(-1)
     return chi2 + scene.constant(picks) + of_picks(prices.row, picks).sum(-1) - prices.emitter, picks
 
 
 def _halve(centre: Array, half: Array, side: Array) -> tuple[Array, Array]:
-    """Return both halves of boxes that are cut across the given side."""
+    """Return the centres and half-widths of both halves of boxes; `side` (q,) is the axis that is cut."""
     rows = np.arange(len(centre))
     half = half.copy()
     half[rows, side] *= 0.5
@@ -136,7 +144,11 @@ def _halve(centre: Array, half: Array, side: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class _Bounds:
-    """Bounds of boxes: lower bounds (q,) of the reduced cost, values at the centres (q,), and sides (q,) to halve."""
+    """Bounds of q boxes.
+
+    `low` (q,) is a lower bound of the reduced cost of all sets with positions in the box. `at` (q,) is the sum of the
+    costs of single rows at the centre; centres with a small sum are tried first. `side` (q,) is the axis to halve.
+    """
 
     low: Array
     at: Array
@@ -144,6 +156,7 @@ class _Bounds:
 
 
 def _bound_all(scene: Scene, prices: Prices, centre: Array, half: Array) -> _Bounds:
+    """Return the bounds of all boxes, in chunks that limit the memory."""
     parts = [
         _bound(scene, prices, centre[first : first + _CHUNK], half[first : first + _CHUNK])
         for first in range(0, len(centre), _CHUNK)
@@ -152,38 +165,42 @@ def _bound_all(scene: Scene, prices: Prices, centre: Array, half: Array) -> _Bou
 
 
 def _bound(scene: Scene, prices: Prices, centre: Array, half: Array) -> _Bounds:
+    """Return the bounds of boxes: first from single rows, then jointly for boxes that single rows do not exclude."""
     radius = np.sqrt((half**2).sum(-1))
     value, slope, remainder = values_in_balls(scene.scan, centre, radius)
     change = value_changes(scene.scan, slope, remainder, half)
     apart = misfits(scene.scan, scene.z, value)
-    s, (own, shrink, _) = scene.sigma[:, None], _errors(scene)
+    s, (conditional, largest_eigenvalue, _) = scene.sigma[:, None], _errors(scene)
     # Lower bound of the cost of a row, without its chi-square, for every set that contains it.
-    base = np.log(2.0 * np.pi * own)[:, None] - scene.gain[:, None] + prices.row
+    base = np.log(2.0 * np.pi * conditional)[:, None] - scene.gain[:, None] + prices.row
     near = np.maximum(np.abs(apart) - change[..., None], 0.0) / s
-    option = np.where(np.isnan(near), np.inf, near**2 / shrink + base)
+    option = np.where(np.isnan(near), np.inf, near**2 / largest_eigenvalue + base)
     constant = scene.penalty - prices.emitter
     low = constant + np.minimum(option.min(-1), scene.missed).sum(-1)
-    here = np.where(np.isnan(apart), np.inf, (apart / s) ** 2 + base)
-    at = constant + np.minimum(here.min(-1), scene.missed).sum(-1)
+    cost_at_centre = np.where(np.isnan(apart), np.inf, (apart / s) ** 2 + base)
+    at = constant + np.minimum(cost_at_centre.min(-1), scene.missed).sum(-1)
     # The joint bound is far more expensive, so it is computed only for boxes that the sum of single bounds leaves open.
-    alive = np.flatnonzero(low < -TOLERANCE)
-    if len(alive):
+    left_open = np.flatnonzero(low < -TOLERANCE)
+    if len(left_open):
         worst = np.where(np.isnan(apart), np.inf, ((np.abs(apart) + change[..., None]) / s) ** 2 + base)
-        picks = _sure_rows(scene, option[alive], worst[alive], low[alive])
+        picks = _sure_rows(scene, option[left_open], worst[left_open], low[left_open])
         # With correlated errors the joint chi-square of the sure rows already includes the chi-square of the others.
         rest = option if scene.independent else np.where(np.isnan(near), np.inf, base)
-        others = np.where(picks >= 0, 0.0, np.minimum(rest[alive].min(-1), scene.missed)).sum(-1)
-        whole = _bound_jointly(scene, picks, apart[alive], slope[alive], remainder[alive])
+        others = np.where(picks >= 0, 0.0, np.minimum(rest[left_open].min(-1), scene.missed)).sum(-1)
+        joint = _bound_jointly(scene, picks, apart[left_open], slope[left_open], remainder[left_open])
         sure = scene.determinant(picks) + np.where(picks >= 0, -scene.gain, 0.0).sum(-1)
-        paid = of_picks(prices.row, picks).sum(-1)
-        low[alive] = np.maximum(low[alive], constant + whole + sure + paid + others)
+        prices_of_sure = of_picks(prices.row, picks).sum(-1)
+        low[left_open] = np.maximum(low[left_open], constant + joint + sure + prices_of_sure + others)
     # Halve the side that changes the rows most, in sigmas; at a station, where slopes are not finite, the longest side.
     weight = np.where(np.isfinite(slope), slope / s, 1.0 / s)
     return _Bounds(low, at, ((weight**2).sum(1) * half**2).argmax(-1))
 
 
 def _errors(scene: Scene) -> tuple[Array, float, float]:
-    """Return the conditional variance (m,) of each row, and the largest and least eigenvalue of the correlation."""
+    """Return the conditional variance (m,) of each row, and the largest and least eigenvalue of the correlation.
+
+    The conditional variance is the variance of the error of a row, given the errors of all other rows.
+    """
     if scene.independent:
         return scene.sigma**2, 1.0, 1.0
     values = np.linalg.eigvalsh(correlation(scene.R))
@@ -191,10 +208,11 @@ def _errors(scene: Scene) -> tuple[Array, float, float]:
 
 
 def _sure_rows(scene: Scene, option: Array, worst: Array, low: Array) -> Array:
-    """Return the values (q, m) that every set with a negative reduced cost in a box must contain; -1 if that is open.
+    """Return the values (q, m) that every set with a negative reduced cost in a box must contain; -1 if none must be.
 
     A value is sure if every other choice in its channel is too expensive. With independent errors it is also sure if it
-    is the cheapest choice everywhere in the box.
+    is the cheapest choice everywhere in the box. `option` and `worst` (q, m, c) are lower and upper bounds of the cost
+    of each value. `low` (q,) is the lower bound of each box so far.
     """
     best = option.argmin(-1)
     least = np.take_along_axis(option, best[..., None], axis=-1)[..., 0]
@@ -202,33 +220,34 @@ def _sure_rows(scene: Scene, option: Array, worst: Array, low: Array) -> Array:
     # Second-best option of each channel, including no detection.
     others = option.copy()
     np.put_along_axis(others, best[..., None], np.inf, axis=-1)
-    other = np.minimum(others.min(-1), scene.missed)
-    sure = (least < scene.missed) & (low[:, None] - least + other >= -TOLERANCE)
+    second_best = np.minimum(others.min(-1), scene.missed)
+    sure = (least < scene.missed) & (low[:, None] - least + second_best >= -TOLERANCE)
     if scene.independent:
-        sure |= most <= other
+        sure |= most <= second_best
     return np.where(sure, best, -1)
 
 
 def _bound_jointly(scene: Scene, picks: Array, apart: Array, slope: Array, remainder: Array) -> Array:
     """Return lower bounds (q,) of the chi-squares of sure rows in boxes.
 
-    With r = z - h at the centre and remainders q: |r - J s - q| >= min_s |r - J s| - |q|, all whitened.
+    r is z - h at the centre, J the derivatives (`slope`), s the displacement, and q the remainders. Then |r - J s - q|
+    >= min_s |r - J s| - |q|, all whitened. `picks` (q, m) are the sure values, and `apart` (q, m, c) all residuals.
     """
-    used = picks >= 0
-    known = used & np.isfinite(slope).all(-1) & np.isfinite(remainder)
+    in_set = picks >= 0
+    known = in_set & np.isfinite(slope).all(-1) & np.isfinite(remainder)
     r = np.where(known, np.take_along_axis(apart, np.maximum(picks, 0)[..., None], axis=-1)[..., 0], 0.0)
     J, q = np.where(known[..., None], slope, 0.0), np.where(known, remainder, 0.0)
-    white = _whiten(scene, known, np.concatenate([J, r[..., None]], axis=-1))
-    r, J = white[..., -1], white[..., :-1]
-    left = r - (J @ (np.linalg.pinv(J) @ r[..., None]))[..., 0]
+    whitened = _whiten(scene, known, np.concatenate([J, r[..., None]], axis=-1))
+    r, J = whitened[..., -1], whitened[..., :-1]
+    unexplained = r - (J @ (np.linalg.pinv(J) @ r[..., None]))[..., 0]
     # The norm of the whitened q is at most |q / s| divided by the root of the least eigenvalue of the correlation.
-    blur = np.sqrt(((q / scene.sigma) ** 2).sum(-1) / _errors(scene)[2])
-    return np.asarray(np.maximum(np.sqrt((left**2).sum(-1)) - blur, 0.0) ** 2)
+    remainder_norm = np.sqrt(((q / scene.sigma) ** 2).sum(-1) / _errors(scene)[2])
+    return np.asarray(np.maximum(np.sqrt((unexplained**2).sum(-1)) - remainder_norm, 0.0) ** 2)
 
 
-def _whiten(scene: Scene, used: Array, columns: Array) -> Array:
-    """Return whitened columns (q, m, c) of the used rows (q, m); zero for other rows."""
+def _whiten(scene: Scene, in_set: Array, columns: Array) -> Array:
+    """Return whitened columns (q, m, c) of the rows in each set; zero for other rows. `in_set` (q, m) is a mask."""
     if scene.independent:
-        return np.asarray(np.where(used[..., None], columns / scene.sigma[:, None], 0.0))
-    both = used[:, :, None] & used[:, None, :]
-    return np.asarray(linalg.whitening(np.where(both, scene.R, 0.0)) @ columns)
+        return np.asarray(np.where(in_set[..., None], columns / scene.sigma[:, None], 0.0))
+    both_in_set = in_set[:, :, None] & in_set[:, None, :]
+    return np.asarray(linalg.whitening(np.where(both_in_set, scene.R, 0.0)) @ columns)

@@ -1,4 +1,7 @@
-"""Set packing: the cheapest selection of sets of rows without a shared row, its prices (dual) and its bound."""
+"""Set packing: the cheapest selection of sets of rows without a shared row, its prices (dual) and its bound.
+
+Letters: q sets, m channels with up to c values each. A row is a value of a channel.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +61,10 @@ class Prices:
 
 
 def incidence(tuples: Tuples, width: int) -> sparse.csc_array:
-    """Return the sparse incidence matrix (m * width, q): 1 if a row (channel * width + value) is in a set."""
+    """Return the sparse incidence matrix (m * width, q): 1 if a row (channel * width + value) is in a set.
+
+    `width` is the number of values of a channel.
+    """
     which, channel = np.nonzero(tuples.picks >= 0)
     row = channel * width + tuples.picks[which, channel]
     shape = (tuples.picks.shape[1] * width, len(tuples.cost))
@@ -66,7 +72,9 @@ def incidence(tuples: Tuples, width: int) -> sparse.csc_array:
 
 
 def cheapest_sets(tuples: Tuples, width: int, count: int | None, forced: int | None = None) -> tuple[Array, float]:
-    """Return the sets of least total cost that share no row, and their total cost; infinite if they do not exist.
+    """Return the numbers (n,) of the sets of least total cost that share no row, and their total cost.
+
+    The cost is infinite if no sets meet the conditions.
 
     Parameters
     ----------
@@ -124,12 +132,12 @@ def price_rows(tuples: Tuples, taken: Array, worth: Array, count: int | None) ->
     m, width = shape = worth.shape
     if not len(tuples.cost):
         return Prices(np.zeros(shape), 0.0)
-    inside, k = incidence(tuples, width), len(taken)
+    incidence_matrix, k = incidence(tuples, width), len(taken)
     # Unknowns: a price for each row, one for an emitter, and the highest quotient of price and worth in each taken set.
-    one, none = sparse.csr_array(np.ones((len(tuples.cost), 1))), sparse.csr_array((len(tuples.cost), k))
-    sets: Any = sparse.hstack([-inside.T, one, none])
-    row, number = inside[:, taken].nonzero()
-    even = sparse.csr_array(
+    ones, zeros = sparse.csr_array(np.ones((len(tuples.cost), 1))), sparse.csr_array((len(tuples.cost), k))
+    sets: Any = sparse.hstack([-incidence_matrix.T, ones, zeros])
+    row, number = incidence_matrix[:, taken].nonzero()
+    sharing = sparse.csr_array(
         (
             np.concatenate([1.0 / worth.ravel()[row], -np.ones(len(row))]),
             (np.tile(np.arange(len(row)), 2), np.concatenate([row, m * width + 1 + number])),
@@ -141,7 +149,7 @@ def price_rows(tuples: Tuples, taken: Array, worth: Array, count: int | None) ->
     free = (0.0, 0.0) if count is None else (None, None)
     bounds = [(0.0, None)] * (m * width) + [free] + [(0.0, None)] * k
     limits = np.concatenate([tuples.cost, np.zeros(len(row))])
-    solved = linprog(total, A_ub=sparse.vstack([sets, even]), b_ub=limits, bounds=bounds)
+    solved = linprog(total, A_ub=sparse.vstack([sets, sharing]), b_ub=limits, bounds=bounds)
     if solved.x is None:
         return Prices(np.zeros(shape), 0.0)
     # A price that is negative by rounding would make the bound invalid.

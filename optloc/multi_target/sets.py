@@ -1,4 +1,8 @@
-"""Unlabelled rows of one epoch, and the cost of a set of rows as one emitter."""
+"""Unlabelled rows of one epoch, and the cost of a set of rows as one emitter.
+
+Letters: m channels with up to c values each, q sets of rows, d coordinates. The picks (q, m) of sets are the numbers of
+the values that they take from each channel; -1 for none. h is the measurement function and J its derivative.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,7 @@ from optloc.tracking.track import State
 
 # Minimum share of its variance that the error of a row has independently of the others. Below it the eigenvalue is
 # rounding error, and the likelihood of sets of rows is unbounded.
-_OWN = 1e-9
+_LEAST_INDEPENDENT = 1e-9
 # Maximum number of alternations of row selection and refinement. Each lowers the truncated cost, so few are enough; the
 # limit ends ties.
 _PASSES = 4
@@ -76,7 +80,7 @@ class Scene:
 
     @property
     def sigma(self) -> Array:
-        """Return the standard deviation of each channel, (m,)."""
+        """Return the standard deviation of each channel, (m,), SI units."""
         return np.asarray(np.sqrt(np.diagonal(self.R)))
 
     @property
@@ -91,7 +95,10 @@ class Scene:
 
     @property
     def least(self) -> int:
-        """Return the least number of rows that are evidence of an emitter; above the number of channels if none are."""
+        """Return the least number of rows that are evidence of an emitter.
+
+        It is above the number of channels if no number of rows is enough.
+        """
         # Worth of each row if it fits perfectly, the most informative first. The least number outweighs the penalty and
         # the missing rows.
         worth = np.sort(self.missed + self.gain - np.log(2.0 * np.pi * own_variance(self.R)))[::-1]
@@ -99,22 +106,25 @@ class Scene:
         return int(np.argmax(best < 0.0)) + 1 if (best < 0.0).any() else len(worth) + 1
 
     def determinant(self, picks: Array) -> Array:
-        """Return ln|2 pi R_T| (q,) of the sets with picks (q, m)."""
-        used = picks >= 0
-        both = used[:, :, None] & used[:, None, :]
+        """Return ln|2 pi R_T| (q,) of the sets with picks (q, m); R_T is the covariance of the rows of a set."""
+        in_set = picks >= 0
+        both_in_set = in_set[:, :, None] & in_set[:, None, :]
         # Rows outside a set are replaced by ones on the diagonal, so that one call handles sets of all sizes.
-        matrix = np.where(both, 2.0 * np.pi * self.R, np.eye(len(self.R)))
+        matrix = np.where(both_in_set, 2.0 * np.pi * self.R, np.eye(len(self.R)))
         return np.asarray(np.linalg.slogdet(matrix)[1])
 
     def constant(self, picks: Array) -> Array:
         """Return the cost (q,) of sets with picks (q, m) without their chi-square."""
-        used = picks >= 0
-        rows = used @ -self.gain + self.missed * (~used).sum(-1)
+        in_set = picks >= 0
+        rows = in_set @ -self.gain + self.missed * (~in_set).sum(-1)
         return np.asarray(self.determinant(picks) + rows + self.penalty)
 
 
 def own_variance(R: Array) -> Array:
-    """Return the conditional variance (m,) of the error of each row, given the errors of all others."""
+    """Return the conditional variance (m,) of the error of each row, given the errors of all others.
+
+    R (m, m) is the covariance of one row from each channel.
+    """
     return np.asarray(np.diagonal(R) / np.diagonal(np.linalg.inv(correlation(R))))
 
 
@@ -142,10 +152,10 @@ def scenes(problem: Problem, clutter: Clutter, penalty: float | None) -> Iterato
         For kinds, unknowns or noise for which sets of rows have no score.
     """
     _check(problem)
-    given = candidates(problem)
+    channel_rows = candidates(problem)
     _, members = channels_of(problem)
-    epoch = given.channels.epoch
-    for k, (_, scan, z) in enumerate(given.scans(0)):
+    epoch = channel_rows.channels.epoch
+    for k, (_, scan, z) in enumerate(channel_rows.scans(0)):
         if not scan.rows:
             continue
         row = np.full(z.shape, -1)
@@ -155,19 +165,21 @@ def scenes(problem: Problem, clutter: Clutter, penalty: float | None) -> Iterato
 
 
 def _scene(scan: Problem, z: Array, row: Array, clutter: Clutter, penalty: float | None) -> Scene:
+    """Return the scene of one epoch, see `Scene`; raise InvalidProblem if some rows are sums of others."""
     R = noises.dense(scan.noise, np.arange(scan.count))
     variance, density = np.diagonal(R), clutter.of(scan)
-    if not np.linalg.eigvalsh(correlation(R))[0] > _OWN:
+    if not np.linalg.eigvalsh(correlation(R))[0] > _LEAST_INDEPENDENT:
         advice = "give each row an independent error too (sigma with arrival_sigma), or leave out redundant rows"
         raise InvalidProblem("some rows of an epoch are exact sums of others", "noise", advice)
     worth = np.sort(-2.0 * np.log(density) - np.log(2.0 * np.pi * variance))[::-1]
     # A row with negative worth carries no information, so it does not add to the penalty.
-    own = float(np.maximum(worth, 0.0)[: scan.dimension].sum()) if penalty is None else float(penalty)
+    penalty_used = float(np.maximum(worth, 0.0)[: scan.dimension].sum()) if penalty is None else float(penalty)
     gain = 2.0 * np.log(clutter.detection / density)
-    return Scene(scan, z, row, R, gain, -2.0 * float(np.log1p(-clutter.detection)), own)
+    return Scene(scan, z, row, R, gain, -2.0 * float(np.log1p(-clutter.detection)), penalty_used)
 
 
 def _check(problem: Problem) -> None:
+    """Raise InvalidProblem if rows, unknowns or batch axes are not supported."""
     if problem.batch_shape:
         raise InvalidProblem("the problem has batch axes", "problem", "give its problems one by one")
     for block in problem.rows:
@@ -215,13 +227,13 @@ class Tuples:
 
 
 def of_picks(values: Array, picks: Array) -> Array:
-    """Return the values (q, m) that picks (q, m) select from values (..., m, c); zero for pick -1."""
-    found = values[np.arange(len(values)), np.maximum(picks, 0)]
-    return np.asarray(np.where(picks >= 0, found, 0.0))
+    """Return the values (q, m) that picks (q, m) select from values (m, c); zero for pick -1."""
+    selected = values[np.arange(len(values)), np.maximum(picks, 0)]
+    return np.asarray(np.where(picks >= 0, selected, 0.0))
 
 
 def merge(*parts: Tuples) -> Tuples:
-    """Return all sets, sorted by cost, each once with its cheapest position."""
+    """Return all sets of the parts, sorted by cost, each set once with its cheapest position."""
     picks, x, cost = (np.concatenate([getattr(part, name) for part in parts]) for name in ("picks", "x", "cost"))
     order = np.argsort(cost, kind="stable")
     # `np.unique` keeps the first of equal sets, which is the cheapest after sorting.
@@ -236,14 +248,17 @@ def no_sets(scene: Scene) -> Tuples:
 
 
 def refine_sets(scene: Scene, picks: Array, start: Array) -> tuple[Tuples, Array]:
-    """Return sets with picks (q, m), refined from starts (q, d), and the position covariances (q, d, d), m^2."""
+    """Return sets with picks (q, m), refined from starts (q, d), and the position covariances (q, d, d), m^2.
+
+    A set that does not converge has infinite cost.
+    """
     if not len(picks):
         return no_sets(scene), np.zeros((0, scene.scan.dimension, scene.scan.dimension))
     problem = scene.scan.with_rows(z=of_picks(scene.z, picks), weight=(picks >= 0).astype(float))
-    done = refine(problem, start)
+    result = refine(problem, start)
     # A set that does not converge has no position, so its cost is infinite.
-    cost = np.where(np.isfinite(done.cost), done.cost, np.inf) + scene.constant(picks)
-    return Tuples(picks, done.x, cost), covariance(done.equations)[0]
+    cost = np.where(np.isfinite(result.cost), result.cost, np.inf) + scene.constant(picks)
+    return Tuples(picks, result.x, cost), covariance(result.equations)[0]
 
 
 def sets_near(scene: Scene, x: Array, cov: Array, price: Array) -> Tuples:
@@ -264,11 +279,11 @@ def sets_near(scene: Scene, x: Array, cov: Array, price: Array) -> Tuples:
     price : array (m, c)
         Additional cost of each row.
     """
-    found = [no_sets(scene)]
-    for blur in (1.0, 0.0):
+    sets = [no_sets(scene)]
+    for with_uncertainty in (1.0, 0.0):
         last = None
         for _ in range(_PASSES):
-            picks = _choose(scene, x, blur * cov, price)
+            picks = _choose(scene, x, with_uncertainty * cov, price)
             if last is not None and np.array_equal(picks, last):
                 break
             # Fewer rows than coordinates do not determine a position.
@@ -279,13 +294,16 @@ def sets_near(scene: Scene, x: Array, cov: Array, price: Array) -> Tuples:
             tuples, cov = refine_sets(scene, picks, x)
             good = np.isfinite(cov).all((-1, -2)) & np.isfinite(tuples.cost)
             tuples, cov = tuples.take(good), cov[good]
-            found.append(tuples)
+            sets.append(tuples)
             x, last = tuples.x, tuples.picks
-    return merge(*found)
+    return merge(*sets)
 
 
 def _choose(scene: Scene, x: Array, cov: Array, price: Array) -> Array:
-    """Return the picks (q, m) that fit best at positions x (q, d) with covariances (q, d, d), channel by channel."""
+    """Return the picks (q, m) that fit best at positions x (q, d) with covariances (q, d, d), channel by channel.
+
+    `price` (m, c) is an additional cost of each value.
+    """
     if not len(x):
         return np.zeros((0, scene.scan.count), dtype=np.int64)
     # A position with a covariance is a predicted target, so the gates are the same as in a tracker.
@@ -300,8 +318,8 @@ def cheapest_rows(scene: Scene, option: Array) -> Array:
     """Return picks (q, m): the cheapest option (q, m, c) of each channel, or -1 if no detection costs less."""
     option = np.where(np.isnan(option), np.inf, option)
     best = option.argmin(-1)
-    seen = np.take_along_axis(option, best[..., None], axis=-1)[..., 0] < scene.missed
-    return np.where(seen, best, -1)
+    detected = np.take_along_axis(option, best[..., None], axis=-1)[..., 0] < scene.missed
+    return np.where(detected, best, -1)
 
 
 def without_one_row(scene: Scene, tuples: Tuples) -> Tuples:
@@ -314,15 +332,18 @@ def without_one_row(scene: Scene, tuples: Tuples) -> Tuples:
 
 
 def row_worth(scene: Scene, tuples: Tuples) -> Array:
-    """Return the decrease (m, c) of the cost of its set due to each row; 1 for rows without a set."""
+    """Return the decrease (m, c) of the cost of its set due to each row; 1 for rows without a set.
+
+    The prices of the rows of a set are shared in proportion to these numbers, so they are above 0.
+    """
     out = np.ones_like(scene.z)
     variance = scene.sigma**2
     most = scene.missed + scene.gain - np.log(2.0 * np.pi * variance)
     for picks, x in zip(tuples.picks, tuples.x, strict=True):
-        used = np.flatnonzero(picks >= 0)
-        apart = offsets(scene.scan, State(0.0, x[None], np.zeros((1, len(x), len(x)))), scene.z)[0][0]
-        lost = most[used] - apart[used, picks[used]] ** 2 / variance[used]
-        out[used, picks[used]] = np.maximum(lost, _LEAST * np.maximum(most[used], 1.0))
+        channels = np.flatnonzero(picks >= 0)
+        residuals = offsets(scene.scan, State(0.0, x[None], np.zeros((1, len(x), len(x)))), scene.z)[0][0]
+        decrease = most[channels] - residuals[channels, picks[channels]] ** 2 / variance[channels]
+        out[channels, picks[channels]] = np.maximum(decrease, _LEAST * np.maximum(most[channels], 1.0))
     return out
 
 
@@ -333,8 +354,8 @@ def values_in_balls(scan: Problem, centre: Array, radius: Array) -> tuple[Array,
     """Return values, derivatives and remainders of the rows of a scan in balls.
 
     In the ball |h(x) - h - J (x - centre)| <= remainder. The remainder is half the squared radius times a bound of the
-    second derivatives. This bound is 1/r for a range, 1/r_h^2 for an azimuth and 1/(r r_h) for an elevation. Here r_h
-    is the distance from the vertical line through the station.
+    second derivatives. This bound is 1/r for a range, 1/r_h^2 for an azimuth and 1/(r r_h) for an elevation. Here r is
+    the distance from the station, and r_h the distance from the vertical line through the station.
 
     Parameters
     ----------
@@ -388,7 +409,7 @@ def value_changes(scan: Problem, slope: Array, remainder: Array, half: Array) ->
 
 
 def _greatest_change(block: Rows, radius: Array) -> Array:
-    """Return a bound (q, m) of the change of the rows of a block in balls, valid without derivatives."""
+    """Return a bound (q, m) of the change of the rows of a block in balls of `radius` (q,), without derivatives."""
     ranges = MODELS[block.kind].ranges
     # A range changes at most by the displacement of the target. An angle changes at most by half a turn.
     limit = sum(map(abs, ranges)) * radius if ranges is not None else np.full(len(radius), np.pi)
@@ -396,7 +417,11 @@ def _greatest_change(block: Rows, radius: Array) -> Array:
 
 
 def _curvature(scan: Problem, block: Rows, centre: Array, radius: Array, value: Array, steep: Array) -> Array:
-    """Return a bound (q, m) of the second derivatives of the rows of a block in balls."""
+    """Return a bound (q, m) of the second derivatives of the rows of a block in balls.
+
+    `centre` (q, d) and `radius` (q,) are the balls, metres. `value` (q, m) are the measurements at the centres, and
+    `steep` (q, m) the lengths of their gradients.
+    """
     ranges = MODELS[block.kind].ranges
     if ranges is None:
         return _ANGLES[block.kind].bend(value, steep, radius[:, None])
@@ -418,7 +443,7 @@ class Angle:
         Length of the interval of its values, radians.
     bend : callable
         Returns a bound (q, m) of its second derivatives in balls, from values and slopes at the centres (q, m) and the
-        radii (q, 1). The slope of an azimuth is 1/r_h, that of an elevation 1/r.
+        radii (q, 1). The slope of an azimuth is 1/r_h, the slope of an elevation 1/r.
     """
 
     width: float
@@ -438,15 +463,15 @@ _ANGLES = {
 
 
 def value_width(problem: Problem, block: Rows) -> Array | None:
-    """Return the length of the interval of possible values of each row; None if it is unbounded."""
+    """Return the length of the interval of possible values of each row, metres or radians; None if it is unbounded."""
     if block.kind in _ANGLES:
         return np.asarray(_ANGLES[block.kind].width)
     if sum(MODELS[block.kind].ranges or (1,)):
         return None
     # A range difference is between plus and minus the distance of its stations.
-    place = problem.stations.position[..., 0, :, :]
-    apart = place[..., block.a, :] - place[..., block.b, :]
-    return np.asarray(2.0 * np.sqrt((apart**2).sum(-1)))
+    position = problem.stations.position[..., 0, :, :]
+    baseline = position[..., block.a, :] - position[..., block.b, :]
+    return np.asarray(2.0 * np.sqrt((baseline**2).sum(-1)))
 
 
 def bounded_kinds() -> list[str]:

@@ -1,8 +1,13 @@
 """Conversion of range differences to arrival times: one row per station, with independent errors.
 
-Range differences z = D tau + n combine the arrivals tau = r + e of one emission e at several stations. If their
-covariance is cov n = D diag(v) D', the rows tau_s = r_s + e are equivalent. These have independent variances v_s and an
-unknown e, and at every position the least cost over e is the same. An error of one station then affects one row only.
+Range differences are z = D tau + n, with arrival times tau = r + e in metres. r is the range from each station to the
+target, and e is the unknown emission time. Each row of D has one entry 1 and one entry -1, for its two stations.
+
+If the noise n has the covariance D diag(v) D', the rows tau_s = r_s + e are equivalent. The arrival times have
+independent variances v_s. At every position, the least cost over e is the same as before. An error of one station then
+affects one row only, so the search for a bad station is simpler.
+
+Letters: N problems of a batch, r range differences and s stations of one epoch and target.
 """
 
 from __future__ import annotations
@@ -27,6 +32,8 @@ _LEAST = 1e-6
 class Arrivals:
     """A problem in which arrival times replace the range differences.
 
+    `origin` maps each suspect row of the new problem back to the original measurements.
+
     Parameters
     ----------
     problem : Problem
@@ -40,8 +47,12 @@ class Arrivals:
 
 
 @dataclass(frozen=True, slots=True)
-class _Sighting:
-    """The range differences of one epoch and target: row numbers (r,), station numbers (s,) and matrix D (r, s)."""
+class _DifferenceSet:
+    """The range differences of one epoch and target.
+
+    `rows` (r,) are their global row numbers. `stations` (s,) are the station numbers that occur in them. `design` is
+    the matrix D (r, s) with entries 1, -1 and 0. `epoch` and `target` are numbers.
+    """
 
     rows: Array
     stations: Array
@@ -65,48 +76,53 @@ def as_arrivals(problem: Problem) -> Arrivals | None:
         A flat batch of problems. It omits rows that are absent in all problems.
     """
     numbers = [np.arange(start, start + r.count) for r, start in zip(problem.rows, problem.starts, strict=True)]
-    differences = [own for own, rows in zip(numbers, problem.rows, strict=True) if rows.kind == "tdoa"]
+    differences = [row_numbers for row_numbers, rows in zip(numbers, problem.rows, strict=True) if rows.kind == "tdoa"]
     if not differences or problem.biases or problem.emitting:
         return None
     weight = np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count))
     # The batch shares one set of arrivals, so each row must be present with weight 1 in all problems, or absent in all.
     present = weight[0] > 0.0
-    taken = np.concatenate(differences)
-    if ((weight > 0.0) != present).any() or (weight[:, taken[present[taken]]] != 1.0).any():
+    tdoa_rows = np.concatenate(differences)
+    if ((weight > 0.0) != present).any() or (weight[:, tdoa_rows[present[tdoa_rows]]] != 1.0).any():
         return None
-    sightings = list(_sightings(problem, taken[present[taken]]))
-    found = [_find_arrivals(problem, one) for one in sightings]
+    sets = list(_difference_sets(problem, tdoa_rows[present[tdoa_rows]]))
+    arrivals = [_find_arrivals(problem, one) for one in sets]
     if (
-        not found
-        or any(one is None for one in found)
-        or not _are_apart(problem.noise, sightings, taken[~present[taken]])
+        not arrivals
+        or any(one is None for one in arrivals)
+        or not _are_uncorrelated(problem.noise, sets, tdoa_rows[~present[tdoa_rows]])
     ):
         return None
-    z, variance = (np.concatenate([one[i] for one in found if one is not None], axis=-1) for i in range(2))
-    return _assemble(problem, sightings, z, variance)
+    z, variance = (np.concatenate([one[i] for one in arrivals if one is not None], axis=-1) for i in range(2))
+    return _assemble(problem, sets, z, variance)
 
 
-def _sightings(problem: Problem, taken: Array) -> Iterator[_Sighting]:
-    """Yield the range differences of each epoch and target, grouped from the row numbers `taken`."""
+def _difference_sets(problem: Problem, numbers: Array) -> Iterator[_DifferenceSet]:
+    """Yield the range differences of each epoch and target; `numbers` (n,) are the global row numbers to group."""
     a, b, epoch, target = (
-        np.concatenate([getattr(rows, name) for rows in problem.rows])[taken] for name in ("a", "b", "epoch", "target")
+        np.concatenate([getattr(rows, name) for rows in problem.rows])[numbers]
+        for name in ("a", "b", "epoch", "target")
     )
     for k, t in np.unique(np.column_stack([epoch, target]), axis=0).tolist():
-        own = np.flatnonzero((epoch == k) & (target == t))
-        stations = np.unique([a[own], b[own]])
-        design = np.zeros((len(own), len(stations)))
-        design[np.arange(len(own)), np.searchsorted(stations, a[own])] += 1.0
-        design[np.arange(len(own)), np.searchsorted(stations, b[own])] -= 1.0
-        yield _Sighting(taken[own], stations, design, k, t)
+        members = np.flatnonzero((epoch == k) & (target == t))
+        stations = np.unique([a[members], b[members]])
+        design = np.zeros((len(members), len(stations)))
+        design[np.arange(len(members)), np.searchsorted(stations, a[members])] += 1.0
+        design[np.arange(len(members)), np.searchsorted(stations, b[members])] -= 1.0
+        yield _DifferenceSet(numbers[members], stations, design, k, t)
 
 
-def _find_arrivals(problem: Problem, one: _Sighting) -> tuple[Array, Array] | None:
-    """Return arrival times (N, s), up to a common offset, and variances (N or 1, s); None if they do not exist."""
-    design, s = one.design, len(one.stations)
+def _find_arrivals(problem: Problem, differences: _DifferenceSet) -> tuple[Array, Array] | None:
+    """Return arrival times (N, s), metres, and their variances (N or 1, s), square metres, of one epoch and target.
+
+    The arrival times have mean zero, because the data do not determine a common offset. The result is None if the
+    differences do not connect all stations, or if their covariance is not D diag(v) D'.
+    """
+    design, s = differences.design, len(differences.stations)
     # With fewer differences the stations fall into groups, and the arrivals of each group have a separate offset.
     if np.linalg.matrix_rank(design) < s - 1:
         return None
-    covariance = dense(problem.noise, one.rows)
+    covariance = dense(problem.noise, differences.rows)
     # D diag(v) D' is linear in v: (r * r, s) times v is the covariance, flattened
     products = (design[:, None] * design[None]).reshape(-1, s)
     flat = covariance.reshape(*covariance.shape[:-2], -1)
@@ -117,37 +133,44 @@ def _find_arrivals(problem: Problem, one: _Sighting) -> tuple[Array, Array] | No
         return None
     variance = np.maximum(variance, _LEAST * variance.mean(-1, keepdims=True))
     # Least-squares arrivals of mean zero. Redundant differences agree, because their noise is a difference of arrivals.
-    return problem.observed[:, one.rows] @ np.linalg.pinv(design).T, variance.reshape(-1, s)
+    return problem.observed[:, differences.rows] @ np.linalg.pinv(design).T, variance.reshape(-1, s)
 
 
-def _are_apart(noise: Noise, sightings: list[_Sighting], absent: Array) -> bool:
-    """Return whether the differences of each epoch and target are uncorrelated with all other rows."""
-    for one in sightings:
+def _are_uncorrelated(noise: Noise, sets: list[_DifferenceSet], absent: Array) -> bool:
+    """Return whether the differences of each epoch and target are uncorrelated with all other present rows.
+
+    `absent` (n,) are the global numbers of the absent range differences. Their correlations do not count.
+    """
+    for differences in sets:
         for block in noise.blocks:
-            inside = np.isin(block.row, one.rows)
+            inside = np.isin(block.row, differences.rows)
             mixed = inside.any(1) & ~(inside | np.isin(block.row, absent)).all(1)
             if mixed.any():
                 return False
     return True
 
 
-def _assemble(problem: Problem, sightings: list[_Sighting], z: Array, variance: Array) -> Arrivals:
-    """Return the problem that consists of the arrival times and the present rows of other kinds."""
-    sizes = [len(one.stations) for one in sightings]
-    station = np.concatenate([one.stations for one in sightings])
+def _assemble(problem: Problem, sets: list[_DifferenceSet], z: Array, variance: Array) -> Arrivals:
+    """Return the problem that consists of the arrival times and of the rows of other kinds.
+
+    `z` (N, n) are the arrival times, metres, and `variance` (N or 1, n) their variances. n counts the stations of all
+    sets, in the order of `sets`.
+    """
+    sizes = [len(differences.stations) for differences in sets]
+    station = np.concatenate([differences.stations for differences in sets])
     ones = np.ones(len(station))
     arrival = Rows(
         "toa",
         z,
         station,
         np.full(len(station), -1),
-        np.repeat([one.epoch for one in sightings], sizes),
-        np.repeat([one.target for one in sightings], sizes),
+        np.repeat([differences.epoch for differences in sets], sizes),
+        np.repeat([differences.target for differences in sets], sizes),
         ones,
         0.0 * ones,
     )
     # Each arrival depends on all differences that involve its station.
-    origin = [one.rows[column != 0.0] for one in sightings for column in one.design.T]
+    origin = [differences.rows[column != 0.0] for differences in sets for column in differences.design.T]
     rows, number = [arrival], np.full(problem.count, -1)
     count = len(station)
     for block, start in zip(problem.rows, problem.starts, strict=True):
@@ -157,24 +180,32 @@ def _assemble(problem: Problem, sightings: list[_Sighting], z: Array, variance: 
             rows.append(block)
             count += block.count
     variance = variance[0] if len(variance) == 1 else variance
-    own = Block(np.arange(len(station))[:, None], variance[..., None, None])
-    noise = group([own, *_keep_noise(problem.noise, number)])
+    arrival_noise = Block(np.arange(len(station))[:, None], variance[..., None, None])
+    noise = group([arrival_noise, *_keep_noise(problem.noise, number)])
     return Arrivals(replace(problem, rows=tuple(rows), noise=noise), tuple(origin))
 
 
 def _keep_noise(noise: Noise, number: Array) -> Iterator[Block]:
-    """Yield the noise blocks of the rows of other kinds, with the new row numbers."""
+    """Yield the noise blocks of the rows of other kinds, with the new row numbers.
+
+    `number` (m,) is the new number of each original row, and -1 for range differences.
+    """
     for block in noise.blocks:
-        kept = (number[block.row] >= 0).all(1)
-        if kept.any():
-            own = block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., kept, :, :]
-            yield Block(number[block.row[kept]], own)
+        has_number = (number[block.row] >= 0).all(1)
+        if has_number.any():
+            covariance = (
+                block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., has_number, :, :]
+            )
+            yield Block(number[block.row[has_number]], covariance)
 
 
 def restore_order(layout: Layout, other: Layout, x: Array) -> Array:
     """Return parameter vectors x (..., size) of layout `other` in the order of `layout`.
 
     `other` contains all unknowns of `layout` and may contain more.
+
+    The arrival-time problem orders its unknowns differently and adds emission times. The result has the order of the
+    original problem.
     """
     shared, local = other.split(x)
     columns = []
@@ -186,6 +217,6 @@ def restore_order(layout: Layout, other: Layout, x: Array) -> Array:
 
 
 def shared_places(layout: Layout, other: Layout) -> Array:
-    """Return the indices (n,) in layout `other` of the shared unknowns of `layout`."""
+    """Return the indices (n,), in layout `other`, of the n shared unknowns of `layout`."""
     starts = ((other.find(slot.name)[0].start, slot.size) for slot in layout.shared)
     return np.concatenate([np.arange(0), *(np.arange(start, start + size) for start, size in starts)])

@@ -1,4 +1,8 @@
-"""Systematic errors (biases): families with one unknown for each station, group of stations, pair, kind or target."""
+"""Systematic errors (biases): families with one unknown for each station, group of stations, pair, kind or target.
+
+A family consists of q members. Each member is one unknown error, or three angles for a rotation in space. A list of
+entries (row, member, coefficient) links members to rows: the row contains the coefficient times the error.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,8 @@ from optloc.problem.validation import check_unknowns
 
 Per = Literal["station", "pair", "kind", "target"]
 Members = Sequence[str] | Mapping[str, Sequence[str]] | None
-_Touch = tuple[Array, Array, Array]
+# Row numbers, member numbers and coefficients, each (n,).
+_Entries = tuple[Array, Array, Array]
 # Names of other unknowns in the layout. A bias with one of these names would hide that unknown.
 _TAKEN = ("position", "velocity", "acceleration", "emission", "stations", "station velocities")
 
@@ -92,26 +97,29 @@ def with_bias(
     bias = complete(bias, problem.times, where, density=density, rate_density=rate_density, knots=knots)
     shape = FORMS[form].shape(bias, problem.dimension)
     quantity = _quantity(problem, bias)
-    centre = _each(in_si(mean, quantity, f"{where}, mean"), shape, where, "mean")
+    centre = _per_member(in_si(mean, quantity, f"{where}, mean"), shape, where, "mean")
     spread = (
         None
         if sigma is None
-        else _each(in_si(sigma, quantity, f"{where}, sigma", deviation=True), shape, where, "sigma")
+        else _per_member(in_si(sigma, quantity, f"{where}, sigma", deviation=True), shape, where, "sigma")
     )
-    made = replace(problem, biases=(*problem.biases, replace(bias, mean=centre, sigma=spread)))
-    check_unknowns(made)
-    return made
+    result = replace(problem, biases=(*problem.biases, replace(bias, mean=centre, sigma=spread)))
+    check_unknowns(result)
+    return result
 
 
 def _quantity(problem: Problem, bias: Bias) -> Quantity:
-    """Return the physical quantity of the values of a bias; "plain" if they have no unit or are angles per second."""
+    """Return the physical quantity of the values of a bias, for the conversion of units.
+
+    The result is "plain" if the values have no unit or are angles per second.
+    """
     form = form_of(bias)
     if form.quantity is not None:
         return form.quantity
     kinds = [rows.kind for rows in problem.rows for _ in range(rows.count)]
-    touched = MODELS[kinds[int(bias.row[0])]].quantity
+    measured = MODELS[kinds[int(bias.row[0])]].quantity
     rates: dict[str, Quantity] = {"length": "speed"}
-    return rates.get(touched, "plain") if form.rate else cast("Quantity", touched)
+    return rates.get(measured, "plain") if form.rate else cast("Quantity", measured)
 
 
 def family(
@@ -150,43 +158,47 @@ def family(
         if value not in known:
             raise InvalidProblem(f"unknown {what} {value!r}", where, nearest(str(value), known))
     # `per` decides the names of the members and the sign with which each row depends on them.
-    found = FORMS[form]
-    touched = _select_rows(rows, found, kind, where)
-    if not found.of_readings and per != "station":
+    bias_form = FORMS[form]
+    blocks = _select_rows(rows, bias_form, kind, where)
+    if not bias_form.of_readings and per != "station":
         raise InvalidProblem("a time along a course belongs to one station", where, "use per = 'station', or groups")
     if per == "kind":
         if members is not None:
             raise InvalidProblem("a kind has no members", where, "leave members out, or use per = 'station'")
-        names, touches = tuple(block.kind for block, _ in touched), _by_kind(touched)
+        names, entries = tuple(block.kind for block, _ in blocks), _by_kind(blocks)
     elif per == "pair":
-        names, touches = _by_pair(touched, stations, members, where)
+        names, entries = _by_pair(blocks, stations, members, where)
     elif per == "target":
-        names, touches = _by_target(touched, targets, members, where)
+        names, entries = _by_target(blocks, targets, members, where)
     else:
-        names, touches = _by_station(touched, found, stations, members, where)
-    row, member, coefficient = (np.concatenate(parts) for parts in zip(*touches, strict=True))
+        names, entries = _by_station(blocks, bias_form, stations, members, where)
+    row, member, coefficient = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     # No measurement would determine a member without rows.
-    idle = sorted(set(range(len(names))) - set(member.tolist()))
-    if idle:
-        raise InvalidProblem(f"{names[idle[0]]} affects no row", f"{where}, members", "leave it out")
-    if found.of_readings:
+    unused = sorted(set(range(len(names))) - set(member.tolist()))
+    if unused:
+        raise InvalidProblem(f"{names[unused[0]]} affects no row", f"{where}, members", "leave it out")
+    if bias_form.of_readings:
         coefficient = coefficient * _sense(rows, row)
     return Bias(name, names, row, member, coefficient, form, np.zeros(1))
 
 
-def _sense(rows: Sequence[Rows], touched: Array) -> float:
-    """Return -1 if all azimuths among the rows with these global numbers were read clockwise, otherwise 1.
+def _sense(rows: Sequence[Rows], affected: Array) -> float:
+    """Return the sign of the bias: -1 if the rows contain azimuths and all were read clockwise, otherwise 1.
 
-    Elevations among these rows do not affect the result.
+    `affected` (n,) are the global numbers of the rows that the bias affects. Elevations among these rows do not affect
+    the result.
     """
     ends = np.cumsum([block.count for block in rows])
-    blocks = [rows[i] for i in np.unique(np.searchsorted(ends, touched, side="right"))]
+    blocks = [rows[i] for i in np.unique(np.searchsorted(ends, affected, side="right"))]
     senses = {block.sense for block in blocks if block.kind == "azimuth"}
     return senses.pop() if len(senses) == 1 else 1.0
 
 
 def _select_rows(rows: Sequence[Rows], form: BiasForm, kind: str | None, where: str) -> list[tuple[Rows, int]]:
-    """Return the blocks of rows that a bias can affect, each with the global number of its first row."""
+    """Return the blocks of rows that a bias can affect, each with the global number of its first row.
+
+    `kind` is the kind that the caller named, or None. `where` is the location that error messages name.
+    """
     starts = np.cumsum([0, *(block.count for block in rows)]).tolist()
     kinds = [block.kind for block in rows]
     if kind is not None and kind not in kinds:
@@ -207,75 +219,90 @@ def _select_rows(rows: Sequence[Rows], form: BiasForm, kind: str | None, where: 
     return chosen
 
 
-def _touch(row: Array, member: Array, sign: float) -> _Touch:
-    """Return row numbers, member numbers and coefficients of the entries that have a member (member >= 0)."""
+def _entries(row: Array, member: Array, sign: float) -> _Entries:
+    """Return row numbers, member numbers and coefficients (n,) of the rows that have a member.
+
+    `row` (m,) are global row numbers. `member` (m,) is the member of each row, or -1 for none. `sign` is the
+    coefficient of all entries.
+    """
     inside = member >= 0
     return row[inside], member[inside], np.full(int(inside.sum()), sign)
 
 
-def _by_kind(touched: list[tuple[Rows, int]]) -> list[_Touch]:
+def _by_kind(blocks: list[tuple[Rows, int]]) -> list[_Entries]:
+    """Return the entries of a family with one member for each kind; `blocks` are the result of `_select_rows`."""
     return [
-        _touch(start + np.arange(block.count), np.full(block.count, i), 1.0) for i, (block, start) in enumerate(touched)
+        _entries(start + np.arange(block.count), np.full(block.count, i), 1.0)
+        for i, (block, start) in enumerate(blocks)
     ]
 
 
 def _by_pair(
-    touched: list[tuple[Rows, int]], stations: Sequence[str], members: Members, where: str
-) -> tuple[tuple[str, ...], list[_Touch]]:
+    blocks: list[tuple[Rows, int]], stations: Sequence[str], members: Members, where: str
+) -> tuple[tuple[str, ...], list[_Entries]]:
+    """Return the member names and the entries of a family with one member for each pair of stations."""
     named = (*stations, "")  # the last entry is index -1, no station
     # Each pair has one number. A missing second station (-1) counts as an extra station with an empty name.
-    codes = [block.a * len(named) + block.b % len(named) for block, _ in touched]
-    found = np.unique(np.concatenate(codes))
-    present = tuple("-".join(filter(None, (named[i // len(named)], named[i % len(named)]))) for i in found.tolist())
+    codes = [block.a * len(named) + block.b % len(named) for block, _ in blocks]
+    pairs = np.unique(np.concatenate(codes))
+    present = tuple("-".join(filter(None, (named[i // len(named)], named[i % len(named)]))) for i in pairs.tolist())
     if isinstance(members, Mapping):
         raise InvalidProblem("pairs have no groups", f"{where}, members", "give names such as 'A-B'")
     names = present if members is None else _check_names(members, present, "pair", where)
-    place = np.array([names.index(label) if label in names else -1 for label in present])
+    member_of = np.array([names.index(label) if label in names else -1 for label in present])
     return names, [
-        _touch(start + np.arange(block.count), place[np.searchsorted(found, code)], 1.0)
-        for (block, start), code in zip(touched, codes, strict=True)
+        _entries(start + np.arange(block.count), member_of[np.searchsorted(pairs, code)], 1.0)
+        for (block, start), code in zip(blocks, codes, strict=True)
     ]
 
 
 def _by_target(
-    touched: list[tuple[Rows, int]], targets: Sequence[str] | None, members: Members, where: str
-) -> tuple[tuple[str, ...], list[_Touch]]:
-    found = np.unique(np.concatenate([block.target for block, _ in touched]))
-    present = {int(i): str(i) if targets is None else targets[i] for i in found if i >= 0}
+    blocks: list[tuple[Rows, int]], targets: Sequence[str] | None, members: Members, where: str
+) -> tuple[tuple[str, ...], list[_Entries]]:
+    """Return the member names and the entries of a family with one member for each target.
+
+    `targets` are the names of the targets; without names, a target is named by its number.
+    """
+    numbers = np.unique(np.concatenate([block.target for block, _ in blocks]))
+    present = {int(i): str(i) if targets is None else targets[i] for i in numbers if i >= 0}
     if isinstance(members, Mapping) or not present:
         what = "no row has a target" if not present else "targets have no groups"
         raise InvalidProblem(what, f"{where}, members", "name the targets")
     known = tuple(present.values())
     names = known if members is None else _check_names(members, known, "target", where)
     # Rows without a target (-1) index the last entry, so they have no error.
-    place = np.full(max(present, default=0) + 2, -1)
+    member_of = np.full(max(present, default=0) + 2, -1)
     for i, label in present.items():
-        place[i] = names.index(label) if label in names else -1
-    return names, [_touch(start + np.arange(block.count), place[block.target], 1.0) for block, start in touched]
+        member_of[i] = names.index(label) if label in names else -1
+    return names, [_entries(start + np.arange(block.count), member_of[block.target], 1.0) for block, start in blocks]
 
 
 def _by_station(
-    touched: list[tuple[Rows, int]], form: BiasForm, stations: Sequence[str], members: Members, where: str
-) -> tuple[tuple[str, ...], list[_Touch]]:
-    measuring = np.unique(np.concatenate([index for block, _ in touched for index in (block.a, block.b)]))
+    blocks: list[tuple[Rows, int]], form: BiasForm, stations: Sequence[str], members: Members, where: str
+) -> tuple[tuple[str, ...], list[_Entries]]:
+    """Return the member names and the entries of a family with one member for each station or group of stations.
+
+    A row with two stations gets two entries. The form of the bias gives the signs of both stations.
+    """
+    measuring = np.unique(np.concatenate([index for block, _ in blocks for index in (block.a, block.b)]))
     if isinstance(members, Mapping):
         owner = dict(_owners(members, stations, where))
         names = tuple(members)
     else:
-        used = [stations[i] for i in measuring.tolist() if i >= 0]
-        names = tuple(used) if members is None else _check_names(members, stations, "station", where)
+        present = [stations[i] for i in measuring.tolist() if i >= 0]
+        names = tuple(present) if members is None else _check_names(members, stations, "station", where)
         owner = {name: i for i, name in enumerate(names)}
-    place = np.array([*(owner.get(name, -1) for name in stations), -1])  # the last entry is index -1, no station
+    member_of = np.array([*(owner.get(name, -1) for name in stations), -1])  # the last entry is index -1, no station
     return names, [
-        _touch(start + np.arange(block.count), place[index], float(sign))
-        for block, start in touched
+        _entries(start + np.arange(block.count), member_of[index], float(sign))
+        for block, start in blocks
         for index, sign in zip((block.a, block.b), form.signs(MODELS[block.kind]), strict=True)
         if sign
     ]
 
 
 def _owners(members: Mapping[str, Sequence[str]], stations: Sequence[str], where: str) -> Iterator[tuple[str, int]]:
-    """Yield each station of a group with the number of the group."""
+    """Yield the name of each station that is in a group, with the number of its group."""
     seen: set[str] = set()
     for i, (group, names) in enumerate(members.items()):
         for name in _check_names(names, stations, "station", f"{where}, {group!r}"):
@@ -285,13 +312,16 @@ def _owners(members: Mapping[str, Sequence[str]], stations: Sequence[str], where
             yield name, i
 
 
-def _check_names(given: Sequence[str], known: Sequence[str], what: str, where: str) -> tuple[str, ...]:
-    """Return the given names as a tuple; raise if the list is empty, or if a name is unknown or repeated."""
+def _check_names(given: Sequence[str], known: Sequence[str], noun: str, where: str) -> tuple[str, ...]:
+    """Return the given names as a tuple; raise if the list is empty, or if a name is unknown or repeated.
+
+    `noun` is the word for a name in messages, such as "station". `where` is the location that messages name.
+    """
     names = (given,) if isinstance(given, str) else tuple(given)
     place = f"{where}, members"
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise InvalidProblem(f"there is no {what} {unknown[0]!r}", place, nearest(unknown[0], list(known)))
+        raise InvalidProblem(f"there is no {noun} {unknown[0]!r}", place, nearest(unknown[0], list(known)))
     if not names or len(set(names)) < len(names):
         twice = next((name for name in names if names.count(name) > 1), None)
         raise InvalidProblem(
@@ -300,16 +330,19 @@ def _check_names(given: Sequence[str], known: Sequence[str], what: str, where: s
     return names
 
 
-def _each(values: Any, shape: tuple[int, ...], where: str, what: str) -> Array:
-    """Return the values as an array of the given shape. The input has one value for all members, or one for each."""
-    array = np.asarray(numbers(values, f"{where}, {what}"))
+def _per_member(values: Any, shape: tuple[int, ...], where: str, noun: str) -> Array:
+    """Return prior values as an array of the given shape, with the members as the first axis.
+
+    `values` has one value for all members, or one value for each member. `noun` is "mean" or "sigma", for messages.
+    """
+    array = np.asarray(numbers(values, f"{where}, {noun}"))
     if array.shape == shape[:1]:
         array = array.reshape(*array.shape, *(1,) * (len(shape) - 1))
     elif array.size == np.prod(shape):
         array = array.reshape(shape)
     if array.ndim and array.shape[0] != shape[0]:
         raise InvalidProblem(
-            f"{what} has {array.size} entries for {shape[0]} members", where, "give one value, or one for each member"
+            f"{noun} has {array.size} entries for {shape[0]} members", where, "give one value, or one for each member"
         )
     return np.array(np.broadcast_to(array, shape))
 
@@ -341,7 +374,7 @@ def with_known_bias(problem: Problem, name: str, values: ArrayLike | Mapping[str
     Raises
     ------
     InvalidProblem
-        If there is no such family or member, or if the values do not fit.
+        If the family or a member does not exist, or if the values do not fit.
     """
     names = [bias.name for bias in problem.biases]
     if name not in names:
@@ -349,13 +382,16 @@ def with_known_bias(problem: Problem, name: str, values: ArrayLike | Mapping[str
     bias = problem.biases[names.index(name)]
     form = form_of(bias)
     shape = form.shape(bias, problem.dimension)
-    known = _order(bias, values, shape if form.steps is None else (problem.epochs, *shape))
+    known = _in_member_order(bias, values, shape if form.steps is None else (problem.epochs, *shape))
     rest = replace(problem, biases=tuple(b for b in problem.biases if b is not bias))
-    return {"turns": _turn, "moves": _move}.get(form.enters, _correct)(rest, bias, known)
+    return {"turns": _turn_axes, "moves": _move_stations}.get(form.enters, _correct_rows)(rest, bias, known)
 
 
-def _order(bias: Bias, values: Any, shape: tuple[int, ...]) -> Array:
-    """Return the values as an array of the given shape, in the order of the members."""
+def _in_member_order(bias: Bias, values: Any, shape: tuple[int, ...]) -> Array:
+    """Return known bias values as an array of the given shape, in the order of the members.
+
+    `values` is an array, or a mapping from member names to values. Members that the mapping lacks get zero.
+    """
     where = f"values of {bias.name!r}"
     if isinstance(values, Mapping) and form_of(bias).steps is not None:
         raise InvalidProblem("a walk has values at every epoch", where, f"give an array of shape {shape}")
@@ -372,8 +408,11 @@ def _order(bias: Bias, values: Any, shape: tuple[int, ...]) -> Array:
     return array.reshape(shape)
 
 
-def _correct(problem: Problem, bias: Bias, known: Array) -> Problem:
-    """Return the problem with known offsets, drifts or scales added to the corrections of its rows."""
+def _correct_rows(problem: Problem, bias: Bias, known: Array) -> Problem:
+    """Return the problem with known offsets, drifts or scales added to the corrections of its rows.
+
+    `known` (q,) are the values of the members. For a walk, `known` (k, q) has one row for each epoch.
+    """
     form, amount, epoch = form_of(bias), np.zeros(problem.count), problem.epoch[bias.row]
     entry, factor = form.effects(bias, problem.times, problem.origin, epoch)
     values = known.ravel()[entry] if form.steps is None else known[epoch[:, None], entry]
@@ -381,40 +420,40 @@ def _correct(problem: Problem, bias: Bias, known: Array) -> Problem:
     rows = []
     for block, start in zip(problem.rows, problem.starts, strict=True):
         # The correction is measured minus modelled. For a scale, z = h (1 + s), it depends on the measurement.
-        own: Any = amount[start : start + block.count]
+        added: Any = amount[start : start + block.count]
         if form.enters == "scales":
-            own = (block.z - block.correction) * own / (1.0 + own)
-        rows.append(replace(block, correction=block.correction + own))
+            added = (block.z - block.correction) * added / (1.0 + added)
+        rows.append(replace(block, correction=block.correction + added))
     return replace(problem, rows=tuple(rows))
 
 
-def _turn(problem: Problem, bias: Bias, known: Array) -> Problem:
-    """Return the problem with the axes of its stations turned by the known angles."""
+def _turn_axes(problem: Problem, bias: Bias, known: Array) -> Problem:
+    """Return the problem with the axes of its stations turned by the known angles (q,) or (q, 3), radians."""
     d, stations = problem.dimension, problem.stations
-    turn = np.zeros((stations.count, 1 if d == 2 else 3))
-    first = np.concatenate([block.a for block in problem.rows])[bias.row]
-    turn[first] = bias.coefficient[:, None] * known.reshape(len(known), -1)[bias.member]
+    angles = np.zeros((stations.count, 1 if d == 2 else 3))
+    station = np.concatenate([block.a for block in problem.rows])[bias.row]
+    angles[station] = bias.coefficient[:, None] * known.reshape(len(known), -1)[bias.member]
     axes = np.eye(d) + np.zeros((1, stations.count, d, d)) if stations.axes is None else stations.axes
-    own = tuple(tuple(axes[..., i, c] for c in range(d)) for i in range(d))
+    rows_of_axes = tuple(tuple(axes[..., i, c] for c in range(d)) for i in range(d))
     # The model of rows with unknown turns uses the same `rotate`, so known and estimated turns agree.
-    rows = rotate(own, tuple(turn[:, c] for c in range(turn.shape[1])))
+    rows = rotate(rows_of_axes, tuple(angles[:, c] for c in range(angles.shape[1])))
     return replace(
         problem, stations=replace(stations, axes=np.stack([np.stack(row, axis=-1) for row in rows], axis=-2))
     )
 
 
-def _move(problem: Problem, bias: Bias, known: Array) -> Problem:
-    """Return the problem with its stations moved along their courses by the known times."""
+def _move_stations(problem: Problem, bias: Bias, known: Array) -> Problem:
+    """Return the problem with its stations moved along their courses by the known times (q,), seconds."""
     stations, seconds = problem.stations, np.zeros((problem.stations.count, 1))
-    for index, side in (("a", 1.0), ("b", -1.0)):
-        here = bias.coefficient == side
-        moved = np.concatenate([getattr(block, index) for block in problem.rows])[bias.row[here]]
-        seconds[moved, 0] = known[bias.member[here]]
+    for index, sign in (("a", 1.0), ("b", -1.0)):
+        selected = bias.coefficient == sign
+        station = np.concatenate([getattr(block, index) for block in problem.rows])[bias.row[selected]]
+        seconds[station, 0] = known[bias.member[selected]]
     velocity, acceleration = course(problem)
-    moved = replace(
+    station = replace(
         stations, position=stations.position + seconds * velocity, velocity=velocity + seconds * acceleration
     )
-    return replace(problem, stations=moved)
+    return replace(problem, stations=station)
 
 
 # Stations that are further along their courses than their stated positions.
@@ -445,12 +484,12 @@ def course(problem: Problem) -> tuple[Array, Array]:
     position, velocity = np.broadcast_arrays(position, velocity)
     if problem.frame.kind == "cartesian" or problem.dimension == 2:
         return velocity, np.zeros_like(velocity)
-    turn = problem.frame.rotation_to_ecef()
-    place, speed, axis = problem.frame.to_ecef(position), velocity @ turn.T, np.array([0.0, 0.0, _TURN])
-    away = np.linalg.norm(place, axis=-1, keepdims=True)
-    pull = -_GM * place / np.maximum(away, _RADIUS) ** 3
-    fall = pull - 2.0 * np.cross(axis, speed) - np.cross(axis, np.cross(axis, place))
-    return velocity, np.where(away > _RADIUS + _SKY, fall @ turn, 0.0)
+    rotation = problem.frame.rotation_to_ecef()
+    ecef, ecef_velocity, axis = problem.frame.to_ecef(position), velocity @ rotation.T, np.array([0.0, 0.0, _TURN])
+    radius = np.linalg.norm(ecef, axis=-1, keepdims=True)
+    gravity = -_GM * ecef / np.maximum(radius, _RADIUS) ** 3
+    acceleration = gravity - 2.0 * np.cross(axis, ecef_velocity) - np.cross(axis, np.cross(axis, ecef))
+    return velocity, np.where(radius > _RADIUS + _SKY, acceleration @ rotation, 0.0)
 
 
 # Unknown propagation speed: all times have the same relative error, which is a scale bias.
@@ -465,6 +504,8 @@ def scale_of(speed: float, sigma: float, rows: Sequence[Array], place: str) -> B
     A time multiplied by the stated speed is the range multiplied by stated speed / true speed. The scale is this
     quotient minus one. The name of its only member is the stated speed.
 
+    The scale is an unknown of the fix, so the uncertainty of the speed enters the covariance of the position.
+
     Parameters
     ----------
     speed, sigma : float
@@ -474,11 +515,11 @@ def scale_of(speed: float, sigma: float, rows: Sequence[Array], place: str) -> B
     place : str
         Location that error messages name.
     """
-    touched = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *rows]))
-    if not len(touched):
+    affected = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *rows]))
+    if not len(affected):
         raise InvalidProblem("the speed has a sigma, but no measurement is a time", place, "leave the sigma out")
-    member, ones = np.zeros(len(touched), dtype=np.int64), np.ones(len(touched))
-    return Bias(SPEED, (f"{speed:g} m/s",), touched, member, ones, "scale", np.zeros(1), np.array([sigma / speed]))
+    member, ones = np.zeros(len(affected), dtype=np.int64), np.ones(len(affected))
+    return Bias(SPEED, (f"{speed:g} m/s",), affected, member, ones, "scale", np.zeros(1), np.array([sigma / speed]))
 
 
 def estimated_speed(name: str, member: str, value: float, sigma: float) -> tuple[float, float] | None:

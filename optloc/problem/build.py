@@ -1,4 +1,8 @@
-"""Build a problem from arrays: `measured` makes rows of one kind, `assemble` joins rows, stations and noise."""
+"""Build a problem from arrays: `measured` makes rows of one kind, `assemble` joins rows, stations and noise.
+
+Letters: m rows, s stations, k epochs, d coordinates. Leading axes `...` count the problems of a batch. Problems that
+differ only in their measured values share checked noise and indices through a cache.
+"""
 
 from __future__ import annotations
 
@@ -205,14 +209,20 @@ def measured(
 
 
 def _filled(values: Any, shape: tuple[int, ...], dtype: Any = float) -> Array:
-    """Return a new array of the given shape with these values: a copy, since callers may change their arrays."""
+    """Return a new array of the given shape with these values: a copy, since callers may change their arrays.
+
+    `values` broadcasts to the shape.
+    """
     out = np.empty(shape, dtype)
     out[...] = values
     return out
 
 
 def _check_noise(kind: str, covariance: Any, signal: Any, deviations: bool) -> None:
-    """Raise unless the noise is given exactly once: by a covariance, a signal, or standard deviations."""
+    """Raise unless the noise is given exactly once: by a covariance, a signal, or standard deviations.
+
+    `deviations` is whether `sigma` or `arrival_sigma` was given.
+    """
     if sum((covariance is not None, signal is not None, deviations)) != 1:
         advice = "give covariance, or signal, or sigma, or arrival_sigma, or the last two together"
         raise InvalidProblem(f"the noise of {kind} must be given once", where=kind, advice=advice)
@@ -221,7 +231,10 @@ def _check_noise(kind: str, covariance: Any, signal: Any, deviations: bool) -> N
 
 
 def _count(kind: str, given: Sequence[Array | None], covariance: Array | None) -> int:
-    """Return the number of rows; raise if the arguments have different numbers of rows."""
+    """Return the number of rows m of one kind; raise if the arguments have different numbers of rows.
+
+    `given` are all arguments with one value per row. A scalar or None does not affect the number.
+    """
     sizes = [v.shape[-1] for v in given if v is not None and v.ndim]
     # A single number applies to all rows. Without any array there is one row.
     count = max(sizes, default=1)
@@ -282,7 +295,7 @@ def assemble(
         raise InvalidProblem("there are no measurements", where="measurements", advice="give at least one")
     # Epochs without rows count if a later epoch has rows.
     epochs = 1 + max(int(m.rows.epoch.max(initial=0)) for m in measurements)
-    made = Problem(
+    result = Problem(
         stations if isinstance(stations, Stations) else station_array(stations),
         tuple(m.rows for m in measurements),
         noises.Noise(()),
@@ -293,27 +306,33 @@ def assemble(
         frame,
         tuple(c for given in constraints for c in (given if isinstance(given, tuple | list) else (given,))),
     )
-    full = numbers(covariance, "covariance")
-    key = _key(made, measurements, full, medium)
+    joint = numbers(covariance, "covariance")
+    key = _key(result, measurements, joint, medium)
     if key is None:
-        return _complete(made, measurements, full, medium)
-    template = _TEMPLATES.find(key, lambda: _template(_complete(made, measurements, full, medium)))
-    for rows in made.rows:
+        return _complete(result, measurements, joint, medium)
+    template = _TEMPLATES.find(key, lambda: _template(_complete(result, measurements, joint, medium)))
+    for rows in result.rows:
         check_values(rows)
-    made = replace(at_rest(made if medium is None else made.in_medium(medium)), noise=template.noise)
-    vars(made).update(template.derived)
-    return made
+    result = replace(at_rest(result if medium is None else result.in_medium(medium)), noise=template.noise)
+    vars(result).update(template.derived)
+    return result
 
 
 class _Template(NamedTuple):
-    """Checked noise and derived indices that problems share if they differ only in their measured values."""
+    """Checked noise and derived indices that problems share if they differ only in their measured values.
+
+    `derived` has the cached properties that `_DERIVED` names, by name.
+    """
 
     noise: noises.Noise
     derived: dict[str, Any]
 
     @property
     def size(self) -> int:
-        """Return the approximate size in numbers: 500 for objects, the covariances, and ten per row for the key."""
+        """Return the approximate size in numbers, for the limit of the cache.
+
+        The size is 500 for objects, plus the covariances, plus ten per row for the key.
+        """
         return 500 + sum(10 * block.row.size + block.covariance.size for block in self.noise.blocks)
 
 
@@ -323,33 +342,44 @@ _TEMPLATES = Cache[_Template](2**20, lambda template: template.size)
 _DERIVED = ("starts", "layout", "batch_shape", "structure")
 
 
-def _key(made: Problem, measurements: Sequence[Measured], full: Array | None, medium: Medium | None) -> Any:
-    """Return a key of all content of a problem except its measured values; None for large problems."""
-    rows = [(r.kind, r.z.shape, r.a, r.b, r.epoch, r.target, r.weight, r.correction) for r in made.rows]
+def _key(problem: Problem, measurements: Sequence[Measured], joint: Array | None, medium: Medium | None) -> Any:
+    """Return a cache key of all content of a problem except its measured values; None for large problems.
+
+    `joint` is the joint covariance (..., m, m) of all rows, if the caller gave one.
+    """
+    rows = [(r.kind, r.z.shape, r.a, r.b, r.epoch, r.target, r.weight, r.correction) for r in problem.rows]
     noise = [(m.variance, m.arrival, m.covariance, m.signal) for m in measurements]
-    rest = (made.times, made.motions, made.biases, made.priors, made.frame, made.constraints)
-    return key_of(made.stations, rows, noise, full, rest, medium)
+    rest = (problem.times, problem.motions, problem.biases, problem.priors, problem.frame, problem.constraints)
+    return key_of(problem.stations, rows, noise, joint, rest, medium)
 
 
-def _template(made: Problem) -> _Template:
+def _template(problem: Problem) -> _Template:
+    """Return the part of a complete problem that the cache stores."""
     # Copied, because a covariance may be the caller's array.
-    noise = noises.Noise(tuple(noises.Block(b.row, np.array(b.covariance)) for b in made.noise.blocks))
-    return _Template(noise, {name: getattr(made, name) for name in _DERIVED})
+    noise = noises.Noise(tuple(noises.Block(b.row, np.array(b.covariance)) for b in problem.noise.blocks))
+    return _Template(noise, {name: getattr(problem, name) for name in _DERIVED})
 
 
-def _complete(made: Problem, measurements: Sequence[Measured], full: Array | None, medium: Medium | None) -> Problem:
-    """Return the problem with its noise and medium; raise InvalidProblem if the input is invalid."""
-    if full is None:
-        parts = zip(measurements, made.starts, strict=True)
-        noise = noises.group([block for m, start in parts for block in _noise(m, start, made.stations.count)])
+def _complete(
+    problem: Problem, measurements: Sequence[Measured], joint: Array | None, medium: Medium | None
+) -> Problem:
+    """Return the problem with its noise and medium; raise InvalidProblem if the input is invalid.
+
+    `joint` is the joint covariance (..., m, m) of all rows. If it is None, the noise of each kind applies.
+    """
+    if joint is None:
+        parts = zip(measurements, problem.starts, strict=True)
+        noise = noises.group([block for m, start in parts for block in _noise(m, start, problem.stations.count)])
     else:
-        if full.shape[-2:] != (made.count, made.count):
+        if joint.shape[-2:] != (problem.count, problem.count):
             raise InvalidProblem(
-                f"the joint covariance has shape {full.shape}", "covariance", f"give one of {made.count} x {made.count}"
+                f"the joint covariance has shape {joint.shape}",
+                "covariance",
+                f"give one of {problem.count} x {problem.count}",
             )
-        noise = noises.Noise((noises.Block(np.arange(made.count)[None], full[..., None, :, :]),))
-    made = replace(made, noise=noise)
-    return checked(made if medium is None else made.in_medium(medium))
+        noise = noises.Noise((noises.Block(np.arange(problem.count)[None], joint[..., None, :, :]),))
+    problem = replace(problem, noise=noise)
+    return checked(problem if medium is None else problem.in_medium(medium))
 
 
 def station_array(
@@ -383,16 +413,21 @@ def station_array(
             f"stations have shape {array.shape}", where="stations", advice="give an array (stations, 2 or 3) in metres"
         )
     labels = tuple(names) if names is not None else tuple(f"S{i}" for i in range(array.shape[-2]))
-    rates, own = (None if v is None else np.asarray(numbers(v, "stations")) for v in (velocity, axes))
+    rates, axes_array = (None if v is None else np.asarray(numbers(v, "stations")) for v in (velocity, axes))
     # For stations at rest the epoch axis has length one.
-    return Stations(_dated(array, 2), labels, _dated(rates, 2), _dated(own, 3))
+    return Stations(_dated(array, 2), labels, _dated(rates, 2), _dated(axes_array, 3))
 
 
 def _dated(array: Any, rank: int) -> Any:
+    """Return the array with an epoch axis of length one in front if it has `rank` axes; other input unchanged."""
     return array[None] if array is not None and array.ndim == rank else array
 
 
 def _noise(m: Measured, start: int, stations: int) -> list[noises.Block]:
+    """Return the noise blocks of the rows of one kind.
+
+    `start` is the global number of their first row. `stations` is the number of stations.
+    """
     rows = np.arange(start, start + m.rows.count)
     if m.variance is not None and m.arrival is None:
         return [noises.Block(rows[:, None], m.variance[..., None, None])]
@@ -412,6 +447,7 @@ def _noise(m: Measured, start: int, stations: int) -> list[noises.Block]:
 
 
 def _signal_blocks(m: Measured, start: int, stations: int, signal: Signal) -> list[noises.Block]:
+    """Return one noise block for each epoch and target, from signal-to-noise ratios; arguments as for `_noise`."""
     if len(signal.snr) != stations:
         what = f"there are {len(signal.snr)} signal-to-noise ratios for {stations} stations"
         raise InvalidProblem(what, "signal", "give one for each station, NaN for stations that do not take part")
@@ -423,7 +459,8 @@ def _signal_blocks(m: Measured, start: int, stations: int, signal: Signal) -> li
 def _arrival_blocks(m: Measured, start: int, variance: Array) -> list[noises.Block]:
     """Return one noise block for each epoch and target, because its rows combine the same arrivals.
 
-    The block is the covariance of the arrivals plus the independent variance of each row.
+    The block is the covariance of the arrivals plus the independent variance of each row. `start` is the global number
+    of the first row. `variance` (..., s) is the variance of the arrival at each station.
     """
     rows, signs = m.rows, MODELS[m.rows.kind].signs
     if signs is None:

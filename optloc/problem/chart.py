@@ -1,9 +1,11 @@
 """Coordinates in which the error of a fix is Gaussian: metres, or inverse range, or neither.
 
 With the mean c of the stations as origin, a position is ``x = c + (r / w)(u0 + B p)``. Here r and u0 are the distance
-and the direction of the fix. The columns of B are orthogonal to u0. p is a direction and w an inverse range. The fix is
-p = 0, w = 1. Infinity is w = 0, a regular point. The error of a distant emitter is curved in metres and Gaussian in
-``y = (p, w)``.
+and the direction of the fix. The columns of B are orthogonal to u0. p is a direction and w an inverse range; both have
+no unit. The fix is p = 0, w = 1. Infinity is w = 0, a regular point. The error of a distant emitter is curved in metres
+and Gaussian in ``y = (p, w)``.
+
+Letters: d coordinates (2 or 3), q points, N fixes. Leading axes `...` count the fixes of a batch.
 """
 
 from __future__ import annotations
@@ -50,6 +52,8 @@ def distance_and_direction(position: Array, centre: Array) -> tuple[Array, Array
 def basis(direction: Array) -> Array:
     """Return d - 1 orthonormal vectors (..., d, d - 1), in columns, orthogonal to unit vectors (..., d), d = 2 or 3.
 
+    They are the matrix B of this module.
+
     References
     ----------
     T. Duff et al., "Building an orthonormal basis, revisited", Journal of Computer Graphics Techniques 6 (2017).
@@ -88,14 +92,20 @@ def to_chart(points: Array, position: Array, centre: Array) -> Array:
 
 
 def to_position(y: Array, position: Array, centre: Array) -> Array:
-    """Return the positions (..., d), metres, of chart coordinates y (..., d); see `to_chart`."""
+    """Return the positions (..., d), metres, of chart coordinates y (..., d); the inverse of `to_chart`.
+
+    `position` and `centre` (..., d) are the fix and the mean of the stations, metres.
+    """
     r, u0 = distance_and_direction(position, centre)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(centre + (r / y[..., -1])[..., None] * _ray(y, u0))
 
 
 def jacobian(y: Array, position: Array, centre: Array) -> Array:
-    """Return the Jacobian dx/dy (..., d, d) at chart coordinates y (..., d); at the fix it is [r B, -r u0]."""
+    """Return the Jacobian dx/dy (..., d, d) at chart coordinates y (..., d); at the fix it is [r B, -r u0].
+
+    `position` and `centre` (..., d) are the fix and the mean of the stations, metres.
+    """
     r, u0 = distance_and_direction(position, centre)
     shape = np.broadcast_shapes(y.shape, u0.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -106,19 +116,28 @@ def jacobian(y: Array, position: Array, centre: Array) -> Array:
 
 
 def log_volume(y: Array, position: Array, centre: Array) -> Array:
-    """Return ``log |det dx/dy|`` (...) at chart coordinates y (..., d): ``d log r - (d + 1) log w``."""
+    """Return ``log |det dx/dy|`` (...) at chart coordinates y (..., d): ``d log r - (d + 1) log w``.
+
+    It converts a density in chart coordinates to a density in metres. `position` and `centre` (..., d) are the fix and
+    the mean of the stations, metres.
+    """
     r, d = distance_and_direction(position, centre)[0], y.shape[-1]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(d * np.log(r) - (d + 1) * np.log(y[..., -1]))
 
 
 def _ray(y: Array, u0: Array) -> Array:
-    """Return the vectors u0 + B p (..., d) for chart coordinates y (..., d) and directions u0 (..., d)."""
+    """Return the vectors u0 + B p (..., d) for chart coordinates y (..., d) and directions u0 (..., d).
+
+    They point from the centre to the positions with coordinates y. Their length is at least 1.
+    """
     return np.asarray(u0 + (basis(u0) * y[..., None, :-1]).sum(-1))
 
 
 def quantile(probability: float, dimension: int) -> float:
     """Return the quantile of the chi-square distribution with `dimension` degrees of freedom.
+
+    A squared error in standard deviations is below this number with the given probability.
 
     Parameters
     ----------
@@ -135,7 +154,10 @@ def quantile(probability: float, dimension: int) -> float:
 
 
 def tail_probability(cost: Array, dof: Array) -> Array:
-    """Return the p-value (...), the chi-square probability of a cost at least this large; NaN without redundancy."""
+    """Return the p-value (...), the chi-square probability of a cost at least this large; NaN without redundancy.
+
+    `cost` (...) is chi-square at the fix. `dof` (...) is the number of degrees of freedom.
+    """
     from scipy.special import gammaincc
 
     redundant = (dof > 0) & np.isfinite(cost)
@@ -197,14 +219,14 @@ class Chart:
 
     @property
     def mean(self) -> Array:
-        """Return the chart coordinates (..., d) of the fixes: p = 0, w = 1."""
+        """Return the chart coordinates (..., d) of the fixes themselves: p = 0, w = 1."""
         y = np.zeros(self.position.shape)
         y[..., -1] = 1.0
         return y
 
     @property
     def gradient(self) -> Array:
-        """Return G = dx/dy (..., d, d) at the fixes, metres."""
+        """Return G = dx/dy (..., d, d) at the fixes, metres per unit of the chart coordinates."""
         return jacobian(self.mean, self.position, self.centre)
 
     @property
@@ -248,8 +270,8 @@ class Chart:
         away = np.asarray(points) - self.position
         dy = self.to_chart(points) - self.mean
         # dy' G'A G dy: the gradient at the fix converts a step in chart coordinates to metres.
-        bent = (self.gradient * np.where(np.isfinite(dy), dy, 0.0)[..., None, :]).sum(-1)
-        step = np.where((self.kind == INVERSE_RANGE)[..., None], bent, away)
+        to_metres = (self.gradient * np.where(np.isfinite(dy), dy, 0.0)[..., None, :]).sum(-1)
+        step = np.where((self.kind == INVERSE_RANGE)[..., None], to_metres, away)
         solved, known = linalg.solve(np.broadcast_to(self.covariance, (*step.shape, step.shape[-1])), step[..., None])
         form = (step * solved[..., 0]).sum(-1)
         if (on_surface := self._is_singular()).any():
@@ -258,15 +280,15 @@ class Chart:
         behind = inverse & ~((dy[..., -1] > -1.0) & np.isfinite(dy).all(-1))
         form = np.array(np.where(known & (self.kind != CURVED), np.where(behind, np.inf, form), np.nan))
         away = np.broadcast_to(away, (*form.shape, away.shape[-1]))
-        for i, law in self._truncated_fixes():
+        for i, distribution in self._truncated_fixes():
             selected = np.zeros(self.kind.shape, dtype=bool)
             selected[i] = True
             selected = np.broadcast_to(selected, form.shape)
-            form[selected] = law.distance_squared(away[selected])
+            form[selected] = distribution.distance_squared(away[selected])
         return form
 
     def _is_singular(self) -> Array:
-        """Return a flag (...) for singular covariances: an equality constraint fixes the position in one direction."""
+        """Return a mask (...) of singular covariances: an equality constraint fixes the position in one direction."""
         finite = np.asarray(np.isfinite(self.covariance).all((-1, -2)))
         values = np.linalg.eigvalsh(np.where(finite[..., None, None], self.covariance, np.eye(self.position.shape[-1])))
         return np.asarray(values[..., 0] <= HELD * values[..., -1])
@@ -276,6 +298,9 @@ class Chart:
 
         A surface has fewer degrees of freedom than space. The returned distance has, with d degrees of freedom, the
         same probability as the distance on the surface. Steps that leave the surface get infinity.
+
+        `step` are metres relative to the fixes. `form` (...) are the squared distances by the inverse covariance.
+        `known` (...) selects the fixes for which `form` is valid.
         """
         from scipy.special import gammainc, gammaincinv
 
@@ -291,7 +316,7 @@ class Chart:
 
     @property
     def cut_off(self) -> Array:
-        """Return a flag (...) for each Cartesian fix whose distribution is truncated at bounds."""
+        """Return a mask (...) of the Cartesian fixes whose distribution is truncated at bounds."""
         if self.truncated is None:
             return np.zeros(self.kind.shape, dtype=bool)
         return np.asarray(self.truncated.cuts & (self.kind == CARTESIAN))
@@ -318,7 +343,7 @@ class Chart:
         bool array (...)
             Whether a point is in the error ellipsoid: in metres, or in chart coordinates.
         """
-        self._demand("region")
+        self._require_gaussian("region")
         with np.errstate(invalid="ignore"):
             return np.asarray(self.distance_squared(points) <= quantile(level, self.position.shape[-1]))
 
@@ -347,12 +372,12 @@ class Chart:
         """
         if extent not in _EXTENTS:
             raise InvalidProblem(f"there is no interval of {extent!r}", "extent", nearest(str(extent), _EXTENTS))
-        self._demand(f"interval of the {extent}")
+        self._require_gaussian(f"interval of the {extent}")
         if extent in {"elevation", "height", "z"} and self.position.shape[-1] != 3:
             raise InvalidProblem(f"a fix in the plane has no {extent}", "extent", "use x, y, range or bearing")
         low, high = map(np.array, _EXTENTS[extent](self, float(np.sqrt(quantile(level, 1)))))
-        for i, law in self._truncated_fixes():
-            low[i], high[i] = law.interval(self._number(extent, i), level)
+        for i, distribution in self._truncated_fixes():
+            low[i], high[i] = distribution.interval(self._coordinate_function(extent, i), level)
         return low, high
 
     def mean_of(self, x: Array, covariance: Array, start: int) -> Array:
@@ -360,15 +385,20 @@ class Chart:
 
         Truncation at bounds shifts the mean. The position is entries `start` to `start + d`. The mean of the other
         unknowns follows from their correlation with the position.
+
+        `x` are the estimates with the highest likelihood.
         """
-        out, part = np.array(x), slice(start, start + self.position.shape[-1])
+        out, position = np.array(x), slice(start, start + self.position.shape[-1])
         for i, law in self._truncated_fixes():
-            own = covariance[i]
-            out[i] += own[:, part] @ np.linalg.pinv(own[part, part], hermitian=True) @ law.moments()[0]
+            cov = covariance[i]
+            out[i] += cov[:, position] @ np.linalg.pinv(cov[position, position], hermitian=True) @ law.moments()[0]
         return out
 
-    def _number(self, extent: Extent, i: tuple[int, ...]) -> Callable[[Array], Array]:
-        """Return the function that maps points, in metres relative to fix i, to the coordinate of an interval."""
+    def _coordinate_function(self, extent: Extent, i: tuple[int, ...]) -> Callable[[Array], Array]:
+        """Return the function of points (..., d) that returns one coordinate (...) of each point, metres or radians.
+
+        The points are metres relative to fix i. A truncated distribution needs this function for its interval.
+        """
         start, centre = self.position[i], self.centre[i]
         if extent in _COORDINATES:
             j = _COORDINATES[extent]
@@ -385,40 +415,49 @@ class Chart:
 
         return bearing
 
-    def _demand(self, what: str) -> None:
-        """Raise if a fix is curved, because no Gaussian is valid for it."""
+    def _require_gaussian(self, result: str) -> None:
+        """Raise if a fix is curved, because no Gaussian is valid for it; `result` names the requested result."""
         curved = int((self.kind == CURVED).sum())
         if curved:
-            whose = "this fix is" if self.kind.ndim == 0 else f"{curved} of {self.kind.size} fixes are"
-            raise InvalidProblem(f"{whose} not Gaussian in any coordinates, so there is no {what}", "fix", _ADVICE)
+            subject = "this fix is" if self.kind.ndim == 0 else f"{curved} of {self.kind.size} fixes are"
+            raise InvalidProblem(f"{subject} not Gaussian in any coordinates, so there is no {result}", "fix", _ADVICE)
 
 
 def _range(chart: Chart, z: float) -> tuple[Array, Array]:
-    """Return the ends of the range, metres: r / (1 +- z sigma_w) in inverse range, r -+ z sigma_r in metres."""
+    """Return the ends (...) of the range interval, metres.
+
+    They are r / (1 +- z sigma_w) in inverse range and r -+ z sigma_r in metres. z is the half-width of the interval in
+    standard deviations.
+    """
     r, step = chart.distance, z * np.sqrt(chart.spread[..., -1, -1])
     with np.errstate(divide="ignore", invalid="ignore"):
         far = np.where(step < 1.0, r / (1.0 - step), np.inf)
-        near, width = r / (1.0 + step), z * np.sqrt(_form(chart.covariance, chart.direction, chart.direction))
+        near, width = r / (1.0 + step), z * np.sqrt(_bilinear(chart.covariance, chart.direction, chart.direction))
     inverse = chart.kind == INVERSE_RANGE
     return np.where(inverse, near, np.maximum(r - width, 0.0)), np.where(inverse, far, r + width)
 
 
 def _bearing(chart: Chart, z: float) -> tuple[Array, Array]:
-    east, _, ahead = _sides(chart)
+    """Return the ends (...) of the bearing interval, radians; z is the half-width in standard deviations."""
+    east, _, ahead = _local_axes(chart)
     middle = np.arctan2(chart.direction[..., 1], chart.direction[..., 0])
-    low, high = _turn(chart, z, east, ahead)
+    low, high = _angle_interval(chart, z, east, ahead)
     return middle + low, middle + high
 
 
 def _elevation(chart: Chart, z: float) -> tuple[Array, Array]:
-    _, up, _ = _sides(chart)
-    low, high = _turn(chart, z, up, chart.direction)
+    """Return the ends (...) of the elevation interval, radians; z is the half-width in standard deviations."""
+    _, up, _ = _local_axes(chart)
+    low, high = _angle_interval(chart, z, up, chart.direction)
     middle = np.arctan2(chart.direction[..., 2], up[..., 2])
     return np.maximum(middle + low, -0.5 * np.pi), np.minimum(middle + high, 0.5 * np.pi)
 
 
 def _coordinate(j: int) -> Callable[[Chart, float], tuple[Array, Array]]:
+    """Return the function of a chart and z that returns the ends (...) of the interval of coordinate j, metres."""
+
     def ends(chart: Chart, z: float) -> tuple[Array, Array]:
+        """Return the ends (...) of the interval, metres; raise if a fix is not Gaussian in metres."""
         if (chart.kind != CARTESIAN).any():
             what = "a coordinate of a fix that is not Gaussian in metres has no interval"
             raise InvalidProblem(what, "extent", _ADVICE)
@@ -439,11 +478,11 @@ _EXTENTS: dict[Extent, Callable[[Chart, float], tuple[Array, Array]]] = {
 }
 
 
-def _sides(chart: Chart) -> tuple[Array, Array, Array]:
+def _local_axes(chart: Chart) -> tuple[Array, Array, Array]:
     """Return three unit vectors (..., d) for the direction u0.
 
     The first is horizontal and orthogonal to u0. The second points upward and is orthogonal to u0. The third is the
-    horizontal component of u0.
+    horizontal component of u0, with length 1. In the plane the second is zero.
     """
     u0 = chart.direction
     size = np.hypot(u0[..., 0], u0[..., 1])
@@ -457,11 +496,12 @@ def _sides(chart: Chart) -> tuple[Array, Array, Array]:
     return np.stack([-s, c, o], axis=-1), up, np.stack([c, s, o], axis=-1)
 
 
-def _turn(chart: Chart, z: float, side: Array, ahead: Array) -> tuple[Array, Array]:
+def _angle_interval(chart: Chart, z: float, side: Array, ahead: Array) -> tuple[Array, Array]:
     """Return the least and the greatest angle (...), radians, from `ahead` towards `side`, both unit vectors (..., d).
 
-    The tangent of the angle is a quotient of two Gaussian numbers. The numerator has mean zero, the denominator mean m.
-    By Fieller, its interval is all t with ``(t m)^2 <= z^2 var(numerator - t denominator)``.
+    z is the half-width of the interval in standard deviations. The tangent of the angle is a quotient of two Gaussian
+    numbers. The numerator has mean zero, the denominator mean m. By Fieller, its interval is all t with ``(t m)^2 <=
+    z^2 var(numerator - t denominator)``. If every angle is possible, the ends are -pi and pi.
 
     References
     ----------
@@ -471,19 +511,19 @@ def _turn(chart: Chart, z: float, side: Array, ahead: Array) -> tuple[Array, Arr
     middle = r * (ahead * u0).sum(-1)
     # In chart coordinates only the component orthogonal to the direction is random; in metres both are.
     inverse = (chart.kind == INVERSE_RANGE)[..., None]
-    below = np.where(inverse, ahead - (ahead * u0).sum(-1, keepdims=True) * u0, ahead)
-    v = z**2 * _form(chart.covariance, side, side)
-    mixed = z**2 * _form(chart.covariance, side, below)
-    lead = middle**2 - z**2 * _form(chart.covariance, below, below)
+    denominator = np.where(inverse, ahead - (ahead * u0).sum(-1, keepdims=True) * u0, ahead)
+    variance = z**2 * _bilinear(chart.covariance, side, side)
+    covariance = z**2 * _bilinear(chart.covariance, side, denominator)
+    lead = middle**2 - z**2 * _bilinear(chart.covariance, denominator, denominator)
     with np.errstate(divide="ignore", invalid="ignore"):
-        root = np.sqrt(np.maximum(mixed**2 + lead * v, 0.0))
-        low, high = np.arctan((-mixed - root) / lead), np.arctan((-mixed + root) / lead)
+        root = np.sqrt(np.maximum(covariance**2 + lead * variance, 0.0))
+        low, high = np.arctan((-covariance - root) / lead), np.arctan((-covariance + root) / lead)
     # If the region contains the centre, or a point straight above it, the angle is undefined there and any value is
     # possible.
     known = lead > 0.0
     return np.where(known, low, -np.pi), np.where(known, high, np.pi)
 
 
-def _form(matrix: Array, u: Array, v: Array) -> Array:
+def _bilinear(matrix: Array, u: Array, v: Array) -> Array:
     """Return the bilinear form u'M v (...) of vectors (..., d) and a matrix (..., d, d)."""
     return np.asarray((u[..., :, None] * matrix * v[..., None, :]).sum((-1, -2)))

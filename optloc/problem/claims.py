@@ -59,27 +59,29 @@ class Claims:
         return np.asarray(self.proof != UNTRIED)
 
     def write(self, items: Array | int, other: Claims) -> None:
-        """Overwrite the entries at `items` (indices or a mask) with `other`: n claims (n,), or one () for all."""
+        """Overwrite the entries at `items` (indices or a mask) with `other`: n claims (n,), or one claim () for all."""
         places = np.atleast_1d(items)  # with a scalar index NumPy would store an array () as an object
         for each in fields(self):
             getattr(self, each.name)[places] = getattr(other, each.name)
 
     def tell(self) -> Array:
-        """Return the certificates as a read-only object array (...); None where no proof was tried."""
+        """Return the certificates as a read-only object array (...) of `Certificate`; None where no proof was tried."""
         out = np.empty(self.proof.shape, dtype=object)
         names = [each.name for each in fields(self)]
         columns = (getattr(self, name).ravel().tolist() for name in names)
         for i, values in zip(np.ndindex(out.shape), zip(*columns, strict=True), strict=True):
-            own = dict(zip(names, values, strict=True))
+            entries = dict(zip(names, values, strict=True))
             # All missing bounds share one NaN object, so that certificates without a bound compare as equal.
-            none = {name: _NONE for name in ("bound", "gap") if isnan(own[name])}
-            out[i] = Certificate(**own | none | {"proof": PROOFS[own["proof"]]}) if own["proof"] else None
+            missing = {name: _NONE for name in ("bound", "gap") if isnan(entries[name])}
+            out[i] = (
+                Certificate(**entries | missing | {"proof": PROOFS[entries["proof"]]}) if entries["proof"] else None
+            )
         out.flags.writeable = False
         return out
 
 
 def claim(certificate: Certificate) -> Claims:
-    """Return a certificate as claims without batch axes."""
+    """Return a certificate as claims without batch axes, each field of shape ()."""
     out = empty_claims(1)
     out.proof[0] = PROOFS.index(certificate.proof)
     for each in fields(out)[1:]:
@@ -95,11 +97,11 @@ def empty_claims(count: int) -> Claims:
 
 
 def repeated_claims(one: Claims, shape: int | tuple[int, ...]) -> Claims:
-    """Return read-only claims of the given shape that are all equal to `one`."""
+    """Return read-only claims of the given shape that are all equal to `one`, which has no batch axes."""
     return Claims(*(np.broadcast_to(getattr(one, each.name), shape) for each in fields(one)))
 
 
 def merged_claims(chosen: Array, one: Claims, other: Claims) -> Claims:
-    """Return claims (N,): `one` where `chosen` is true, otherwise `other`; each has shape (N,) or ()."""
+    """Return claims (N,): `one` where `chosen` (N,) is true, otherwise `other`; each has shape (N,) or ()."""
     pairs = ((getattr(one, each.name), getattr(other, each.name)) for each in fields(one))
     return Claims(*(np.where(chosen, *pair) for pair in pairs))

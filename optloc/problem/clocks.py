@@ -1,4 +1,8 @@
-"""Biases that change during a run: random walks with spectral densities or Allan deviations, and splines with knots."""
+"""Biases that change during a run: random walks with spectral densities or Allan deviations, and splines with knots.
+
+Letters: q members of a bias, k epochs, p knots and c coefficients of a spline. `where` and `place` are the locations
+that error messages name.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,8 @@ def greville(bias: Bias) -> Array:
     """Return the times (c,), seconds, at which each coefficient of a spline is approximately the value of the spline.
 
     They are averages of consecutive knots (Greville abscissae).
+
+    The spline starts of a fix and its output use these times.
     """
     assert bias.knots is not None
     full = _padded(bias.knots)
@@ -30,7 +36,7 @@ def greville(bias: Bias) -> Array:
 
 
 def coefficients(knots: Array) -> int:
-    """Return the number of coefficients of a spline over knots (p,)."""
+    """Return the number c of coefficients of a spline over knots (p,): p + 2 for cubic polynomials."""
     return len(knots) + DEGREE - 1
 
 
@@ -55,13 +61,15 @@ def spline_weights(knots: Array, times: Array) -> tuple[Array, Array]:
 
 
 def _padded(knots: Array) -> Array:
+    """Return the knots (p + 6,) of the cubic spline basis, in which the first and the last knot occur four times."""
     return np.concatenate([np.full(DEGREE, knots[0]), knots, np.full(DEGREE, knots[-1])])
 
 
 def with_knots(bias: Bias, times: Array, where: str, knots: Any) -> Bias:
-    """Return the bias with the knots of a spline over a run. `knots` gives the times, seconds, or the number of knots.
+    """Return the bias with the knots of a spline over a run.
 
-    If it gives the number, the knots are evenly spaced.
+    `times` (k,) are the epochs, seconds. `knots` gives the times of the knots, seconds, or their number. If it gives
+    the number, the knots are evenly spaced. `where` is the location that messages name.
 
     Raises
     ------
@@ -91,6 +99,7 @@ def check_spline(bias: Bias, times: Array, where: str) -> None:
 
 
 def _check_knots(knots: Array, times: Array, place: str) -> None:
+    """Raise if the run, with epochs at `times` (k,), extends beyond the knots (p,); both in seconds."""
     if times[0] < knots[0] or times[-1] > knots[-1]:
         what = f"the run lasts from {times[0]:.6g} to {times[-1]:.6g} s, beyond the knots"
         raise InvalidProblem(what, place, "let the first and the last knot enclose it")
@@ -100,12 +109,15 @@ def _check_knots(knots: Array, times: Array, place: str) -> None:
 
 
 def rate_name(name: str) -> str:
-    """Return the name of the rate of a walk."""
+    """Return the name of the unknown that is the rate of a walk, from the name of the walk."""
     return f"{name} rate"
 
 
 def state_of(bias: Bias) -> tuple[str, ...]:
-    """Return the names of the unknowns of a bias: its value and, if a walk has one, its rate."""
+    """Return the names of the unknowns of a bias: its value and, if a walk has one, its rate.
+
+    The number of names is the order of the walk: 1, or 2 with a rate.
+    """
     return (bias.name, rate_name(bias.name))[: 1 if bias.density is None else bias.density.shape[1]]
 
 
@@ -139,14 +151,14 @@ def process(bias: Bias, times: Array) -> tuple[Array, Array]:
     assert bias.density is not None
     step, order = np.diff(times), bias.density.shape[1]
     transition = np.broadcast_to(np.eye(order), (len(step), order, order)).copy()
-    white, t = bias.density[:, 0], step[:, None]
-    covariance = np.zeros((len(step), len(white), order, order))
-    covariance[..., 0, 0] = white * t
+    density, t = bias.density[:, 0], step[:, None]
+    covariance = np.zeros((len(step), len(density), order, order))
+    covariance[..., 0, 0] = density * t
     if order == 2:
-        transition[:, 0, 1], wander = step, bias.density[:, 1]
-        covariance[..., 0, 0] += wander * t**3 / 3.0
-        covariance[..., 0, 1] = covariance[..., 1, 0] = wander * t**2 / 2.0
-        covariance[..., 1, 1] = wander * t
+        transition[:, 0, 1], rate_density = step, bias.density[:, 1]
+        covariance[..., 0, 0] += rate_density * t**3 / 3.0
+        covariance[..., 0, 1] = covariance[..., 1, 0] = rate_density * t**2 / 2.0
+        covariance[..., 1, 1] = rate_density * t
     return transition, covariance
 
 
@@ -163,7 +175,7 @@ def with_densities(bias: Bias, times: Array, where: str, density: Any, rate_dens
         Location that error messages name.
     density, rate_density : float or array (q,), optional
         Spectral densities of the white noise that drives the error (unit squared per second) and its rate (unit squared
-        per second cubed). None: no such noise.
+        per second cubed). None: this noise is absent.
     """
     members = len(bias.members)
     if density is None and rate_density is None:
@@ -228,9 +240,9 @@ def clock_densities(tau: Any, deviation: Any, speed: float = SPEED_OF_LIGHT) -> 
         raise InvalidProblem("a time or a deviation is not positive", "deviation", "give such as 1.0 s and 1e-9")
     design = np.stack([1.0 / times, times / 3.0], axis=1)[:, : min(2, len(times))]
     # Relative errors, so that a deviation of 1e-12 has the same weight as a deviation of 1e-9.
-    found, _ = nnls(design / sizes[:, None] ** 2, np.ones(len(sizes)))
-    white, wander = (*found.tolist(), 0.0)[:2]
-    return speed**2 * white, speed**2 * wander
+    fitted, _ = nnls(design / sizes[:, None] ** 2, np.ones(len(sizes)))
+    h1, h2 = (*fitted.tolist(), 0.0)[:2]
+    return speed**2 * h1, speed**2 * h2
 
 
 def check_walk(bias: Bias, times: Array, where: str) -> None:

@@ -62,24 +62,25 @@ class Direction:
     ----------
     vector : array (d,)
         Unit vector of the highest likelihood, in the frame of the problem.
-    azimuth : tuple of float
-        Angle from the first horizontal axis towards the second, and the ends of its 95 % interval, radians. In frames
-        on Earth it counts from east towards north. The ends are not wrapped; they are a full turn apart if every
-        azimuth is possible.
-    elevation : tuple of float
+    azimuth : tuple of three float
+        Angle from the first horizontal axis towards the second, and the lower and upper end of its 95 % interval,
+        radians. In frames on Earth it counts from east towards north. The ends are not wrapped; they are a full turn
+        apart if every azimuth is possible.
+    elevation : tuple of three float
         Angle above the horizontal plane and the ends of its interval, radians; empty in two dimensions.
     half_angles : array (d - 1,)
         Semi-axes of the 95 % cone, radians, the larger first. They belong to the ellipse that has the second moments of
         `outline`.
     axes : array (d, d - 1)
         Unit vectors along the semi-axes, in columns.
-    Unit vectors on the edge of the 95 % cone. In space they are counter-clockwise as seen from outside; in the plane
-    they are the two edges.
-    range : tuple of float
+    outline : array (k, d)
+        Unit vectors on the edge of the 95 % cone. In space they are counter-clockwise as seen from outside; in the
+        plane they are the two edges.
+    range : tuple of three float
         Distance from the mean of the stations and the ends of its 95 % interval, metres. The far end is infinite if the
         data do not exclude infinity.
     gap : float
-        Cost of this direction minus the cost of the first direction.
+        Cost (chi-square) of this direction minus the cost of the first direction.
     """
 
     vector: Array
@@ -98,29 +99,37 @@ class Direction:
 
     @property
     def mixed(self) -> bool:
-        """Return whether the upper end of the range interval is finite."""
+        """Return whether the upper end of the range interval is finite, so that the data determine a range too."""
         return bool(np.isfinite(self.range[2]))
 
     def covers(self, vectors: Array) -> Array:
-        """Return whether vectors (..., d) are inside the 95 % cone, (...)."""
+        """Return a bool array (...): whether vectors (..., d) of any length are inside the 95 % cone."""
         return is_in_cone(self.vector, self.outline, vectors)
 
 
 def is_in_cone(axis: Array, outline: Array, vectors: Array) -> Array:
-    """Return whether vectors (..., d) are in the cone around `axis` (d,) with edge vectors `outline` (k, d)."""
-    rim, flat = angles_off_axis(axis, outline), angles_off_axis(axis, np.asarray(vectors, dtype=float))
+    """Return whether vectors (..., d) are in the cone around `axis` (d,) with edge vectors `outline` (k, d).
+
+    In the plane, the cone is between the extreme edges. In space, a vector is inside if it is on the inner side of the
+    edge between its two neighbouring outline vectors.
+    """
+    rim, angles = angles_off_axis(axis, outline), angles_off_axis(axis, np.asarray(vectors, dtype=float))
     if len(axis) == 2:
-        return np.asarray((flat[..., 0] >= rim.min()) & (flat[..., 0] <= rim.max()))
-    turn = np.arctan2(rim[:, 1], rim[:, 0])
-    rim = rim[np.argsort(turn)]
-    last = np.searchsorted(np.sort(turn), np.arctan2(flat[..., 1], flat[..., 0])) % len(rim)
+        return np.asarray((angles[..., 0] >= rim.min()) & (angles[..., 0] <= rim.max()))
+    polar = np.arctan2(rim[:, 1], rim[:, 0])
+    rim = rim[np.argsort(polar)]
+    last = np.searchsorted(np.sort(polar), np.arctan2(angles[..., 1], angles[..., 0])) % len(rim)
     start, end = rim[last - 1], rim[last]
-    along, away = end - start, flat - start
-    return np.asarray(along[..., 0] * away[..., 1] - along[..., 1] * away[..., 0] >= 0.0)
+    edge, offset = end - start, angles - start
+    return np.asarray(edge[..., 0] * offset[..., 1] - edge[..., 1] * offset[..., 0] >= 0.0)
 
 
 def angles_off_axis(axis: Array, vectors: Array) -> Array:
-    """Return the angles (..., d - 1), radians, between vectors (..., d) and an axis (d,), along two orthogonal axes."""
+    """Return the angles (..., d - 1), radians, between vectors (..., d) and an axis (d,), as components.
+
+    The components refer to the vectors `basis(axis)`, which are orthogonal to the axis. The length of the components is
+    the angle between vector and axis.
+    """
     unit = vectors / np.sqrt((vectors**2).sum(-1, keepdims=True))
     across = unit @ basis(axis)
     size = np.sqrt((across**2).sum(-1, keepdims=True))
@@ -191,15 +200,21 @@ class Determined:
         low, high = one.azimuth[1], min(one.azimuth[2], one.azimuth[1] + 2.0 * np.pi)
         near, far = one.range[1], one.range[2] if one.mixed else max(reach, 2.0 * one.range[1])
         # Horizontal distance is slant range times cos(elevation): take its least and its greatest value.
-        steep = np.cos(np.array(one.elevation[1:])) if one.elevation else np.ones(2)
+        cosines = np.cos(np.array(one.elevation[1:])) if one.elevation else np.ones(2)
         level = one.elevation and one.elevation[1] <= 0.0 <= one.elevation[2]
-        near, far = 0.0 if whole else near * max(float(steep.min()), 0.0), far * (1.0 if level else float(steep.max()))
-        turn = np.linspace(low, high, max(2, int(np.ceil((high - low) / _CORNER)) + 1))
-        arc = np.stack([np.cos(turn), np.sin(turn)], axis=-1) @ self.level[:2]
+        near, far = (
+            0.0 if whole else near * max(float(cosines.min()), 0.0),
+            far * (1.0 if level else float(cosines.max())),
+        )
+        azimuths = np.linspace(low, high, max(2, int(np.ceil((high - low) / _CORNER)) + 1))
+        arc = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=-1) @ self.level[:2]
         return np.asarray(self.origin + np.concatenate([far * arc, near * arc[::-1], far * arc[:1]]))
 
     def ray(self, one: Direction, reach: float) -> Array:
-        """Return the line (2, d), metres, from the mean of the stations along a direction; `reach` as for `wedge`."""
+        """Return the line (2, d), metres, from the mean of the stations along a direction.
+
+        If the range has no upper end, the line has the length `reach`, or twice the least range if that is longer.
+        """
         far = one.range[2] if one.mixed else max(reach, 2.0 * one.range[1])
         return np.stack([self.origin, self.origin + far * one.vector])
 
@@ -217,7 +232,10 @@ class Determined:
         }
 
     def _direction(self, one: Direction) -> dict[str, Any]:
-        """Return one direction as a dictionary for `to_dict`."""
+        """Return one direction as a dictionary for `to_dict`.
+
+        Angles are in degrees, ranges in metres.
+        """
         azimuth, *ends = np.degrees(one.azimuth).tolist()
         entries = {"vector": one.vector.tolist(), "azimuth_deg": azimuth, "azimuth_interval_deg": ends}
         if self.north:
@@ -250,6 +268,8 @@ def bearing_of(azimuth: tuple[float, float, float]) -> tuple[float, float, float
     """Return the bearing and its interval, degrees clockwise from north, of an azimuth with its interval, radians.
 
     The bearing is from 0 to 360 degrees.
+
+    The ends of the interval are not wrapped, the lower end first.
     """
     middle, low, high = (90.0 - np.degrees(each) for each in azimuth)
     turn = middle - middle % 360.0

@@ -1,4 +1,9 @@
-"""Groups of epochs with one structure, as batches. The stations of each epoch are data, so they can differ."""
+"""Groups of epochs with one structure, as batches. The stations of each epoch are data, so they can differ.
+
+A run often has epochs that different stations received. One compiled plan solves all epochs of a group at once.
+
+Letters: k epochs of the run, n epochs of a group, r rows of an epoch, s stations of an epoch, m rows of the run.
+"""
 
 from __future__ import annotations
 
@@ -57,13 +62,13 @@ class EpochGroup:
         block = np.searchsorted(self.run.starts, self.rows[0], side="right") - 1
         made = []
         for number, one in enumerate(self.run.rows):
-            own = np.flatnonzero(block == number)
-            if len(own):
-                made.append(_rows(one, self.rows[:, own] - self.run.starts[number], *self.ends[:, own]))
-        return replace(bare, stations=stations, rows=tuple(made), noise=_noise(self.run.noise, self.rows)).flat()
+            members = np.flatnonzero(block == number)
+            if len(members):
+                made.append(_batch_rows(one, self.rows[:, members] - self.run.starts[number], *self.ends[:, members]))
+        return replace(bare, stations=stations, rows=tuple(made), noise=_batch_noise(self.run.noise, self.rows)).flat()
 
     def take(self, items: slice) -> EpochGroup:
-        """Return some of the epochs as a group."""
+        """Return some of the epochs as a group; `items` selects positions in `epochs`."""
         rows, stations = (None if array is None else array[items] for array in (self.rows, self.stations))
         return EpochGroup(self.epochs[items], self.run, rows, self.ends, stations)
 
@@ -78,11 +83,15 @@ class EpochGroup:
         """
         if self.stations is None:
             return text
-        own = self.stations[item]
-        return _MARK.sub(lambda found: self.run.stations.names[own[int(found[1])]], text)
+        numbers = self.stations[item]
+        return _MARK.sub(lambda match: self.run.stations.names[numbers[int(match[1])]], text)
 
     def name(self, fix: Fix) -> Fix:
-        """Return the fixes of the batch with the names that their stations have in the run."""
+        """Return the fixes of the batch with the names that their stations have in the run.
+
+        Reasons and suspects of a fix contain placeholders for stations, because the problems of a batch share their
+        names.
+        """
         if self.stations is None:
             return fix
         reason = fix.reason.copy()
@@ -92,11 +101,12 @@ class EpochGroup:
         if fix.explanations is None:
             return replace(fix, reason=reason)
         explanations = np.empty(len(reason), dtype=object)
-        for i, found in enumerate(fix.explanations):
-            explanations[i] = tuple(self._name_suspects(one, i) for one in found)
+        for i, explanations_of_fix in enumerate(fix.explanations):
+            explanations[i] = tuple(self._name_suspects(one, i) for one in explanations_of_fix)
         return replace(fix, reason=reason, explanations=explanations)
 
     def _name_suspects(self, one: Explanation, item: int) -> Explanation:
+        """Return the explanation with the station names of the run; `item` is the number of the problem."""
         return replace(one, suspects=tuple(replace(s, name=self.label(s.name, item)) for s in one.suspects))
 
 
@@ -112,19 +122,22 @@ def epoch_groups(problem: Problem) -> tuple[EpochGroup, ...]:
         A separable run, without batch axes.
     """
     assert separable(problem)
-    whole = (EpochGroup(np.arange(problem.epochs), problem),)
+    one_group = (EpochGroup(np.arange(problem.epochs), problem),)
     # A plan contains the names of stations with unknown errors, and the axes of stations, so stations must not differ.
     if problem.batch_shape or problem.stations.unknown_for or problem.stations.axes is not None:
-        return whole
+        return one_group
     table = _RowTable.of(problem)
-    found = [_group(problem, table, epochs, rows) for epochs, rows in table.alike()]
-    layouts = [one.take(slice(1)).problem.layout if one.rows is not None and one.rows.size else None for one in found]
+    groups = [_epoch_group(problem, table, epochs, rows) for epochs, rows in table.alike()]
+    layouts = [one.take(slice(1)).problem.layout if one.rows is not None and one.rows.size else None for one in groups]
     # Epochs without rows, or without an unknown that other epochs have, fit into one common batch only.
-    return whole if any(layout != layouts[0] or layout is None for layout in layouts) else tuple(found)
+    return one_group if any(layout != layouts[0] or layout is None for layout in layouts) else tuple(groups)
 
 
 def problem_of(groups: Sequence[EpochGroup], epoch: int) -> Problem:
-    """Return the problem of one epoch, as a flat batch of one, with the station names of the run."""
+    """Return the problem of one epoch, as a flat batch of one, with the station names of the run.
+
+    `epoch` is the number of the epoch in the run. Raise LookupError if no group contains it.
+    """
     for one in groups:
         item = int(np.searchsorted(one.epochs, epoch))
         if item < len(one.epochs) and one.epochs[item] == epoch:
@@ -135,25 +148,33 @@ def problem_of(groups: Sequence[EpochGroup], epoch: int) -> Problem:
 
 
 def explanations_by_epoch(problem: Problem, explanations: Array) -> Array:
-    """Return explanations (k,) of fixes by `epoch_groups`, with the row numbers of the batch of `by_epoch`."""
-    out, place = explanations.copy(), rows_by_epoch(problem)
+    """Return explanations (k,) of fixes by `epoch_groups`, with the row numbers of the batch of `by_epoch`.
+
+    `explanations` (k,) is an object array with a tuple of explanations for each epoch.
+    """
+    out, batch_row = explanations.copy(), rows_by_epoch(problem)
     for one in epoch_groups(problem):
         if one.rows is not None:
-            for epoch, rows in zip(one.epochs, place[one.rows], strict=True):
+            for epoch, rows in zip(one.epochs, batch_row[one.rows], strict=True):
                 out[epoch] = tuple(_renumbered(each, rows) for each in out[epoch])
     return out
 
 
 def _renumbered(one: Explanation, rows: Array) -> Explanation:
+    """Return the explanation with new row numbers; `rows` (r,) is the new number of each row."""
     suspects = (replace(s, rows=tuple(rows[np.array(s.rows, dtype=int)].tolist())) for s in one.suspects)
     return replace(one, suspects=tuple(suspects))
 
 
 @dataclass(frozen=True, slots=True)
 class _RowTable:
-    """The rows (m,) of all kinds: block, stations a and b, target, epoch, whether present, and noise group.
+    """The rows (m,) of all kinds of a run, as columns.
 
-    `order` sorts the rows by epoch, then as `by_epoch` does: by the first appearance of their kind, stations and
+    `block` is the number of the row's entry in `Problem.rows`. `a` and `b` are its stations, `target` and `epoch` are
+    its target and its epoch. `present` is whether its weight is above zero. `noise` is a number that correlated rows
+    share. `epochs` is the number of epochs.
+
+    `order` (m,) sorts the rows by epoch, then as `by_epoch` does: by the first appearance of their kind, stations and
     target.
     """
 
@@ -169,6 +190,7 @@ class _RowTable:
 
     @classmethod
     def of(cls, problem: Problem) -> _RowTable:
+        """Return the table of a run without batch axes."""
         block = np.repeat(np.arange(len(problem.rows)), [rows.count for rows in problem.rows]).astype(np.int32)
         a, b, target, epoch, weight = (
             np.concatenate([getattr(rows, name) for rows in problem.rows])
@@ -178,43 +200,49 @@ class _RowTable:
         for one in problem.noise.blocks:
             if one.row.shape[1] > 1:
                 noise[one.row] = one.row[:, :1]
-        _, place = first_rows(block, a + 1, b + 1, target + 1)  # -1 is no station
-        order = np.lexsort((place, block, epoch))
+        _, kind_of_row = first_rows(block, a + 1, b + 1, target + 1)  # -1 is no station
+        order = np.lexsort((kind_of_row, block, epoch))
         return cls(block, a, b, target, epoch, weight > 0.0, noise, order, problem.epochs)
 
     def alike(self) -> Iterator[tuple[Array, Array]]:
-        """Yield the epochs (n,) of each structure, and their rows (n, r)."""
+        """Yield the epochs (n,) of each structure, and the row numbers (n, r) of these epochs."""
         size = np.bincount(self.epoch, minlength=self.epochs)
         start = np.cumsum(size) - size
         for count in np.unique(size).tolist():
             epochs = np.flatnonzero(size == count)
             members = self.order[start[epochs, None] + np.arange(count)]
-            for pick in _equal(self._structure(members)):
+            for pick in _equal_rows(self._structure(members)):
                 yield epochs[pick], members[pick]
 
     def _structure(self, members: Array) -> Array:
-        """Return the structure of each epoch as integers (n, c). Epochs of one batch have equal rows."""
+        """Return the structure of each epoch as integers (n, c); epochs with equal integers fit into one batch.
+
+        `members` (n, r) are the row numbers of each epoch. Stations enter by their order of appearance, not by number.
+        """
         ends = np.concatenate([self.a[members], self.b[members]], axis=1)
-        columns = [self.block[members], self.target[members], self.present[members], _labels(ends)]
-        return np.concatenate([*columns, _labels(self.noise[members])], axis=1, dtype=np.int32)
+        columns = [self.block[members], self.target[members], self.present[members], _number_by_appearance(ends)]
+        return np.concatenate([*columns, _number_by_appearance(self.noise[members])], axis=1, dtype=np.int32)
 
 
-def _labels(values: Array) -> Array:
-    """Return the entries of each row of values (n, r), numbered in the order of appearance; -1 if negative."""
+def _number_by_appearance(values: Array) -> Array:
+    """Return the entries of each row of values (n, r), numbered in the order of appearance; -1 if negative.
+
+    For example, (7, 3, 7, -1) gives (0, 1, 0, -1).
+    """
     out = np.full(values.shape, -1, dtype=np.int32)
-    used = np.zeros(len(values), dtype=np.int32)
+    count = np.zeros(len(values), dtype=np.int32)
     for j in range(values.shape[1]):
         same = values[:, :j] == values[:, j : j + 1]
         earlier = same.any(1) if j else np.zeros(len(values), dtype=bool)
-        fresh = ~earlier & (values[:, j] >= 0)
+        is_new = ~earlier & (values[:, j] >= 0)
         if j:
             out[earlier, j] = out[earlier, same.argmax(1)[earlier]]
-        out[fresh, j] = used[fresh]
-        used += fresh
+        out[is_new, j] = count[is_new]
+        count += is_new
     return out
 
 
-def _equal(table: Array) -> list[Array]:
+def _equal_rows(table: Array) -> list[Array]:
     """Return the indices of equal rows of a table (n, c), one array per group, in the order of first appearance."""
     varying = table[:, (table != table[:1]).any(0)]
     if not varying.shape[1]:
@@ -223,37 +251,48 @@ def _equal(table: Array) -> list[Array]:
     return [np.flatnonzero(inverse.ravel() == i) for i in np.argsort(first)]
 
 
-def _group(problem: Problem, table: _RowTable, epochs: Array, rows: Array) -> EpochGroup:
-    """Return epochs (n,) with row numbers (n, r) as one group."""
+def _epoch_group(problem: Problem, table: _RowTable, epochs: Array, rows: Array) -> EpochGroup:
+    """Return epochs (n,) with row numbers (n, r) as one group.
+
+    If all epochs have the same stations, the batch has the stations of the run. Otherwise the stations get numbers by
+    appearance.
+    """
     ends = np.stack([table.a[rows], table.b[rows]], axis=1)
     if (ends == ends[:1]).all():
         return EpochGroup(epochs, problem, rows, ends[0])
-    local = _labels(ends[:1].reshape(1, -1))[0].astype(np.int64)
+    local = _number_by_appearance(ends[:1].reshape(1, -1))[0].astype(np.int64)
     first = [int(np.flatnonzero(local == i)[0]) for i in range(int(local.max(initial=-1)) + 1)]
     return EpochGroup(epochs, problem, rows, local.reshape(2, -1), ends.reshape(len(ends), -1)[:, first])
 
 
-def _stations_of(stations: Stations, own: Array) -> Stations:
-    """Return the stations (n, s) of each problem of a batch. Their names are placeholders with their numbers."""
+def _stations_of(stations: Stations, numbers: Array) -> Stations:
+    """Return the stations of each problem of a batch, with names that are placeholders with their numbers.
+
+    `numbers` (n, s) are the station numbers in the run.
+    """
 
     def pick(array: Array | None) -> Array | None:
+        """Return the entries (n, 1, s, d) of the stations of each problem; None for None."""
         if array is None:
             return None
         if array.ndim == 3:  # all epochs have the same positions
-            return np.asarray(array[0][own][:, None])
-        return np.asarray(np.take_along_axis(array, own[:, None, :, None], axis=2))
+            return np.asarray(array[0][numbers][:, None])
+        return np.asarray(np.take_along_axis(array, numbers[:, None, :, None], axis=2))
 
     position = pick(stations.position)
     assert position is not None
-    names = tuple(f"\ue000{i}\ue001" for i in range(own.shape[1]))
+    names = tuple(f"\ue000{i}\ue001" for i in range(numbers.shape[1]))
     # Covariances of station errors that act as noise belong to the stations, so they are selected too.
     both = (stations.covariance, stations.velocity_covariance)
-    errors = [None if each is None else _once(each[own]) for each in both]
+    errors = [None if each is None else _without_equal_axis(each[numbers]) for each in both]
     return Stations(position, names, pick(stations.velocity), None, errors[0], stations.span, errors[1])
 
 
-def _rows(one: Rows, chosen: Array, a: Array, b: Array) -> Rows:
-    """Return chosen rows (n, r) of a kind as rows of a batch; arrays that all problems share get no batch axis."""
+def _batch_rows(one: Rows, chosen: Array, a: Array, b: Array) -> Rows:
+    """Return chosen rows (n, r) of a kind as rows of a batch; arrays that all problems share get no batch axis.
+
+    `chosen` (n, r) are row numbers within the kind. `a` and `b` (r,) are the stations of the rows in the batch.
+    """
     zeros = np.zeros(len(a), dtype=np.int64)
     return replace(
         one,
@@ -262,27 +301,27 @@ def _rows(one: Rows, chosen: Array, a: Array, b: Array) -> Rows:
         b=b,
         epoch=zeros,
         target=one.target[chosen[0]],
-        weight=_once(one.weight[chosen]),
-        correction=_once(one.correction[chosen]),
+        weight=_without_equal_axis(one.weight[chosen]),
+        correction=_without_equal_axis(one.correction[chosen]),
     )
 
 
-def _once(values: Array) -> Array:
+def _without_equal_axis(values: Array) -> Array:
     """Return values (n, ...) without the batch axis if all problems have the same values."""
     return values[0] if (values == values[:1]).all() else values
 
 
-def _noise(noise: Noise, rows: Array) -> Noise:
-    """Return the noise of rows (n, r) as noise of a batch of n problems."""
-    one = np.full(1 + max(int(block.row.max()) for block in noise.blocks), -1)
+def _batch_noise(noise: Noise, rows: Array) -> Noise:
+    """Return the noise of rows (n, r) as noise of a batch of n problems; `rows` are row numbers of the run."""
+    first_member = np.full(1 + max(int(block.row.max()) for block in noise.blocks), -1)
     for block in noise.blocks:
-        one[block.row] = block.row[:, :1]
-    label, blocks = one[rows[0]], []
+        first_member[block.row] = block.row[:, :1]
+    label, blocks = first_member[rows[0]], []
     alone = np.flatnonzero((label[:, None] == label).sum(1) == 1)
     if len(alone):
         variance = gathered(noise, rows[:, alone].reshape(-1, 1)).reshape(len(rows), len(alone), 1, 1)
-        blocks.append(Block(alone[:, None], _once(variance)))
+        blocks.append(Block(alone[:, None], _without_equal_axis(variance)))
     for name in np.unique(np.delete(label, alone)):
-        own = np.flatnonzero(label == name)
-        blocks.append(Block(own[None], _once(gathered(noise, rows[:, own])[:, None])))
+        members = np.flatnonzero(label == name)
+        blocks.append(Block(members[None], _without_equal_axis(gathered(noise, rows[:, members])[:, None])))
     return group(blocks)

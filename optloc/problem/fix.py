@@ -1,4 +1,8 @@
-"""The answer to a problem: estimate, covariance, status, certificate, and other positions that fit the data."""
+"""The answer to a problem: estimate, covariance, status, certificate, and other positions that fit the data.
+
+Letters: size of the parameter vector, n shared unknowns, d coordinates, k epochs, p unknowns of an epoch, m rows, q
+entries of a named part. Leading axes `...` count the fixes of a batch.
+"""
 
 from __future__ import annotations
 
@@ -218,11 +222,15 @@ class Fix:
         return self.take("velocity")
 
     def take(self, name: str) -> Array:
-        """Return the named unknowns of the estimate, for instance "position[1]" or "clock"."""
+        """Return the named unknowns of the estimate, (..., q) or (..., k, q), for instance "position[1]" or "clock"."""
         return self.layout.take(self.x, self._slot(name))
 
     def _slot(self, name: str) -> str:
-        """Return the slot name of a part. "position" means the position of the only target with unknown position."""
+        """Return the name that the layout uses for a part.
+
+        "position" means the position of the only target with unknown position. The layout adds a number, such as
+        "position[1]", if there are several targets.
+        """
         slots = [slot.name for slot in (*self.layout.shared, *self.layout.local)]
         numbered = [slot for slot in slots if slot.partition("[")[0] == name]
         return numbered[0] if name in _STATES and len(numbered) == 1 else name
@@ -244,7 +252,7 @@ class Fix:
 
     @property
     def bias(self) -> Mapping[str, Array]:
-        """Return the estimates of all unknowns except the states of targets, by name."""
+        """Return the estimates of all unknowns except the states of targets, by name, in SI units."""
         names = (slot.name for slot in (*self.layout.shared, *self.layout.local))
         return {name: self.take(name) for name in names if name.partition("[")[0] not in _STATES}
 
@@ -253,19 +261,25 @@ class Fix:
         return self.layout.find(name)[0].entries
 
     def covariance(self, name: str = "position") -> Array:
-        """Return the covariance of a named part: (..., q, q), or (..., k, q, q) for a state at each epoch."""
+        """Return the covariance of a named part: (..., q, q), or (..., k, q, q) for a state at each epoch.
+
+        The unit is the squared SI unit of the part.
+        """
         slot, shared = self.layout.find(self._slot(name))
-        part = slice(slot.start, slot.start + slot.size)
+        entries = slice(slot.start, slot.start + slot.size)
         if shared:
-            return self.cov[..., part, part]
+            return self.cov[..., entries, entries]
         if self.local is None or slot.start + slot.size > self.local.shape[-1]:
             raise InvalidProblem(
                 f"the covariance of {name} is not stored, because it is unknown at each epoch", name, "read other names"
             )
-        return self.local[..., part, part]
+        return self.local[..., entries, entries]
 
     def sigma(self, name: str = "position") -> Array:
-        """Return the standard deviations of a named part: (..., q), or (..., k, q) for a state at each epoch."""
+        """Return the standard deviations of a named part: (..., q), or (..., k, q) for a state at each epoch.
+
+        The unit is the SI unit of the part.
+        """
         return np.asarray(np.sqrt(np.diagonal(self.covariance(name), axis1=-2, axis2=-1)))
 
     def undetermined(self, name: str = "position") -> Array:
@@ -290,8 +304,8 @@ class Fix:
         limit = np.full(self.shape, _OPEN_BY_UNIT.get(slot.unit, _OPEN_LENGTH))
         if slot.name.partition("[")[0] != "position" or self.reach is None:
             return limit
-        away = 0.0 if self.chart is None else np.nan_to_num(self.chart.distance)
-        size = np.nan_to_num(self.reach) + away
+        distance = 0.0 if self.chart is None else np.nan_to_num(self.chart.distance)
+        size = np.nan_to_num(self.reach) + distance
         # A single fixed station has size zero, and a target at this station has distance zero.
         return np.where(size > 0.0, _OPEN * size, limit)
 
@@ -302,7 +316,7 @@ class Fix:
 
     @property
     def geodetic(self) -> tuple[Array, Array, Array]:
-        """Return latitude, longitude (radians) and ellipsoidal height (metres) of the position."""
+        """Return latitude, longitude (radians) and ellipsoidal height (metres) of the position, each (...)."""
         return self.frame.to_geodetic(self.position)
 
     @property
@@ -337,20 +351,20 @@ class Fix:
 
     def __repr__(self) -> str:
         """Return the text that the command line prints for a fix; for a batch the number of fixes of each status."""
-        return str(_TELLER[0]().text_of(self)) if _TELLER else object.__repr__(self)
+        return str(_RENDERER[0]().text_of(self)) if _RENDERER else object.__repr__(self)
 
     def _repr_html_(self) -> str:
         """Return the same text as HTML, for notebooks."""
-        return str(_TELLER[0]().html_of(self)) if _TELLER else ""
+        return str(_RENDERER[0]().html_of(self)) if _RENDERER else ""
 
     @property
     def determined(self) -> Determined | None:
         """Return directions, ranges and curves of a single fix that the data determine, in every status.
 
-        They are computed when you read them. The result is None if the fix does not hold its problem, as in batches
+        They are computed when you read them. The result is None if the fix does not contain its problem, as in batches
         with many refused fixes. `optloc.model_checks.determined(problem, fix)` then computes them.
         """
-        return cast("Determined | None", _TELLER[0]().determined_of(self))
+        return cast("Determined | None", _RENDERER[0]().determined_of(self))
 
     def to_dict(self) -> dict[str, object]:
         """Return the fix as plain numbers, texts and lists, ready for JSON.
@@ -361,7 +375,7 @@ class Fix:
             Status, position, sigma, covariance, alternatives, certificate and more by name, as in
             ``optloc fix --json``: metres and degrees, None for missing numbers. For a batch ``{"fixes": [...]}``.
         """
-        return dict(_TELLER[0]().dict_of(self))
+        return dict(_RENDERER[0]().dict_of(self))
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return a data frame with one row for each fix (and target, and epoch), as ``optloc fix --out`` writes it.
@@ -373,7 +387,7 @@ class Fix:
         InvalidProblem
             If pandas is not installed.
         """
-        return cast("pd.DataFrame", _TELLER[0]().frame_of(self))
+        return cast("pd.DataFrame", _RENDERER[0]().frame_of(self))
 
     def to_geojson(self, problem: Problem | None = None) -> dict[str, object]:
         """Return positions and their 95 % regions as a GeoJSON feature collection (RFC 7946).
@@ -388,12 +402,13 @@ class Fix:
         InvalidProblem
             If the positions are not on Earth.
         """
-        return dict(_TELLER[0]().geojson_of(self, problem))
+        return dict(_RENDERER[0]().geojson_of(self, problem))
 
     def gaussian(self) -> tuple[Array, Array]:
         """Return the mean (..., n) and covariance (..., n, n) of the shared unknowns, for the start of a tracker.
 
-        The mean accounts for truncation at bounds.
+        The mean accounts for truncation at bounds. The covariance is multiplied by `Chart.inflation`, which is above 1
+        for fixes with the finding `tails`.
         """
         mean, cov = self.x[..., : self.layout.n_shared], self.cov
         if self.chart is not None and self.chart.truncated is not None:
@@ -410,8 +425,8 @@ class Fix:
         """
         out = np.empty(self.shape, dtype=object)
         for i in np.ndindex(self.shape):
-            found = () if self.explanations is None else self.explanations[i]
-            out[i] = found[0].suspects if found else ()
+            explanations = () if self.explanations is None else self.explanations[i]
+            out[i] = explanations[0].suspects if explanations else ()
         return cast("tuple[Suspect, ...]", out[()])
 
     @property
@@ -432,6 +447,7 @@ class Fix:
 
     @property
     def _all_marks(self) -> Array:
+        """Return all findings of each fix (...), one bit for each `Status`, including the note `unchecked`."""
         # A fix of an external solver can have a status without marks.
         marks = np.left_shift(1, self.code.astype(np.int32)) if self.marks is None else self.marks
         return np.asarray(marks | np.where(self.unchecked, Status.UNCHECKED.mark, 0))
@@ -446,8 +462,8 @@ class Fix:
         # Many fixes share few different sets of findings.
         marks, index = np.unique(self._all_marks, return_inverse=True)
         sets = np.empty(len(marks), dtype=object)
-        for i, found in enumerate(marks.tolist()):
-            sets[i] = tuple(one for one in (*PRECEDENCE, *NOTES) if one is not Status.OK and found & one.mark)
+        for i, bits in enumerate(marks.tolist()):
+            sets[i] = tuple(one for one in (*PRECEDENCE, *NOTES) if one is not Status.OK and bits & one.mark)
         return cast("tuple[Status, ...]", sets[index.reshape(self.shape)] if self.shape else sets[0])
 
     def covers(self, points: Array, level: float = 0.95) -> Array:
@@ -491,6 +507,7 @@ class Fix:
         return self._gaussian_chart(level).interval(extent, level)
 
     def _gaussian_chart(self, level: float) -> Chart:
+        """Return the chart; raise if it does not exist, or if the finding `tails` forbids this probability level."""
         if self.chart is None:
             raise InvalidProblem("only a fix of a single position has a chart", "fix", "use its covariance")
         if level > TOLD and bool((self.has(Status.TAILS) & (self.chart.kind == CARTESIAN)).any()):
@@ -534,7 +551,7 @@ class Fix:
         return self.reshape((self.code.size,))
 
     def reshape(self, shape: tuple[int, ...]) -> Fix:
-        """Return the fixes of a flat batch with these batch axes."""
+        """Return the fixes of a flat batch with the batch axes `shape`."""
         return change(self, lambda array, core: array.reshape((*shape, *array.shape[array.ndim - core :])))
 
     def __getitem__(self, index: Index) -> Fix:
@@ -547,15 +564,19 @@ class Fix:
 
 
 # A module of a higher layer makes texts, tables and maps. The package `optloc` registers it here once.
-_TELLER: list[Callable[[], Any]] = []
+_RENDERER: list[Callable[[], Any]] = []
 
 
-def set_renderer(teller: Callable[[], Any]) -> None:
-    """Register the loader of the module that makes texts, tables and maps of fixes: `optloc.show.fixes`."""
-    _TELLER[:] = [teller]
+def set_renderer(renderer: Callable[[], Any]) -> None:
+    """Register the loader of the module that makes texts, tables and maps of fixes: `optloc.show.fixes`.
+
+    `renderer` returns the module. It is called at the first use, because the module belongs to a higher layer.
+    """
+    _RENDERER[:] = [renderer]
 
 
 def _as_array(value: Any) -> Array:
+    """Return an array without axes if the value is a scalar or an object, so that `Fix` stores arrays only."""
     if isinstance(value, np.ndarray | np.generic):
         return np.asarray(value)
     out = np.empty(1, dtype=object)

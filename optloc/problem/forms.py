@@ -1,4 +1,8 @@
-"""Forms of systematic errors: how an error enters rows, the unit of its values, and its change in time."""
+"""Forms of systematic errors: how an error enters rows, the unit of its values, and its change in time.
+
+A family of biases has q members. It affects n pairs of a row and a member, each with a coefficient (n,). c values of a
+member enter one row: one value, or the four coefficients of a spline that matter at a time.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +18,25 @@ from optloc.base.units import SI_UNIT, Quantity
 from optloc.models import Model
 from optloc.problem import clocks
 
+# Indices of the values that enter each pair of row and member, and their factors, each (n, c).
 _Effects = tuple[Array, Array]
 
 
 def _constant(bias: Bias, times: Array, origin: float, epoch: Array) -> _Effects:
+    """Return the value indices and the factors, each (n, 1), of an error that is constant.
+
+    Arguments of this and the next two functions as for `BiasForm.effects`.
+    """
     return bias.member[:, None], (bias.coefficient * 1.0)[:, None]
 
 
 def _in_proportion_to_time(bias: Bias, times: Array, origin: float, epoch: Array) -> _Effects:
+    """Return the value indices and the factors, each (n, 1), of a drift: coefficient times seconds since `origin`."""
     return bias.member[:, None], (bias.coefficient * (times - origin)[epoch])[:, None]
 
 
 def _in_pieces(bias: Bias, times: Array, origin: float, epoch: Array) -> _Effects:
+    """Return the value indices and the factors, each (n, 4), of a spline."""
     assert bias.knots is not None
     entry, factor = clocks.spline_weights(bias.knots, times)
     first = bias.member[:, None] * clocks.coefficients(bias.knots)
@@ -94,11 +105,14 @@ class BiasForm:
         return self.enters != "moves"
 
     def touches(self, model: Model) -> bool:
-        """Return whether the error can change rows of a kind."""
+        """Return whether an error of this form can change rows of the kind `model`."""
         return {"turns": model.axes, "moves": model.stations > 0}.get(self.enters, True)
 
     def signs(self, model: Model) -> tuple[int, int]:
-        """Return the signs with which the errors of the first and the second station enter a row; 0 for no effect."""
+        """Return the signs with which the errors of the first and the second station enter a row; 0 for no effect.
+
+        They are the coefficients of a bias with one member for each station.
+        """
         if self.enters == "turns" or model.stations == 1:
             return (1, 0)
         # A coefficient of 1 moves the first station of the row along its course, -1 the second.
@@ -114,7 +128,10 @@ class BiasForm:
         return per_second(rows) if self.rate else rows
 
     def shape(self, bias: Bias, dimension: int) -> tuple[int, ...]:
-        """Return the shape of the values: (members,), or (members, number of angles or coefficients)."""
+        """Return the shape of the values of a bias: (q,), or (q, number of angles or coefficients).
+
+        `dimension` is 2 or 3. A rotation has three angles in space.
+        """
         if self.values_at is not None:
             return (len(bias.members), len(self.values_at(bias)))
         return (len(bias.members), *((3,) if self.enters == "turns" and dimension == 3 else ()))
@@ -127,19 +144,22 @@ class BiasForm:
 
 
 def per_second(unit: str) -> str:
-    """Return the SI unit per second of a unit; empty for an empty unit."""
+    """Return the SI unit per second of a unit, for instance "m/s" for "m"; empty for an empty unit."""
     return {"": "", "m/s": "m/s^2"}.get(unit, f"{unit}/s")
 
 
 def _straight_walk(bias: Bias) -> tuple[Bias, ...]:
-    """Return an offset with the prior of the first value of a walk and, if the walk has a rate, a drift."""
+    """Return an offset with the prior of the first value of a walk and, if the walk has a rate, a drift.
+
+    The search for starts uses them instead of the walk, because they are linear in time.
+    """
     offset, drift = _straight_spline(bias)
     known = replace(offset, sigma=bias.sigma, mean=bias.mean)
     return (known, drift)[: len(clocks.state_of(bias))]
 
 
 def _straight_spline(bias: Bias) -> tuple[Bias, ...]:
-    """Return an offset and a drift without priors."""
+    """Return an offset and a drift without priors, which replace a spline in the search for starts."""
     offset = replace(bias, form="offset", density=None, knots=None, sigma=None, mean=np.zeros(1))
     return offset, replace(offset, name=clocks.rate_name(bias.name), form="drift")
 

@@ -14,6 +14,7 @@ from optloc.problem.forms import form_of, per_second
 
 # Units for output. All internal values are SI.
 _STATE = (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
+# Name, number of entries, unit and names of the members of a part, as in `Slot`.
 _Part = tuple[str, int, str, tuple[str, ...]]
 
 
@@ -41,7 +42,7 @@ class Slot:
 
     @property
     def entries(self) -> tuple[str, ...]:
-        """Return the names of the entries: a coordinate, a member, or a member and a coordinate."""
+        """Return the names of the entries (size,): a coordinate, a member, or a member and a coordinate."""
         per = self.size // max(len(self.members), 1)
         axes = tuple("xyz"[:per]) if per > 1 else ("",)
         return tuple(f"{member} {axis}".strip() for member in self.members or ("",) for axis in axes)
@@ -50,6 +51,8 @@ class Slot:
 @dataclass(frozen=True, slots=True)
 class Layout:
     """The order of unknowns: the shared slots first, then the local slots of epoch 0, of epoch 1 and so on.
+
+    The parameter vector has n shared entries, then l local entries for each of the k epochs. Its size is n + k l.
 
     Parameters
     ----------
@@ -65,17 +68,17 @@ class Layout:
 
     @property
     def n_shared(self) -> int:
-        """Return the number of shared unknowns."""
+        """Return the number n of shared unknowns."""
         return sum(slot.size for slot in self.shared)
 
     @property
     def n_local(self) -> int:
-        """Return the number of unknowns local to each epoch."""
+        """Return the number l of unknowns local to each epoch."""
         return sum(slot.size for slot in self.local)
 
     @property
     def size(self) -> int:
-        """Return the length of the parameter vector."""
+        """Return the length n + k l of the parameter vector."""
         return self.n_shared + self.epochs * self.n_local
 
     def find(self, name: str) -> tuple[Slot, bool]:
@@ -98,7 +101,7 @@ class Layout:
         return x[..., :n], library(x).reshape(x[..., n:], (*x.shape[:-1], self.epochs, self.n_local))
 
     def take(self, x: Array, name: str) -> Array:
-        """Return a named part of x: (..., q) for shared unknowns, (..., k, q) for local ones."""
+        """Return a named part of x (..., size): (..., q) for shared unknowns, (..., k, q) for local ones."""
         slot, is_shared = self.find(name)
         shared, local = self.split(x)
         return (shared if is_shared else local)[..., slot.start : slot.start + slot.size]
@@ -109,13 +112,17 @@ class Layout:
 
 
 def state_names(target: int, count: int, order: int) -> tuple[str, ...]:
-    """Return the slot names of a target's state; they contain the target number if there are several targets."""
+    """Return the slot names of a target's state; they contain the target number if there are several targets.
+
+    `count` is the number of targets. `order` is the number of derivatives: 0 position, 1 also velocity, 2 also
+    acceleration.
+    """
     suffix = f"[{target}]" if count > 1 else ""
     return tuple(name + suffix for name, _ in _STATE[: order + 1])
 
 
 def emission_name(target: int, count: int) -> str:
-    """Return the slot name of a target's emission time."""
+    """Return the slot name of a target's emission time; `count` is the number of targets."""
     return f"emission[{target}]" if count > 1 else "emission"
 
 
@@ -148,26 +155,27 @@ def layout(
     local: list[_Part] = []
     for i, motion in enumerate(motions):
         if motion.known is None:
-            room = shared if motion.span == "run" else local
+            parts = shared if motion.span == "run" else local
             units = (unit for _, unit in _STATE)
             names = state_names(i, len(motions), motion.order)
-            room.extend((name, stations.dimension, unit, ()) for name, unit in zip(names, units, strict=False))
+            parts.extend((name, stations.dimension, unit, ()) for name, unit in zip(names, units, strict=False))
     for bias, unit in zip(biases, bias_units or [""] * len(biases), strict=True):
         form = form_of(bias)
-        room = shared if form.steps is None else local
+        parts = shared if form.steps is None else local
         size, members = prod(form.shape(bias, stations.dimension)), form.members(bias)
         entries = zip(state_of(bias), (form.unit(unit), per_second(unit)), strict=False)
-        room.extend((name, size, own, members) for name, own in entries)
+        parts.extend((name, size, unit_of_state, members) for name, unit_of_state in entries)
     # Emission times are unknowns of one epoch. Station errors are unknowns of the span that the stations state.
     local.extend((emission_name(i, len(motions)), 1, "m", ()) for i in emitting)
     if stations.unknown_for:
-        room = shared if stations.unknown_for == "run" else local
+        parts = shared if stations.unknown_for == "run" else local
         size = stations.count * stations.dimension
-        room.extend((name, size, unit, stations.names) for name, unit, _ in stations.errors)
+        parts.extend((name, size, unit, stations.names) for name, unit, _ in stations.errors)
     return Layout(_slots(shared), _slots(local), epochs)
 
 
 def _slots(parts: list[_Part]) -> tuple[Slot, ...]:
+    """Return the slots of consecutive parts of the vector."""
     slots, start = [], 0
     for name, size, unit, members in parts:
         slots.append(Slot(name, start, size, unit, members))

@@ -1,4 +1,8 @@
-"""Robust loss functions: the cost of a residual, and the weight of its row in least squares."""
+"""Robust loss functions: the cost of a residual, and the weight of its row in least squares.
+
+u is a residual in standard deviations, rho(u) its loss, and psi = rho' / 2. Least squares has rho = u² and psi = u. E
+is the expectation for a standard normal u. c is the constant of a loss.
+"""
 
 from __future__ import annotations
 
@@ -49,11 +53,11 @@ class Loss:
     flat: bool = False
 
     def rho(self, u: Array) -> Array:
-        """Return the loss of each residual u, in standard deviations; u² for small residuals."""
+        """Return the loss of each residual u (...), in standard deviations; u² for small residuals."""
         return self.cost(np.asarray(u, dtype=float), self.constant)
 
     def weight(self, u: Array) -> Array:
-        """Return the weight in [0, 1] of each residual u, in standard deviations, for weighted least squares."""
+        """Return the weight psi(u) / u in [0, 1] of each residual u (...), in standard deviations."""
         return self.importance(np.asarray(u, dtype=float), self.constant)
 
     @property
@@ -65,7 +69,7 @@ class Loss:
     def slope(self) -> float:
         """Return the expectation of psi'(u) for a standard normal u.
 
-        It is computed as E u psi(u) (integration by parts), which is valid even if psi has steps.
+        It is computed as the expectation of u psi(u) (integration by parts), which is valid even if psi has steps.
         """
         return _moments(self)[1]
 
@@ -78,7 +82,7 @@ class Loss:
     def efficiency(self) -> float:
         """Return the mean square error of least squares over the error of this loss, for clean Gaussian data.
 
-        P. J. Huber, "Robust Statistics" (1981), eq. 3.2.13: (E psi')² / E psi².
+        It is (E psi')² / E psi², at most 1: P. J. Huber, "Robust Statistics" (1981), eq. 3.2.13.
         """
         return self.slope**2 / self.psi_squared
 
@@ -98,7 +102,10 @@ _NODES, _REACH = 60, 12.0
 
 @lru_cache
 def _moments(loss: Loss) -> tuple[float, float, float]:
-    """Return the expectations of psi², u psi and weight for a standard normal u, by quadrature between the kinks."""
+    """Return three expectations for a standard normal u: of psi(u)², of u psi(u) and of the weight.
+
+    They are computed by quadrature between the kinks of the loss.
+    """
     node, share = np.polynomial.legendre.leggauss(_NODES)
     # The integrand is smooth between the kinks at 0 and at the constant. The panel ends at 6 sigma make the nodes dense
     # where the density is large.
@@ -111,34 +118,42 @@ def _moments(loss: Loss) -> tuple[float, float, float]:
 
 
 def _huber(u: Array, c: float) -> Array:
+    """Return Huber's loss: u² up to the constant c, and a straight line beyond it."""
     return np.where(np.abs(u) <= c, u**2, 2.0 * c * np.abs(u) - c**2)
 
 
 def _huber_weight(u: Array, c: float) -> Array:
+    """Return the weights of Huber's loss: 1 up to the constant c, then c / abs(u)."""
     return np.asarray(c / np.maximum(np.abs(u), c))
 
 
 def _cauchy(u: Array, c: float) -> Array:
+    """Return Cauchy's loss c² log(1 + u² / c²)."""
     return np.asarray(c**2 * np.log1p((u / c) ** 2))
 
 
 def _cauchy_weight(u: Array, c: float) -> Array:
+    """Return the weights 1 / (1 + u² / c²) of Cauchy's loss."""
     return np.asarray(1.0 / (1.0 + (u / c) ** 2))
 
 
 def _truncated(u: Array, c: float) -> Array:
+    """Return the truncated loss: u², but c² at most."""
     return np.asarray(np.minimum(u**2, c**2))
 
 
 def _truncated_weight(u: Array, c: float) -> Array:
+    """Return the weights of the truncated loss: 1 up to the constant c, 0 beyond it."""
     return np.asarray(1.0 * (np.abs(u) <= c))
 
 
 def _late(u: Array, c: float) -> Array:
+    """Return the one-sided loss: Cauchy's loss for positive residuals, u² for negative residuals."""
     return np.where(u > 0.0, _cauchy(u, c), u**2)
 
 
 def _late_weight(u: Array, c: float) -> Array:
+    """Return the weights of the one-sided loss: 1 for negative residuals, as for Cauchy's loss otherwise."""
     return _cauchy_weight(np.maximum(u, 0.0), c)
 
 
@@ -160,9 +175,9 @@ def late_loss(share: float, delay: float) -> Loss:
     """Return the loss for rows of which a share is late, with exponentially distributed delays.
 
     The residual of a row, in sigma, is normal. With probability p = `share` an exponential delay is added. Its density
-    is (1 - p) phi(u) + p g(u). Here g is the density of an exponential plus a normal variable (Grushka 1972, equation
-    5). The loss is twice the negative logarithm of this density, measured from its mode, which is some hundredths of
-    sigma above zero. Early rows cost u².
+    is (1 - p) phi(u) + p g(u). Here phi is the standard normal density, and g is the density of an exponential plus a
+    normal variable (Grushka 1972, equation 5). The loss is twice the negative logarithm of this density, measured from
+    its mode, which is some hundredths of sigma above zero. Early rows cost u².
 
     Parameters
     ----------
@@ -181,14 +196,16 @@ def late_loss(share: float, delay: float) -> Loss:
         advice = "write the share of late rows and their mean delay in sigma, such as late(0.1,8)"
         raise InvalidProblem(f"there is no loss {name}", "method", advice)
     mode = _mode(share, delay)
-    least = _late_density(np.array(mode), share, delay)[0]
+    log_density_at_mode = _late_density(np.array(mode), share, delay)[0]
     curvature = float(_late_density(np.array(mode + _STEP), share, delay)[1]) / _STEP
 
     def cost(u: Array, _: float) -> Array:
-        here = _late_density(np.maximum(u, 0.0) + mode, share, delay)[0]
-        return np.where(u > 0.0, np.maximum(2.0 * (least - here), 0.0), u**2)
+        """Return the loss of residuals u, in standard deviations."""
+        log_density = _late_density(np.maximum(u, 0.0) + mode, share, delay)[0]
+        return np.where(u > 0.0, np.maximum(2.0 * (log_density_at_mode - log_density), 0.0), u**2)
 
     def importance(u: Array, _: float) -> Array:
+        """Return the weights psi(u) / u of residuals u, between 0 and 1."""
         psi = _late_density(np.maximum(u, 0.0) + mode, share, delay)[1]
         with np.errstate(divide="ignore", invalid="ignore"):
             weight = np.where(u > _ZERO, psi / u, curvature)
@@ -202,23 +219,29 @@ def late_loss(share: float, delay: float) -> Loss:
 
 
 def _late_density(u: Array, share: float, delay: float) -> tuple[Array, Array]:
-    """Return the logarithm of the density of u with a share of late rows, and minus its derivative."""
+    """Return the logarithm of the density of residuals u (...) with a share of late rows, and minus its derivative.
+
+    u is in standard deviations. `share` and `delay` as for `late_loss`.
+    """
     from scipy.special import log_ndtr
 
     late = np.log(share / delay) + 0.5 / delay**2 - u / delay + log_ndtr(u - 1.0 / delay)
     prompt = np.log1p(-share) - 0.5 * u**2 - _LOG_ROOT
     density = np.logaddexp(late, prompt)
-    chance = np.exp(late - density)
+    p_late = np.exp(late - density)
     # Derivative of the logarithm of the normal distribution function: its hazard rate.
     hazard = np.exp(-0.5 * (u - 1.0 / delay) ** 2 - _LOG_ROOT - log_ndtr(u - 1.0 / delay))
-    return density, (1.0 - chance) * u + chance * (1.0 / delay - hazard)
+    return density, (1.0 - p_late) * u + p_late * (1.0 / delay - hazard)
 
 
 _LOG_ROOT = 0.5 * float(np.log(2.0 * np.pi))
 
 
 def _mode(share: float, delay: float) -> float:
-    """Return the mode of the density of residuals with a share of late rows, in sigma, by bisection."""
+    """Return the mode of the density of residuals with a share of late rows, in sigma, by bisection.
+
+    The loss is measured from the mode, so that it is least at u = 0.
+    """
     low, high = 0.0, 1.0 + 2.0 * delay
     for _ in range(60):  # 60 halvings reach rounding error
         middle = 0.5 * (low + high)
@@ -231,14 +254,15 @@ class _NamedLosses(dict[str, Loss]):
     """Table of losses that also makes losses from names such as "late(0.1,8)"."""
 
     def __missing__(self, name: str) -> Loss:
-        found = _LATE_NAME.fullmatch(name.replace(" ", ""))
-        if found is None:
+        """Return the loss of a name such as "late(0.1,8)"; raise KeyError for other names."""
+        match = _LATE_NAME.fullmatch(name.replace(" ", ""))
+        if match is None:
             raise KeyError(name)
-        return late_loss(float(found["share"]), float(found["delay"]))
+        return late_loss(float(match["share"]), float(match["delay"]))
 
 
 # Each constant gives an `efficiency` of 95 %, for the truncated loss 99 %.
-_OWN = (
+_BUILT_IN = (
     Loss(
         "huber", 1.345, _huber, _huber_weight, "Huber's convex loss: a gross error has no more influence than 1.3 sigma"
     ),
@@ -254,7 +278,7 @@ _OWN = (
     ),
 )
 LOSSES: Registry[Loss] = Registry(
-    "optloc.losses", lambda value: isinstance(value, Loss), {loss.name: loss for loss in _OWN}, _NamedLosses
+    "optloc.losses", lambda value: isinstance(value, Loss), {loss.name: loss for loss in _BUILT_IN}, _NamedLosses
 )
 """Losses by name, each a stage of a method: Huber 1964; Holland, Welsch 1977; Blake, Zisserman 1987; Cauchy one-sided.
 

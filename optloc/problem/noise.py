@@ -1,4 +1,8 @@
-"""Measurement noise: a covariance in blocks over rows, never one full matrix."""
+"""Measurement noise: a covariance in blocks over rows, never one full matrix.
+
+Letters: m rows of the problem, g groups of r rows in a block, s stations, q selected rows, p columns. A whitening
+matrix W of a covariance C has W C W' = I.
+"""
 
 from __future__ import annotations
 
@@ -67,20 +71,23 @@ class Whitener:
         return self if shared else Whitener(self.row, self.matrix[index])
 
     def apply(self, values: Array) -> Array:
-        """Return whitened values (..., g * r, p) of values (..., m, p), for the rows of this block."""
+        """Return whitened values (..., g r, p) of values (..., m, p), for the g r rows of this block.
+
+        The columns are, for instance, a residual and a Jacobian.
+        """
         g, r = self.row.shape
         matrix, count = arrays.as_array_like(self.matrix, values), values.shape[-2]
-        whole = self.row.size == count and np.array_equal(self.row.ravel(), np.arange(count))
-        white: Array
+        all_rows = self.row.size == count and np.array_equal(self.row.ravel(), np.arange(count))
+        whitened: Array
         # Independent rows, and one group of all rows, are the usual cases. They need no gathering and no reshape.
         if r == 1:
-            white = matrix[..., 0] * (values if whole else arrays.gather(values, self.row[:, 0], -2))
+            whitened = matrix[..., 0] * (values if all_rows else arrays.gather(values, self.row[:, 0], -2))
         elif g == 1:
-            white = matrix[..., 0, :, :] @ (values if whole else arrays.gather(values, self.row[0], -2))
+            whitened = matrix[..., 0, :, :] @ (values if all_rows else arrays.gather(values, self.row[0], -2))
         else:
-            white = matrix @ arrays.gather(values, self.row, -2)
-            white = arrays.library(white).reshape(white, (*white.shape[:-3], g * r, white.shape[-1]))
-        return white
+            whitened = matrix @ arrays.gather(values, self.row, -2)
+            whitened = arrays.library(whitened).reshape(whitened, (*whitened.shape[:-3], g * r, whitened.shape[-1]))
+        return whitened
 
 
 def independent(variance: Array) -> Noise:
@@ -96,7 +103,10 @@ def independent(variance: Array) -> Noise:
 
 
 def group_members(key: Array) -> list[Array]:
-    """Return the indices of equal keys (m,): one array (g, r) for each group size r, with one group in each row."""
+    """Return the indices of equal keys (m,): one array (g, r) for each group size r, with one group in each row.
+
+    For example, the keys (5, 7, 5) give the arrays [[1]] and [[0, 2]].
+    """
     # A stable sort keeps the order of the rows, in which the covariance is given.
     order = np.argsort(key, kind="stable")
     _, first, sizes = np.unique(key[order], return_index=True, return_counts=True)
@@ -118,13 +128,13 @@ def arrivals(ends: Sequence[tuple[Array, int | Array]], variance: Array) -> Arra
     array (..., g, r, r)
         Singular if the rows of a group form a loop. The whitener then uses the pseudo-inverse.
     """
-    used = [(index, np.broadcast_to(sign, index.shape)) for index, sign in ends if np.any(sign)]
+    parts = [(index, np.broadcast_to(sign, index.shape)) for index, sign in ends if np.any(sign)]
     shape = ends[0][0].shape
     covariance = np.zeros((*variance.shape[:-1], *shape, shape[-1]))
     # Two rows with a common station are correlated: positive if it is at the same end of both differences, negative if
     # it is at opposite ends.
-    for one, sign in used:
-        for two, other in used:
+    for one, sign in parts:
+        for two, other in parts:
             shared = (one[:, :, None] == two[:, None, :]) * (sign[:, :, None] * other[:, None, :])
             covariance += shared * variance[..., one][..., None]
     return covariance
@@ -145,6 +155,7 @@ def group(blocks: Sequence[Block]) -> Noise:
 
 
 def _stack(blocks: list[Block]) -> Block:
+    """Return one block with the groups of all blocks; the groups have equal size and batch shape."""
     if len(blocks) == 1:
         return blocks[0]
     covariances = []
@@ -170,24 +181,29 @@ def whiten(noise: Noise, weight: Array) -> tuple[Whitener, ...]:
 
 
 def _whitener(block: Block, weight: Array) -> Whitener:
-    picked, xp = arrays.gather(weight, block.row), arrays.library(weight)
+    """Return the whitening matrices of one block with row weights (..., m); see `whiten`."""
+    weights, xp = arrays.gather(weight, block.row), arrays.library(weight)
     # With unit weights the whitening matrices of the covariance apply; the batch shares them if it shares the
     # covariance.
-    if bool(xp.all(picked == 1.0)):
+    if bool(xp.all(weights == 1.0)):
         # Arrays of another library can belong to one trace, so they are not cached.
-        own = arrays.is_other_library(block.covariance)
-        return Whitener(block.row, linalg.whitening(block.covariance) if own else block.whitening)
-    present = picked > 0.0
+        other_library = arrays.is_other_library(block.covariance)
+        return Whitener(block.row, linalg.whitening(block.covariance) if other_library else block.whitening)
+    present = weights > 0.0
     variance = xp.linalg.diagonal(block.covariance)
-    extra = xp.where(present, (1.0 / xp.where(present, picked, 1.0) - 1.0) * variance, 0.0)
+    added_variance = xp.where(present, (1.0 / xp.where(present, weights, 1.0) - 1.0) * variance, 0.0)
     # `linalg.whitening` treats rows and columns of zeros as absent, exactly and without a limit.
-    both = present[..., :, None] & present[..., None, :]
-    covariance = xp.where(both, block.covariance, 0.0) + extra[..., None] * arrays.eye(block.row.shape[1], weight)
+    present_pairs = present[..., :, None] & present[..., None, :]
+    covariance = xp.where(present_pairs, block.covariance, 0.0) + added_variance[..., None] * arrays.eye(
+        block.row.shape[1], weight
+    )
     return Whitener(block.row, linalg.whitening(covariance))
 
 
 def gathered(noise: Noise, members: Array) -> Array:
     """Return the covariance of the given groups of rows.
+
+    Groups can differ from the groups of the noise. Rows without a common noise group are uncorrelated.
 
     Parameters
     ----------
@@ -210,9 +226,9 @@ def gathered(noise: Noise, members: Array) -> Array:
     for block in noise.blocks:
         inner = (*block.covariance.shape[:-3], *block.row.shape, block.row.shape[1])
         one, two = np.broadcast_arrays(block.row[:, :, None], block.row[:, None, :])
-        kept = (group_of[one] >= 0) & (group_of[one] == group_of[two])
-        where = (group_of[one[kept]], slot[one[kept]], slot[two[kept]])
-        out[..., where[0], where[1], where[2]] = np.broadcast_to(block.covariance, inner)[..., kept]
+        inside_group = (group_of[one] >= 0) & (group_of[one] == group_of[two])
+        entries = (group_of[one[inside_group]], slot[one[inside_group]], slot[two[inside_group]])
+        out[..., entries[0], entries[1], entries[2]] = np.broadcast_to(block.covariance, inner)[..., inside_group]
     return out
 
 
@@ -222,7 +238,7 @@ def dense(noise: Noise, rows: Array) -> Array:
 
 
 def variances(noise: Noise, count: int) -> Array:
-    """Return the variances (..., m) of all `count` rows."""
+    """Return the variances (..., m) of all m = `count` rows, in the squared units of the rows."""
     shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in noise.blocks))
     out = np.zeros((*shape, count))
     for block in noise.blocks:
@@ -231,7 +247,10 @@ def variances(noise: Noise, count: int) -> Array:
 
 
 def whiten_rows(noise: tuple[Whitener, ...], values: Array) -> Array:
-    """Return whitened values (..., q, p) of values (..., m, p) of all rows, one block after the other."""
+    """Return whitened values (..., q, p) of values (..., m, p) of all rows, one block after the other.
+
+    The q rows of the result are sorted by block, not by row number.
+    """
     parts = [whitener.apply(values) for whitener in noise]
     shape = np.broadcast_shapes(*(part.shape[:-2] for part in parts))
     return np.concatenate([np.broadcast_to(part, (*shape, *part.shape[-2:])) for part in parts], axis=-2)

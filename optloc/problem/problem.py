@@ -1,4 +1,8 @@
-"""One estimation problem: stations, rows, noise and unknowns. It can be a batch of problems with one structure."""
+"""One estimation problem: stations, rows, noise and unknowns. It can be a batch of problems with one structure.
+
+Letters: N problems of a flat batch, m rows, s stations, k epochs, d coordinates. `core` is the rank of an array without
+batch axes. An array without batch axes is shared by all problems of the batch.
+"""
 
 from __future__ import annotations
 
@@ -88,26 +92,26 @@ class Problem:
 
     @property
     def emitting(self) -> tuple[int, ...]:
-        """Return the numbers of the targets whose emission times are unknown."""
+        """Return the numbers of the targets whose emission times are unknown, ascending; -1 for unlabelled rows."""
         # An unlabelled row (-1) has the emission time of a target that is identified later.
-        found = {t for block in self.rows if MODELS[block.kind].emission for t in set(block.target.tolist())}
-        return tuple(sorted(found))
+        targets = {t for block in self.rows if MODELS[block.kind].emission for t in set(block.target.tolist())}
+        return tuple(sorted(targets))
 
     @cached_property
     def layout(self) -> Layout:
-        """Return the layout of the unknowns."""
+        """Return the layout of the unknowns: the place of each unknown in the parameter vector."""
         # A bias has the unit of the rows that it affects. `layout` has no access to the rows.
         units = [self._unit(bias.row) for bias in self.biases]
         return layout(self.stations, self.motions, self.biases, self.emitting, self.epochs, units)
 
-    def _unit(self, touched: Array) -> str:
-        """Return the SI unit of the rows with these global numbers; empty if they have several units."""
-        found = {
-            SI_UNIT[MODELS[block.kind].quantity]  # type: ignore[index]  # the table holds known quantities only
+    def _unit(self, numbers: Array) -> str:
+        """Return the SI unit of the rows with these global numbers (n,); empty if they have several units."""
+        units = {
+            SI_UNIT[MODELS[block.kind].quantity]  # type: ignore[index]  # the table has known quantities only
             for block, start in zip(self.rows, self.starts, strict=True)
-            if np.any((touched >= start) & (touched < start + block.count))
+            if np.any((numbers >= start) & (numbers < start + block.count))
         }
-        return found.pop() if len(found) == 1 else ""
+        return units.pop() if len(units) == 1 else ""
 
     @property
     def weight(self) -> Array:
@@ -138,17 +142,20 @@ class Problem:
     def batch_shape(self) -> tuple[int, ...]:
         """Return the batch axes, to which the leading axes of all arrays broadcast."""
         # Most shapes are equal. `numpy.broadcast_shapes` is slow, so it runs only if several shapes differ.
-        found = {array.shape[: array.ndim - core] for array, core in _arrays(self)} - {()}
-        return np.broadcast_shapes(*found) if len(found) > 1 else next(iter(found), ())
+        shapes = {array.shape[: array.ndim - core] for array, core in _arrays(self)} - {()}
+        return np.broadcast_shapes(*shapes) if len(shapes) > 1 else next(iter(shapes), ())
 
     @cached_property
     def structure(self) -> tuple[Any, ...]:
-        """Return a hashable key of everything except the numbers. Problems with equal keys share compiled programs."""
+        """Return a hashable key of everything except the numbers. Problems with equal keys share compiled programs.
+
+        The key contains, for instance, the kinds, the stations of each row, the unknowns and the frame.
+        """
         rows = tuple((r.kind, r.a.tobytes(), r.b.tobytes(), r.epoch.tobytes(), r.target.tobytes()) for r in self.rows)
         blocks = tuple((b.row.shape, b.row.tobytes()) for b in self.noise.blocks)
-        motions = tuple((m.order, m.span, m.known is None, m.reference, *_course(m)) for m in self.motions)
+        motions = tuple((m.order, m.span, m.known is None, m.reference, *_motion_key(m)) for m in self.motions)
         biases = tuple(
-            (b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes(), b.coefficient.tobytes(), *_shape(b))
+            (b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes(), b.coefficient.tobytes(), *_bias_key(b))
             for b in self.biases
         )
         # Positions, measurements, weights and covariances are not part of the key, because they change between solves.
@@ -161,7 +168,7 @@ class Problem:
         # Polygons are not part of the key: cached programs depend on the bands of their edges, which their keys
         # contain.
         bands = [c for c in self.constraints if isinstance(c, Band)]
-        constraints = tuple((c.kind, c.target, *_along(c, self.motions[c.target])) for c in bands)
+        constraints = tuple((c.kind, c.target, *_band_key(c, self.motions[c.target])) for c in bands)
         medium = () if self.medium is None else (self.medium,)
         return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints, *medium)
 
@@ -174,9 +181,9 @@ class Problem:
             For kinds without a model for bent rays, for a frame that does not fit the medium, and for stations outside
             the medium.
         """
-        made = replace(self, rows=tuple(replace(r, kind=bent(r.kind)) for r in self.rows), medium=medium)
-        check_medium(made)
-        return made
+        problem = replace(self, rows=tuple(replace(r, kind=bent(r.kind)) for r in self.rows), medium=medium)
+        check_medium(problem)
+        return problem
 
     def straightened(self) -> Problem:
         """Return the problem with straight rays at one speed, as an approximation for the search for starts."""
@@ -200,6 +207,7 @@ class Problem:
         size = int(np.prod(shape))
 
         def reshape(array: Array, core: int) -> Array:
+            """Return the array with one batch axis; unchanged if all problems share it."""
             if array.ndim == core:
                 return array
             inner = array.shape[array.ndim - core :]
@@ -214,9 +222,9 @@ class Problem:
 
     def take(self, index: Array) -> Problem:
         """Return the problems of a flat batch at these indices or this mask. The structure stays."""
-        whole = np.arange(self.batch_shape[0])
-        numbers = whole[index]
-        if np.array_equal(numbers, whole):
+        all_problems = np.arange(self.batch_shape[0])
+        numbers = all_problems[index]
+        if np.array_equal(numbers, all_problems):
             return self
 
         def pick(array: Array, core: int) -> Array:
@@ -230,7 +238,7 @@ class Problem:
         return taken
 
     def with_rows(self, z: Array | None = None, weight: Array | None = None) -> Problem:
-        """Return the problem with new measurements or weights of all rows, each (..., m)."""
+        """Return the problem with new measurements or weights of all rows, each (..., m); None keeps the old ones."""
         rows, cut = [], np.cumsum([block.count for block in self.rows])[:-1]
         zs = [block.z for block in self.rows] if z is None else np.split(z, cut, axis=-1)
         weights = [block.weight for block in self.rows] if weight is None else np.split(weight, cut, axis=-1)
@@ -268,24 +276,26 @@ def check_medium(problem: Problem) -> None:
     (low, high), height = medium.reach, problem.stations.position[..., 2]
     bad = np.argwhere((height < low) | (height > high))
     if len(bad):
-        name, at = problem.stations.names[int(bad[0][-1])], height[tuple(bad[0])]
-        ends = f"{medium.surface - high:g} to {medium.surface - low:g} m"
-        what = f"station {name!r} is at depth {medium.surface - at:g} m, and the speeds are for {ends}"
+        name, station_height = problem.stations.names[int(bad[0][-1])], height[tuple(bad[0])]
+        depths = f"{medium.surface - high:g} to {medium.surface - low:g} m"
+        what = f"station {name!r} is at depth {medium.surface - station_height:g} m, and the speeds are for {depths}"
         raise InvalidProblem(what, "stations", "widen the table of speeds, or check the sign of z")
 
 
 # Parts of a structure that few problems have. Problems without them keep the keys of stored simulations.
 
 
-def _course(motion: Motion) -> tuple[Any, ...]:
+def _motion_key(motion: Motion) -> tuple[Any, ...]:
+    """Return the part of a key that describes a course over ground or a known change of height; () otherwise."""
     return () if motion.over == "space" and motion.rise is None else (motion.over, motion.rise is None)
 
 
-def _along(band: Band, motion: Motion) -> tuple[str, ...]:
+def _band_key(band: Band, motion: Motion) -> tuple[str, ...]:
+    """Return the part of a key that marks a band along a course that is unknown; () otherwise."""
     return ("along",) if band.along and motion.order and motion.span == "run" else ()
 
 
-def _shape(bias: Bias) -> tuple[Any, ...]:
+def _bias_key(bias: Bias) -> tuple[Any, ...]:
     """Return the properties of a walk or spline that determine columns: the shape of its densities, and its knots."""
     if bias.density is None and bias.knots is None:
         return ()
@@ -293,6 +303,7 @@ def _shape(bias: Bias) -> tuple[Any, ...]:
 
 
 def _join(parts: list[Array]) -> Array:
+    """Return the values of all blocks of rows (..., m) as a new array, in the order of the blocks."""
     if len(parts) == 1 and isinstance(parts[0], np.ndarray):
         return parts[0].copy()  # ten times faster than a concatenation, and also a new array
     xp = library(parts[0])
@@ -317,22 +328,27 @@ _NUMBERS: dict[type, dict[str, int]] = {
 
 
 def _numbers(part: Any) -> list[tuple[str, Array, int]]:
-    found = [(name, getattr(part, name), core) for name, core in _NUMBERS[type(part)].items()]
-    return [one for one in found if one[1] is not None]
+    """Return name, array and rank without batch axes of each numeric array of a part of a problem."""
+    arrays = [(name, getattr(part, name), core) for name, core in _NUMBERS[type(part)].items()]
+    return [entry for entry in arrays if entry[1] is not None]
 
 
 def _arrays(problem: Problem) -> list[tuple[Array, int]]:
+    """Return each numeric array of a problem, with its rank without batch axes."""
     blocks = problem.noise.blocks
     parts = (problem.stations, *problem.rows, *blocks, *problem.motions, *problem.priors, *problem.constraints)
     return [(array, core) for part in parts for _, array, core in _numbers(part)]
 
 
 def map_numbers(problem: Problem, change: Any) -> Problem:
-    """Return the problem with every numeric array replaced by ``change(array, rank without batch axes)``."""
+    """Return the problem with every numeric array replaced by ``change(array, rank without batch axes)``.
+
+    Batches are selected, reshaped and moved to other array libraries by this function.
+    """
 
     def changed(part: Any) -> Any:
-        found = [(name, array, change(array, core)) for name, array, core in _numbers(part)]
-        numbers = {name: new for name, old, new in found if new is not old}
+        arrays = [(name, array, change(array, core)) for name, array, core in _numbers(part)]
+        numbers = {name: new for name, old, new in arrays if new is not old}
         return replace(part, **numbers) if numbers else part
 
     def each(parts: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -350,4 +366,5 @@ def map_numbers(problem: Problem, change: Any) -> Problem:
 
 
 def _map_z(problem: Problem, change: Any) -> Problem:
+    """Return the problem with the measured values of each block replaced by ``change(z)``."""
     return replace(problem, rows=tuple(replace(r, z=change(r.z)) for r in problem.rows))

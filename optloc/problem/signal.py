@@ -1,9 +1,9 @@
 """Noise from signals: the accuracy of measured delays and gains at a given signal-to-noise ratio.
 
 A Gaussian signal with a flat spectrum from zero to W (rad/s) is recorded for T seconds at stations i. At each station
-the noise in the band is independent and white; rho_i is the ratio of signal power to noise power, and P is the sum of
-the rho_i. At each frequency the covariance of the stations is I + v v' with v_i = sqrt(rho_i) exp(-j w tau_i). The
-Fisher information of the delays is
+the noise in the band is independent and white. rho_i is the ratio of signal power to noise power, P the sum of the
+rho_i, and tau_i the delay in seconds. At each frequency w the covariance of the stations is I + v v' with
+v_i = sqrt(rho_i) exp(-j w tau_i), where j is the imaginary unit. The Fisher information of the delays is
 
     T W^3 / (3 pi (1 + P)) (P diag(rho) - rho rho').
 
@@ -13,9 +13,9 @@ The Fisher information of the logarithms of the amplitudes, which is independent
 
 An error that all stations share cancels in differences. The errors of the differences are therefore equal to
 differences of independent station errors. The variance of these errors is 3 pi (1 + P) / (T W^3 P rho_i) for delays and
-pi (1 + P) / (T W P rho_i) for log-amplitudes. At equal ratios the first is equation 31 of the registration paper
-(docs/papers/registration). Equation 38 of that paper is smaller, because it assumes that the level of the signal and
-the gain of the reference are known.
+pi (1 + P) / (T W P rho_i) for log-amplitudes. At equal ratios the first is equation 31 of "Error registration of
+multiple moving observers by TDOA and GROA", Journal of Electronics & Information Technology 39 (2017). Equation 38 of
+that paper is smaller, because it assumes that the level of the signal and the gain of the reference are known.
 
 Sources: W. R. Hahn, S. A. Tretter, "Optimum processing for delay-vector estimation in passive signal arrays", IEEE
 Trans. Information Theory 19 (1973); K. C. Ho, M. Sun, "Passive source localization using time differences of arrival
@@ -70,6 +70,7 @@ class Signal:
     speed: float = SPEED_OF_LIGHT
 
     def __post_init__(self) -> None:
+        """Check all fields, and store the ratios as a float array."""
         snr = np.array(self.snr, dtype=float)
         if snr.ndim != 1 or np.isfinite(snr).sum() < 2:
             raise InvalidProblem(f"snr has shape {snr.shape}", "snr", "give one for each station, two or more")
@@ -85,12 +86,13 @@ class Signal:
 
     @property
     def _factor(self) -> Array:
-        """Return the variance of the log-amplitude of each station (s,), pi (1 + P) / (T W P rho)."""
+        """Return the variance of the log-amplitude of each station (s,), pi (1 + P) / (T W P rho), without a unit."""
         total = np.nansum(self.snr)
         return np.asarray(np.pi * (1.0 + total) / (self.duration * self._band * total * self.snr))
 
     @property
     def _band(self) -> float:
+        """Return the bandwidth W, radians per second."""
         return 2.0 * np.pi * self.bandwidth
 
     @property
@@ -100,14 +102,23 @@ class Signal:
 
     @cached_property
     def _levels(self) -> Array:
-        """Return the covariance (s, s) of the log-amplitudes, without the error that all stations share."""
+        """Return the covariance (s, s) of the log-amplitudes, without the error that all stations share.
+
+        With a reference station, the row and the column of this station are zero.
+        """
         levels = np.diag(self._factor)
         if self.reference is None:
             return levels
         # Inverse of the information without the reference station, by the Sherman-Morrison formula.
-        total, own = np.nansum(self.snr), self.snr[self.reference]
+        total, snr_of_reference = np.nansum(self.snr), self.snr[self.reference]
         ratio = (1.0 - total) / (1.0 + total) / total
-        levels -= np.pi * (1.0 + total) / (self.duration * self._band * total) * ratio / (1.0 + ratio * (total - own))
+        levels -= (
+            np.pi
+            * (1.0 + total)
+            / (self.duration * self._band * total)
+            * ratio
+            / (1.0 + ratio * (total - snr_of_reference))
+        )
         levels[self.reference] = levels[:, self.reference] = 0.0
         return levels
 
@@ -136,16 +147,16 @@ class Signal:
         # An error that all stations share must cancel: in the row, or in its unknown emission time.
         if not ratio and not model.emission and model.ranges != (1, -1):
             raise InvalidProblem(f"{kind} is neither a time difference nor a gain ratio", "signal", "give sigma")
-        own = self._levels if ratio else np.diag(self.arrival_sigma**2)
+        by_station = self._levels if ratio else np.diag(self.arrival_sigma**2)
         signs = _RATIO if model.ranges is None else model.ranges
         ends = [(index, sign) for index, sign in zip((a, b), signs, strict=True) if sign]
         covariance = np.zeros((*a.shape, a.shape[-1]))
         for one, first in ends:
             for two, second in ends:
-                covariance = covariance + first * second * own[one[..., :, None], two[..., None, :]]
+                covariance = covariance + first * second * by_station[one[..., :, None], two[..., None, :]]
         if ratio:
-            size = np.sqrt(self.snr[b] / self.snr[a])
-            covariance = covariance * size[..., :, None] * size[..., None, :]
+            amplitude_ratio = np.sqrt(self.snr[b] / self.snr[a])
+            covariance = covariance * amplitude_ratio[..., :, None] * amplitude_ratio[..., None, :]
         if not np.isfinite(covariance).all():
             raise InvalidProblem(f"a {kind} row names a station without a signal", "snr", "give its ratio")
         return covariance

@@ -53,7 +53,7 @@ def in_order(order: str | Sequence[str], dimension: int, mean: Array, cov: Array
     wanted = order.replace(",", " ").split() if isinstance(order, str) else list(order)
     unknown = [name for name in wanted if name not in known]
     if unknown or len(set(wanted)) < len(wanted) or not wanted:
-        what = f"the state has no {unknown[0]!r}" if unknown else f"{order!r} is not an order of components"
-        raise InvalidProblem(what, "order", f"name some of {' '.join(known)}, each once")
+        problem = f"the state has no {unknown[0]!r}" if unknown else f"{order!r} is not an order of components"
+        raise InvalidProblem(problem, "order", f"name some of {' '.join(known)}, each once")
     index = np.array([known.index(name) for name in wanted])
     return mean[..., index], cov[..., index[:, None], index]

@@ -2,8 +2,12 @@
 
 Without bounds the distribution is ``N(x + shift, covariance)``. It is truncated to the admitted points. The fix x is
 the admitted point of highest density. The distribution is integrated along rays from the fix, each up to the first
-bound. Regions and intervals have the highest density, because an interval with equal tails never contains a target
-on the bound.
+bound. Regions and intervals have the highest density, because an interval with equal tails never contains a target on
+the bound.
+
+Letters: h bounds, d coordinates, k rays, n nodes on a ray. The squared deviation of a point is its squared distance
+from x + shift, in standard deviations. The excess of a point is its squared deviation minus the squared deviation of
+the fix.
 """
 
 from __future__ import annotations
@@ -77,11 +81,13 @@ class Truncated:
 
     @property
     def cuts(self) -> Array:
-        """Return a flag (...) for each distribution that a bound truncates."""
+        """Return a mask (...) of the distributions that a bound truncates."""
         return np.asarray(np.isfinite(self.slack).any(-1) & np.isfinite(self.covariance).all((-1, -2)))
 
     def moments(self) -> tuple[Array, Array]:
-        """Return mean minus fix (..., d), m, and covariance (..., d, d), m^2, of truncated distributions.
+        """Return mean minus fix (..., d), metres, and covariance (..., d, d), m^2, of truncated distributions.
+
+        One bound without ends has a closed form. All other distributions are integrated along rays.
 
         References
         ----------
@@ -96,7 +102,10 @@ class Truncated:
         return mean, covariance
 
     def moments_by_rays(self) -> tuple[Array, Array]:
-        """Return the moments of one distribution with any bounds: mean minus fix (d,) and covariance (d, d)."""
+        """Return the moments of one distribution with any bounds: mean minus fix (d,) and covariance (d, d).
+
+        The units are metres and square metres.
+        """
         rays = self._rays()
         weight = rays.weight / rays.weight.sum()
         mean = (weight[..., None] * rays.place).sum((0, 1))
@@ -106,7 +115,8 @@ class Truncated:
     def distance_squared(self, points: Array) -> Array:
         """Return the chi-square value (...) of the highest-density region whose edge contains points (..., d).
 
-        For one distribution; points are in metres from the fix. The value is infinite for points that a bound excludes.
+        Call it for one distribution. Points are in metres from the fix. The value is infinite for points that a bound
+        excludes.
         """
         from scipy.special import gammaincinv
 
@@ -119,13 +129,15 @@ class Truncated:
         return np.where(self.admits(points) & is_along(rays.projector, points), value, np.inf)
 
     def admits(self, points: Array) -> Array:
-        """Return a flag (...) for points (..., d), metres from the fix of one distribution, that the bounds admit."""
+        """Return a mask (...) of the points (..., d), metres from the fix of one distribution, inside the bounds."""
         sigma = np.sqrt(np.maximum(np.einsum("hi,ij,hj->h", self.normal, self.covariance, self.normal), 0.0))
         beyond = points @ self.normal.T - np.where(np.isfinite(self.slack), self.slack, 0.0)
         outside = np.isfinite(self.slack) & (beyond > self.give + _ON * sigma)
-        where = points @ self.along.T
+        position_on_edge = points @ self.along.T
         # An edge bounds only the points between its ends.
-        return np.asarray(~(outside & (where >= self.span[:, 0]) & (where <= self.span[:, 1])).any(-1))
+        return np.asarray(
+            ~(outside & (position_on_edge >= self.span[:, 0]) & (position_on_edge <= self.span[:, 1])).any(-1)
+        )
 
     def interval(self, number: Callable[[Array], Array], level: float) -> tuple[float, float]:
         """Return the shortest interval that contains a quantity of one distribution with a given probability.
@@ -139,34 +151,38 @@ class Truncated:
         """
         rays = self._rays()
         ends = number(np.concatenate([np.zeros((1, len(self.shift))), rays.tip]))
-        place, weight = rays.spread()
-        values, weight = number(place).ravel(), weight.ravel()
+        points, weight = rays.spread()
+        values, weight = number(points).ravel(), weight.ravel()
         order = np.argsort(values)
-        share = np.cumsum(weight[order])
-        share = (share - 0.5 * weight[order]) / share[-1]
-        inner = values[order]
-        shares = np.concatenate([[0.0], share, [1.0]])
-        inner = np.concatenate([[min(inner[0], ends.min())], inner, [max(inner[-1], ends.max())]])
+        cumulative = np.cumsum(weight[order])
+        cumulative = (cumulative - 0.5 * weight[order]) / cumulative[-1]
+        sorted_values = values[order]
+        probabilities = np.concatenate([[0.0], cumulative, [1.0]])
+        sorted_values = np.concatenate(
+            [[min(sorted_values[0], ends.min())], sorted_values, [max(sorted_values[-1], ends.max())]]
+        )
         first = np.linspace(0.0, 1.0 - level, _STARTS)
-        low, high = np.interp(first, shares, inner), np.interp(first + level, shares, inner)
+        low, high = (
+            np.interp(first, probabilities, sorted_values),
+            np.interp(first + level, probabilities, sorted_values),
+        )
         width = high - low
         best = int(np.argmin(width))
         for end in (0, -1):  # if several are about equally short, take one at a bound
-            best = end if width[end] <= (1.0 + _ALIKE) * width.min() and np.isin(inner[end], ends) else best
+            best = end if width[end] <= (1.0 + _ALIKE) * width.min() and np.isin(sorted_values[end], ends) else best
         return float(low[best]), float(high[best])
 
     def draw(self, n: int, seed: int) -> tuple[Array, Array]:
         """Return n random points (n, d) of one distribution, metres from the fix, and their excesses (n,).
 
-        The excess of a point is its squared deviation minus the squared deviation of the fix. The points are a
-        systematic resampling of nodes on the rays; `seed` determines its start.
+        The points are a systematic resampling of nodes on the rays; `seed` determines its start.
         """
         rays = self._rays()
-        place, weight = rays.spread()
+        nodes, weight = rays.spread()
         share = np.cumsum(weight.ravel())
-        at = (np.random.default_rng(seed).random() + np.arange(n)) / n * share[-1]
-        chosen = np.searchsorted(share, at).clip(max=share.size - 1)
-        points = place.reshape(-1, place.shape[-1])[chosen]
+        targets = (np.random.default_rng(seed).random() + np.arange(n)) / n * share[-1]
+        chosen = np.searchsorted(share, targets).clip(max=share.size - 1)
+        points = nodes.reshape(-1, nodes.shape[-1])[chosen]
         away = (points - self.shift) @ rays.whitener.T
         return points, (away**2).sum(-1) - (rays.middle**2).sum()
 
@@ -190,10 +206,11 @@ class Truncated:
         share = np.minimum(1.0, (rays.lean + np.sqrt(rays.lean**2 + excess)) / np.maximum(rays.length, 1e-300))
         points = (rays.tip * share[:, None]) @ plane.T
         # In two dimensions the rays are sorted by angle.
-        line = points if plane.shape[1] == 2 else points[ConvexHull(points).vertices]
-        return np.concatenate([line, line[:1]])
+        boundary = points if plane.shape[1] == 2 else points[ConvexHull(points).vertices]
+        return np.concatenate([boundary, boundary[:1]])
 
     def _rays(self) -> _Rays:
+        """Return one distribution in polar coordinates around its fix, with quadrature nodes on each ray."""
         factor = factor_of(self.covariance)
         rank = factor.shape[1]
         whitener = np.linalg.solve(factor.T @ factor, factor.T)
@@ -208,13 +225,16 @@ class Truncated:
         return _Rays(lean, length, rank, middle, whitener, factor @ whitener, place, tip, weight)
 
     def exits(self, step: Array) -> Array:
-        """Return the number (k,) of steps (k, d) from the fix to the first bound; infinite without a bound."""
+        """Return the number (k,) of steps (k, d), metres, from the fix to the first bound; infinite without a bound.
+
+        The number is not an integer: 2.5 means that the bound is 2.5 times the step away.
+        """
         rate, size = step @ self.normal.T, np.sqrt((step**2).sum(-1, keepdims=True))
         with np.errstate(divide="ignore", invalid="ignore"):
             length = np.where(rate > _EXACT * size, np.maximum(self.slack, 0.0) / rate, np.inf)
-            where = np.where(np.isfinite(length), length, 0.0) * (step @ self.along.T)
-        slip = _LONGER * np.where(np.isfinite(self.span), np.abs(self.span), 0.0).sum(-1)
-        meets = (where >= self.span[:, 0] - slip) & (where <= self.span[:, 1] + slip)
+            position_on_edge = np.where(np.isfinite(length), length, 0.0) * (step @ self.along.T)
+        tolerance = _LONGER * np.where(np.isfinite(self.span), np.abs(self.span), 0.0).sum(-1)
+        meets = (position_on_edge >= self.span[:, 0] - tolerance) & (position_on_edge <= self.span[:, 1] + tolerance)
         return np.asarray(np.where(meets & ~np.isnan(length), length, np.inf).min(-1, initial=np.inf))
 
 
@@ -265,22 +285,23 @@ class _Rays(NamedTuple):
         return self.tip[:, None] * node[..., None], weight
 
     def levels(self) -> tuple[Array, Array]:
-        """Return thresholds (t,) and the probabilities that they enclose.
+        """Return thresholds (t,) and the probabilities (t,) of the regions that they enclose, both increasing.
 
-        A threshold is the square root of a squared deviation minus the squared deviation of the fix.
+        A threshold is the square root of an excess.
         """
         grid = np.linspace(0.0, np.sqrt(_END), _LEVELS)
         mass = np.array([self._mass(one) for one in grid**2])
         return grid, mass / mass[-1]
 
     def _mass(self, excess: float) -> float:
+        """Return the unnormalised probability of points whose excess is at most `excess`."""
         end = np.minimum(self.length, self.lean + np.sqrt(self.lean**2 + excess))[:, None]
         node, share = _gauss()
         return float((share * end * _density(end * node, self.lean[:, None], self.rank)).sum())
 
 
 def is_along(projector: Array, points: Array) -> Array:
-    """Return a flag (...) for points (..., d), metres from a fix, near the surface of its equality constraints.
+    """Return a mask (...) of the points (..., d), metres from a fix, near the surface of its equality constraints.
 
     `projector` (..., d, d) projects onto the tangent plane. The tolerance allows for a surface as curved as the Earth.
     """
@@ -289,33 +310,43 @@ def is_along(projector: Array, points: Array) -> Array:
     return np.asarray(off <= _BENT * np.sqrt((within**2).sum(-1)) + _ROUNDED)
 
 
-def _moments_behind_one_bound(law: Truncated) -> tuple[Array, Array]:
-    """Return mean minus fix (..., d) and covariance (..., d, d) of distributions truncated at their first bound."""
+def _moments_behind_one_bound(distribution: Truncated) -> tuple[Array, Array]:
+    """Return mean minus fix (..., d) and covariance (..., d, d) of distributions truncated at their first bound.
+
+    The units are metres and square metres. Only the first bound of each distribution counts.
+    """
     from scipy.special import log_ndtr
 
-    first = np.isfinite(law.slack).argmax(-1)[..., None]
-    normal = np.take_along_axis(law.normal, first[..., None], axis=-2)[..., 0, :]
-    slack = np.take_along_axis(law.slack, first, axis=-1)[..., 0]
-    across = (law.covariance * normal[..., None, :]).sum(-1)
+    first = np.isfinite(distribution.slack).argmax(-1)[..., None]
+    normal = np.take_along_axis(distribution.normal, first[..., None], axis=-2)[..., 0, :]
+    slack = np.take_along_axis(distribution.slack, first, axis=-1)[..., 0]
+    across = (distribution.covariance * normal[..., None, :]).sum(-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         sigma = np.sqrt((across * normal).sum(-1))
-        away = (slack - (normal * law.shift).sum(-1)) / sigma
-        # Density divided by probability, of a standard normal variable below `away`.
-        hazard = np.exp(-0.5 * away**2 - 0.5 * np.log(2.0 * np.pi) - log_ndtr(away))
+        bound = (slack - (normal * distribution.shift).sum(-1)) / sigma
+        # Density divided by probability, of a standard normal variable below `bound`.
+        hazard = np.exp(-0.5 * bound**2 - 0.5 * np.log(2.0 * np.pi) - log_ndtr(bound))
         unit = across / sigma[..., None]
-        mean = law.shift - hazard[..., None] * unit
-        less = hazard * (away + hazard)
-        return mean, law.covariance - less[..., None, None] * unit[..., :, None] * unit[..., None, :]
+        mean = distribution.shift - hazard[..., None] * unit
+        reduction = hazard * (bound + hazard)
+        return mean, distribution.covariance - reduction[..., None, None] * unit[..., :, None] * unit[..., None, :]
 
 
 def factor_of(covariance: Array) -> Array:
-    """Return a matrix F (d, rank) with F F' = covariance (d, d), which may be singular."""
+    """Return a matrix F (d, rank) with F F' = covariance (d, d), which may be singular.
+
+    F converts `rank` independent standard normal numbers to a displacement in metres.
+    """
     lower = factor_semidefinite(covariance)
     return np.asarray(lower[:, np.diagonal(lower) ** 2 > HELD * np.trace(covariance)])
 
 
 def _density(length: Array, lean: Array, rank: int) -> Array:
-    """Return the density at lengths along rays, relative to the density at the fix, times the volume element."""
+    """Return the density at lengths along rays, relative to the density at the fix, times the volume element.
+
+    Lengths are in standard deviations. `lean` is the mean of the distribution without bounds along the ray. The volume
+    element of `rank` dimensions is length to the power rank - 1.
+    """
     return np.asarray(length ** (rank - 1) * np.exp(length * (lean - 0.5 * length)))
 
 
@@ -328,5 +359,5 @@ def _gauss() -> tuple[Array, Array]:
 
 @lru_cache(maxsize=4)
 def _directions(rank: int) -> Array:
-    """Return evenly distributed unit vectors (k, rank)."""
+    """Return evenly distributed unit vectors (k, rank), the directions of the rays."""
     return np.array([[-1.0], [1.0]])[:, :rank] if rank <= 1 else spread_directions(_RAYS[rank], rank)

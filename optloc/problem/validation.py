@@ -37,7 +37,7 @@ def checked(problem: Problem) -> Problem:
     Raises
     ------
     InvalidProblem
-        The message names the station, row or argument, and what to do.
+        The message names the station, row or argument, and gives advice.
     """
     if not isinstance(problem.frame, Frame):
         raise InvalidProblem(f"{problem.frame!r} is not a frame", "frame", "give an optloc.Frame")
@@ -82,6 +82,7 @@ def _out_of_range(values: Any) -> tuple[Any, str]:
 
 
 def _check_stations(problem: Problem) -> None:
+    """Raise if positions, names or error covariances of the stations are invalid."""
     stations: Stations = problem.stations
     bad, why = _out_of_range(stations.position)
     if bad.any():
@@ -139,6 +140,7 @@ def _check_moving(problem: Problem) -> None:
 
 
 def _check_rows(problem: Problem, rows: Rows) -> None:
+    """Raise if indices, values or weights of one kind of rows are invalid, or if the kind does not fit the problem."""
     model = MODELS[rows.kind]
     if problem.dimension not in model.dimensions:
         raise InvalidProblem(
@@ -149,8 +151,8 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
         raise InvalidProblem(f"{rows.kind} rows in ECEF need the stations' own axes", rows.kind, advice)
     if model.velocity and model.stations and problem.stations.velocity is None:
         # Stations without velocities count as fixed. Stations whose positions change do not.
-        place = problem.stations.position
-        moved = np.argwhere((place != place[..., :1, :, :]).any(-1))
+        position = problem.stations.position
+        moved = np.argwhere((position != position[..., :1, :, :]).any(-1))
         if len(moved):
             what = f"station {problem.stations.names[int(moved[0][-1])]!r} moves, but has no velocity for {rows.kind}"
             advice = "give velocities (vx, vy, vz in a file): differences of positions are too coarse for rates"
@@ -195,13 +197,14 @@ def check_values(rows: Rows) -> None:
     """
     large = np.abs(rows.z) > LARGEST
     if large.any():
-        place = tuple(np.argwhere(large)[0])
-        why = "infinite" if np.isinf(rows.z[place]) else f"beyond {LARGEST:g}"
-        what = f"{rows.kind} row {place[-1]} is {why}"
+        index = tuple(np.argwhere(large)[0])
+        why = "infinite" if np.isinf(rows.z[index]) else f"beyond {LARGEST:g}"
+        what = f"{rows.kind} row {index[-1]} is {why}"
         raise InvalidProblem(what, "z", "remove the row or give it weight zero")
 
 
 def _check_noise(noise: Noise, count: int) -> None:
+    """Raise unless each row has exactly one valid covariance; `count` is the number of rows."""
     seen = np.sort(np.concatenate([block.row.ravel() for block in noise.blocks] or [np.zeros(0, dtype=int)]))
     if not np.array_equal(seen, np.arange(count)):
         raise InvalidProblem("the noise does not cover every row exactly once", "noise", "give each row one covariance")
@@ -209,12 +212,14 @@ def _check_noise(noise: Noise, count: int) -> None:
         _check_covariance(block.covariance, "noise of row", block.row[:, 0])
 
 
-def _check_covariance(covariance: Array, what: str, names: Sequence[str] | Array | None) -> None:
+def _check_covariance(covariance: Array, place: str, names: Sequence[str] | Array | None) -> None:
+    """Raise if a covariance (..., g, r, r) is invalid; `place` and the group's entry of `names` enter the message."""
+
     def fail(bad: Any, why: str) -> None:
         if np.any(bad):
-            place = int(np.argwhere(bad)[0][-1])
-            label = f" {names[place]}" if names is not None and place < len(names) else ""
-            raise InvalidProblem(f"the covariance in {what}{label} is {why}", "covariance", "give a true covariance")
+            index = int(np.argwhere(bad)[0][-1])
+            label = f" {names[index]}" if names is not None and index < len(names) else ""
+            raise InvalidProblem(f"the covariance in {place}{label} is {why}", "covariance", "give a true covariance")
 
     fail(~np.isfinite(covariance).all((-1, -2)), "not finite")
     diagonal = np.diagonal(covariance, axis1=-2, axis2=-1)
@@ -234,12 +239,13 @@ def _check_covariance(covariance: Array, what: str, names: Sequence[str] | Array
 
 
 def _check_times(problem: Problem) -> None:
+    """Raise unless the times of the epochs are finite and increase."""
     times = problem.times
     if times.ndim != 1 or _out_of_range(times)[0].any():
         raise InvalidProblem("times are not a list of finite seconds", "times", "give one number per epoch")
     if (np.diff(times) <= 0.0).any():
-        place = int(np.flatnonzero(np.diff(times) <= 0.0)[0]) + 1
-        raise InvalidProblem(f"epoch {place} is not later than epoch {place - 1}", "times", "sort the epochs")
+        epoch = int(np.flatnonzero(np.diff(times) <= 0.0)[0]) + 1
+        raise InvalidProblem(f"epoch {epoch} is not later than epoch {epoch - 1}", "times", "sort the epochs")
     if any(rows.epoch.max(initial=0) >= len(times) for rows in problem.rows):
         raise InvalidProblem(f"there are only {len(times)} times", "times", "give one for each epoch")
 
@@ -258,18 +264,7 @@ def _check_rates(problem: Problem) -> None:
 
 
 def check_unknowns(problem: Problem) -> None:
-    """Raise if a motion, bias or prior is invalid.
-
-    Parameters
-    ----------
-    problem : Problem
-        A problem whose stations, rows and times are valid.
-
-    Raises
-    ------
-    InvalidProblem
-        The message names the motion, bias or prior.
-    """
+    """Raise if a motion, bias or prior is invalid; the stations, rows and times must be valid."""
     for number, motion in enumerate(problem.motions):
         _check_motion(problem, motion, number)
     for bias in problem.biases:
@@ -285,6 +280,7 @@ def check_unknowns(problem: Problem) -> None:
 
 
 def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
+    """Raise if the motion of target `number` is invalid."""
     where = f"motions[{number}]"
     if motion.order not in (0, 1, 2):
         raise InvalidProblem(f"the motion has order {motion.order}", where, "use order 0, 1 or 2")
@@ -315,6 +311,7 @@ def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
 
 
 def _check_course_over(problem: Problem, motion: Motion, where: str) -> None:
+    """Raise if a course over ground, or a known change of height (`rise`), does not fit the problem."""
     if motion.over not in ("space", "ground"):
         raise InvalidProblem(f"a course over {motion.over!r}", where, "use 'space' or 'ground'")
     moving = [m for m in problem.motions if m.known is None and m.order > 0]
@@ -341,6 +338,7 @@ def _check_course_over(problem: Problem, motion: Motion, where: str) -> None:
 
 
 def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
+    """Raise if the entries, the prior or the form of a bias are invalid."""
     form = form_of(bias)
     sizes = [len(bias.row), len(bias.member), len(bias.coefficient)]
     if len(set(sizes)) > 1:
@@ -374,6 +372,7 @@ def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
 
 
 def _check_rotation(problem: Problem, bias: Bias, where: str) -> None:
+    """Raise if a rotation affects rows that are not measured in the axes of a station."""
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         inside = (bias.row >= start) & (bias.row < start + rows.count)
         if inside.any() and not MODELS[rows.kind].axes:
@@ -407,6 +406,7 @@ def _check_course(problem: Problem, bias: Bias, where: str) -> None:
 
 
 def _check_prior(problem: Problem, prior: Prior) -> None:
+    """Raise if a prior does not fit the size of its unknown, or if its mean is out of range."""
     where = f"prior on {prior.name}"
     slot, _ = problem.layout.find(prior.name)
     if prior.mean.shape[-1:] != (slot.size,) or prior.covariance.shape[-2:] != (slot.size, slot.size):
@@ -431,18 +431,7 @@ _SLIVER = 1e-12
 
 
 def check_constraints(problem: Problem) -> None:
-    """Raise if a constraint is invalid. Constraints that no position meets are not an error: they give a status.
-
-    Parameters
-    ----------
-    problem : Problem
-        A problem whose stations, rows and motions are valid.
-
-    Raises
-    ------
-    InvalidProblem
-        The message names the constraint.
-    """
+    """Raise if a constraint is invalid. Constraints that no position meets are not an error: they give a status."""
     for constraint in problem.constraints:
         where = f"constraint {constraint.name!r}"
         _check_target(problem, constraint, where)
@@ -466,6 +455,7 @@ def bands_by_quantity(constraints: Sequence[Band | Polygon]) -> list[list[Band]]
 
 
 def _check_target(problem: Problem, constraint: Band | Polygon, where: str) -> None:
+    """Raise if the target of a constraint is missing or known, or if other unknowns connect its free epochs."""
     count = len(problem.motions)
     if not 0 <= constraint.target < count:
         raise InvalidProblem(f"there is no target {constraint.target}", where, f"use 0 to {count - 1}")
@@ -478,6 +468,7 @@ def _check_target(problem: Problem, constraint: Band | Polygon, where: str) -> N
 
 
 def _check_plan(problem: Problem, where: str) -> None:
+    """Raise if the frame has no horizontal plan, which a polygon needs."""
     if problem.frame.kind == "ecef":
         advice = "use the frame enu, whose first two coordinates are east and north"
         raise InvalidProblem("a polygon needs a plan, and the frame is ECEF", where, advice)
@@ -513,7 +504,10 @@ def check_polygon(vertices: Array, where: str) -> None:
 
 
 def _crossing(v: Array, size: float) -> tuple[int, int] | None:
-    """Return the numbers of two edges of a polygon that meet elsewhere than at a common corner, or None."""
+    """Return the numbers of two edges of a polygon that meet elsewhere than at a common corner, or None.
+
+    `v` (n, 2) are the corners, and `size` is the size of the polygon, both in metres.
+    """
     a, b, n = v, np.roll(v, -1, axis=0), len(v)
     i, j = np.triu_indices(n, 1)
     # Pairs of edges without a common corner. The last edge is a neighbour of the first.
@@ -528,20 +522,23 @@ def _crossing(v: Array, size: float) -> tuple[int, int] | None:
     low, high = np.minimum(a, b), np.maximum(a, b)
     overlap = ((low[i] <= high[j]) & (low[j] <= high[i])).all(-1)
     # Neighbours always meet at their corner. They overlap only if one turns straight back.
-    back = (np.abs(_cross(along[i], along[j])) <= _SLIVER * size**2) & ((along[i] * along[j]).sum(-1) < 0.0)
-    bad = np.flatnonzero(np.where(apart, straddle & overlap, back & ((j - i == 1) | (j - i == n - 1))))
+    turns_back = (np.abs(_cross(along[i], along[j])) <= _SLIVER * size**2) & ((along[i] * along[j]).sum(-1) < 0.0)
+    bad = np.flatnonzero(np.where(apart, straddle & overlap, turns_back & ((j - i == 1) | (j - i == n - 1))))
     return (int(i[bad[0]]), int(j[bad[0]])) if len(bad) else None
 
 
 def _rounded(area: Array, size: float) -> Array:
+    """Return signed areas with rounding errors replaced by zero."""
     return np.where(np.abs(area) <= _SLIVER * size**2, 0.0, area)
 
 
 def _cross(a: Array, b: Array) -> Array:
+    """Return the cross product (...) of plane vectors (..., 2): twice a signed area."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
 def _check_band(problem: Problem, band: Band, where: str) -> None:
+    """Raise if the kind, coefficients or bounds of a band are invalid."""
     surface = SURFACES.get(band.kind)
     if surface is None:
         raise InvalidProblem(f"unknown quantity {band.kind!r}", where, nearest(band.kind, SURFACES))
@@ -570,6 +567,7 @@ def _check_band(problem: Problem, band: Band, where: str) -> None:
 
 
 def _check_along(motion: Motion, band: Band, where: str) -> None:
+    """Raise if a band cannot apply at all times of this motion."""
     other = "or apply it at the reference time only, with along=False"
     if (band.kind, motion.over) not in (("height", "ground"), ("plane", "space")):
         what, advice = f"{band.kind} cannot apply along a course over {motion.over}", f"use the other course, {other}"

@@ -1,4 +1,9 @@
-"""Estimation of noise levels of stations, pairs or kinds from the residuals of many fixes."""
+"""Estimation of noise levels of stations, pairs or kinds from the residuals of many fixes.
+
+The residuals of N fixes are sums of errors. Each error belongs to one of G groups, and each group has one level.
+`Elements` are the linearised fixes with these errors. q is the number of errors of a fix, m of its rows, and c of its
+offsets.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +49,7 @@ class NoiseLevels:
         an epoch.
     stated : array (G,)
         Standard deviation that the problem states, root mean square, SI units. For common errors, which the problem
-        does not state, it is that of the rows.
+        does not state, it is the value of the rows.
     factor : array (G,)
         Factors of the stated standard deviations. 1 if the data do not determine a factor; 0 for a common error without
         evidence.
@@ -91,7 +96,7 @@ class NoiseLevels:
 
     @property
     def used(self) -> Array:
-        """Return the final factors (G,) of the stated standard deviations, with the factors for tails."""
+        """Return the final factors (G,) of the stated standard deviations, including the factors for tails."""
         return np.asarray(self.factor * self.tails)
 
     @property
@@ -161,13 +166,16 @@ def noise_levels(
     batch = batch_of(problem)
     if fix is None and batch.layout.size:
         fix = solve(batch, method)
-    kept, x = usable(batch, fix)
+    fixed, x = usable(batch, fix)
     shared_by = shared_grouping(by, common)
-    return levels_of(elements(batch.take(kept), x, by, shared_by), by, shared_by)
+    return levels_of(elements(batch.take(fixed), x, by, shared_by), by, shared_by)
 
 
 def shared_grouping(by: By, common: By | bool | None) -> By | None:
-    """Return the grouping of common errors: `by` if `common` is True, None without common errors."""
+    """Return the grouping of common errors: `by` if `common` is True, None without common errors.
+
+    A common error is an error that all rows of a group share in an epoch.
+    """
     return by if common is True else common or None
 
 
@@ -188,7 +196,7 @@ def with_noise_levels(problem: Problem, levels: NoiseLevels) -> Problem:
     """
     factor = dict(zip(levels.names, levels.used.tolist(), strict=True))
     present = problem.weight > 0.0
-    noise = Noise(tuple(_scale(problem, block, levels.by, factor, present) for block in problem.noise.blocks))
+    noise = Noise(tuple(_scale_block(problem, block, levels.by, factor, present) for block in problem.noise.blocks))
     if levels.common is None:
         return replace(problem, noise=noise)
     sigma = dict(zip(levels.names, (levels.used * levels.stated).tolist(), strict=True))
@@ -197,26 +205,34 @@ def with_noise_levels(problem: Problem, levels: NoiseLevels) -> Problem:
     return replace(problem, noise=_with_common(problem, noise, levels.common, common) if common else noise)
 
 
-def _scale(problem: Problem, block: Block, by: By, factor: dict[str, float], present: Array) -> Block:
+def _scale_block(problem: Problem, block: Block, by: By, factor: dict[str, float], present: Array) -> Block:
+    """Return a noise block in which each error is multiplied by the factor of its group; absent rows keep their noise.
+
+    `factor` maps names of groups to factors; other groups have the factor 1. `present` (..., m) marks the rows that are
+    present.
+    """
     effect, names, _ = split(problem, block, by, present)
-    own = np.array([[factor.get(name, 1.0) for name in row] for row in names.tolist()])
-    scaled = effect * own[:, None, :]
-    here = present[..., block.row]
+    factors = np.array([[factor.get(name, 1.0) for name in row] for row in names.tolist()])
+    scaled = effect * factors[:, None, :]
+    is_present = present[..., block.row]
     # Absent rows keep the stated noise, because the levels were not estimated from them.
-    both = here[..., :, None] & here[..., None, :]
-    return Block(block.row, np.where(both, scaled @ np.swapaxes(scaled, -1, -2), block.covariance))
+    both_present = is_present[..., :, None] & is_present[..., None, :]
+    return Block(block.row, np.where(both_present, scaled @ np.swapaxes(scaled, -1, -2), block.covariance))
 
 
 def _with_common(problem: Problem, noise: Noise, by: By, sigma: dict[str, float]) -> Noise:
-    """Return the noise plus an error that the rows of a group share in an epoch, of standard deviations `sigma`."""
+    """Return the noise plus an error that the rows of a group share in an epoch.
+
+    `sigma` maps the names of groups to the standard deviations of this error, SI units.
+    """
     if has_correlated_epochs(problem):
         what = "errors of rows of several epochs are correlated"
         raise InvalidProblem(what, "noise", "leave out the errors in common of an epoch")
     effect, _, _ = common_effects(problem, by, sigma)
     blocks = []
     for members in group_members(problem.epoch):
-        own = effect[members]
-        blocks.append(Block(members, gathered(noise, members) + own @ np.swapaxes(own, -1, -2)))
+        effect_of_epoch = effect[members]
+        blocks.append(Block(members, gathered(noise, members) + effect_of_epoch @ np.swapaxes(effect_of_epoch, -1, -2)))
     return group(blocks)
 
 
@@ -247,8 +263,8 @@ def common_level(problem: Problem, *, method: str = "cauchy", fix: Fix | None = 
     batch = batch_of(problem)
     if fix is None and batch.layout.size:
         fix = solve(batch, method)
-    kept, x = usable(batch, fix)
-    return common_level_at(batch.take(kept), x)
+    fixed, x = usable(batch, fix)
+    return common_level_at(batch.take(fixed), x)
 
 
 def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
@@ -263,73 +279,83 @@ def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
         size = batch.batch_shape[0]
         return np.arange(size), np.zeros((size, 0))
     flat = fix.flat()
-    kept = np.flatnonzero(np.isfinite(flat.x).all(-1) & flat.answered)
-    if not len(kept):
+    fixed = np.flatnonzero(np.isfinite(flat.x).all(-1) & flat.answered)
+    if not len(fixed):
         raise InvalidProblem("no epoch has a fix", "noise", "see `optloc fix` for the reasons")
-    return kept, flat.x[kept]
+    return fixed, flat.x[fixed]
 
 
-def levels_of(made: Elements, by: By, common: By | None = None, *, tails: bool = True) -> NoiseLevels:
-    """Return the noise levels of linearised fixes. `tails` adds factors that bound the tails; see `noise_levels`."""
-    return replace(_report(made, by, *fitted(made, common), tails=tails), common=common)
+def levels_of(linearised: Elements, by: By, common: By | None = None, *, tails: bool = True) -> NoiseLevels:
+    """Return the noise levels of linearised fixes.
+
+    `by` is the grouping of errors, and `common` the grouping of shared errors of an epoch, if any. `tails` adds factors
+    that bound the tails; see `noise_levels`.
+    """
+    return replace(_report(linearised, by, *fitted(linearised, common), tails=tails), common=common)
 
 
-def fitted(made: Elements, shared_by: By | None) -> tuple[VarianceFit, Array]:
-    """Return the fit of the variance factors, and a mask (g,) of the common errors without evidence."""
+def fitted(linearised: Elements, shared_by: By | None) -> tuple[VarianceFit, Array]:
+    """Return the fit of the variance factors, and a mask (G,) of the common errors without evidence.
+
+    Common errors without evidence are zero. The fit is repeated without common errors whose interval includes zero; see
+    `_all_or_none`.
+    """
     from threadpoolctl import threadpool_limits
 
-    common = made.common[:-1]
+    common = linearised.common[:-1]
     # Threads do not speed up products of small matrices. On a busy machine, waiting for them takes ten times as long.
     with threadpool_limits(1):
-        plain = fit(made, common, common)
+        without_common = fit(linearised, common, common)
         # The problem states no noise for common errors, so without evidence they are zero.
-        seen = _all_or_none(visible(made, plain, common), common, shared_by)
-        found = fit(made, common & ~seen, common) if seen.any() else plain
-        while (fewer := _all_or_none(seen & (found.low > 0.0), common, shared_by)).sum() < seen.sum():
-            seen = fewer
-            found = fit(made, common & ~seen, common) if seen.any() else plain
-    return found, common & ~seen
+        evident = _all_or_none(visible(linearised, without_common, common), common, shared_by)
+        result = fit(linearised, common & ~evident, common) if evident.any() else without_common
+        while (still_evident := _all_or_none(evident & (result.low > 0.0), common, shared_by)).sum() < evident.sum():
+            evident = still_evident
+            result = fit(linearised, common & ~evident, common) if evident.any() else without_common
+    return result, common & ~evident
 
 
 def _all_or_none(shown: Array, common: Array, by: By | None) -> Array:
     """Return a mask (G,) of the common errors to keep: with evidence for one station or pair, all are kept.
 
-    A fix can follow as many common errors as it has unknowns. If only a few had a level, the others would count as
-    exact, and the fix too.
+    `shown` (G,) marks the common errors with evidence, and `common` (G,) all common errors. A fix can follow as many
+    common errors as it has unknowns. If only a few had a level, the others would count as exact, and the fix too.
     """
     return shown if by == "kind" else common & shown.any()
 
 
-def _report(made: Elements, by: By, found: VarianceFit, none: Array, *, tails: bool) -> NoiseLevels:
-    """Return the levels of all groups with errors, from a fit and the mask (g,) of groups without evidence."""
-    size = len(made.names)
-    count, gross = total(made.of_effect, size), total(made.of_effect, size, found.gross)
-    used = np.flatnonzero(count)
+def _report(linearised: Elements, by: By, fit_result: VarianceFit, no_evidence: Array, *, tails: bool) -> NoiseLevels:
+    """Return the levels of all groups with errors, from a fit and the mask `no_evidence` (G,) of common errors."""
+    size = len(linearised.names)
+    count, gross = total(linearised.of_effect, size), total(linearised.of_effect, size, fit_result.gross)
+    with_errors = np.flatnonzero(count)
     # T_jj times the variance is the share of an error that the residuals show.
-    share = found.tests.size[:, : found.gross.shape[1]] * np.nan_to_num(found.variance)[made.of_effect]
-    redundancy, factor = total(made.of_effect, size, share), np.sqrt(found.variance)
+    share = (
+        fit_result.tests.size[:, : fit_result.gross.shape[1]] * np.nan_to_num(fit_result.variance)[linearised.of_effect]
+    )
+    redundancy, factor = total(linearised.of_effect, size, share), np.sqrt(fit_result.variance)
     # Errors that are gross for the fitted noise are left out of both ratios, so that the ratios are comparable.
-    own = np.append(none, False)[made.of_effect]
-    stated = without(tested(made, np.where(own, 0.0, 1.0)), found.gross)
-    low, high = (np.where(none, np.nan, np.sqrt(end)) for end in (found.low, found.high))
-    names = np.array(made.names, dtype=object)
-    wider = np.where(np.isnan(found.low), 1.0, tail_factors(made, found) if tails else 1.0)
+    is_zero = np.append(no_evidence, False)[linearised.of_effect]
+    stated = without(tested(linearised, np.where(is_zero, 0.0, 1.0)), fit_result.gross)
+    low, high = (np.where(no_evidence, np.nan, np.sqrt(end)) for end in (fit_result.low, fit_result.high))
+    names = np.array(linearised.names, dtype=object)
+    tail_factor = np.where(np.isnan(fit_result.low), 1.0, tail_factors(linearised, fit_result) if tails else 1.0)
     return NoiseLevels(
         by,
-        tuple(made.names[i] for i in used),
-        np.sqrt(total(made.of_effect, size, made.sigma**2)[used] / count[used]),
-        factor[used],
-        (factor * found.error)[used],
-        low[used],
-        high[used],
-        (redundancy / np.maximum(count - gross, 1))[used],
-        count[used].astype(np.int64),
-        gross[used].astype(np.int64),
+        tuple(linearised.names[i] for i in with_errors),
+        np.sqrt(total(linearised.of_effect, size, linearised.sigma**2)[with_errors] / count[with_errors]),
+        factor[with_errors],
+        (factor * fit_result.error)[with_errors],
+        low[with_errors],
+        high[with_errors],
+        (redundancy / np.maximum(count - gross, 1))[with_errors],
+        count[with_errors].astype(np.int64),
+        gross[with_errors].astype(np.int64),
         _ratio(stated),
-        _ratio(found.tests),
+        _ratio(fit_result.tests),
         int((stated.dof > 0).sum()),
-        (*_sentences(names, found, redundancy, none), *_tail_sentences(names, wider)),
-        wider[used],
+        (*_sentences(names, fit_result, redundancy, no_evidence), *_tail_sentences(names, tail_factor)),
+        tail_factor[with_errors],
     )
 
 
@@ -337,16 +363,20 @@ def _report(made: Elements, by: By, found: VarianceFit, none: Array, *, tails: b
 _LONG = 1.1
 
 
-def _tail_sentences(names: Array, wider: Array) -> list[str]:
-    """Return a sentence for each group whose errors have longer tails than normal errors."""
+def _tail_sentences(names: Array, factors: Array) -> list[str]:
+    """Return a sentence for each group whose errors have longer tails than normal errors.
+
+    `names` (G,) are the groups, and `factors` (G,) the additional factors for tails.
+    """
     return [
         f"errors of {name} have long tails: the sigma used is {size:.2g} times the most likely sigma"
-        for name, size in zip(names.tolist(), wider.tolist(), strict=True)
+        for name, size in zip(names.tolist(), factors.tolist(), strict=True)
         if size > _LONG
     ]
 
 
 def _ratio(tests: Tested) -> float:
+    """Return chi-square per degree of freedom over all fixes."""
     return float(tests.cost.sum() / max(int(tests.dof.sum()), 1))
 
 
@@ -355,23 +385,28 @@ def _ratio(tests: Tested) -> float:
 _SCARCE = 2.0
 
 
-def _sentences(names: Array, found: VarianceFit, redundancy: Array, none: Array) -> tuple[str, ...]:
-    """Return sentences about the levels that the data do not determine."""
-    said = []
-    if found.shared.any():
-        what = "it keeps the stated noise" if found.stay else "all of them share one factor"
-        apart = "" if found.stay else " separately"
-        said.append(f"the data do not determine the noise of {_list(names[found.shared])}{apart}: {what}")
-    if (open_ := ~found.shared & (found.low == 0.0)).any():
-        said.append(f"the noise of {_list(names[open_])} may be zero: the level used is a lower limit")
-    if (scarce := np.isfinite(found.low) & (redundancy < _SCARCE)).any():
-        said.append(f"the redundancy of {_list(names[scarce])} is below two: its level is unreliable")
-    if none.any():
-        said.append(f"the data do not show that rows have an error in common: {_list(names[none])}")
-    return tuple(said)
+def _sentences(names: Array, fit_result: VarianceFit, redundancy: Array, no_evidence: Array) -> tuple[str, ...]:
+    """Return sentences about the levels that the data do not determine.
+
+    `redundancy` (G,) is the number of errors of each group that the residuals show, as a sum of shares. `no_evidence`
+    (G,) marks common errors without evidence.
+    """
+    sentences = []
+    if fit_result.shared.any():
+        what = "it keeps the stated noise" if fit_result.stay else "all of them share one factor"
+        apart = "" if fit_result.stay else " separately"
+        sentences.append(f"the data do not determine the noise of {_list(names[fit_result.shared])}{apart}: {what}")
+    if (maybe_zero := ~fit_result.shared & (fit_result.low == 0.0)).any():
+        sentences.append(f"the noise of {_list(names[maybe_zero])} may be zero: the level used is a lower limit")
+    if (scarce := np.isfinite(fit_result.low) & (redundancy < _SCARCE)).any():
+        sentences.append(f"the redundancy of {_list(names[scarce])} is below two: its level is unreliable")
+    if no_evidence.any():
+        sentences.append(f"the data do not show that rows have an error in common: {_list(names[no_evidence])}")
+    return tuple(sentences)
 
 
 def _list(names: Array) -> str:
+    """Return names as a list in words; at most `_NAMED` are written, the others counted."""
     return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
 
 
@@ -393,8 +428,8 @@ def late_signals(problem: Problem, *, method: str = "cauchy", fix: Fix | None = 
     Parameters
     ----------
     problem : Problem
-        As for `noise_levels`. Differences of arrivals are converted to arrivals. The stated noise is that of rows that
-        are not late.
+        As for `noise_levels`. Differences of arrivals are converted to arrivals. The stated noise applies to rows
+        that are not late.
     method : str
         Method of the first fixes; see `solve`. It must treat both signs alike, because its fixes show whether errors
         are delays.
@@ -421,11 +456,11 @@ def late_signals(problem: Problem, *, method: str = "cauchy", fix: Fix | None = 
     batch = batch_of(problem)
     if fix is not None or not batch.layout.size:
         return late_signals_at(batch, *usable(batch, fix))
-    taken = as_arrivals(batch)
-    batch, share = batch if taken is None else taken.problem, 1.0
+    arrivals = as_arrivals(batch)
+    batch, share = batch if arrivals is None else arrivals.problem, 1.0
     for _ in range(_ROUNDS):
-        found = late_signals_at(batch, *usable(batch, solve(batch, method)))
-        if not found.share or abs(np.log(found.share / share)) < _SAME:
+        late = late_signals_at(batch, *usable(batch, solve(batch, method)))
+        if not late.share or abs(np.log(late.share / share)) < _SAME:
             break
-        method, share = found.method, found.share
-    return found
+        method, share = late.method, late.share
+    return late

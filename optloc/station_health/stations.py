@@ -1,4 +1,8 @@
-"""Health of stations over many fixes: offset, noise and gross errors of each, compared with the other stations."""
+"""Health of stations over many fixes: offset, noise and gross errors of each, compared with the other stations.
+
+Letters: N fixes, G groups (stations, pairs or kinds), q errors and c offsets of a fix, n residuals. `Elements` are the
+linearised fixes, and `Tested` are the tests of their errors and offsets.
+"""
 
 from __future__ import annotations
 
@@ -104,9 +108,12 @@ class Health:
 
     @property
     def least_noticed(self) -> Array:
-        """Return the error (G,) that a search for suspects detects with probability 95 %, as the median over fixes."""
-        own = (self.sigma[self.group == g] for g in range(len(self.names)))
-        return np.array([NOTICEABLE * np.median(sigma) for sigma in own])
+        """Return the error (G,) that a search for suspects detects with probability 95 %, as the median over fixes.
+
+        The unit is the unit of the group, see `units`.
+        """
+        sigmas = (self.sigma[self.group == g] for g in range(len(self.names)))
+        return np.array([NOTICEABLE * np.median(sigma) for sigma in sigmas])
 
 
 def health(problem: Problem, by: By = "station", *, method: str = "auto", fix: Fix | None = None) -> Health:
@@ -148,7 +155,7 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
     Parameters
     ----------
     batch : Problem
-        Result of `batch_of`.
+        Result of `batch_of`, with N problems.
     fixed : int array (n,), array (n, size)
         Result of `usable`: numbers of the problems with a fix, and their parameter vectors.
     by : "station", "pair" or "kind"
@@ -156,98 +163,104 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
     explained : object array (N,), optional
         Explanations of all fixes, if suspects were searched for.
     """
-    kept, x = fixed
-    made = elements(batch.take(kept), x, by)
-    _check_redundancy(made)
+    fixes, x = fixed
+    linearised = elements(batch.take(fixes), x, by)
+    _check_redundancy(linearised)
     # Gross errors are detected after noise and offsets are known. Otherwise a bias would be an outlier of every fix.
-    levels, offsets = _estimate_jointly(made, by)
-    found = snooped(
-        tested(_subtract(made, offsets), _variance(made, levels)), slice(made.effect.shape[-1], None), OUTLIER
+    levels, offsets = _estimate_jointly(linearised, by)
+    tests = snooped(
+        tested(_subtract(linearised, offsets), _variance(linearised, levels)),
+        slice(linearised.effect.shape[-1], None),
+        OUTLIER,
     )
-    item, own = np.nonzero(np.isfinite(found.sigma) & (made.of_offset >= 0))
-    group = made.of_offset[item, own]
-    outlying = found.gross[item, own]
-    count = np.bincount(group, minlength=len(made.names))
-    used = np.flatnonzero(count)
-    number = np.full(len(made.names), -1)
-    number[used] = np.arange(len(used))
-    names = tuple(made.names[g] for g in used)
-    own_level = [levels.names.index(name) if name in levels.names else -1 for name in names]
-    noise, noise_error = (np.append(v, np.nan)[own_level] for v in (levels.sigma, levels.sigma_error))
+    item, column = np.nonzero(np.isfinite(tests.sigma) & (linearised.of_offset >= 0))
+    group = linearised.of_offset[item, column]
+    outlying = tests.gross[item, column]
+    count = np.bincount(group, minlength=len(linearised.names))
+    with_residuals = np.flatnonzero(count)
+    number = np.full(len(linearised.names), -1)
+    number[with_residuals] = np.arange(len(with_residuals))
+    names = tuple(linearised.names[g] for g in with_residuals)
+    level_of = [levels.names.index(name) if name in levels.names else -1 for name in names]
+    noise, noise_error = (np.append(v, np.nan)[level_of] for v in (levels.sigma, levels.sigma_error))
     return Health(
         by=by,
         names=names,
         units=_units(batch, by, names),
-        count=count[used],
-        bias=offsets.value[used],
-        bias_error=offsets.error[used],
-        scale=offsets.slope[used],
-        scale_error=offsets.slope_error[used],
+        count=count[with_residuals],
+        bias=offsets.value[with_residuals],
+        bias_error=offsets.error[with_residuals],
+        scale=offsets.slope[with_residuals],
+        scale_error=offsets.slope_error[with_residuals],
         noise=noise,
         noise_error=noise_error,
-        outliers=np.bincount(group, outlying, len(made.names))[used] / count[used],
+        outliers=np.bincount(group, outlying, len(linearised.names))[with_residuals] / count[with_residuals],
         suspect=_suspect_shares(batch, explained, by, names),
         levels=levels,
-        epoch=kept[item],
+        epoch=fixes[item],
         group=number[group],
-        residual=found.shift[item, own] + offsets.value[group],
-        sigma=found.sigma[item, own],
+        residual=tests.shift[item, column] + offsets.value[group],
+        sigma=tests.sigma[item, column],
         outlying=outlying,
-        sentences=(*levels.sentences, *_sentences(offsets, made.names, used)),
+        sentences=(*levels.sentences, *_sentences(offsets, linearised.names, with_residuals)),
     )
 
 
-def _check_redundancy(made: Elements) -> None:
+def _check_redundancy(linearised: Elements) -> None:
     """Raise InvalidProblem if no measurement of any fix can be checked by the others."""
-    tests = tested(made, np.ones(()))
+    tests = tested(linearised, np.ones(()))
     size = np.diagonal(tests.matrix[:, tests.errors :, tests.errors :], axis1=-2, axis2=-1)
-    if not ((size > 0.0) & (made.of_offset >= 0)).any():
+    if not ((size > 0.0) & (linearised.of_offset >= 0)).any():
         what = "no fix has redundancy, so its measurements cannot be checked"
         raise InvalidProblem(what, "health", "add stations, or known values such as a height, a bias or a prior")
 
 
-def _estimate_jointly(made: Elements, by: By) -> tuple[NoiseLevels, Offsets]:
+def _estimate_jointly(linearised: Elements, by: By) -> tuple[NoiseLevels, Offsets]:
     """Return noise levels and offsets that are consistent: each is estimated with the other given."""
     # Offsets first, with the stated noise, because biases in the residuals would increase the estimated noise.
-    offsets = offsets_of(made, tested(made, np.ones(())))
+    offsets = offsets_of(linearised, tested(linearised, np.ones(())))
     for _ in range(_ROUNDS):
-        levels = levels_of(_subtract(made, offsets), by, tails=False)
-        offsets = offsets_of(made, tested(made, _variance(made, levels)))
+        levels = levels_of(_subtract(linearised, offsets), by, tails=False)
+        offsets = offsets_of(linearised, tested(linearised, _variance(linearised, levels)))
     return levels, offsets
 
 
-def _subtract(made: Elements, offsets: Offsets) -> Elements:
+def _subtract(linearised: Elements, offsets: Offsets) -> Elements:
     """Return the elements with the offsets subtracted from the residuals."""
-    value = np.append(np.nan_to_num(offsets.value), 0.0)[made.of_offset]
-    return replace(made, residual=made.residual - (made.offset @ value[..., None])[..., 0])
+    value = np.append(np.nan_to_num(offsets.value), 0.0)[linearised.of_offset]
+    return replace(linearised, residual=linearised.residual - (linearised.offset @ value[..., None])[..., 0])
 
 
-def _variance(made: Elements, levels: NoiseLevels) -> Array:
-    """Return the variance (N, q) of each error."""
+def _variance(linearised: Elements, levels: NoiseLevels) -> Array:
+    """Return the variance (N, q) of each error as a multiple of the stated variance; 1 for groups without a level."""
     factor = dict(zip(levels.names, levels.factor.tolist(), strict=True))
-    return np.array([*(factor.get(name, 1.0) for name in made.names), 1.0])[made.of_effect] ** 2
+    return np.array([*(factor.get(name, 1.0) for name in linearised.names), 1.0])[linearised.of_effect] ** 2
 
 
 def _units(batch: Problem, by: By, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the SI unit of the measurements of each group (G,)."""
     ends = ends_of(batch, by).name
-    found: dict[str, str] = {}
+    unit_of: dict[str, str] = {}
     for rows, start in zip(batch.rows, batch.starts, strict=True):
-        unit = SI_UNIT[MODELS[rows.kind].quantity]  # type: ignore[index]  # the table holds known quantities only
-        found |= dict.fromkeys(ends[start : start + rows.count].ravel().tolist(), unit)
-    return tuple(found[name] for name in names)
+        unit = SI_UNIT[MODELS[rows.kind].quantity]  # type: ignore[index]  # the table has known quantities only
+        unit_of |= dict.fromkeys(ends[start : start + rows.count].ravel().tolist(), unit)
+    return tuple(unit_of[name] for name in names)
 
 
 def _suspect_shares(batch: Problem, explained: Array | None, by: By, names: tuple[str, ...]) -> Array:
-    """Return, for each group (G,), the share of its fixes in which it, or one of its rows, is a suspect."""
+    """Return, for each group (G,), the share of its fixes in which it, or one of its rows, is a suspect.
+
+    The result is NaN if `explained`, the explanations of the fixes, is None.
+    """
     if explained is None:
         return np.full(len(names), np.nan)
     ends = ends_of(batch, by).name
     total, suspected = dict.fromkeys(names, 0), dict.fromkeys(names, 0)
     weight = np.broadcast_to(batch.weight, (len(np.ravel(explained)), batch.count))
-    for own, present in zip(np.ravel(explained), weight > 0.0, strict=True):
+    for explanations, present in zip(np.ravel(explained), weight > 0.0, strict=True):
         for name in {*ends[present].ravel().tolist()} & total.keys():
             total[name] += 1
-        suspects = own[0].suspects if own else ()
+        suspects = explanations[0].suspects if explanations else ()
         for name in {
             n for s in suspects for n in _suspect_groups(s.name, s.group, ends[list(s.rows)], by)
         } & suspected.keys():
@@ -256,31 +269,43 @@ def _suspect_shares(batch: Problem, explained: Array | None, by: By, names: tupl
 
 
 def _suspect_groups(name: str, group: str, ends: Array, by: By) -> set[str]:
-    """Return the groups of a suspect: the groups of its rows or, for a station, the groups with its name."""
-    touched = {*ends.ravel().tolist()} - {""}
+    """Return the groups of a suspect: the groups of its rows or, for a station, the groups with its name.
+
+    `name` and `group` are fields of the `Suspect`. `ends` are the names of the groups of its rows.
+    """
+    groups = {*ends.ravel().tolist()} - {""}
     if group != "station" or by != "station":
-        return touched
+        return groups
     # A station with several kinds of measurements has one group for each kind.
-    own = name.removeprefix("station ")
-    return {n for n in touched if n == own or n.startswith(f"{own} ")}
+    station = name.removeprefix("station ")
+    return {n for n in groups if n == station or n.startswith(f"{station} ")}
 
 
-def _sentences(offsets: Offsets, names: tuple[str, ...], used: Array) -> tuple[str, ...]:
-    """Return one sentence for each combination of offsets that the data do not determine."""
-    said = []
+def _sentences(offsets: Offsets, names: tuple[str, ...], with_residuals: Array) -> tuple[str, ...]:
+    """Return one sentence for each combination of offsets that the data do not determine.
+
+    `names` are the names of all groups. `with_residuals` (g,) are the numbers of the groups with residuals.
+    """
+    sentences = []
     for direction in offsets.open:
-        share = np.abs(direction[used]) > _PART * np.abs(direction).max()
-        who = [names[g] for g in used[share]]
-        listed = ", ".join(who[:6]) + (f" and {len(who) - 6} more" if len(who) > 6 else "")
-        if not who:  # the combination involves only groups without used rows
+        involved = np.abs(direction[with_residuals]) > _PART * np.abs(direction).max()
+        involved_names = [names[g] for g in with_residuals[involved]]
+        listed = ", ".join(involved_names[:6]) + (
+            f" and {len(involved_names) - 6} more" if len(involved_names) > 6 else ""
+        )
+        if not involved_names:  # the combination involves only groups without used rows
             continue
-        if len(who) == 1:
-            said.append(f"the data do not show a bias of {listed}")
-        elif np.ptp(direction[used][share]) < _PART * np.abs(direction).max():
-            said.append(f"biases of {listed} are relative to their mean over all rows: a common bias cannot be seen")
+        if len(involved_names) == 1:
+            sentences.append(f"the data do not show a bias of {listed}")
+        elif np.ptp(direction[with_residuals][involved]) < _PART * np.abs(direction).max():
+            sentences.append(
+                f"biases of {listed} are relative to their mean over all rows: a common bias cannot be seen"
+            )
         else:
-            said.append(f"the data do not show every combination of the biases of {listed}: the others are set to zero")
-    return tuple(dict.fromkeys(said))
+            sentences.append(
+                f"the data do not show every combination of the biases of {listed}: the others are set to zero"
+            )
+    return tuple(dict.fromkeys(sentences))
 
 
 # Robust estimation of offsets that many fixes share, from the left-out residuals of each station.
@@ -307,18 +332,21 @@ class Offsets:
     open: Array
 
 
-def offsets_of(made: Elements, tests: Tested) -> Offsets:
+def offsets_of(linearised: Elements, tests: Tested) -> Offsets:
     """Return the offsets that many problems share.
 
     The test of group g in one problem is w_g = (t_g - sum_h T_gh b_h) / sqrt(T_gg): its left-out residual with the
-    offsets of the others removed. At the true offsets b of all groups it is standard normal. The b minimise the sum of
-    Huber's function of all w, which is convex, by iteratively reweighted least squares. Combinations that do not change
-    any w are zero on average over the rows, for instance a common delay if emission times are unknown. Standard errors
-    are the larger of two: of the sandwich form with the problems as clusters, and of normal tests.
+    offsets of the others removed. T and t are the matrix and the vector of `Tested`, and b_h is the offset of group h.
+    At the true offsets b of all groups it is standard normal.
+
+    The b minimise the sum of Huber's function of all w, which is convex, by iteratively reweighted least squares.
+    Combinations that do not change any w are zero on average over the rows, for instance a common delay if emission
+    times are unknown. Standard errors are the larger of two: of the sandwich form with the problems as clusters, and of
+    normal tests.
 
     Parameters
     ----------
-    made : Elements
+    linearised : Elements
         N linearised problems.
     tests : Tested
         Tests of these problems.
@@ -327,94 +355,117 @@ def offsets_of(made: Elements, tests: Tested) -> Offsets:
     ----------
     P. J. Huber, "Robust Statistics" (1981), sections 7.3 to 7.6.
     """
-    count, q = len(made.names), tests.errors
+    count, q = len(linearised.names), tests.errors
     matrix, vector = tests.matrix[:, q:, q:], tests.vector[:, q:]
     size = np.diagonal(matrix, axis1=-2, axis2=-1)
-    item, own = np.nonzero((size > 0.0) & (made.of_offset >= 0))
-    scale = np.sqrt(size[item, own])
+    item, column = np.nonzero((size > 0.0) & (linearised.of_offset >= 0))
+    scale = np.sqrt(size[item, column])
     # One equation of unit variance for every valid test, in terms of its own offset and the offsets of the others.
-    y = vector[item, own] / scale
-    other = made.of_offset[item]
-    design = _sparse(matrix[item, own] / scale[:, None], other, count)
-    group = made.of_offset[item, own]
+    y = vector[item, column] / scale
+    other = linearised.of_offset[item]
+    design = _sparse(matrix[item, column] / scale[:, None], other, count)
+    group = linearised.of_offset[item, column]
     number = np.bincount(group, minlength=count).astype(float)
-    value, error, lost = _regress(design, y, item, number)
-    away, spread = _centre(made, group, item, own, count)
-    steep = np.isfinite(spread) & (spread > 0.0) & (number >= _FEW)
+    value, error, undetermined = _regress(design, y, item, number)
+    path_from_mean, spread = _centre(linearised, group, item, column, count)
+    has_growth = np.isfinite(spread) & (spread > 0.0) & (number >= _FEW)
     slope, slope_error = np.full(count, np.nan), np.full(count, np.nan)
-    if steep.any():
+    if has_growth.any():
         # Growth in units of the spread of the paths, so that the columns of offsets and growth have similar size.
-        units = np.where(steep, spread, 1.0)
-        grown = matrix[item, own] / scale[:, None] * np.nan_to_num(away[item] / np.append(units, 1.0)[other])
-        more = sparse.hstack([design, _sparse(grown, other, count)]).tocsr()
-        both, errors, _ = _regress(more, y, item, np.tile(number, 2))
-        slope, slope_error = (np.where(steep, v[count:] / units, np.nan) for v in (both, errors))
-    seen = number > 0.0
-    return Offsets(np.where(seen, value, np.nan), np.where(seen, error, np.nan), slope, slope_error, lost)
+        units = np.where(has_growth, spread, 1.0)
+        growth_columns = (
+            matrix[item, column] / scale[:, None] * np.nan_to_num(path_from_mean[item] / np.append(units, 1.0)[other])
+        )
+        both_columns = sparse.hstack([design, _sparse(growth_columns, other, count)]).tocsr()
+        both, errors, _ = _regress(both_columns, y, item, np.tile(number, 2))
+        slope, slope_error = (np.where(has_growth, v[count:] / units, np.nan) for v in (both, errors))
+    has_rows = number > 0.0
+    return Offsets(
+        np.where(has_rows, value, np.nan), np.where(has_rows, error, np.nan), slope, slope_error, undetermined
+    )
 
 
 def _sparse(values: Array, column: Array, count: int) -> sparse.csr_array:
-    """Return a sparse matrix (n, count) with values (n, c) at columns (n, c); column -1 means no entry."""
+    """Return a sparse matrix (n, count) with values (n, c) at columns (n, c); column -1 means no entry.
+
+    The argument `column` (n, c) gives the columns; equal columns of a row add up.
+    """
     kept = (column >= 0) & (values != 0.0)
     row = np.broadcast_to(np.arange(len(column))[:, None], column.shape)
     return sparse.csr_array((values[kept], (row[kept], column[kept])), shape=(len(column), count))
 
 
-def _centre(made: Elements, group: Array, item: Array, own: Array, count: int) -> tuple[Array, Array]:
-    """Return the paths (N, c) minus their mean over each group, and the standard deviation (G,) of each, metres."""
-    path = made.path[item, own]
+def _centre(linearised: Elements, group: Array, item: Array, column: Array, count: int) -> tuple[Array, Array]:
+    """Return the paths (N, c) minus their mean over each group, and the standard deviation (G,) of each, metres.
+
+    `group`, `item` and `column` (n,) are the group, the problem and the column of each valid offset. `count` is the
+    number of groups G.
+    """
+    path = linearised.path[item, column]
     number = np.maximum(np.bincount(group, minlength=count), 1)
     mean = np.bincount(group, path, count) / number
     spread = np.sqrt(np.bincount(group, (path - mean[group]) ** 2, count) / number)
-    return made.path - np.append(mean, 0.0)[made.of_offset], spread
+    return linearised.path - np.append(mean, 0.0)[linearised.of_offset], spread
 
 
 def _regress(design: sparse.csr_array, y: Array, item: Array, number: Array) -> tuple[Array, Array, Array]:
-    """Return coefficients (p,) of Huber's regression, their standard errors, and undetermined combinations (r, p)."""
+    """Return coefficients (p,) of Huber's regression, their standard errors (p,), and undetermined combinations (r, p).
+
+    `design` (n, p) and `y` (n,) are equations of unit variance. `item` (n,) is the problem of each equation, because
+    the equations of a problem are correlated. `number` (p,) is the number of rows of the group of each coefficient.
+    """
     value = np.zeros(design.shape[1])
     for _ in range(_STEPS):
-        off = y - design @ value
+        residual = y - design @ value
         # Every step estimates the scale from the median, so gross errors do not increase it.
-        bound = _HUBER * max(float(np.median(np.abs(off))) / _MAD, 1e-12)
-        weight = bound / np.maximum(np.abs(off), bound)
-        inverse, lost = _pseudo_inverse((design.T @ (design * weight[:, None])), number)
-        move = inverse @ (design.T @ (weight * off))
-        value = value + move
-        if np.abs(move / np.sqrt(np.maximum(np.diagonal(inverse), _TINY))).max() < _STILL:
+        bound = _HUBER * max(float(np.median(np.abs(residual))) / _MAD, 1e-12)
+        weight = bound / np.maximum(np.abs(residual), bound)
+        inverse, undetermined = _pseudo_inverse((design.T @ (design * weight[:, None])), number)
+        step = inverse @ (design.T @ (weight * residual))
+        value = value + step
+        if np.abs(step / np.sqrt(np.maximum(np.diagonal(inverse), _TINY))).max() < _STILL:
             break
     # Sandwich form: the bread from rows within the bound, the filling from the total score of each problem, because the
     # tests of a problem are correlated.
-    off = y - design @ value
-    inside = (np.abs(off) <= bound).astype(float)
-    bread, lost = _pseudo_inverse(design.T @ (design * inside[:, None]), number)
-    pull = design * np.clip(off, -bound, bound)[:, None]
-    each = sparse.csr_array((np.ones(len(item)), (item, np.arange(len(item))))) @ pull
-    covariance = bread @ (each.T @ each).toarray() @ bread
+    residual = y - design @ value
+    inside = (np.abs(residual) <= bound).astype(float)
+    bread, undetermined = _pseudo_inverse(design.T @ (design * inside[:, None]), number)
+    scores = design * np.clip(residual, -bound, bound)[:, None]
+    scores_of_problem = sparse.csr_array((np.ones(len(item)), (item, np.arange(len(item))))) @ scores
+    covariance = bread @ (scores_of_problem.T @ scores_of_problem).toarray() @ bread
     stated = (bound / _HUBER) ** 2 * np.diagonal(bread)
     error = np.sqrt(np.maximum(np.diagonal(covariance), stated))
-    return value, np.where(np.diagonal(bread) > 0.0, error, np.nan), lost
+    return value, np.where(np.diagonal(bread) > 0.0, error, np.nan), undetermined
 
 
 def _pseudo_inverse(matrix: sparse.csr_array, number: Array) -> tuple[Array, Array]:
-    """Return the pseudo-inverse with the least mean square over rows, and the combinations that are undetermined."""
+    """Return the pseudo-inverse (p, p) with the least mean square over rows, and the undetermined combinations (r, p).
+
+    `matrix` (p, p) is a normal matrix. `number` (p,) is the number of rows of each coefficient.
+    """
     # With this scaling the shortest solution has the least mean square over rows.
     weigh = 1.0 / np.sqrt(np.maximum(number, 1.0))
     scaled = matrix.toarray() * weigh[:, None] * weigh
     values, vectors = np.linalg.eigh(scaled)
-    seen = values > _UNSEEN * max(float(values[-1]), _TINY)
-    half = weigh[:, None] * vectors
-    return (half[:, seen] / values[seen]) @ half[:, seen].T, _split_by_groups(vectors[:, ~seen], weigh, number > 0.0)
+    determined = values > _UNSEEN * max(float(values[-1]), _TINY)
+    scaled_vectors = weigh[:, None] * vectors
+    return (scaled_vectors[:, determined] / values[determined]) @ scaled_vectors[:, determined].T, _split_by_groups(
+        vectors[:, ~determined], weigh, number > 0.0
+    )
 
 
-def _split_by_groups(basis: Array, weigh: Array, used: Array) -> Array:
-    """Return unit vectors (r, p) that span an undetermined space (p, r), with few groups in each vector."""
+def _split_by_groups(basis: Array, weigh: Array, has_rows: Array) -> Array:
+    """Return unit vectors (r, p) that span an undetermined space (p, r), with few groups in each vector.
+
+    `weigh` (p,) is the scale of each coefficient, and `has_rows` (p,) marks coefficients with rows.
+    """
     # Every basis of the space is valid. Groups that the space does not connect get separate vectors.
-    projector = basis @ basis.T * np.outer(used, used)
+    projector = basis @ basis.T * np.outer(has_rows, has_rows)
     count, label = connected_components(np.abs(projector) > _TIED, directed=False)
-    found = []
+    vectors_by_group = []
     # Restricted to connected groups, the projector has eigenvalue one on the undetermined combinations of these groups.
     for part in range(count):
         inside = np.where(label == part, projector, 0.0) * (label == part)[:, None]
         values, vectors = np.linalg.eigh(inside)
-        found += [weigh * vector for vector in vectors[:, values > 0.5].T]
-    return np.array([vector / np.linalg.norm(vector) for vector in found]).reshape(-1, len(weigh))
+        vectors_by_group += [weigh * vector for vector in vectors[:, values > 0.5].T]
+    return np.array([vector / np.linalg.norm(vector) for vector in vectors_by_group]).reshape(-1, len(weigh))

@@ -1,4 +1,8 @@
-"""Structure of the noise: independent errors of rows, stations or kinds, common errors of epochs, lasting errors."""
+"""Structure of the noise: independent errors of rows, stations or kinds, common errors of epochs, lasting errors.
+
+A common error is shared by the rows of a group in one epoch. A lasting error is correlated between successive epochs.
+Letters: N fixes, G groups, q errors of a fix.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +33,7 @@ from optloc.station_health.levels import (
 # the interval of a level by 4 %.
 _SURE, _WORTH = 4.0, 0.2
 # Visible share of a common error below which a sentence reports that fixes absorb it.
-_FOLLOWED = 0.5
+_ABSORBED = 0.5
 # Minimum number of pairs of successive epochs for a correlation, and pairs per part: its matrices take a few megabytes.
 _PAIRS, _PART = 30, 500
 # Upper limit of the correlation, because with 1 the interval of a level would be infinite.
@@ -62,7 +66,7 @@ class Tried:
 
     @property
     def total(self) -> float:
-        """Return the sum of deviance and penalty."""
+        """Return the sum of deviance and penalty; the structure with the least sum is the best."""
         return self.deviance + self.price
 
 
@@ -150,42 +154,46 @@ def structure_at(batch: Problem, x: Array, number: Array, *, ordered: bool) -> N
 
     with threadpool_limits(1):
         # If the noise is correlated between epochs, the model has no separate error of each epoch.
-        plain = _fit_structure(batch, x, "kind", None)
-        common = plain if has_correlated_epochs(batch) else _fit_structure(batch, x, "kind", "kind")
-        best = common if common.seen and common.tried.total < plain.tried.total else plain
+        without_common = _fit_structure(batch, x, "kind", None)
+        common = without_common if has_correlated_epochs(batch) else _fit_structure(batch, x, "kind", "kind")
+        best = common if common.seen and common.tried.total < without_common.tried.total else without_common
         lasting = _lasting(batch, x, number, best)
-        found = [plain, common] if common.seen else [plain]
-        if best is plain and ordered and not lasting:
+        candidates = [without_common, common] if common.seen else [without_common]
+        if best is without_common and ordered and not lasting:
             finer = [_fit_structure(batch, x, by, None) for by in _groupings(batch)]
-            found += [structure for structure in finer if structure.tried.levels > plain.tried.levels]
-    tried = tuple(sorted((candidate.tried for candidate in found), key=lambda structure: structure.total))
+            candidates += [structure for structure in finer if structure.tried.levels > without_common.tried.levels]
+    tried = tuple(sorted((candidate.tried for candidate in candidates), key=lambda structure: structure.total))
     return NoiseStructure(tried, lasting, tuple(_sentences(tried, lasting, common if best is common else None)))
 
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """A structure with its elements, its fit, and a mask (g,) of the groups without evidence."""
+    """A structure that was fitted to the residuals.
+
+    `tried` is the structure with its likelihood. `linearised` are the fixes with the errors of this structure, and
+    `fit` are the factors of these errors. `absent` (G,) marks the common errors without evidence.
+    """
 
     tried: Tried
-    made: Elements
+    linearised: Elements
     fit: VarianceFit
     absent: Array
 
     @property
     def seen(self) -> bool:
         """Return whether there is evidence of a common error."""
-        return bool((self.made.common[:-1] & ~self.absent).any())
+        return bool((self.linearised.common[:-1] & ~self.absent).any())
 
 
 def _fit_structure(batch: Problem, x: Array, by: By, common: By | None) -> _Candidate:
-    """Return a structure fitted to the residuals."""
-    made = elements(batch, x, by, common)
-    fit, absent = fitted(made, common)
+    """Return a structure fitted to the residuals of fixes x (N, size) of a flat batch."""
+    linearised = elements(batch, x, by, common)
+    fit, absent = fitted(linearised, common)
     known = np.isfinite(fit.low) & ~absent
     levels = int((known & ~fit.shared).sum()) + int((known & fit.shared).any())
-    redundancy = max(int(tested(made, np.ones(())).dof.sum()), 1)
+    redundancy = max(int(tested(linearised, np.ones(())).dof.sum()), 1)
     price = levels * float(np.log(redundancy))
-    return _Candidate(Tried(by, common, levels, deviance(made, fit), price), made, fit, absent)
+    return _Candidate(Tried(by, common, levels, deviance(linearised, fit), price), linearised, fit, absent)
 
 
 def _groupings(batch: Problem) -> Iterator[By]:
@@ -201,54 +209,69 @@ def _groupings(batch: Problem) -> Iterator[By]:
 
 
 def _lasting(batch: Problem, x: Array, number: Array, best: _Candidate) -> dict[str, float]:
-    """Return the correlation of the errors of each kind between successive epochs, if it is significant."""
-    made = elements(batch, x, "station", "kind" if best.tried.common else None)
-    level = dict(zip(best.made.names, np.nan_to_num(best.fit.variance, nan=1.0).tolist(), strict=True))
+    """Return the correlation of the errors of each kind between successive epochs, by kind, if it is significant.
+
+    `number` (N,) is the epoch of each fix. `best` is the best structure without lasting errors; its levels weight the
+    errors.
+    """
+    linearised = elements(batch, x, "station", "kind" if best.tried.common else None)
+    level = dict(zip(best.linearised.names, np.nan_to_num(best.fit.variance, nan=1.0).tolist(), strict=True))
     kinds = _kind_of(batch)
-    kind_of = np.array([kinds.get(name, name) for name in made.names], dtype=object)
-    own_level = [level.get(name, level.get(str(kind), 1.0)) for name, kind in zip(made.names, kind_of, strict=True)]
-    variance = np.array([*own_level, 0.0])
-    _, tests = cleaned(made, variance[made.of_effect])
+    kind_of = np.array([kinds.get(name, name) for name in linearised.names], dtype=object)
+    level_of_group = [
+        level.get(name, level.get(str(kind), 1.0)) for name, kind in zip(linearised.names, kind_of, strict=True)
+    ]
+    variance = np.array([*level_of_group, 0.0])
+    _, tests = cleaned(linearised, variance[linearised.of_effect])
     follows = np.flatnonzero(np.diff(number) == 1)
     parts = [follows[i : i + _PART] for i in range(0, len(follows), _PART)]
-    found, known = {}, {name for name, low in zip(best.made.names, best.fit.low, strict=True) if np.isfinite(low)}
+    correlations, known = (
+        {},
+        {name for name, low in zip(best.linearised.names, best.fit.low, strict=True) if np.isfinite(low)},
+    )
     for kind in sorted(known & {*kind_of.tolist()}):
-        own = np.flatnonzero(kind_of == kind)
-        sums = [_products(tests, made.of_effect, own, variance, part) for part in parts]
+        groups = np.flatnonzero(kind_of == kind)
+        sums = [_products(tests, linearised.of_effect, groups, variance, part) for part in parts]
         product, share = (np.concatenate([one[i] for one in sums] or [np.zeros(0)]) for i in range(2))
         if np.count_nonzero(share) < _PAIRS:
             continue
         size, error = (float(v / share.sum()) for v in (product.sum(), np.sqrt((product**2).sum())))
         if size > max(_SURE * error, _WORTH):
-            found[kind] = min(size, _LASTS)
-    return found
+            correlations[kind] = min(size, _LASTS)
+    return correlations
 
 
 def _kind_of(batch: Problem) -> dict[str, str]:
-    """Return the kind of the rows of each group of stations."""
+    """Return the kind of the rows of each group of stations, by group name."""
     ends, kinds = ends_of(batch, "station").name, kinds_of(batch)
     return {name: str(kind) for row, kind in zip(ends.tolist(), kinds.tolist(), strict=True) for name in row if name}
 
 
-def _products(tests: Tested, of: Array, own: Array, variance: Array, first: Array) -> tuple[Array, Array]:
-    """Return products of the errors of some groups in successive epochs, and their means at a correlation of one.
+def _products(tests: Tested, group_of: Array, groups: Array, variance: Array, first: Array) -> tuple[Array, Array]:
+    """Return products (n,) of the errors of some groups in successive epochs, and their means (n,) at correlation one.
+
+    `group_of` (N, q) is the group of each error. `groups` (g,) are the groups that count. `variance` (G + 1,) are the
+    variance factors theta. `first` (n,) is the first epoch of each pair.
 
     An epoch has tests t = T e of its errors e, the next epoch t' = T' e'. The expectation of the sum of t_g t'_g over
     the groups g is the correlation times the sum of T_gh T'_gh theta_h.
     """
-    here = of[:, :, None] == own
-    vector = np.einsum("nqg,nq->ng", here[first], tests.vector[first, : tests.errors])
-    after = np.einsum("nqg,nq->ng", here[first + 1], tests.vector[first + 1, : tests.errors])
+    is_in_group = group_of[:, :, None] == groups
+    vector = np.einsum("nqg,nq->ng", is_in_group[first], tests.vector[first, : tests.errors])
+    after = np.einsum("nqg,nq->ng", is_in_group[first + 1], tests.vector[first + 1, : tests.errors])
     matrix, next_matrix = (
-        np.swapaxes(here[i], 1, 2) @ tests.matrix[i][:, : tests.errors, : tests.errors] @ here[i]
+        np.swapaxes(is_in_group[i], 1, 2) @ tests.matrix[i][:, : tests.errors, : tests.errors] @ is_in_group[i]
         for i in (first, first + 1)
     )
-    scale = variance[own]
+    scale = variance[groups]
     return (vector * after * scale).sum(1), (matrix * next_matrix * scale * scale[:, None]).sum((1, 2))
 
 
 def _sentences(tried: tuple[Tried, ...], lasting: dict[str, float], common: _Candidate | None) -> Iterator[str]:
-    """Yield sentences about the structure, and about errors that residuals cannot show."""
+    """Yield sentences about the structure, and about errors that residuals cannot show.
+
+    `common` is the fitted structure with common errors if it is the best, otherwise None.
+    """
     best = tried[0]
     if len(tried) > 1:
         gain = tried[1].total - best.total
@@ -259,28 +282,29 @@ def _sentences(tried: tuple[Tried, ...], lasting: dict[str, float], common: _Can
             "are less certain than with independent errors"
         )
     if best.common and common is not None:
-        followed = _followed(common)
-        if followed:
-            what = ", ".join(f"{100.0 * share:.0f} % of {name}" for name, share in followed.items())
+        absorbed = _absorbed(common)
+        if absorbed:
+            what = ", ".join(f"{100.0 * share:.0f} % of {name}" for name, share in absorbed.items())
             yield f"fixes absorb {what}: known positions or more stations would show the rest"
     yield "residuals cannot show an error that shifts all fixes alike: measure at a known position to find it"
 
 
-def _words(one: Tried) -> str:
-    besides = f" and an error in common of each {one.common} in an epoch" if one.common else ""
-    return f"levels of each {one.by}{besides}"
+def _words(structure: Tried) -> str:
+    """Return a structure in words."""
+    addition = f" and an error in common of each {structure.common} in an epoch" if structure.common else ""
+    return f"levels of each {structure.by}{addition}"
 
 
-def _followed(one: _Candidate) -> dict[str, float]:
-    """Return the share of each common error that fixes absorb, if it is more than half."""
-    q = one.made.of_effect.shape[1]
-    found = {}
-    for g in np.flatnonzero(one.made.common[:-1] & (np.nan_to_num(one.fit.low) > 0.0)):
-        own = one.made.of_effect == g
-        share = float((one.fit.tests.size[:, :q][own] * one.fit.variance[g]).mean())
-        if share < _FOLLOWED:
-            found[one.made.names[g]] = 1.0 - share
-    return found
+def _absorbed(candidate: _Candidate) -> dict[str, float]:
+    """Return the share of each common error that fixes absorb, by name, if it is more than half."""
+    q = candidate.linearised.of_effect.shape[1]
+    shares = {}
+    for g in np.flatnonzero(candidate.linearised.common[:-1] & (np.nan_to_num(candidate.fit.low) > 0.0)):
+        in_group = candidate.linearised.of_effect == g
+        share = float((candidate.fit.tests.size[:, :q][in_group] * candidate.fit.variance[g]).mean())
+        if share < _ABSORBED:
+            shares[candidate.linearised.names[g]] = 1.0 - share
+    return shares
 
 
 # Alternate fixes and levels until they agree.
@@ -321,22 +345,26 @@ def with_estimated_noise(
         return with_noise_levels(problem, levels), levels
     part = _stretches(len(noise_fixes.kept))
     ordered = _in_order(problem)
-    found = structure_at(
+    structure = structure_at(
         batch.take(noise_fixes.kept[part]), noise_fixes.x[part], noise_fixes.kept[part], ordered=ordered
     )
-    _check_lasting(found.lasting, {*map(str, kinds_of(batch))})
+    _check_lasting(structure.lasting, {*map(str, kinds_of(batch))})
     levels = noise_fixes.levels(batch)
-    if (found.by, found.common) != ("kind", None):
-        plain, noise_fixes = levels, _alternate(problem, batch, found.by, found.common, method, noise_fixes)
-        levels = _at_least(noise_fixes.levels(batch), plain, found.lasting if ordered else None)
-    levels = _widened(levels, found.lasting)
-    levels = replace(levels, sentences=(*found.sentences, *levels.sentences))
+    if (structure.by, structure.common) != ("kind", None):
+        plain, noise_fixes = levels, _alternate(problem, batch, structure.by, structure.common, method, noise_fixes)
+        levels = _at_least(noise_fixes.levels(batch), plain, structure.lasting if ordered else None)
+    levels = _widened(levels, structure.lasting)
+    levels = replace(levels, sentences=(*structure.sentences, *levels.sentences))
     return with_noise_levels(problem, levels), levels
 
 
 @dataclass(frozen=True, slots=True)
 class _NoiseFixes:
-    """Fixes (n,) of a batch, and the structure of the noise that was used for them."""
+    """Fixes of a batch, and the structure of the noise that was used for them.
+
+    `kept` (n,) are the numbers of the problems with a fix, and `x` (n, size) their parameter vectors. `by` and `common`
+    are the groupings as in `NoiseStructure`.
+    """
 
     by: By
     common: By | None
@@ -344,12 +372,15 @@ class _NoiseFixes:
     x: Array
 
     def levels(self, batch: Problem) -> NoiseLevels:
-        """Return the levels from stretches of the fixes, or from all fixes if the stretches lack some groups."""
-        whole, part = batch.take(self.kept), _stretches(len(self.kept))
-        some = whole.take(part)
-        if _present_groups(some, self.by) != _present_groups(whole, self.by):
-            some, part = whole, np.arange(len(self.kept))
-        return levels_of(elements(some, self.x[part], self.by, self.common), self.by, self.common)
+        """Return the levels from stretches of the fixes, or from all fixes if the stretches lack some groups.
+
+        A thousand fixes determine the levels well enough, in constant time; see `_stretches`.
+        """
+        all_fixes, part = batch.take(self.kept), _stretches(len(self.kept))
+        chosen = all_fixes.take(part)
+        if _present_groups(chosen, self.by) != _present_groups(all_fixes, self.by):
+            chosen, part = all_fixes, np.arange(len(self.kept))
+        return levels_of(elements(chosen, self.x[part], self.by, self.common), self.by, self.common)
 
 
 def _present_groups(batch: Problem, by: By) -> set[str]:
@@ -359,7 +390,10 @@ def _present_groups(batch: Problem, by: By) -> set[str]:
 
 
 def _stretches(count: int) -> Array:
-    """Return the numbers of the fixes that determine the structure: all, or evenly spaced stretches."""
+    """Return the numbers of the fixes that determine the structure: all, or evenly spaced stretches.
+
+    Stretches contain successive epochs, which the correlation between epochs needs. `count` is the number of fixes.
+    """
     if count <= _MANY:
         return np.arange(count)
     first = np.linspace(0, count - _STRETCH, _MANY // _STRETCH).astype(int)
@@ -369,7 +403,11 @@ def _stretches(count: int) -> Array:
 def _alternate(
     problem: Problem, batch: Problem, by: By, common: By | None, method: str, before: _NoiseFixes | None = None
 ) -> _NoiseFixes:
-    """Return fixes whose noise agrees with their residuals; the iteration starts from the fixes `before`, if given."""
+    """Return fixes whose noise agrees with their residuals; the iteration starts from the fixes `before`, if given.
+
+    `batch` is ``batch_of(problem)``. `by` and `common` are the groupings of errors, and `method` is the method of the
+    fixes.
+    """
     from optloc.solvers.solution import solve
 
     if before is None:
@@ -377,34 +415,38 @@ def _alternate(
     else:
         before_kept, x = before.kept, before.x
     # Iterations use some of the fixes, evenly spaced. Their levels are accurate enough to weight the next fixes.
-    kept, some, factor = before_kept, slice(None, None, max(len(before_kept) // _SOME, 1)), np.ones(1)
+    kept, sample, factor = before_kept, slice(None, None, max(len(before_kept) // _SOME, 1)), np.ones(1)
     # Better weights change the fixes, and the fixes change the residuals, so iterate until the levels are stable.
-    for turn in range(1 + _ROUNDS):
-        made = elements(batch.take(kept[some]), x[some], by, common)
+    for iteration in range(1 + _ROUNDS):
+        linearised = elements(batch.take(kept[sample]), x[sample], by, common)
         # Factors refer to the stated noise. A level that the data do not determine keeps the stated noise.
-        levels = levels_of(made, by, common, tails=False)
+        levels = levels_of(linearised, by, common, tails=False)
         if np.isnan(levels.low).all():
             advice = "state a sigma, or add rows, stations or epochs"
             raise InvalidProblem("the data do not determine the noise", "noise", advice)
         same = factor.shape == levels.factor.shape
-        if turn == _ROUNDS or (same and np.abs(levels.factor - factor).max() <= _CLOSE * levels.factor.max()):
+        if iteration == _ROUNDS or (same and np.abs(levels.factor - factor).max() <= _CLOSE * levels.factor.max()):
             break
         factor = levels.factor
         kept, x = _fix_again(batch_of(with_noise_levels(problem, levels)), method, kept, x)
     return _NoiseFixes(by, common, kept, x)
 
 
-def _fix_again(now: Problem, method: str, kept: Array, x: Array) -> tuple[Array, Array]:
-    """Return the fixes with new noise: for least squares without bounds by descent from the earlier fixes."""
+def _fix_again(batch: Problem, method: str, kept: Array, x: Array) -> tuple[Array, Array]:
+    """Return the fixes with new noise: for least squares without bounds by descent from the earlier fixes.
+
+    `batch` is the batch with the new noise. `kept` (n,) are the problems with an earlier fix, and `x` (n, size) these
+    fixes. The result has the same form.
+    """
     from optloc.solvers.solution import solve
 
-    if not now.layout.size:
+    if not batch.layout.size:
         return kept, x
-    if method != "auto" or any(not is_exact(constraint) for constraint in now.constraints):
-        return usable(now, solve(now, method))
-    found, cost = descend(now.take(kept), x)
-    finite = np.isfinite(cost) & np.isfinite(found).all(-1)
-    return kept[finite], found[finite]
+    if method != "auto" or any(not is_exact(constraint) for constraint in batch.constraints):
+        return usable(batch, solve(batch, method))
+    refined, cost = descend(batch.take(kept), x)
+    finite = np.isfinite(cost) & np.isfinite(refined).all(-1)
+    return kept[finite], refined[finite]
 
 
 # Correlation of errors above which their level is not estimated: two hundred epochs then equal ten independent epochs.
@@ -412,7 +454,10 @@ _TOO_LONG = 0.9
 
 
 def _check_lasting(lasting: dict[str, float], kinds: set[str]) -> None:
-    """Raise InvalidProblem if errors hardly change, because fixes follow them and residuals do not show them."""
+    """Raise InvalidProblem if errors hardly change, because fixes follow them and residuals do not show them.
+
+    `lasting` is the correlation of the errors between epochs, by kind.
+    """
     for kind in sorted(kinds):
         if lasting.get(kind, 0.0) > _TOO_LONG:
             what = f"errors of {kind} hardly change (correlation {lasting[kind]:.2g} between epochs): residuals do not"
@@ -423,8 +468,10 @@ def _check_lasting(lasting: dict[str, float], kinds: set[str]) -> None:
 def _at_least(levels: NoiseLevels, plain: NoiseLevels, lasting: dict[str, float] | None) -> NoiseLevels:
     """Return levels of rows that are at least the levels without a common error, if the common error lasts or may last.
 
-    A lasting common error consists of few independent errors, so residuals do not separate it from errors of rows.
-    Without this limit, with ranges that are 7 % too long, 14 % of the fixes had errors beyond five sigma.
+    `plain` are the levels without a common error. `lasting` is the correlation of errors by kind, or None if the order
+    of the fixes is unknown; every error may then last. A lasting common error consists of few independent errors, so
+    residuals do not separate it from errors of rows. Without this limit, with ranges that are 7 % too long, 14 % of the
+    fixes had errors beyond five sigma.
     """
     least = {name: i for i, name in enumerate(plain.names) if lasting is None or common_name(name) in lasting}
     low, factor, high = levels.low.copy(), levels.factor.copy(), levels.high.copy()
@@ -437,7 +484,8 @@ def _at_least(levels: NoiseLevels, plain: NoiseLevels, lasting: dict[str, float]
 def _widened(levels: NoiseLevels, lasting: dict[str, float]) -> NoiseLevels:
     """Return levels with wider intervals for lasting errors: the squares of neighbours are correlated by r^2.
 
-    The variance of their mean is (1 + r^2) / (1 - r^2) times the variance of independent squares (Bartlett 1946).
+    `lasting` is the correlation r of the errors between epochs, by kind. The variance of their mean is (1 + r^2) / (1 -
+    r^2) times the variance of independent squares (Bartlett 1946).
     """
     r = np.array([lasting.get(name, 0.0) for name in levels.names])
     wider = np.sqrt((1.0 + r**2) / (1.0 - r**2))

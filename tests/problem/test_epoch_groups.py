@@ -12,7 +12,7 @@ from optloc.base.types import Motion, Rows
 from optloc.engine.plan import plan_of
 from optloc.problem.build import station_array
 from optloc.problem.epoch_groups import epoch_groups, problem_of
-from optloc.problem.epochs import _places, by_epoch
+from optloc.problem.epochs import _distinct_rows, by_epoch
 
 STATIONS = np.random.default_rng(3).uniform([-3e4, -3e4, 0.0], [3e4, 3e4, 3e3], (12, 3))
 NAMES = tuple(f"R{i}" for i in range(12))
@@ -120,6 +120,6 @@ def test_rows_that_repeat_within_an_epoch_keep_places_of_their_own(count, seed):
     for key in zip(a.tolist(), b.tolist(), target.tolist(), epoch.tolist(), strict=True):
         places.append(keys.setdefault((*key[:3], seen[key]), len(keys)))
         seen[key] += 1
-    found, place = _places(rows)
+    found, place = _distinct_rows(rows)
     assert [tuple(one) for one in found.tolist()] == list(keys)
     assert place.tolist() == places

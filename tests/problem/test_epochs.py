@@ -116,5 +116,5 @@ def test_runs_that_do_not_fit_are_refused(change, words):
 
 
 def test_an_empty_stretch_is_refused():
-    with pytest.raises(InvalidProblem, match="hold no rows"):
+    with pytest.raises(InvalidProblem, match="have no rows"):
         cut(run(10), 4, 4)
