@@ -182,7 +182,7 @@ def sparse_fit(
     Notes
     -----
     Solved in the coordinates ``z = S V' y`` of the singular value decomposition ``B = U S V'`` less the least-squares
-    fit: all numbers are in sigmas, even if the noise is very small compared with the distances.
+    fit: all numbers are in sigmas, even if the noise is small compared with the distances.
     """
     B, g = np.asarray(B, dtype=np.float64), np.asarray(g, dtype=np.float64)
     m, n = B.shape

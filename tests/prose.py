@@ -15,7 +15,8 @@ from proselint.registry import CheckRegistry
 from proselint.tools import LintFile
 
 # Checks that misread technical text: straight quotes are code, lines of a table repeat a word, "free steps" is no
-# cliché, "the least worst angle" and "measured less true" are terms, and files may have the name of a day.
+# cliché, "the least worst angle" and "measured less true" are terms, files may have the name of a day, and titles of
+# papers are quoted as they are.
 NOT_USED = (
     "typography",
     "lexical_illusions",
@@ -25,6 +26,7 @@ NOT_USED = (
     "redundancy.misc.garner",
     "cliches.misc.garner",
     "misc.capitalization.days",
+    "needless_variants",
 )
 CODE = re.compile(r"`[^`\n]*`|:math:`[^`]*`|\$[^$]*\$")
 

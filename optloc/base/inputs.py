@@ -270,7 +270,7 @@ def _all_of(read: Callable[[int], bytes], what: str, where: str, *, lines: bool 
 def _open(path: Path) -> int:
     """Return a file descriptor of a regular file and record its path; raise InvalidProblem for anything else."""
     try:
-        # Only opening the file is a reliable test. O_NONBLOCK: opening a pipe without a writer would wait for ever.
+        # Only opening the file is a reliable test. O_NONBLOCK: opening a pipe without a writer would wait without end.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except (FileNotFoundError, NotADirectoryError):
         raise InvalidProblem("there is no such file", str(path), _similar_file(path)) from None

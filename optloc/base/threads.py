@@ -53,7 +53,7 @@ def thread_count() -> int:
 def held_by_forks(lock: LockType, begin: Callable[[], None] = lambda: None) -> LockType:
     """Register a lock so that it is free in a forked child, and return it. A fork first acquires the lock.
 
-    Without it, a child that forks while another thread holds the lock could wait for ever.
+    Without it, a child that forks while another thread holds the lock could wait without end.
 
     Parameters
     ----------

@@ -108,7 +108,7 @@ class Error:
 
     @property
     def log_tail(self) -> float:
-        """Return the logarithm of the p-value of the estimate: very negative for a clear error, 0 if `dof` is 0."""
+        """Return the logarithm of the p-value of the estimate: far below 0 for a clear error, 0 if `dof` is 0."""
         return float(log_tail(np.array(self.statistic), np.array(self.dof)))
 
 
@@ -230,7 +230,7 @@ def _roots(equations: Normal, A: Array, B: Array, epoch: Array) -> tuple[Array, 
 
 
 def log_tail(statistic: Array, dof: Array) -> Array:
-    """Return the logarithm of the tail probability of a chi-square, also for very small probabilities.
+    """Return the logarithm of the tail probability of a chi-square, also for small probabilities.
 
     Below the range of floating-point numbers, the leading term of the asymptotic series is used (Abramowitz, Stegun
     1964, eq. 6.5.32). With `dof` of zero, the result is 0, a probability of one.

@@ -229,7 +229,7 @@ def _in_inverse_range(test: ShapeTest, centre: Array, covariance: Array) -> Arra
     return test.departs(np.where(still[..., None], 0.0, there - position[:, None]), sigmas)
 
 
-# Cost of positions at very large distances.
+# Cost of positions at large distances.
 
 # Distance that represents infinity, in spreads of the stations: wave fronts bend by 5e-8 of the spread there, and the
 # rounding of a difference of ranges is 1e-9 of it.
@@ -249,7 +249,7 @@ _BROKEN = 1e-4
 
 
 def cost_at_infinity(problem: Problem, x: Array) -> Array:
-    """Return the lowest cost (N,) of positions at infinity; very large if the cost is unbounded there.
+    """Return the lowest cost (N,) of positions at infinity; large if the cost is unbounded there.
 
     `problem` is a flat batch of N problems with one position. The fixes `x` (N, size) give the first direction and the
     start of the other unknowns.

@@ -320,7 +320,7 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
     if own.shape[0] > 0 and reaches_infinity(cost.kinds, cost.K):
         middle, _ = station_cube(cost.kinds, cost.data, x)
         floor += _length_of_lines(cost, own, middle)
-        # Lines from the reference position have fewer exact digits than lines from the fix, which very sharp rows
+        # Lines from the reference position have fewer exact digits than lines from the fix, which sharp rows
         # need.
         if relative_rounding(cost.K) * floor < _SHARP:
             chart = LocalAxes(origin, sense, back, gram, slip, floor, own, True, middle)

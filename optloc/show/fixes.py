@@ -242,7 +242,7 @@ def _coordinates(fix: Fix) -> list[tuple[str, str]]:
 
 
 def _chi_square(fix: Fix) -> str:
-    """Return the cost, the degrees of freedom and the p-value as text, with a warning if the p-value is very small."""
+    """Return the cost, the degrees of freedom and the p-value as text, with a warning if the p-value is small."""
     if int(fix.dof) <= 0 or not np.isfinite(fix.cost):
         return "no redundancy: nothing to test"
     p = float(fix.p_value)

@@ -47,7 +47,7 @@ from optloc.tracking.track import (
 from optloc.tracking.updates import Filter, Update, Updated, filter_of, innovation, read, weights_within
 
 # If the first scan is less likely than this, it contradicts the given state. The run is then refused, so the limit is
-# very small.
+# small.
 _CONTRADICTORY = 1e-9
 Screen = tuple[float, float, float]
 

@@ -209,7 +209,7 @@ def _is_done(
 
 @compiled
 def _is_flat_out(run: RunCost, space: Space, tables: RunTables, level: float) -> bool:
-    """Return whether a box at infinity is very small and its cost at infinity is below a level.
+    """Return whether a box at infinity is small and its cost at infinity is below a level.
 
     Halving this box would never exclude it, so the search ends.
     """

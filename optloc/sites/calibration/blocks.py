@@ -219,7 +219,7 @@ def stations_alone(net: Network, at: NetworkEstimate, which: Array) -> Problem:
         if given.any():
             rows.append(_masked_rows(kind, z[which], sigma[which], given, a=ends))
     has_prior = np.isfinite(net.place_sigma[which])
-    # the prior covers all coordinates of a station, so unknown coordinates get a very wide one
+    # the prior covers all coordinates of a station, so unknown coordinates get a wide one
     spread = float(np.ptp(places, axis=0).max()) or 1.0
     sigma = np.clip(net.place_sigma[which], _EXACT * spread, 1e6 * spread)
     prior = Prior("position", net.place[which], sigma[..., None] ** 2 * np.eye(net.dimension))

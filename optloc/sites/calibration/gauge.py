@@ -85,7 +85,7 @@ def without_pulses(lik: Likelihood, at: NetworkEstimate) -> Array:
     """
     by_station, by_pulse, known = lik.jacobian(at)
     n, r, p = by_station.shape
-    # the columns of a distant pulse have very different lengths, so scale them first
+    # the columns of a distant pulse have different lengths, so scale them first
     length = np.sqrt((by_pulse**2).sum(axis=1, keepdims=True))
     q, triangle = np.linalg.qr(by_pulse / np.where(length > 0.0, length, 1.0))
     pivot = np.abs(np.einsum("nii->ni", triangle))
