@@ -202,7 +202,7 @@ def test_rows_are_there_as_they_are_made(tmp_path, monkeypatch, name):
         return UPDATES["ekf"](scan, mean, cov)
 
     monkeypatch.setitem(UPDATES, "looking", looking)
-    monkeypatch.setattr("optloc.cli.track._LATE", 0.0)  # at once, no longer ten times a second
+    monkeypatch.setattr("optloc.cli.track._MIN_GAP", 0.0)  # at once, no longer ten times a second
     run(drive(tmp_path), "--filter", "looking", "--out", tmp_path / name)
     assert seen == [["starting", "started", *["ok"] * count] for count in range(10)]
     assert not partial.exists()
