@@ -196,6 +196,7 @@ def _plain_numbers(column: Array) -> NumberColumn | None:
     text = text.filter(pc.invert(nothing))
     if not pc.all(pc.match_substring_regex(text, _PLAIN)).as_py():
         return None
+    # `written` has the number of decimals of each cell, and `units` the digits without the point as an integer.
     point = pc.find_substring(text, ".").to_numpy()
     written = np.where(point < 0, 0, pc.binary_length(text).to_numpy() - point - 1).astype(np.int64)
     try:

@@ -75,6 +75,7 @@ def _stated_speed(file: ProblemFile, source: str) -> float | None:
     given, place = file.propagation_speed, join(source, "key 'propagation_speed'")
     if isinstance(given, SoundTable):
         water = given.medium != "air"
+        # Grams of salt in a kilogram of water: sea water has 35 by default, other water none.
         if not water and (given.salinity is not None or given.depth):
             raise InvalidProblem("air has no salinity and no depth", place, "remove them")
         usual = 35.0 if given.medium == "sea water" else 0.0

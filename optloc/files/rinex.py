@@ -284,7 +284,7 @@ def read_navigation(path: Path) -> Navigation:
             raise InvalidProblem(
                 "an ephemeris must begin with a satellite such as G07", file.at(i), "copy the file again"
             )
-        lines = _SHORT.get(name[0], _LINES)
+        lines = _SHORT.get(name[0], _LINES)  # number of lines of the record, which depends on the system
         if name[0] in SYSTEMS:
             found.setdefault(name, []).append(_elements(file, i, name[0], old=old))
         i += lines
@@ -310,6 +310,7 @@ def _elements(file: _File, i: int, system: str, *, old: bool) -> list[float]:
     lacking = next((k for k, text in cells[:_NEEDED] if not text.strip()), None)
     if lacking is not None:
         raise InvalidProblem("a number is missing in the ephemeris", file.at(lacking), "remove its eight lines")
+    # Numbers after the first `_NEEDED` may be empty; they count as zero.
     values = [_number(file, k, text, "the element") if text.strip() else 0.0 for k, text in cells]
     by_name = {name: values[place] for name, place in _PLACES.items()}
     by_name |= {"toc": toc, "tgd": values[_DELAY[system]]} | dict(zip(("af0", "af1", "af2"), values, strict=False))

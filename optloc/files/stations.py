@@ -304,6 +304,7 @@ def stations_over_epochs(
     station) whose position is required. At an epoch without rows of a station, its position has no effect: the first
     known position is used. Velocity and axes are None if the table has none.
     """
+    # Rows of the table before and after each epoch (-1 without a row), and the weight of the row after.
     low, high, share = _by_label(found, epochs) if found.table.has("epoch") else _by_time(found, section, epochs)
     missing = low[used[:, 0], used[:, 1]] < 0
     if missing.any():

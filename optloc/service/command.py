@@ -261,7 +261,10 @@ class ServiceOptions:
 
 
 def run_live(file: Path, options: ServiceOptions) -> int:
-    """Run a stream until its source ends or a signal arrives, and return the exit code."""
+    """Run a stream until its source ends or a signal arrives, and return the exit code.
+
+    `file` is the problem file of the site.
+    """
     from optloc.service.recording import read_recording
     from optloc.service.site import read_site
     from optloc.service.sources import adapter_of
@@ -275,6 +278,7 @@ def run_live(file: Path, options: ServiceOptions) -> int:
     # lines of a file can wait, so no proof needs to be skipped
     waits = recording is not None or (options.stdin and _is_file(sys.stdin))
     shed = not waits if options.shed is None else options.shed
+    # If no proof is skipped, the default deadline is infinite. Settings that are None keep their default values.
     given = options.settings | ({"deadline": inf} if not shed and options.settings.get("deadline") is None else {})
     settings = Settings(shed=shed, **{key: value for key, value in given.items() if value is not None})
     claim(settings.record, inputs=[file])
