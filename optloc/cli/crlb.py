@@ -354,7 +354,8 @@ def _grid(
 ) -> tuple[tuple[Array, Array], float]:
     """Return the coordinates (points,) of a map along both sides, and the height of the map, m.
 
-    The coordinates are in degrees on Earth, else in metres.
+    The coordinates are in degrees on Earth, else in metres. Of a problem in space, the map is a horizontal plane. Its
+    height is `height`, or the height of the stated position or of the fix.
     """
     place = _place(file, problem, at, truth, needed=height is None and problem.dimension == 3)
     x0, x1, y0, y1 = extent(problem, place) if limits is None else _limits(limits, problem)
@@ -364,7 +365,8 @@ def _grid(
 def _place(file: Path, problem: Problem, at: str | None, truth: Array, *, needed: bool) -> Array | None:
     """Return the position (1, d) that the user states, m, or the fix; None if no position is needed.
 
-    `truth` (size,) has the stated position. Raise InvalidProblem if the file has no fix.
+    `truth` (size,) has the stated position. With several unknown targets, the stated position is not used. `needed` is
+    whether the file is fixed without a stated position. Raise InvalidProblem if the file has no fix.
     """
     sought = [i for i, motion in enumerate(problem.motions) if motion.known is None]
     positions = [slot for slot in problem.layout.shared if slot.name.partition("[")[0] == "position"]

@@ -97,6 +97,7 @@ _NARROWEST, _WIDEST = 20, 1000
 
 def _prepare() -> None:
     """Set up standard streams and terminal width so that no output can fail."""
+    # The lowest free number is opened: 0, 1 and 2 are the standard streams.
     while (number := os.open(os.devnull, os.O_RDWR)) < 3:
         pass  # occupy the number of a closed stream, so that the next opened file does not get it
     os.close(number)

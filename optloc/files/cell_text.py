@@ -251,6 +251,7 @@ def date_seconds(table: Table, name: str, zone: str | None) -> NumberColumn:
         nanoseconds = column[row].astype("datetime64[ns]").astype(np.int64)
         return NumberColumn(Decimals.scaled(nanoseconds, np.full(len(row), 9)), row)
     cells = ["" if cell is None else str(cell).strip() for cell in column.tolist()]
+    # `filled_rows` have a date, and `bare_rows` a date without a time zone.
     filled_rows = [row for row, cell in enumerate(cells) if cell.lower() not in NOTHING]
     bare_rows = [
         row for row in filled_rows if not _ZONE.search(cells[row].partition("T")[2] or cells[row].partition(" ")[2])

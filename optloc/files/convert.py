@@ -315,7 +315,10 @@ def _height(found: Sequence[Readings], stations: ColumnPlaces) -> tuple[str, str
 
 
 def _sigmas(hints: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
-    """Return the standard deviation of each sort of readings as text; None if the table has a column of them."""
+    """Return the standard deviation of each sort of readings as text; None if the table has a column of them.
+
+    The option `--sigma` has one value for all sorts, or a value for each kind, such as "tdoa=20 ns,azimuth=1 deg".
+    """
     if hints.sigma is None:
         for one in found:
             if one.sigma is None:

@@ -93,7 +93,7 @@ def _rows(record: Mapping[str, Any], place: str) -> list[Row]:
 
     `place` is the place for messages.
     """
-    # `shared` has the values that all rows repeat, `inner` the rows of objects in lists, and `parallel` the lists of
+    # `shared` has the values that all rows repeat, and `inner` the rows of objects in lists. `parallel` has lists of
     # numbers or text, which become columns.
     shared: Row = {}
     inner: list[Row] = []

@@ -48,6 +48,7 @@ def from_bow(found: Readings, roles: Roles, column: str, hints: ColumnHints) -> 
         raise InvalidProblem(
             f"the headings {column!r} are magnetic, and the declination is unknown", table.source, advice
         )
+    # `nothing` has the numbers that mean no heading, as `--missing` states.
     column_values, nothing = numbers(table, column), marks_of(hints) or frozenset()
     given = dict(zip(column_values.row.tolist(), column_values.values.tolist(), strict=True))
     lacking = next((row for row in found.row.tolist() if given.get(row) is None or given[row] in nothing), None)

@@ -53,6 +53,7 @@ def _medium(table: MediumTable, reference: float | None, source: str) -> Medium:
     if table.kind == "atmosphere" and reference is not None:
         what = "an atmosphere determines the speed: the speed of light over the refractive index"
         raise InvalidProblem(what, place, "remove propagation_speed")
+    # functions that convert lengths and speeds from the units of the table to SI
     length, speed = (
         Units(quantity).conversion(unit, place).to_si  # type: ignore[arg-type]
         for quantity, unit in (("length", table.unit), ("speed", table.speed_unit))

@@ -234,7 +234,7 @@ def _records_of_2(file: _File, types: int) -> Iterator[tuple[int, float, str, st
 
     `types` is the number of observations of a satellite, which determines the number of lines of a record.
     """
-    each, i = -(-types // _WRAPPED["observations"]), 0
+    each, i = -(-types // _WRAPPED["observations"]), 0  # `each` is the number of lines of a satellite, rounded up
     while i < len(file.lines):
         line = file.lines[i]
         if not line.strip():
@@ -245,6 +245,7 @@ def _records_of_2(file: _File, types: int) -> Iterator[tuple[int, float, str, st
             i += 1 + count
             continue
         seconds, names = _seconds(file, i, line[:26]), ""
+        # The list of satellites wraps: three characters each, in the columns 33 to 68 of one or more lines.
         more = max(1, -(-count // _WRAPPED["satellites"]))
         for k in range(i, i + more):
             names += file.line(k)[32:68].ljust(36)

@@ -128,7 +128,8 @@ def write_satellites(
     """Write positions and velocities of satellites at the times of measurements, as a table of stations in ECEF.
 
     `source` has the orbits and `times` the measurements. `stated` has the stated columns by role. `stations` has fixed
-    stations, which are added at each time.
+    stations, which are added at each time with zero velocity; None for no fixed stations. If the measurements name
+    satellites, each satellite is written at its own times. Otherwise all satellites are written at all times.
     """
     if times is None:
         advice = "give the table of the measurements with --times; it needs times, and may have satellites"

@@ -150,6 +150,7 @@ def survey(section: StationsTable, table: Table, frame_table: FrameTable, where:
         if frame.geodetic and frame_table.kind == "geodetic":
             velocity = np.einsum("nij,ni->nj", frame.enu_axes(position), velocity)
     axes = _axes(section, table, frame, position)
+    # standard deviations of the positions, and of the velocities
     sigma, of_rates = (_sigma(section, table, where, key) for key in ("sigma", "velocity_sigma"))
     return Survey(names, index, position, velocity, axes, sigma, of_rates, table), frame
 
@@ -199,7 +200,10 @@ def _dimension(wanted: FrameTable, frame: Frame, where: str) -> int:
 
 
 def _frame(wanted: FrameTable, where: str) -> Frame:
-    """Return the frame that a file states; raise InvalidProblem for a missing or superfluous origin."""
+    """Return the frame that a file states; raise InvalidProblem for a missing or superfluous origin.
+
+    `wanted` is the table ``[frame]``, and `where` the place of the stations for messages.
+    """
     place = wanted.origin
     if wanted.kind == "enu" and place is not None:
         return Frame.enu(lat_deg=place.lat_deg, lon_deg=place.lon_deg, height=place.height)

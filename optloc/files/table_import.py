@@ -437,7 +437,7 @@ def unused_measurement(column: str, lengths: bool = False) -> str | None:
 
 
 def unit_for(column: str, form: Form, hints: ColumnHints, values: Decimals, where: str) -> tuple[str, str]:
-    """Return the unit of a column and a note; raise InvalidProblem if the unit is unknown.
+    """Return the unit of a column and a note (empty without one); raise InvalidProblem if the unit is unknown.
 
     The unit comes from the option `--unit`, from the column name, or for angles from the size of `values`.
     """

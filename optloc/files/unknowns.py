@@ -334,6 +334,7 @@ def prior_of(table: PriorTable, dimension: int, source: str) -> Prior:
         raise InvalidProblem(
             f"the mean has {len(table.mean)} coordinates, not {size}", where, "give one number for each coordinate"
         )
+    # A list is in the unit of the mean; a single value may be text with another unit, and is converted to SI here.
     sigmas = table.sigma if isinstance(table.sigma, list) else [units.plain(table.sigma, unit, where)] * size
     sigma = np.array(sigmas) * (units.conversion(unit, where).factor if isinstance(table.sigma, list) else 1.0)
     if len(sigma) != size or (sigma <= 0.0).any():

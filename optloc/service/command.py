@@ -205,7 +205,11 @@ def serve(
 
 
 def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str, form: str) -> dict[str, Any]:
-    """Return the values of options as arguments of `optloc.service.stream.Settings`; times in seconds."""
+    """Return the values of options as arguments of `optloc.service.stream.Settings`; times in seconds.
+
+    `wait` and `deadline` are texts with a unit. `late` is "drop" or "revise", and `part` a text such as "1/4". A
+    deadline of None is decided later: it depends on the source.
+    """
     from optloc.service.answers import FORMATS
     from optloc.service.engine import PHASES
 

@@ -60,6 +60,7 @@ def _epochs(made: Draft) -> Iterator[Recorded]:
     epoch = loaded.problem.epoch
     for chunk, number in zip(made.chunks, made.numbers, strict=True):
         section = made.file.measurements[next(i for i, table in enumerate(made.tables) if table is chunk.table)]
+        # `count` is the number of stations of a row
         z, count = chunk.table.numbers("z", optional=True), MODELS[chunk.kind].stations
         sigma = chunk.table.numbers("sigma") if chunk.table.has("sigma") else None
         # The reader exchanged the stations of reversed differences. The values of the file need their original order.

@@ -112,6 +112,7 @@ class Ready:
         v) are the other rows, in their units.
         """
         z = np.zeros((len(values), self.count))
+        # A difference is the first arrival minus the second. Nothing is subtracted from a time of arrival.
         less = np.where(self.second >= 0, arrivals[:, self.second], 0.0) if len(self.row) else 0.0
         z[:, self.row] = self.scale * (arrivals[:, self.first] - less)
         for column, row, unit, more in self.stated:
