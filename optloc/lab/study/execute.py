@@ -88,7 +88,8 @@ def run_design(
     by : Executor
         Executor of the tasks.
     tell : callable, optional
-        Called after every part, and first with the existing parts.
+        Called with the number of new rows and their numbers by status: first for the existing parts, then after every
+        part.
     say : callable
         Called with a sentence for each damaged part, which is then computed again.
 
@@ -235,6 +236,7 @@ class _Work:
         trial, and a task of an abandoned cell, gets the failure in its rows.
         """
         chunk, cell = task.chunk, task.chunk.cell.key
+        # `_lost` sums the failures of a cell, in time limits of a whole chunk.
         if cell not in self._given_up:
             self._lost[cell] = self._lost.get(cell, 0.0) + (task.share if lost.status == LATE else _DEATH)
             if self._lost[cell] >= _PATIENCE:

@@ -180,6 +180,7 @@ def begin(design: StudyDesign, folder: Path) -> StudyManifest:
     if (folder / MANIFEST).exists():
         before = read_manifest(folder)
         same = before.fingerprint == wanted.fingerprint and wanted.chunks.keys() <= before.chunks.keys()
+        # `joined` returns None if the data differ. Then the manifest is `wanted` itself, which is an error here.
         manifest = before if same else joined(before, wanted) or wanted
         if manifest is wanted:
             what = f"the folder contains another study ({before.name!r}, or other trials, seed or settings)"

@@ -199,6 +199,7 @@ def _block(case: Case, number: int, n: int) -> tuple[Array, Array, Array, Array,
             stations = place_stations(table.layout, case.where, rng, n)
         problem = _with_stations(problem, stations)
     true_problem, injected = add_injected_errors(problem, table, case.where)
+    # `names` are the names of the position and, if the target moves, of the velocity.
     place, names = join(case.where, "truth"), case.state
     # The order of these draws decides the data, like the seed.
     values = {names[0]: place_targets(table.truth, problem.frame, stations, place, rng)}

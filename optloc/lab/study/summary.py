@@ -173,7 +173,7 @@ def cells(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _cell(part: pd.DataFrame) -> dict[str, Any]:
-    """Return the statistics of the rows of one cell, by the column names of `cells`."""
+    """Return the statistics of the judged rows of one cell, by the column names of `cells`; NaN without a value."""
     accurate = accuracy_rows(part)
     error, bound, deviation = (part[n].to_numpy(dtype=float)[accurate] for n in ("error", "crlb", "deviation"))
     ratio, half = over_bound(error, bound)
