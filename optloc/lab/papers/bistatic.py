@@ -217,7 +217,7 @@ def run_batches(
     sequence : SeedSequence
         Seed of the draws.
     path : float
-        Standard deviation of the excess path, metres.
+        Standard deviation of a measured excess path, metres.
     whole : int, optional
         Number of epochs drawn, so that shorter records are the first parts of longer ones.
     """

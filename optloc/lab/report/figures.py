@@ -95,7 +95,7 @@ def accuracy(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
             ratio, half = selected["ratio"].to_numpy(dtype=float), selected["ratio_half"].to_numpy(dtype=float)
             if not np.isfinite(ratio).any():
                 continue
-            # On a logarithmic axis a bar must end above zero.
+            # On a logarithmic axis a bar must end above zero. The half width is NaN for a single trial.
             low = np.minimum(np.nan_to_num(half), 0.9 * ratio)
             _line(axes, mark, x, ratio, marker=True)
             axes.errorbar(x, ratio, yerr=[low, np.nan_to_num(half)], fmt="none", ecolor=mark.colour, lw=0.8, capsize=2)
@@ -273,6 +273,7 @@ def history_picture(result: Histories, looks: Looks) -> Figure:
     for axes, (by, label) in zip(panel_axes, COUNTS.items(), strict=True):
         for name, width in zip(result.methods, np.linspace(*_WIDTHS, len(result.methods)), strict=True):
             counts = result.frame.loc[result.frame["method"] == name, by].to_numpy(dtype=float)
+            # The method does not have this count.
             if np.isnan(counts).any():
                 continue
             at = np.unique(counts)

@@ -512,6 +512,7 @@ def with_gap(table: Any) -> Any:
     """
     import pyarrow as pa
 
+    # A trial has the same digest `data` and number `trial` in the rows of all methods.
     cells = table["data"].combine_chunks()
     data = np.asarray(cells.indices) if len(table) else np.zeros(0, dtype=np.int64)
     trial, cost = np.asarray(table["trial"]), np.asarray(table["cost"], dtype=float)

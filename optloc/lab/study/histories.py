@@ -150,7 +150,7 @@ def histories(trials: Trials) -> Histories:
     if not traces:
         reason = remarks[0] if remarks else "there is no method"
         raise InvalidProblem(f"no method has a history ({reason})", trials.title, "name a minimizer with --method")
-    # A history may reach a cost below the lowest known cost. `fmin` ignores NaN, which marks a trial without such a cost.
+    # A history may reach a cost below the lowest known cost. `fmin` ignores NaN, the mark of an unknown cost.
     least = np.array(trials.least, dtype=float)
     for of_method in traces.values():
         least = np.fmin(least, [np.min(trace.cost, initial=np.inf) for trace in of_method])

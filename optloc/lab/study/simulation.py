@@ -158,6 +158,7 @@ def block_size(case: Case) -> int:
 
 def draw(case: Case, first: int, count: int) -> DrawnCase:
     """Return `count` trials of a case, from the trial `first` on; they do not depend on other draws."""
+    # Draw whole blocks, then select the wanted trials. So a trial does not depend on `first` and `count`.
     per_block = block_size(case)
     blocks = range(first // per_block, -(-(first + count) // per_block))
     parts = [_block(case, number, per_block) for number in blocks]
@@ -456,10 +457,14 @@ def _biases(case: Case, bias: Bias, rng: Rng, n: int) -> Array:
 
 
 def _bias_value(case: Case, bias: Bias, value: Amount, where: str) -> float:
-    """Return a value of a bias in SI units; an offset has the unit of its rows, a boresight is an angle."""
+    """Return a value of a bias in SI units; an offset has the unit of its rows, a boresight is an angle.
+
+    `value` is a number in SI units, or a text with a unit and perhaps a sign.
+    """
     if isinstance(value, int | float):
         return float(value)
     form = form_of(bias)
+    # No quantity means an offset: its kind is the kind of the first row that it affects.
     if form.quantity is None and not form.rate:
         starts = np.array(case.template.starts)
         kind = case.template.rows[int(np.searchsorted(starts, bias.row[0], side="right")) - 1].kind
