@@ -229,8 +229,8 @@ def run_batches(
     fix = solve(run, "lsr", start=course.reshape(trials, 6))
     last = np.array([epochs])
     return {
-        "pseudo-linear course": _errors(course[:, None, 0], True, last),
-        "batch maximum likelihood": _errors(fix.position[:, None], True, last),
+        "pseudo-linear course": _errors(course[:, None, 0], slow=True, epochs=last),
+        "batch maximum likelihood": _errors(fix.position[:, None], slow=True, epochs=last),
     }
 
 

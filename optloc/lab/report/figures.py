@@ -179,7 +179,7 @@ def distributions(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
             selected = part[part["method"] == mark.name]
             if len(selected):
                 values = selected["deviation"].to_numpy(dtype=float)[accuracy_rows(selected)]
-                # Zero has no logarithm, and the axis begins at a tenth.
+                # Zero has no logarithm; 0.01 is below the axis, which begins at 0.1.
                 _line(axes, mark, *distribution(np.maximum(values, 1e-2), len(selected)), marker=False, steps=True)
         x = np.geomspace(0.1, 10.0, 120)
         # The squared error of an efficient estimate in units of its bound has a chi-square distribution.

@@ -354,6 +354,7 @@ def _template(table: ScenarioTable, folder: Path, where: str, seed: int) -> Prob
     if table.layout is not None:
         return _problem_of_layout(table, where, seed)
     assert table.problem is not None
+    # With values=False, the problem file needs no measured values.
     shipped = files("optloc") / "scenarios"
     names = sorted(entry.name.removesuffix(".toml") for entry in shipped.iterdir() if entry.name.endswith(".toml"))
     path = within(folder, table.problem, join(where, "problem"))

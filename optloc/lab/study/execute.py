@@ -144,8 +144,8 @@ def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[TrialPart]:
                 for result in _parallel(work.hand_out(), running):
                     yield from work.take(result)
             except running.deaths:
-                # A cluster has lost several workers. The chunks that they had are computed here, the others on the
-                # cluster.
+                # A cluster has lost several workers. Their chunks are computed in a process of this machine, the others
+                # on the cluster.
                 for task in list(work.running.values()):
                     yield from work.take(local.compute(task.chunk, by.limit))
 

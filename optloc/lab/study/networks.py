@@ -290,6 +290,7 @@ def refined(network: Network, starts: NetworkEstimate) -> NetworkResult:
     if not np.isfinite(cost).any():
         return NetworkResult(Status.NUMERICAL, "No start led to a network.", *missing, np.nan, 0)
     best = minima.take(np.array([int(np.nanargmin(cost))]))
+    # `free` is the number of motions of the frame: they change no predicted arrival, so they use no row.
     covariance, free = _covariance(network, best)
     dof = network.rows - network.unknowns + free
     if not np.isfinite(covariance).all():
@@ -416,6 +417,7 @@ def _result_columns(result: NetworkResult, network: Network, truth: NetworkEstim
     # A covariance belongs to the frame of its network. So the error for `nees` is computed in the frame of the result,
     # and the error for `deviation` in the frame of the truth.
     error_in_result_frame = distances_apart(truth.stations[0], result.stations)
+    # The arrivals do not determine a common offset of all clocks. The standard deviation in `error_bias` removes it.
     return {
         "status": result.status.label,
         "reason": result.reason,

@@ -464,7 +464,7 @@ def _bias_value(case: Case, bias: Bias, value: Amount, where: str) -> float:
     if isinstance(value, int | float):
         return float(value)
     form = form_of(bias)
-    # No quantity means an offset: its kind is the kind of the first row that it affects.
+    # The value has the quantity of the rows: its unit is a unit of the kind of the first row that the bias affects.
     if form.quantity is None and not form.rate:
         starts = np.array(case.template.starts)
         kind = case.template.rows[int(np.searchsorted(starts, bias.row[0], side="right")) - 1].kind

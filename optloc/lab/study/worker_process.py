@@ -109,7 +109,10 @@ class WorkerProcess:
         return reply
 
     def end(self, seconds: float = 0.0) -> str:
-        """Kill the process and its children, after at most `seconds`, and return its exit code as text."""
+        """Kill the process and its children, and return its exit code as text.
+
+        First wait at most `seconds` until the process ends without a signal, because a killed process has another code.
+        """
         with self._ended:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(seconds)
@@ -183,6 +186,7 @@ class WorkerPool:
         except EOFError as error:
             return Lost(chunk.key, DIED, str(error))
         finally:
+            # A living worker becomes idle, and a dead one is removed.
             with self._lock:
                 (self._idle.append if worker.lives() else self._all.discard)(worker)
 
