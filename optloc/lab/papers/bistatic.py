@@ -529,7 +529,7 @@ _SIZES: dict[Size, BistaticSample] = {"quick": BistaticSample(1000, 150, 200), "
 
 
 def _run(sample: BistaticSample, seed: int, tick: Tick) -> Report:
-    """Run all simulations of the paper, and return the report."""
+    """Return the report of all simulations with the sizes `sample`; call `tick` after each simulation."""
 
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))

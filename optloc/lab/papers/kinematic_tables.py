@@ -323,7 +323,7 @@ _WORK = 11  # calls of `tick` below
 
 
 def _run(sample: KinematicSample, seed: int, tick: Tick) -> Report:
-    """Run all simulations of the paper, and return the report."""
+    """Return the report of all simulations with the sizes `sample`; call `tick` after each simulation."""
     scene = KinematicScenario()
 
     def done(value: T) -> T:

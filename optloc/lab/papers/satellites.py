@@ -548,7 +548,7 @@ _SIZES: dict[Size, SatellitesSample] = {"quick": SatellitesSample(200, 100), "fu
 
 
 def _run(sample: SatellitesSample, seed: int, tick: Tick) -> Report:
-    """Run all simulations of the paper, and return the report."""
+    """Return the report of all simulations with the sizes `sample`; call `tick` after each simulation."""
 
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))

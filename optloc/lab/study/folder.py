@@ -124,6 +124,7 @@ def joined(existing: StudyManifest, wanted: StudyManifest) -> StudyManifest | No
         return None
     names = set(wanted.methods.values())
     kept = {key: name for key, name in existing.methods.items() if name not in names}
+    # The key of a chunk begins with the key of its cell.
     chunks = {key: count for key, count in existing.chunks.items() if key.partition("-")[0] in kept}
     return replace(existing, chunks=chunks | wanted.chunks, methods=kept | wanted.methods)
 

@@ -385,6 +385,7 @@ def _joined(parts: Sequence[ConvergenceTrace]) -> ConvergenceTrace:
     for part in parts[1:]:
         last_counts = [values[-1] if len(values) else 0.0 for values in joined[1:]]
         shifted = [values + offset for values, offset in zip(part[1:], last_counts, strict=True)]
+        # Costs are joined as they are; counts that are NaN stay NaN.
         joined = ConvergenceTrace(*(np.concatenate(pair) for pair in zip(joined, (part.cost, *shifted), strict=True)))
     return joined
 
@@ -416,6 +417,7 @@ def _least_squares(problem: Problem, pool: Pool, choice: Choice, *, damped: bool
 
     `limit` is the greatest number of steps. `choice` is not used: all recorders of `_STAGES` have it.
     """
+    # `item` (m,) is the trial of each candidate, and `slot` (m,) its place in the pool.
     item, slot = pool.occupied
     x = pool.x[item, slot]
     run = partial(refine, problem, x, item=item, damped=damped)

@@ -307,6 +307,7 @@ def _covariance(network: Network, estimate: NetworkEstimate) -> tuple[Array, int
     The covariance is given in the frame of all stations, and is NaN if the arrivals do not determine the network. The
     motions are the rigid motions and clock shifts that no arrival measures; they add to the degrees of freedom.
     """
+    # `free` are the motions of the frame. `open` are other motions that change no arrival: then no covariance exists.
     frame = determined(likelihood(network), estimate)
     p, free = frame.jacobian.shape[1], frame.free.shape[1]
     if not frame.open.shape[1]:
