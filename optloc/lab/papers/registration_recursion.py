@@ -62,8 +62,7 @@ def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Arr
 
     The step uses the sums of eq. 11 and 12 over the epochs. The covariance R of an epoch is proportional to I + 11', so
     its inverse removes the mean of each epoch from the arrivals. Elimination of the unknown biases removes the mean of
-    each channel over the run. The sums contain only products of what remains. The step is NaN if the equations are
-    singular.
+    each channel over the run. The sums are computed from the remainders. The step is NaN if the equations are singular.
 
     Parameters
     ----------

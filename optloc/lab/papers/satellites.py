@@ -359,7 +359,8 @@ def metres(value: float) -> str:
 def table_fixed(found: Mapping[str, SatelliteRun], bound: Array) -> TextTable:
     """Return the table of filters that start from fixes; `bound` (steps,) is the posterior bound, metres.
 
-    `found` has the runs by filter. The last column is the largest distance of the estimates from those of the EKF.
+    `found` has the runs by filter. The last column is the largest distance of the estimates from the estimates of
+    the EKF.
     """
     steps = [step for step in _STEPS if step <= len(bound)]
     plain = found["ekf"].position

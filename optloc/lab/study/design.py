@@ -88,7 +88,7 @@ class Cell:
         method, case = self.method, self.case
         if method.chunk is not None:
             return method.chunk
-        # Most trials, most simulated numbers, and least trials of a chunk.
+        # Most trials, most measurements, and fewest trials of a chunk.
         longest, numbers, least = (
             (_SLOW, _NUMBERS // _SLOWER, _LEAST) if method.slow else (_FAST, _NUMBERS, _LEAST_FAST)
         )
