@@ -437,8 +437,8 @@ def whole_track_errors(drawn: AnglesDraw, tick: Tick) -> list[tuple[str, Array]]
     """Return the errors (3,) at the end of simulation 1, by method.
 
     The methods are three fits to the whole track in closed form, the most likely track, and the filter with two values
-    of a_max. a_max is the largest acceleration of the filter's model in m/s^2. The errors are root mean squares over trials of position,
-    velocity and acceleration, SI units. The function calls `tick` at its end.
+    of a_max. a_max is the largest acceleration of the filter's model in m/s^2. The errors are root mean squares over
+    trials of position, velocity and acceleration, SI units. The function calls `tick` at its end.
     """
     problem = replace(drawn.problem, motions=(Motion(2, reference=float(STRAIGHT.epochs)),))
     true_state, scale_of_order = (

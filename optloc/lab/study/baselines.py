@@ -185,7 +185,7 @@ def least_squares(problem: Problem, start: Array, limit: int = _EVALUATIONS) -> 
     from scipy import optimize
 
     began = perf_counter()
-    # Shape (N, 1, size): one candidate for each problem. Cost and code are those of a failure, until a run succeeds.
+    # Shape (N, 1, size): one candidate for each problem. Cost and code mark a failure until a run succeeds.
     pool = np.array(start, dtype=float)[:, None]
     cost, code = np.full(pool.shape[:2], np.inf), np.full(pool.shape[:2], int(Status.NUMERICAL), dtype=np.int8)
     for _ in range(weighings(problem)):
