@@ -152,7 +152,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
     alone = separable(problem)
     batch = _apart(problem, alone)
     redundancy = degrees_of_freedom(batch)
-    parts = _components(problem)
+    parts = _components(problem)  # number of connected groups of stations in each epoch
     flattest, widest = _spread(_station_positions(problem, alone))
     # If epochs are fixed separately, report the epoch whose stations are closest to a line or plane.
     worst = int(np.argmin(flattest / widest))
@@ -207,6 +207,7 @@ def _bias(loaded: Loaded, bias: Bias) -> str:
     )
     if bias.density is not None:
         # the drift after one second is easier to judge than a spectral density
+        # column 0 of `density` is the density of the value, a further column the density of its rate
         ends = np.sqrt([bias.density[:, 0].min(), bias.density[:, 0].max()])
         drift = " to ".join(dict.fromkeys(f"{v:.3g}" for v in ends))
         names += f", {drift} {slot.unit} after a second" + (", rates walk too" if bias.density.shape[1] > 1 else "")
@@ -237,12 +238,13 @@ def _components(problem: Problem) -> Array:
         # Differences and ratios connect two stations; ranges, angles and sums of ranges do not.
         if MODELS[block.kind].stations == 2 and (ranges is None or sum(ranges) == 0):
             present = block.weight > 0.0
-            # One graph holds all epochs: station i of epoch k is node k s + i.
+            # One graph holds all epochs: its vertex with the number e s + i is station i in epoch e.
             ends.append(np.stack([block.epoch * s + block.a, block.epoch * s + block.b])[:, present])
     edges = np.concatenate(ends, axis=-1) if ends else np.zeros((2, 0), dtype=int)
     graph = coo_array((np.ones(edges.shape[1]), (edges[0], edges[1])), shape=(k * s, k * s))
     _, label = connected_components(graph, directed=False)
     touched = np.unique(edges)
+    # distinct pairs of an epoch and a connected group in it
     pairs = np.unique(np.stack([touched // s, label[touched]]), axis=1)
     return np.bincount(pairs[0], minlength=k)
 
@@ -314,6 +316,7 @@ def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
     `method` is the method of the fixes, and `by` groups the errors. Raise InvalidProblem if no epoch has a fix.
     """
     batch, alone = batch_of(loaded.problem), separable(loaded.problem)
+    # Without unknowns (known targets, no biases), there is nothing to fix: parameter vectors are empty.
     if not batch.layout.size:
         count = batch.batch_shape[0]
         return Checked(health_of(batch, (np.arange(count), np.zeros((count, 0))), by))

@@ -224,6 +224,7 @@ def make(tell: Callable[[int, int], None] = lambda done, total: None) -> list[st
     kernels are on disk at the end.
     """
     names = [name for name, part in parts().items() if part.missing()]
+    # `known` has all functions of each part, and `done` the compiled functions of all parts.
     known, done, lock = dict[str, set[str]](), set[str](), Lock()
 
     def follow(name: str) -> None:

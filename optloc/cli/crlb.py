@@ -58,7 +58,11 @@ def run_crlb(
     plot: Path | None = None,
     quiet: bool = False,
 ) -> int:
-    """Print the Cramer-Rao bound at a true position or at the fix, draw it against time, and return the exit code."""
+    """Print the Cramer-Rao bound at a true position or at the fix, and draw it against time in the file `plot`.
+
+    The exit code is 1 if no unknown has a bound, or a standard deviation is not finite. `as_json` prints JSON, and
+    `quiet` prints nothing.
+    """
     from optloc.bounds.cramer_rao import crlb
 
     loaded = read(file, values=False)
@@ -175,6 +179,7 @@ def reliability_of(problem: Problem, x: Array, suspects: Sequence[Suspect] = ())
     items = np.flatnonzero(np.isfinite(places).all(-1))
     # evenly spaced epochs suffice: the geometry of a run changes slowly
     items = items[np.unique(np.linspace(0, len(items) - 1, min(len(items), _MAX_EPOCHS)).astype(int))]
+    # by station and kind, over the epochs: the largest value of `least`, SI units, and of `shift`, m
     worst: dict[str, tuple[float, float]] = {}
     for i in items:
         found = reliability(flat.take(np.array([i])), places[i], suspects)
@@ -292,6 +297,7 @@ def _course_table(course: Course, known: Course | None, loaded: Loaded) -> Table
         table.add_column(name, justify="right")
     values: list[Array] = []
     for slot in (course.layout.find(name)[0] for name in _shown_unknowns(course.layout)):
+        # `size` is the size of the unit in SI units; it is negative if the unit reverses the sign.
         unit, size = loaded.bias_unit(slot.name, slot.unit)
         table.add_column(f"{slot.name}{_RMS[bool(slot.members)]}, {unit}".rstrip(", "), justify="right")
         values.append(course.total(slot.name) / (abs(size) * np.sqrt(slot.size if slot.members else 1)))
@@ -348,7 +354,8 @@ def _grid(
 ) -> tuple[tuple[Array, Array], float]:
     """Return the coordinates (points,) of a map along both sides, and the height of the map, m.
 
-    The coordinates are in degrees on Earth, else in metres.
+    The coordinates are in degrees on Earth, else in metres. Of a problem in space, the map is a horizontal plane. Its
+    height is `height`, or the height of the stated position or of the fix.
     """
     place = _place(file, problem, at, truth, needed=height is None and problem.dimension == 3)
     x0, x1, y0, y1 = extent(problem, place) if limits is None else _limits(limits, problem)
@@ -358,7 +365,8 @@ def _grid(
 def _place(file: Path, problem: Problem, at: str | None, truth: Array, *, needed: bool) -> Array | None:
     """Return the position (1, d) that the user states, m, or the fix; None if no position is needed.
 
-    `truth` (size,) has the stated position. Raise InvalidProblem if the file has no fix.
+    `truth` (size,) has the stated position. With several unknown targets, the stated position is not used. `needed` is
+    whether the file is fixed without a stated position. Raise InvalidProblem if the file has no fix.
     """
     sought = [i for i, motion in enumerate(problem.motions) if motion.known is None]
     positions = [slot for slot in problem.layout.shared if slot.name.partition("[")[0] == "position"]
@@ -552,6 +560,8 @@ def vector(problem: Problem, position: str | None, velocity: str | None, geodeti
     # All targets get the same position and velocity.
     values = {"position": place, "velocity": None if velocity is None else coordinates(velocity, "--velocity")}
     layout = problem.layout
+    # `shared` has the unknowns of all epochs together, `local` the unknowns of each epoch. A slot is the place of an
+    # unknown in one of them.
     shared, local = np.zeros(layout.n_shared), np.zeros((problem.epochs, layout.n_local))
     for i, motion in enumerate(problem.motions):
         if motion.known is not None:

@@ -94,7 +94,10 @@ def machine() -> dict[str, Any]:
 
 
 def machine_code() -> dict[str, Any]:
-    """Return the folder of the machine code, its processor, and the parts on disk."""
+    """Return the folder of the machine code, its processor, and the parts on disk.
+
+    The folder is None if none can be used. Without numba, there are no parts. "parts" has True for a part on disk.
+    """
     from optloc.kernels.jit import enabled
 
     if not enabled():

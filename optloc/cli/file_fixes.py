@@ -88,11 +88,14 @@ def fix_file(loaded: Loaded, method: str, quiet: bool) -> FileFixes:
 
 
 def fix_epochs(loaded: Loaded, method: str, quiet: bool) -> tuple[Fix, bool]:
-    """Return the fixes of separate epochs in the order of the epochs, and whether weights of rows changed."""
+    """Return the fixes of separate epochs in the order of the epochs, and whether weights of rows changed.
+
+    `method` is the method as in `optloc.solve`. `quiet` hides the progress bar.
+    """
     from optloc.solvers.methods import is_quick
     from optloc.solvers.solution import solve
 
-    reweighted, order, stages = False, [], {}
+    reweighted, order, stages = False, [], {}  # `order` has the epoch numbers of the fixes, in the order of the fixes
 
     def parts() -> Iterator[Fix]:
         """Yield the fixes of batches of epochs with equal structure, with their labels."""
@@ -191,7 +194,10 @@ def table_json(loaded: Loaded) -> dict[str, Any]:
 
 
 def fixes_json(found: FileFixes) -> dict[str, Any]:
-    """Return all fixes of a file as one JSON value; lengths in metres, angles in degrees."""
+    """Return all fixes of a file as one JSON value; lengths in metres, angles in degrees.
+
+    The entries of "fixes" are the rows of the table `found.columns`, one for each epoch and target.
+    """
     from optloc.uncertainty.radii import accuracy
 
     frame, rows = found.loaded.problem.frame, records(found.columns)

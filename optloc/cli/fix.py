@@ -90,9 +90,12 @@ def run_fix(
 ) -> int:
     """Fix a problem file or a table under more constraints, write and print the result, and return the exit code.
 
-    `more` has the constraints by the name of their option. `noise`, `rescale`, `late` and `explain` are options that
-    estimate the noise and the causes of misfits. `allow` has the statuses that give exit code 0 as well as ok. `table`
-    has the column hints of a table; None for a problem file.
+    `more` has the constraints by the name of their option. `as_json` prints JSON, and `quiet` prints nothing. `out`,
+    `geojson_path`, `plot` and `html` are the files to write: results, GeoJSON, picture and page; None for no file.
+    `allow` has the statuses that give exit code 0 as well as ok. `table` has the column hints of a table; None for a
+    problem file. Four options estimate the noise and the causes of misfits. `noise` is the grouping of
+    `--noise-from-data`, and None leaves the noise as stated. `rescale` applies one common factor to the stated noise.
+    `late` fixes with a loss for late rows, and `explain` fixes again with the most likely systematic error.
     """
     on_output = geojson_path is not None and str(geojson_path) == "-"
     if as_json and on_output:
@@ -106,6 +109,7 @@ def run_fix(
         loaded = replace(loaded, problem=rescaled.scale(loaded.problem))
     signals = late_signals(loaded.problem) if late else None
     found = fix_file(loaded, signals.method if signals is not None and signals.share else method, quiet or as_json)
+    # The table of results has a row for each epoch and target. Add the late rows only if each fix is one row.
     if signals is not None and len(signals.late) == len(found.columns["x"]):
         found.columns.update(late_rows=signals.late, on_late_rows=signals.carried)
     levels = found.loaded.levels
@@ -304,7 +308,8 @@ def tell_level(
 ) -> tuple[str, ...]:
     """Return sentences on the stated noise and on late rows, each with the option that helps.
 
-    `used` and `late_used` are whether the fixes already use the common factor, and the loss for late rows.
+    `level` is the common factor of the stated noise, and `late` has the late rows; None without an estimate. `used` is
+    whether the fixes already use the common factor. `late_used` is whether they use the loss for late rows.
     """
     texts = []
     if late is not None and late.sentence:
@@ -341,6 +346,7 @@ def grouping_of(by: str, where: str) -> By:
 
 def _levels_json(levels: NoiseLevels) -> dict[str, Any]:
     """Return noise levels as a JSON value, SI units."""
+    # `low` and `high` of the levels are factors of the stated standard deviations.
     columns: Columns = {"name": np.array(levels.names), "sigma": levels.sigma, "sigma_error": levels.sigma_error}
     columns |= {"low": levels.low * levels.stated, "high": levels.high * levels.stated}
     columns |= {
@@ -440,11 +446,12 @@ def _show_explained(found: FileFixes, other: FileFixes | None, console: Console)
     if other is None:
         say(console, "No single error explains the misfit.")
         return
-    bias, fix = other.loaded.problem.biases[-1], other.fix
+    bias, fix = other.loaded.problem.biases[-1], other.fix  # the explaining error is the last bias of the problem
     table = Table(title=f"With the {bias.name}", title_justify="left")
     for name in ("", "without it", "with it", "change"):
         table.add_column(name, justify="left" if not name else "right")
     table.add_row("status", Status(int(found.fix.flat().code[0])).label, Status(int(fix.code)).label, "")
+    # Separate epochs have a p-value each, so there is no single value to compare.
     before = "-" if found.apart else as_p(float(found.fix.p_value))
     table.add_row("p", before, as_p(float(fix.p_value)), "")
     rows = min(len(found.columns["x"]), _STATES)

@@ -159,6 +159,7 @@ def takes_table(command: Callable[..., None]) -> Callable[..., None]:
         named = {"columns": columns_of(given["columns"]), "ignore": tuple(given["ignore"] or ())}
         command(**values, given=given | named)
 
+    # typer reads the options from the signature: replace the parameter `given` by one parameter for each table option.
     kept = [entry for entry in command_signature.parameters.values() if entry.name != "given"]
     table_options = [
         Parameter(name, Parameter.KEYWORD_ONLY, default=False if name in _FLAGS else None, annotation=kind)
@@ -313,8 +314,9 @@ def read_problem(
 ) -> Loaded:
     """Return the content of a problem file with more constraints, or of a table with column hints.
 
-    For a table, print its interpretation, unless `quiet`; with `on_error`, print to standard error. `values` requires
-    measured values in a problem file. `hints` has the column hints of a table; it is None for a problem file.
+    For a table, print its interpretation, unless `quiet`; with `on_error`, print to standard error. `more` has further
+    constraints by the name of their option. `values` requires measured values in a problem file. `hints` has the column
+    hints of a table; it is None for a problem file.
     """
     from optloc.files.reader import read
 

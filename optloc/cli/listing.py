@@ -45,6 +45,7 @@ def _print(rows: Rows, console: Console) -> None:
     texts = {name: " ".join([name, *(row.get(name, "") for row in rows)]) for name in names}
     words = {name: max(map(len, text.split())) for name, text in texts.items()}
     least = max(len(row[title]) for row in rows) + sum(words.values()) + 3 * len(names) + 4
+    # Paragraphs: the table needs too many lines for each entry, or is wider than the screen.
     if sum(widths) > _MAX_WRAPS * console.width or least > console.width:
         for row in rows:
             console.print(Text.assemble((row[title], "bold"), f": {row['summary']}"), highlight=False)

@@ -43,7 +43,7 @@ EXIT_CODES = "Exit codes: 0 all statuses are ok or allowed, 1 a status is not ok
 
 def run_process(command: Callable[[], Any]) -> None:
     """Run a command as a whole process and exit; Ctrl-C and a closed pipe end it without a traceback."""
-    code: Any = 0
+    code: Any = 0  # for `sys.exit`: a number or None, or a text
     ignored = signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None)  # as with nohup
     try:
         _prepare()
@@ -97,6 +97,7 @@ _NARROWEST, _WIDEST = 20, 1000
 
 def _prepare() -> None:
     """Set up standard streams and terminal width so that no output can fail."""
+    # The lowest free number is opened: 0, 1 and 2 are the standard streams.
     while (number := os.open(os.devnull, os.O_RDWR)) < 3:
         pass  # occupy the number of a closed stream, so that the next opened file does not get it
     os.close(number)

@@ -158,6 +158,7 @@ def meter(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """Yield a function of the finished and the total steps: a bar on terminals, elsewhere a line every few seconds."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+    # `known` has the latest numbers. On a terminal the bar shows them, so the lines are muted.
     console, known = Screen(stderr=True), [0, 0]
     lines = Reporter(lambda: f"{title}: {known[0]} of about {known[1]}")
     lines.muted = quiet or console.is_terminal

@@ -40,7 +40,11 @@ def _solve_all(request: PictureRequest) -> tuple[Loaded, Problem, Fix]:
 
 
 def _solve_one(request: PictureRequest) -> tuple[Problem, Fix, str]:
-    """Return the problem of one epoch, or of a run, with its fix and a title."""
+    """Return the problem of one epoch, or of a run, with its fix and a title.
+
+    If the epochs of the file share unknowns, the problem is the whole run. Otherwise it is the epoch that `request`
+    names, or the first epoch.
+    """
     from optloc.solvers.solution import solve
 
     loaded = read(request.file)

@@ -77,7 +77,11 @@ def _region(problem: Problem, text: str | None) -> tuple[Any, Any] | None:
 
 
 def _record(loaded: Loaded, found: Emitters) -> dict[str, Any]:
-    """Return the emitters of an epoch as a JSON value: metres, costs as chi-square."""
+    """Return the emitters of an epoch as a JSON value: metres, costs as chi-square.
+
+    A ghost is a position that is not an emitter in the best assignment of rows, but in another assignment with about
+    the same cost.
+    """
     return {
         "status": found.status.label,
         "reason": found.reason,

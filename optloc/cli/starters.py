@@ -74,7 +74,10 @@ def titles() -> dict[str, str]:
 
 
 def run_demo(name: str | None, plot: Path | None, *, as_json: bool, quiet: bool) -> int:
-    """Fix one shipped problem, or walk through three of them, and return the exit code."""
+    """Fix the shipped problem `name`, or three examples if `name` is None, and return the exit code.
+
+    The exit code is 1 if a fix has another status than its problem should give. `plot` is the picture to write.
+    """
     known = shipped_problems()
     if name is not None and name not in known:
         raise InvalidProblem(f"there is no demo {name!r}", "demo", nearest(name, list(known)))
@@ -92,7 +95,10 @@ def run_demo(name: str | None, plot: Path | None, *, as_json: bool, quiet: bool)
 
 
 def _run_examples(plot: Path | None, quiet: bool) -> int:
-    """Fix and explain three shipped problems; return exit code 0 if each has the status in its text."""
+    """Fix and explain three shipped problems; return exit code 0 if each has the status in its text.
+
+    The first fix is drawn: in the file `plot`, or in the default file if `plot` is None.
+    """
     console = Screen(quiet=quiet)
     code = 0
     for i, (text, name) in enumerate(_SECTIONS):
@@ -215,6 +221,7 @@ def _compose(kind: str, model: Model) -> str:
     from optloc.problem.build import assemble, measured, station_array
 
     names, d = list(_PLACES), max(model.dimensions)
+    # `one` has the stations of the rows: all stations, or all except the first station.
     one = np.arange(len(names)) if model.stations == 1 else np.arange(1, len(names))
     # Differences refer to the first station. The additional ranges make each kind solvable.
     a, b = (one if model.stations else None), (np.zeros_like(one) if model.stations == 2 else None)
@@ -224,6 +231,7 @@ def _compose(kind: str, model: Model) -> str:
     rows = [measured(kind, a=a, b=b, sigma=sigma), measured("range", a=np.arange(len(names)), sigma=_RANGE_SIGMA)]
     motion = Motion(order=1) if model.velocity else Motion()
     problem = assemble(station_array(place, names), *rows, motions=(motion,))
+    # The parameters are position and velocity; a target that does not move has no velocity. The seed is 1.
     drawn = simulate(problem, np.concatenate([_TRUTH[:d], _SPEED[:d]])[: problem.layout.size], 1)
     lines = [
         f"# {kind}: {model.summary}.",

@@ -209,7 +209,7 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
         target = np.concatenate([rows.target for rows in problem.rows])
         kept = target_of_row == name if target_of_row is not None else target == i
         epochs = np.unique(problem.epoch[kept])
-        again = np.flatnonzero(np.diff(loaded.times[epochs]) <= 0.0)
+        again = np.flatnonzero(np.diff(loaded.times[epochs]) <= 0.0)  # epochs are sorted, so a difference is 0 or more
         if len(again):
             one, two = (loaded.epochs[epochs[again[0] + j]] for j in (0, 1))
             what = f"the epochs {one!r} and {two!r} of {name} have the same time"
@@ -217,6 +217,7 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
         # A file without times has one epoch, so any time serves.
         times = loaded.times if np.isfinite(loaded.times).all() else problem.times
         run = alone(problem, kept, times)
+        # Arrival times depend on an unknown emission time; their differences do not.
         run = differences(run) if run.emitting else run
         if not run.count:
             what = f"each epoch of {name} has one arrival, which has no information without its emission time"
@@ -225,7 +226,10 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
 
 
 def _start(problem: Problem, dynamics: Dynamics, wanted: TrackOptions) -> State | None:
-    """Return the initial state of the options, SI; None without an initial state."""
+    """Return the initial state of the options, SI; None without an initial state.
+
+    The state has position, and velocity and acceleration if the model `dynamics` has them.
+    """
     if (wanted.start is None) != (wanted.sigma is None):
         lacking = "--start" if wanted.start is None else "--start-sigma"
         raise InvalidProblem("an initial state needs numbers and standard deviations", lacking, "give both or neither")

@@ -37,6 +37,7 @@ def run_wheel(out: Path, *, quiet: bool = False) -> int:
     """Compile all kernels for a common processor, pack them as a wheel and print its path; return the exit code."""
     if not enabled():
         raise InvalidProblem("numba is not installed, or disabled", "--wheel", "install or enable numba")
+    # If no processor is chosen yet, run this command again in a new process for the common processor.
     chosen = _COMMON.get(machine())
     if not is_chosen() and chosen is not None:
         # numba reads the processor at import, so a new process is needed

@@ -70,13 +70,15 @@ def orbit(one: Ephemeris, system: str, t: Array) -> tuple[Array, Array]:
     gm, a, since = _GM[system], one.root_a**2, t - one.toe
     mean = one.m0 + (np.sqrt(gm / a**3) + one.delta_n) * since
     anomaly = mean + one.e * np.sin(mean)
-    for _ in range(_STEPS):
+    for _ in range(_STEPS):  # Newton's method for Kepler's equation: eccentric anomaly from mean anomaly
         anomaly = anomaly - (anomaly - one.e * np.sin(anomaly) - mean) / (1.0 - one.e * np.cos(anomaly))
     latitude = np.arctan2(np.sqrt(1.0 - one.e**2) * np.sin(anomaly), np.cos(anomaly) - one.e) + one.omega
+    # Harmonic corrections: u is the argument of latitude, r the radius, and tilt the inclination of the orbit.
     sine, cosine = np.sin(2.0 * latitude), np.cos(2.0 * latitude)
     u = latitude + one.cus * sine + one.cuc * cosine
     r = a * (1.0 - one.e * np.cos(anomaly)) + one.crs * sine + one.crc * cosine
     tilt = one.i0 + one.cis * sine + one.cic * cosine + one.idot * since
+    # Longitude of the ascending node, from which u counts, in axes that rotate with the Earth.
     node = one.omega0 + (one.omega_dot - EARTH_RATE) * since - EARTH_RATE * (one.toe - one.week)
     along, across = r * np.cos(u), r * np.sin(u)
     position = np.stack(

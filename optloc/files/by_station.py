@@ -56,8 +56,8 @@ class StationValues(NamedTuple):
 def station_values(word: str, given: Any, names: Sequence[str], reference: str | None) -> StationValues:
     """Return the values of an argument `given`, with the numbers of the stations of each value as keys.
 
-    A key is (station, -1), or a pair of numbers for time differences. `word` is the name of the argument. Values of the
-    reference station relative to itself are left out. Raise InvalidProblem for other forms of values.
+    A key is (station, -1), or a pair of numbers for time differences. `reference` None means the first station. Values
+    of the reference station relative to itself are left out. Raise InvalidProblem for other forms of values.
     """
     if reference is not None and reference not in names:
         raise no_station(reference, "reference", names)
@@ -82,6 +82,7 @@ def station_values(word: str, given: Any, names: Sequence[str], reference: str |
         found = StationValues(np.stack(columns, axis=-1) if columns else np.zeros(0), list(given))
     else:
         values, keys = _numbers(word, given), list(names)
+        # An array of time differences may leave out the reference, whose difference is zero.
         if word == "tdoa" and values.ndim and values.shape[-1] == len(names) - 1:
             keys.remove(first)
         if values.ndim == 0 or values.shape[-1] != len(keys):
@@ -166,6 +167,7 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
     row for each epoch. Raise InvalidProblem for a table without these columns, or with two values of one station.
     """
     columns = list(frame.columns)
+    # `wide` has the columns that are named after stations. If all columns are, the table has one column per station.
     wide = _named(word, columns, names, reference)
     if wide and len(wide) == len(columns):
         return _wide(word, frame, names, reference)
@@ -177,6 +179,7 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
         role: next((stems[each] for each in words if each in stems), None)
         for role, words in (("a", WORDS["a"].split()), ("b", WORDS["b"].split()), ("z", value_words))
     }
+    # A tidy table has one row for each value: columns for station and value, and no other column named after a station.
     tidy = None not in (chosen["a"], chosen["z"]) and {*wide} <= {*chosen.values()}
     if wide and not tidy:
         return _wide(word, frame, names, reference)
@@ -194,6 +197,7 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
     labels = [None] * len(ends) if epochs is None else frame[epochs].tolist()
     keys, rows = ({one: i for i, one in enumerate(dict.fromkeys(each))} for each in (ends, labels))
     values = _numbers(word, frame[chosen["z"]].to_numpy())
+    # Values that the table does not have stay NaN, or NaT (no date) for dates.
     grid = np.full(
         (len(rows), len(keys)),
         np.datetime64("NaT") if values.dtype.kind == "M" else np.nan,

@@ -196,6 +196,7 @@ def _plain_numbers(column: Array) -> NumberColumn | None:
     text = text.filter(pc.invert(nothing))
     if not pc.all(pc.match_substring_regex(text, _PLAIN)).as_py():
         return None
+    # `written` has the number of decimals of each cell, and `units` the digits without the point as an integer.
     point = pc.find_substring(text, ".").to_numpy()
     written = np.where(point < 0, 0, pc.binary_length(text).to_numpy() - point - 1).astype(np.int64)
     try:
@@ -250,6 +251,7 @@ def date_seconds(table: Table, name: str, zone: str | None) -> NumberColumn:
         nanoseconds = column[row].astype("datetime64[ns]").astype(np.int64)
         return NumberColumn(Decimals.scaled(nanoseconds, np.full(len(row), 9)), row)
     cells = ["" if cell is None else str(cell).strip() for cell in column.tolist()]
+    # `filled_rows` have a date, and `bare_rows` a date without a time zone.
     filled_rows = [row for row, cell in enumerate(cells) if cell.lower() not in NOTHING]
     bare_rows = [
         row for row in filled_rows if not _ZONE.search(cells[row].partition("T")[2] or cells[row].partition(" ")[2])

@@ -167,6 +167,7 @@ def _of_table(source: Path, hints: ColumnHints) -> TableProblem:
     table = without_ignored_columns(read_table(source), hints.ignore)
     stated_columns = {role: name for role, name in hints.columns.items() if hints.stations is None or role not in PLACE}
     roles = Roles.of(table, stated_columns)
+    # Arrivals with the name and position of a satellite in each row are pseudoranges.
     satellites = all(roles.find(role) for role in ("toa", "satellite", "x"))
     if (hints.what == "pseudoranges" and roles.find("satellite")) or (hints.what is None and satellites):
         return pseudoranges(source, roles, hints)
@@ -261,6 +262,7 @@ def _plan(
 
     `found` are the sorts of readings in the table. `named` are the columns that are named after stations.
     """
+    # Kinds that do not exist in the plane need stations in space.
     stations = in_space(stations) if any(2 not in MODELS[one.form.kind].dimensions for one in found) else stations
     stations, heading_note = stations_turned(stations, found)
     epochs = epochs_of(roles, hints, found)
@@ -279,6 +281,7 @@ def _plan(
         lines = (f"propagation_speed = {speed!r}",)
         notes.append(f"S minus P times {speed:.6g} m/s, vp vs / (vp - vs), is a range (straight rays, constant speeds)")
     after: tuple[str, ...] = ()
+    # With a column "epoch", the window was already used to make its labels.
     if hints.window is not None and "epoch" not in epochs:
         after = ("", "[epochs]", f"window = {json.dumps(hints.window)}")
     height, note = _height(found, stations)
@@ -312,7 +315,10 @@ def _height(found: Sequence[Readings], stations: ColumnPlaces) -> tuple[str, str
 
 
 def _sigmas(hints: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
-    """Return the standard deviation of each sort of readings as text; None if the table has a column of them."""
+    """Return the standard deviation of each sort of readings as text; None if the table has a column of them.
+
+    The option `--sigma` has one value for all sorts, or a value for each kind, such as "tdoa=20 ns,azimuth=1 deg".
+    """
     if hints.sigma is None:
         for one in found:
             if one.sigma is None:

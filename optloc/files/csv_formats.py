@@ -93,6 +93,8 @@ def _rows(record: Mapping[str, Any], place: str) -> list[Row]:
 
     `place` is the place for messages.
     """
+    # `shared` has the values that all rows repeat, and `inner` the rows of objects in lists. `parallel` has lists of
+    # numbers or text, which become columns.
     shared: Row = {}
     inner: list[Row] = []
     parallel: dict[str, list[Any]] = {}
@@ -182,6 +184,7 @@ def _clusters(data: Sequence[Mapping[str, Any]], source: str) -> Iterator[Row]:
             if not numbers or len(cells) < len(_CLUSTER) - 1:
                 what = f"{str(cells)[:_SHOWN]} is not a reception"
                 raise InvalidProblem(what, place, "write [x, y, z, microseconds]")
+            # A fifth number is the variance of the time, microseconds squared; a negative variance counts as zero.
             reals = [float(cell) for cell in cells]
             reception = dict(zip(_CLUSTER, [*reals[:4], *(sqrt(max(cell, 0.0)) for cell in reals[4:5])], strict=False))
             name = "/".join(f"{cell:.0f}" for cell in reals[:3])

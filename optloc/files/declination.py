@@ -101,7 +101,10 @@ def declinations(position: Array, frame: Frame, day: date, where: str) -> Array:
 
 
 def _model(day: date, where: str) -> tuple[Any, float]:
-    """Return the model that is valid at a date, and the date in years."""
+    """Return the model that is valid at a date, and the date in years, such as 2026.5.
+
+    Raise InvalidProblem if pygeomag is not installed, or no model is valid. `where` is the place for messages.
+    """
     try:
         import pygeomag
     except ImportError:

@@ -48,13 +48,14 @@ def from_bow(found: Readings, roles: Roles, column: str, hints: ColumnHints) -> 
         raise InvalidProblem(
             f"the headings {column!r} are magnetic, and the declination is unknown", table.source, advice
         )
+    # `nothing` has the numbers that mean no heading, as `--missing` states.
     column_values, nothing = numbers(table, column), marks_of(hints) or frozenset()
     given = dict(zip(column_values.row.tolist(), column_values.values.tolist(), strict=True))
     lacking = next((row for row in found.row.tolist() if given.get(row) is None or given[row] in nothing), None)
     if lacking is not None:
         advice = "remove the row, or use --azimuth north-clockwise if the bearings are true bearings"
         raise InvalidProblem("the bearing has no heading", table.where(column, lacking), advice)
-    used = [given[row] for row in found.row.tolist()]
+    used = [given[row] for row in found.row.tolist()]  # the heading of each bearing
     unit = _unit(column, used, hints, table.where(column))
     full_turn = in_unit(Decimal(360), "deg", unit, found.form)
     wrong = next((i for i, heading in enumerate(used) if abs(heading) > full_turn * Decimal("1.0001")), None)
@@ -65,6 +66,7 @@ def from_bow(found: Readings, roles: Roles, column: str, hints: ColumnHints) -> 
         value + in_unit(heading, unit, found.unit, found.form)
         for value, heading in zip(found.values.tolist(), used, strict=True)
     ]
+    # A decimal remainder has the sign of the number: add a turn, so that bearings are from zero to a full turn.
     if found.unit in _FULL_TURN:
         full_turn = _FULL_TURN[found.unit]
         sums = [(value % full_turn + full_turn) % full_turn for value in sums]
@@ -95,6 +97,7 @@ def stations_turned(stations: ColumnPlaces, found: Sequence[Readings]) -> tuple[
         raise InvalidProblem(
             f"station {lacking!r} has no heading", "--stations", "give a heading for each station, 0 for north"
         )
+    # A station without bearings may lack a heading. Zero is then stored, without an effect.
     note = "bearings are relative to the headings of the stations in their table"
     return replace(stations, columns={**stations.columns, "heading_deg": np.nan_to_num(headings)}), note
 

@@ -165,6 +165,7 @@ def _chunk(c: Context, kind: str) -> RowChunk:
     # Reverse a difference by exchanging its stations, not by changing the value: noise and biases then stay valid.
     if section.positive == "b-farther" and _is_difference(model):
         a, b = b, a
+    # At most one of the three is not None: standard deviations of rows, of arrivals, or a covariance.
     sigma, arrival, covariance = spread_of(c, model, units, unit, z)
     seconds = Units("time").conversion(section.time_unit, join(c.where, "key 'time_unit'")).factor
     east, day = _declination(c, units.name(name)) if kind == "azimuth" else (0.0, None)
@@ -371,6 +372,7 @@ def spread_of(
     if sum((column or section.sigma is not None, *(form is not None for form in forms))) > 1:
         advice = "give sigma, arrival_sigma, covariance or snr"
         raise InvalidProblem("the noise is given more than once", c.where, advice)
+    # The search for the noise level starts from a typical value of the quantity, SI units.
     if section.sigma == ESTIMATE and not column:
         return np.full(z.shape, _START_SIGMA.get(model.quantity, 1.0)), None, None
     if (sigma := sigma_of(c, units, unit, z)) is not None:
@@ -397,7 +399,10 @@ def sigma_of(c: Context, units: Units, unit: Conversion, z: Array) -> Array | No
 
 
 def signal_of(c: Context) -> Signal | None:
-    """Return the signal that determines the noise of rows, or None without a signal."""
+    """Return the signal that determines the noise of rows, or None without a signal.
+
+    The signal-to-noise ratio is NaN for a station without a value. Raise InvalidProblem if a part is missing.
+    """
     section, parts = c.section, ("snr", "bandwidth", "duration")
     lacking = [name for name in parts if getattr(section, name) is None]
     if section.snr is None or section.bandwidth is None or section.duration is None:
@@ -492,6 +497,7 @@ def check_repeats(
     """
     for kind in dict.fromkeys(chunk.kind for chunk in chunks):
         same = [i for i, chunk in enumerate(chunks) if chunk.kind == kind]
+        # Add 1, since a missing station has the number -1.
         ends = [(chunks[i].a + 1, chunks[i].b + 1, index[i], target[i]) for i in same]
         keys_of_rows = [np.concatenate(each) for each in zip(*ends, strict=True)]
         if len(first_rows(*keys_of_rows)[0]) == len(keys_of_rows[0]):
@@ -502,6 +508,7 @@ def check_repeats(
         keys = table[1:_PLACE, order]
         twice = np.flatnonzero((keys[:, 1:] == keys[:, :-1]).all(0))
         if len(twice):
+            # Report the copy that comes first in the file. Column 3 is the epoch, and column `_PLACE` the row.
             at = twice[np.argmin(order[twice + 1])]
             one, two = (table[[0, _PLACE], order[i]].astype(int) for i in (at, at + 1))
             epoch = epochs.labels[int(table[3, order[at]])]

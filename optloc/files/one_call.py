@@ -473,7 +473,7 @@ def _rows(
     propagation speed, m/s. Raise InvalidProblem for infinite values, or for times in a wrong unit.
     """
     kind = ARGUMENTS[word].kind
-    a, b = np.array(found.keys, dtype=np.int64).T
+    a, b = np.array(found.keys, dtype=np.int64).T  # b is -1 except for time differences
     values = found.values
     if word == "toa":
         # Dates always become seconds, independent of the unit of sigma.
@@ -522,6 +522,7 @@ def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:
         return np.where(known, (counted - first) * 1e-9, np.nan)
     if times.dtype.kind in "iu":
         return np.asarray((times - times.min(-1, keepdims=True)).astype(float))
+    # Floats: `coarse` is the rounding of the largest time, m. A row without any time has nothing to subtract.
     with np.errstate(invalid="ignore"):
         coarse = np.spacing(np.fmax.reduce(np.abs(times), axis=None, initial=0.0)) * unit.factor
         first = np.fmin.reduce(times, axis=-1, keepdims=True)

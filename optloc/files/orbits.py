@@ -268,6 +268,7 @@ def _line_sets(text: str, source: str) -> list[_Set]:
     """Return the sets of two-line elements, each with the name in the line before, if any."""
     lines = [(i, line.rstrip()) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     sets, name = [], ""
+    # Pairs of a line and the next line, each with its number; the last line is followed by an empty line.
     following = iter([*pairwise(lines), (lines[-1], (0, ""))] if lines else [])
     for (i, line), (_, after) in following:
         where = f"{source}, line {i}"
@@ -281,7 +282,7 @@ def _line_sets(text: str, source: str) -> list[_Set]:
             raise InvalidProblem("a first line of elements has no second line", where, "give both lines, unchanged")
         sets.append(_Set(name, line[2:7].strip(), where, partial(_from_lines, name, line, after, where)))
         name = ""
-        next(following)
+        next(following)  # the second line of elements was used
     return sets
 
 
@@ -435,6 +436,7 @@ def _interpolate(
         what = f"{_date(seconds[outside[0]])} is before the first or after the last position"
         raise InvalidProblem(what, where, "use the file of that day; times are dates, or seconds since 1970, UTC")
     position, velocity = _polynomial(nodes, places, at, _POINTS, where)
+    # The difference to a polynomial through fewer points estimates the error of the interpolation, m.
     off = np.linalg.norm(position - _polynomial(nodes, places, at, _CHECK_POINTS, where)[0], axis=1).max(initial=0.0)
     if off > _MAX_DIFFERENCE:
         step = float(np.diff(nodes).min())
@@ -463,7 +465,7 @@ def _polynomial(nodes: Array, places: Array, at: Array, count: int, where: str) 
         step = float(steps.mean())
         through = KroghInterpolator((times_of_points - times_of_points[0]) / step, places[first : first + count])
         position[mine], velocity[mine] = through.derivatives((at[mine] - times_of_points[0]) / step, 2)
-        velocity[mine] /= step
+        velocity[mine] /= step  # from metres per step to metres per second
     return position, velocity
 
 

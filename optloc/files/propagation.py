@@ -53,6 +53,7 @@ def _medium(table: MediumTable, reference: float | None, source: str) -> Medium:
     if table.kind == "atmosphere" and reference is not None:
         what = "an atmosphere determines the speed: the speed of light over the refractive index"
         raise InvalidProblem(what, place, "remove propagation_speed")
+    # functions that convert lengths and speeds from the units of the table to SI
     length, speed = (
         Units(quantity).conversion(unit, place).to_si  # type: ignore[arg-type]
         for quantity, unit in (("length", table.unit), ("speed", table.speed_unit))
@@ -75,6 +76,7 @@ def _stated_speed(file: ProblemFile, source: str) -> float | None:
     given, place = file.propagation_speed, join(source, "key 'propagation_speed'")
     if isinstance(given, SoundTable):
         water = given.medium != "air"
+        # Grams of salt in a kilogram of water: sea water has 35 by default, other water none.
         if not water and (given.salinity is not None or given.depth):
             raise InvalidProblem("air has no salinity and no depth", place, "remove them")
         usual = 35.0 if given.medium == "sea water" else 0.0

@@ -169,6 +169,7 @@ def _at_transmission(
         if name not in ephemerides:
             continue
         every = ephemerides[name]
+        # age (rows, ephemerides), s; infinite for an ephemeris of an unhealthy satellite
         age = np.abs(sent[rows, None] - every.toe) + np.where(every.health == 0.0, 0.0, np.inf)
         nearest = age.argmin(1)
         fresh = np.take_along_axis(age, nearest[:, None], axis=1)[:, 0] <= _MAX_AGE
@@ -201,10 +202,11 @@ def _first_pass(source: Path, epoch: Array, place: Array, z: Array, count: int, 
     from optloc.linear.constraints import height
     from optloc.solvers.solution import solve
 
-    slot = np.arange(len(epoch)) - np.searchsorted(epoch, epoch)  # epochs are sorted
+    # number of each satellite in its epoch, 0, 1 and so on; epochs are sorted
+    slot = np.arange(len(epoch)) - np.searchsorted(epoch, epoch)
     width = int(slot.max()) + 1
     stations, ranges, weight = np.zeros((count, width, 3)), np.zeros((count, width)), np.zeros((count, width))
-    stations[:] = place[0]
+    stations[:] = place[0]  # any finite position, for places that stay empty: their weight is 0
     stations[epoch, slot], ranges[epoch, slot], weight[epoch, slot] = place, z, 1.0
     least, on_ground = (_MIN_SATELLITES - 1, height(0.0, 0.0)) if level else (_MIN_SATELLITES, ())
     enough = np.flatnonzero(weight.sum(1) >= least)
@@ -315,6 +317,7 @@ def read_log(path: Path, system: str) -> Observations:
     flight_ns = (clock % week - whole["ReceivedSvTimeNanos"][rows]).astype(float) + rest
     flight_ns -= week * np.round(flight_ns / week)  # at the turn of a week
     names = [f"{system}{int(v) - (_QZSS if system == 'J' else 0):02d}" for v in table.numbers("Svid")[rows]]
+    # a satellite that occurs twice at one time keeps its first row: in reversed order, the first row is stored last
     keys = {(t, name): k for k, (t, name) in reversed([*enumerate(zip(clock.tolist(), names, strict=True))])}
     kept = np.array(sorted(keys.values(), key=lambda k: (clock[k], k)))
     far = flight_ns[kept] * 1e-9 * SPEED_OF_LIGHT

@@ -227,7 +227,7 @@ def assemble(
     more : mapping of str to ConstraintTable, optional
         As in `read`.
     """
-    stated = file
+    stated = file  # the azimuth convention that is stated, and not assumed below
     file, station_table, tables = with_standard_names(file, station_table, tables, source)
     azimuths = azimuths_of(stated, file)
     if ASSUMED in azimuths:
@@ -256,7 +256,7 @@ def assemble(
     noise = _noise(file, chunks, numbers, index, target, source)
     written = [(number, chunk.units, chunk.written_unit) for number, chunk in zip(numbers, chunks, strict=True)]
     biases = [bias_of(b, rows, stations.names, epochs, stations.dimension, written, source) for b in file.biases]
-    units = {bias.name: unit for bias, unit in biases if unit[0]}
+    units = {bias.name: unit for bias, unit in biases if unit[0]}  # no entry for rows in several units
     all_biases = tuple(bias for bias, _ in biases)
     all_biases += speed_bias(file, written, all_biases, source)
     problem = _problem(file, epochs, stations, rows, noise, all_biases, frame, source, known or {}, more or {})

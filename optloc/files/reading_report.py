@@ -54,7 +54,7 @@ def uses_of(
     stated standard deviation of each sort; None if a column of the table has it.
     """
     out = {name: one.form.kind for one in found for name in one.columns}
-    long = len(out) == len(found)
+    long = len(out) == len(found)  # a table with one reading in each row has one column for each sort
     picks = any(one.form.value == "sp" for one in found)
     # The roles of S minus P: columns of P and S, a column of their difference, or columns of phase and time.
     by_phase = picks and roles.find("sp") is None and not (roles.find("p") and roles.find("s"))
@@ -188,7 +188,7 @@ def check_receivers(table: Table, uses: Mapping[str, str], named: Sequence[Named
     message names the nearest stations and the option that leaves the column out.
     """
     used = [one for one in named if one.column in uses and not one.sigma]
-    if len(used) < 2:
+    if len(used) < 2:  # one column has no pattern
         return
     patterns = dict.fromkeys(_pattern(one) for one in used)
     others = {one.column for one in named} | {*uses}
@@ -217,7 +217,8 @@ def _find(words: Sequence[str], part: Sequence[str]) -> int:
 def _name_in(column: str, pattern: _Pattern, stations: Sequence[str]) -> str | None:
     """Return the part of a column name at the place of a station; None if the name does not match the pattern.
 
-    None also means another column of a known station, or a name that is only by chance at this place.
+    `pattern` is the pattern of the receiver columns, and `stations` are the names of the known stations. None also
+    means another column of a known station, or a name that is only by chance at this place.
     """
     text = without_unit(column)
     words, n_around = tokens(text), len(pattern.before) + len(pattern.behind)

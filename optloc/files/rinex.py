@@ -234,7 +234,7 @@ def _records_of_2(file: _File, types: int) -> Iterator[tuple[int, float, str, st
 
     `types` is the number of observations of a satellite, which determines the number of lines of a record.
     """
-    each, i = -(-types // _WRAPPED["observations"]), 0
+    each, i = -(-types // _WRAPPED["observations"]), 0  # `each` is the number of lines of a satellite, rounded up
     while i < len(file.lines):
         line = file.lines[i]
         if not line.strip():
@@ -245,6 +245,7 @@ def _records_of_2(file: _File, types: int) -> Iterator[tuple[int, float, str, st
             i += 1 + count
             continue
         seconds, names = _seconds(file, i, line[:26]), ""
+        # The list of satellites wraps: three characters each, in the columns 33 to 68 of one or more lines.
         more = max(1, -(-count // _WRAPPED["satellites"]))
         for k in range(i, i + more):
             names += file.line(k)[32:68].ljust(36)
@@ -284,7 +285,7 @@ def read_navigation(path: Path) -> Navigation:
             raise InvalidProblem(
                 "an ephemeris must begin with a satellite such as G07", file.at(i), "copy the file again"
             )
-        lines = _SHORT.get(name[0], _LINES)
+        lines = _SHORT.get(name[0], _LINES)  # number of lines of the record, which depends on the system
         if name[0] in SYSTEMS:
             found.setdefault(name, []).append(_elements(file, i, name[0], old=old))
         i += lines
@@ -310,6 +311,7 @@ def _elements(file: _File, i: int, system: str, *, old: bool) -> list[float]:
     lacking = next((k for k, text in cells[:_NEEDED] if not text.strip()), None)
     if lacking is not None:
         raise InvalidProblem("a number is missing in the ephemeris", file.at(lacking), "remove its eight lines")
+    # Numbers after the first `_NEEDED` may be empty; they count as zero.
     values = [_number(file, k, text, "the element") if text.strip() else 0.0 for k, text in cells]
     by_name = {name: values[place] for name, place in _PLACES.items()}
     by_name |= {"toc": toc, "tgd": values[_DELAY[system]]} | dict(zip(("af0", "af1", "af2"), values, strict=False))

@@ -218,7 +218,7 @@ def _with_standard_rows(
 
     `where` is the place for messages. `compass` is whether azimuths without a stated convention are compass bearings.
     """
-    words = [] if section.kind is None else [section.kind]
+    words = [] if section.kind is None else [section.kind]  # kinds as they are written in the file
     if section.kind is None and table.has("kind"):
         words = sorted(numbered(table.labels("kind"))[0])
     places = {word: _place_of(word, section, table, where) for word in words}
@@ -384,6 +384,7 @@ def placed(roles: Roles, frame: str | None, names: Array | None = None) -> Colum
     "ecef" if the column names contain it, else "cartesian".
     """
     names = roles.labels("name") if names is None else names
+    # Columns of latitude take precedence over columns x and y.
     lat, x = roles.find("lat"), roles.find("x")
     if lat is None and x is None:
         columns = ", ".join(roles.table.columns)

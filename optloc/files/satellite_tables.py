@@ -56,7 +56,7 @@ def pseudoranges(source: Path, roles: Roles, hints: ColumnHints) -> TableProblem
         metres, ranges = place * UNITS["length"][length], Units("length").conversion(unit, "--unit").to_si(z)
         place = at_reception(source, epoch, metres, ranges) / UNITS["length"][length]
         notes += (_ROTATED_NOTE,)
-    columns = {"epoch": epoch, "a": satellite, "z": z}
+    columns = {"epoch": epoch, "a": satellite, "z": z}  # each satellite is a station
     when = roles.find("time")
     if when is not None:
         seconds = column_times(roles, when, hints.zone, hints.time_unit)
@@ -128,7 +128,8 @@ def write_satellites(
     """Write positions and velocities of satellites at the times of measurements, as a table of stations in ECEF.
 
     `source` has the orbits and `times` the measurements. `stated` has the stated columns by role. `stations` has fixed
-    stations, which are added at each time.
+    stations, which are added at each time with zero velocity; None for no fixed stations. If the measurements name
+    satellites, each satellite is written at its own times. Otherwise all satellites are written at all times.
     """
     if times is None:
         advice = "give the table of the measurements with --times; it needs times, and may have satellites"
@@ -146,7 +147,7 @@ def write_satellites(
     parts: list[tuple[Array, ...]] = []
     for name in wanted:
         rows = np.arange(len(seconds)) if satellite_of_row is None else np.flatnonzero(satellite_of_row == name)
-        rows = rows[np.unique(seconds[rows], return_index=True)[1]]
+        rows = rows[np.unique(seconds[rows], return_index=True)[1]]  # one row for each distinct time
         parts.append((np.full(len(rows), name, dtype=object), rows, *orbits.at(name, seconds[rows])))
     rows = np.unique(seconds, return_index=True)[1]
     for name, place in _fixed_stations(stations, stated).items():

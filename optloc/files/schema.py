@@ -520,7 +520,7 @@ def _sentence(error: ValidationError, source: str, data: dict[str, Any], model: 
             len(_path(e["loc"], data)[0]),
         ),
     )
-    path, key = _path(first["loc"], data)
+    path, key = _path(first["loc"], data)  # path of the table, and the key in it
     template = _WHAT.get(first["type"])
     if template is not None:
         what = template.format(key=key, value=first["input"])

@@ -86,7 +86,7 @@ def _wide_sort(
     rows, ends, notes = [], [], []
     deviations: list[Array] = []
     errors_used: list[str] = []
-    first, empty = "", 0
+    first, empty = "", 0  # unit of the first column, to which the other columns are converted; number of empty cells
     for one in columns:
         dated = form.quantity == "length" and is_dated(table, one.column)
         cells = date_seconds(table, one.column, hints.zone) if dated else numbers(table, one.column)
@@ -106,6 +106,7 @@ def _wide_sort(
     if not any(map(len, values)):
         raise InvalidProblem("no cell has a reading", table.source, "check the columns of the receivers")
     pairs = form.stations > 1
+    # The name A-B, or one station and a stated reference, determine the sign: positive if the first is farther.
     minus = all(one.minus or len(one.ends) == 1 for one in columns)
     number = np.repeat(np.arange(len(columns)), list(map(len, values)))
     names, row = tuple(one.column for one in columns), np.concatenate(rows)
@@ -113,6 +114,7 @@ def _wide_sort(
     found = Readings(
         form, first, Decimals.join(values), row, names, number, a, b if pairs else None, notes=tuple(notes)
     )
+    # Standard deviations of a part of the columns are not used.
     if len(deviations) == len(columns):
         found = replace(found, sigma=np.concatenate(deviations), errors=tuple(dict.fromkeys(errors_used)))
     return _checked(found, roles, hints, stations, empty, "a-farther" if minus else None)
@@ -177,6 +179,7 @@ def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Array) -> A
             f"the column is in {column_unit}, but the readings are in {unit}", table.where(column), advice
         )
     sigmas = numbers(table, column)
+    # Number of the cell of each table row among the cells that are not empty; -1 for an empty cell.
     place = np.full(table.count, -1)
     place[sigmas.row] = np.arange(len(sigmas.row))
     lacking = pick[place[pick] < 0]
@@ -217,6 +220,7 @@ def read_inline(roles: Roles, hints: ColumnHints) -> tuple[ColumnPlaces, Array]:
     spots: dict[tuple[Any, ...], str] = {}
     seen: dict[str, int] = {}
     station_of_row, first = [], []
+    # A key is the name and the coordinates of a row.
     for row, key in enumerate(zip(*(column.tolist() for column in every.columns.values()), strict=True)):
         if key not in spots:
             # A station with another position in another row becomes a new station: positions matter, not names.
@@ -338,8 +342,9 @@ def _checked(
 ) -> Readings:
     """Return checked readings.
 
-    Stations are known, missing readings and repeats are removed, sign and convention are set. `empty` is the number of
-    empty cells. `positive` is the sign of differences that the table states; None if it is unknown.
+    Missing readings are removed, repeats are averaged or rejected, and sign and convention are set. `empty` is the
+    number of empty cells. `positive` is the sign of differences that the table states; None if it is unknown. Raise
+    InvalidProblem for an unknown station, a pair of equal stations, or an unknown sign.
     """
     table, known = roles.table, set(stations.names)
     for end in (found.a, found.b):
@@ -383,6 +388,7 @@ def _with_digits(found: Readings, table: Table) -> Readings:
     """Return arrivals with all their digits; raise InvalidProblem if a spreadsheet rounded them."""
     if found.form.kind != "toa":
         return found
+    # A negative number of decimals means lost digits before the point, as in 1.7E12.
     for i in np.flatnonzero(found.values.written < 0).tolist():
         value = found.values[i]
         if len(value.as_tuple().digits) <= _INSTANT <= value.adjusted():
@@ -400,7 +406,7 @@ def _with_digits(found: Readings, table: Table) -> Readings:
 def _with_convention(found: Readings, hints: ColumnHints, stations: ColumnPlaces, source: str) -> Readings:
     """Return azimuths with their convention: from the options, the column name or, on Earth, the compass."""
     named = any(word in stem(found.columns[0]) for word in (BEARING, "brg", "compass", "heading"))
-    if found.heading is not None:
+    if found.heading is not None:  # `from_bow` has set the convention
         return found
     if hints.azimuth is not None or named:
         return replace(found, azimuth=hints.azimuth or COMPASS)
@@ -419,7 +425,7 @@ def epochs_of(roles: Roles, hints: ColumnHints, found: Sequence[Readings]) -> di
     """
     table, taken = roles.table, {name for one in found for name in one.columns}
     out: dict[str, Array] = {}
-    long = len(taken) == len(found)
+    long = len(taken) == len(found)  # a table with one reading in each row has one column for each sort
     if found[0].form.value == "sp":
         taken |= {column for role in ("p", "s", "phase", "time") if (column := roles.find(role))}
     if long and (station := roles.find("station")):
@@ -445,6 +451,7 @@ def epochs_of(roles: Roles, hints: ColumnHints, found: Sequence[Readings]) -> di
         raise InvalidProblem(f"the unit of the times in column {when!r} is unknown", table.source, advice)
     elif when is not None and message is None:
         out["epoch"] = roles.labels("time")
+    # Without labels and times, each row of a wide table is an epoch.
     if not long and not out.keys() & {"epoch", "time"}:
         out["epoch"] = np.array([str(row + 1) for row in range(table.count)], dtype=object)
     return out

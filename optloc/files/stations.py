@@ -150,6 +150,7 @@ def survey(section: StationsTable, table: Table, frame_table: FrameTable, where:
         if frame.geodetic and frame_table.kind == "geodetic":
             velocity = np.einsum("nij,ni->nj", frame.enu_axes(position), velocity)
     axes = _axes(section, table, frame, position)
+    # standard deviations of the positions, and of the velocities
     sigma, of_rates = (_sigma(section, table, where, key) for key in ("sigma", "velocity_sigma"))
     return Survey(names, index, position, velocity, axes, sigma, of_rates, table), frame
 
@@ -199,7 +200,10 @@ def _dimension(wanted: FrameTable, frame: Frame, where: str) -> int:
 
 
 def _frame(wanted: FrameTable, where: str) -> Frame:
-    """Return the frame that a file states; raise InvalidProblem for a missing or superfluous origin."""
+    """Return the frame that a file states; raise InvalidProblem for a missing or superfluous origin.
+
+    `wanted` is the table ``[frame]``, and `where` the place of the stations for messages.
+    """
     place = wanted.origin
     if wanted.kind == "enu" and place is not None:
         return Frame.enu(lat_deg=place.lat_deg, lon_deg=place.lon_deg, height=place.height)
@@ -304,6 +308,7 @@ def stations_over_epochs(
     station) whose position is required. At an epoch without rows of a station, its position has no effect: the first
     known position is used. Velocity and axes are None if the table has none.
     """
+    # Rows of the table before and after each epoch (-1 without a row), and the weight of the row after.
     low, high, share = _by_label(found, epochs) if found.table.has("epoch") else _by_time(found, section, epochs)
     missing = low[used[:, 0], used[:, 1]] < 0
     if missing.any():

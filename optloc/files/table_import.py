@@ -271,6 +271,7 @@ def named_columns(columns: Sequence[str], stations: Sequence[str]) -> list[Named
 
     Their names have one or two names of stations, and otherwise only words with a known meaning.
     """
+    # Names with more words come first, so that a name is not taken for a shorter name inside it.
     known = sorted({tokens(name): name for name in stations if tokens(name)}.items(), key=lambda item: -len(item[0]))
     exact = {name.strip(): name for name in stations}
     found = []
@@ -436,7 +437,7 @@ def unused_measurement(column: str, lengths: bool = False) -> str | None:
 
 
 def unit_for(column: str, form: Form, hints: ColumnHints, values: Decimals, where: str) -> tuple[str, str]:
-    """Return the unit of a column and a note; raise InvalidProblem if the unit is unknown.
+    """Return the unit of a column and a note (empty without one); raise InvalidProblem if the unit is unknown.
 
     The unit comes from the option `--unit`, from the column name, or for angles from the size of `values`.
     """
@@ -530,7 +531,7 @@ def _suspicious_number(found: Readings, epoch: Array) -> Decimal | None:
             continue
         if mark == 0 and found.form.kind == "toa" and _is_relative_to_first(found, epoch):
             continue
-        beyond = int(here[0]) in (0, len(values) - 1)
+        beyond = int(here[0]) in (0, len(values) - 1)  # `values` are sorted
         count, others = counts[here[0]], np.delete(counts, here[0])
         if beyond or (count > 1 and count > others.max()):
             return mark
@@ -553,7 +554,7 @@ def without_repeats(
     each reading. `label` returns the epoch label of a table row.
     """
     ends = [numbered(end)[1] for end in (found.a, found.b) if end is not None]
-    first, group = first_rows(epoch, *ends)
+    first, group = first_rows(epoch, *ends)  # the first reading of each group of repeats, and the group of each reading
     count = len(first)
     if count == len(found.values):
         return found

@@ -208,9 +208,10 @@ def bias_of(
 
 
 def _check_sense(bias: Bias, rows: Sequence[Rows], written: Sequence[tuple[Array, Units, str]], where: str) -> None:
-    """Raise InvalidProblem for a bias of azimuths with both senses, and for a scale of azimuths from north.
+    """Raise InvalidProblem for a bias of clockwise and anticlockwise azimuths, and for a scale of azimuths from north.
 
-    `written` is as in `bias_of`.
+    `rows` has a block of rows for each kind; global row numbers count through all blocks in this order. `written` is
+    as in `bias_of`.
     """
     ends = np.cumsum([block.count for block in rows])
     touched = {int(i) for i in np.unique(np.searchsorted(ends, bias.row, side="right"))}
@@ -231,6 +232,7 @@ def _walk_parameters(table: BiasTable, rows: Sequence[Units], where: str) -> dic
     `rows` are the quantities and settings of the affected rows.
     """
     found: dict[str, Any] = {}
+    # The power of the seconds in the unit: for lengths, a random walk has m^2/s, one of the rate m^2/s^3.
     for key, power in (("density", 1), ("rate_density", 3)):
         text = getattr(table, key)
         if text is not None:
@@ -332,6 +334,7 @@ def prior_of(table: PriorTable, dimension: int, source: str) -> Prior:
         raise InvalidProblem(
             f"the mean has {len(table.mean)} coordinates, not {size}", where, "give one number for each coordinate"
         )
+    # A list is in the unit of the mean; a single value may be text with another unit, and is converted to SI here.
     sigmas = table.sigma if isinstance(table.sigma, list) else [units.plain(table.sigma, unit, where)] * size
     sigma = np.array(sigmas) * (units.conversion(unit, where).factor if isinstance(table.sigma, list) else 1.0)
     if len(sigma) != size or (sigma <= 0.0).any():
@@ -427,6 +430,7 @@ def _reported(
         raise InvalidProblem(what, place, "give one height for each epoch, in the order of time")
     levels = Units("length", c).conversion(table.unit, place).factor * np.array(table.exactly, dtype=float)
     if motion.span == "epoch":
+        # A free target has one constraint: the height minus its known rise above the first height. The rate is zero.
         rise = np.stack([levels - levels[0], np.zeros_like(levels)], axis=-1)
         return replace(motion, rise=rise), height(levels[0] - within, levels[0] + within)
     return reported(levels, times, within=within, order=motion.order, reference=motion.reference)

@@ -39,6 +39,7 @@ def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Re
     """
     position, covariance = fix.position, fix.covariance()
     known = np.asarray(np.isfinite(position).all(-1))
+    # `wild` (n, d) marks coordinates that the data do not determine. Their covariance is not written.
     wild = fix.undetermined()
     has_cov = np.asarray(known & np.isfinite(covariance).all((-1, -2)) & ~wild.any(-1))
     columns: dict[str, list[Any]] = {} if phase is None else {"phase": [phase] * len(events)}
@@ -120,6 +121,7 @@ def proof_records(fix: Fix, events: Sequence[Event], before: Sequence[Record | N
     records = fix_records(fix, events, None)
     out = []
     proofs = (column.tolist() for column in (fix.claims.proof, fix.claims.margin, fix.claims.boxes, fix.claims.reason))
+    # `number` is the outcome of the proof, as an index of `PROOFS`.
     for new, old, number, margin, boxes, reason in zip(records, before, *proofs, strict=True):
         proof: Record = {"proof": PROOFS[number], "margin": margin, "boxes": boxes}
         if number == UNKNOWN:
@@ -249,7 +251,10 @@ def to_aircraft(record: Record, seen: float = 0.0) -> Record:
 
 
 def to_mark(record: Record, frame: Frame) -> Mark:
-    """Return a fix or the state of a track in the form that the export formats need."""
+    """Return a fix or the state of a track in the form that the export formats need.
+
+    `record` is an answer with a position, m, in `frame`. Without a covariance in the record, the covariance is NaN.
+    """
     position, d = np.array(record["position"], dtype=float), len(record["position"])
     covariance = np.full((d, d), np.nan) if record.get("cov") is None else np.array(record["cov"], dtype=float)[:d, :d]
     others = [
@@ -319,7 +324,8 @@ class Latest:
     """
 
     def __init__(self, most: int = 1024) -> None:
-        self._most, self._total = most, 0
+        self._most, self._total = most, 0  # `_total` counts the stored fixes since the start
+        # by name of the target or event, the oldest first: time of the fix (s since 1970) and record
         self._held: dict[str, tuple[float, Record]] = {}
 
     def __call__(self, record: Record) -> None:

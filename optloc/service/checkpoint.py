@@ -62,6 +62,7 @@ def restore(path: Path, events: Events, now: float) -> None:
     try:
         closed = [name_under("closed", name) for name in _typed(found.get("closed"), list, "closed")]
         counts = _counts(found.get("counts"))
+        # Fill `opened` first, and change `events` only if the whole file is valid.
         taken, opened = set(closed), dict[str, Event]()
         for number, each in enumerate(_typed(found.get("open"), list, "open"), 1):
             where = f"{path}, open event {number}"

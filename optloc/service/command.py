@@ -205,7 +205,11 @@ def serve(
 
 
 def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str, form: str) -> dict[str, Any]:
-    """Return the values of options as arguments of `optloc.service.stream.Settings`; times in seconds."""
+    """Return the values of options as arguments of `optloc.service.stream.Settings`; times in seconds.
+
+    `wait` and `deadline` are texts with a unit. `late` is "drop" or "revise", and `part` a text such as "1/4". A
+    deadline of None is decided later: it depends on the source.
+    """
     from optloc.service.answers import FORMATS
     from optloc.service.engine import PHASES
 
@@ -261,7 +265,10 @@ class ServiceOptions:
 
 
 def run_live(file: Path, options: ServiceOptions) -> int:
-    """Run a stream until its source ends or a signal arrives, and return the exit code."""
+    """Run a stream until its source ends or a signal arrives, and return the exit code.
+
+    `file` is the problem file of the site.
+    """
     from optloc.service.recording import read_recording
     from optloc.service.site import read_site
     from optloc.service.sources import adapter_of
@@ -275,6 +282,7 @@ def run_live(file: Path, options: ServiceOptions) -> int:
     # lines of a file can wait, so no proof needs to be skipped
     waits = recording is not None or (options.stdin and _is_file(sys.stdin))
     shed = not waits if options.shed is None else options.shed
+    # If no proof is skipped, the default deadline is infinite. Settings that are None keep their default values.
     given = options.settings | ({"deadline": inf} if not shed and options.settings.get("deadline") is None else {})
     settings = Settings(shed=shed, **{key: value for key, value in given.items() if value is not None})
     claim(settings.record, inputs=[file])

@@ -186,6 +186,8 @@ class Engine:
         all_rows = tuple(range(len(self.site.rows)))
         names: dict[tuple[Any, ...], tuple[SiteRow, ...]] = {all_rows: self.site.rows}
         for event in events:
+            # Sort the rows, so that events with the same rows in another order share one problem. `names` stores rows
+            # only for events without standard deviations.
             keys = tuple(event.rows)
             if event.sigmas or keys not in names:
                 keys = tuple(sorted(keys, key=_order))

@@ -53,6 +53,7 @@ class Metrics:
         self.statuses: Counter[str] = Counter()
         self.proofs: Counter[str] = Counter()
         self.tracks: Counter[str] = Counter()
+        # the latest latencies of each phase, s: a new value replaces the oldest; `_answers` counts all values
         self._latency = {phase: np.zeros(_LATENCIES) for phase in PHASES}
         self._answers: Counter[str] = Counter()
         self.heard: dict[str, float] = {}

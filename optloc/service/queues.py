@@ -212,7 +212,7 @@ class Outbox:
                     return
                 taken, self._lines = self._lines, deque()
                 self._changed.notify_all()
-            if self.failed:
+            if self.failed:  # drop the lines, so that no caller waits for a full queue
                 continue
             try:
                 self._write(b"".join(line for line, _ in taken))

@@ -60,8 +60,10 @@ def _epochs(made: Draft) -> Iterator[Recorded]:
     epoch = loaded.problem.epoch
     for chunk, number in zip(made.chunks, made.numbers, strict=True):
         section = made.file.measurements[next(i for i, table in enumerate(made.tables) if table is chunk.table)]
+        # `count` is the number of stations of a row
         z, count = chunk.table.numbers("z", optional=True), MODELS[chunk.kind].stations
         sigma = chunk.table.numbers("sigma") if chunk.table.has("sigma") else None
+        # The reader exchanged the stations of reversed differences. The values of the file need their original order.
         ends = (chunk.b, chunk.a) if section.positive == "b-farther" and _turned(chunk.kind) else (chunk.a, chunk.b)
         for i in np.flatnonzero(chunk.weight > 0.0).tolist():
             row: dict[str, object] = {"kind": chunk.kind, "z": float(z[chunk.row[i]])}
@@ -86,6 +88,7 @@ def replay(recording: Sequence[Recorded], stream: Stream, speed: float, source: 
     `speed` is the replay speed relative to the recording; infinity: as fast as the stream answers. `source` is the name
     of the recording for messages.
     """
+    # `when` is the time of reading of the last line that has one. `never` is not set: its wait is a sleep.
     began, first, when, never = stream.clock(), np.nan, 0.0, Event()
     waiting: list[QueuedLine] = []
     for number, (received, data) in enumerate(recording, 1):

@@ -50,6 +50,7 @@ def serve(stream: Stream, host: str = HOST, port: int = PORT) -> tuple[int, Call
     except (OSError, OverflowError) as error:
         what = f"the address {host}:{port} is not available ({getattr(error, 'strerror', None) or error})"
         raise InvalidProblem(what, "--http", "choose another port") from None
+    # The application has no start-up work (lifespan). Proxy headers are ignored, since any client can write them.
     config = uvicorn.Config(
         application(stream, local=host in _NAMES),
         log_level="warning",
@@ -74,7 +75,10 @@ def serve(stream: Stream, host: str = HOST, port: int = PORT) -> tuple[int, Call
 
 
 def application(stream: Stream, *, local: bool = True) -> Any:
-    """Return the ASGI application of a stream; with `local`, requests must name this machine."""
+    """Return the ASGI application of a stream.
+
+    With `local`, a request must have a host name of this machine (`_NAMES`); otherwise any host name is permitted.
+    """
     from starlette.applications import Starlette
     from starlette.middleware import Middleware
     from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -133,12 +137,13 @@ def _line_routes(stream: Stream) -> list[Any]:
         body = await _body(request)
         if body is None:
             return refused(413, f"the request has more than {_BODY} bytes")
+        # A JSON body is one event, which may have line breaks. Another body has one event in each line.
         single = request.headers.get("content-type", "").partition(";")[0].strip() == "application/json"
         lines = [body.replace(b"\n", b" ")] if single else [each for each in body.split(b"\n") if each.strip()]
         if not 0 < len(lines) <= WAITING:
             return refused(400, f"send 1 to {WAITING} lines")
         records = await _answers_to(stream, lines, track=track)
-        if isinstance(records, int):
+        if isinstance(records, int):  # an HTTP status code, for a request without answers
             messages = {
                 429: "the input queue is full",
                 503: "the stream ends",

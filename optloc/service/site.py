@@ -112,6 +112,7 @@ class Ready:
         v) are the other rows, in their units.
         """
         z = np.zeros((len(values), self.count))
+        # A difference is the first arrival minus the second. Nothing is subtracted from a time of arrival.
         less = np.where(self.second >= 0, arrivals[:, self.second], 0.0) if len(self.row) else 0.0
         z[:, self.row] = self.scale * (arrivals[:, self.first] - less)
         for column, row, unit, more in self.stated:
@@ -243,7 +244,7 @@ class Site:
         if kind == "toa":
             listed = {row.a for row in kept}
             return (*kept, *(SiteRow(section, -1, kind, name) for name in names if name not in listed))
-        group = {name: name for name in names}
+        group = {name: name for name in names}  # the connected group of each station, named after one of its stations
         for row in kept:
             group = {name: group[row.b] if g == group[row.a] else g for name, g in group.items()}
         for name in names[1:]:
@@ -260,9 +261,12 @@ class Site:
         draft, order = self._draft((*timed, *rows))
         problem = draft.loaded.problem
         bare = problem.with_rows(z=np.zeros(problem.count))
+        # `links` has the rows that come from arrivals, each with the places of its arrivals among `receivers`. `stated`
+        # has the other rows, by chunk.
         place, stated, links = {station: i for i, station in enumerate(receivers)}, [], []
         for chunk, number in zip(draft.chunks, draft.numbers, strict=True):
             section = next(i for i, table in enumerate(draft.tables) if table is chunk.table)
+            # index of each row in (*timed, *rows); -1 for a row without a value
             column = np.array([order[section][row] for row in chunk.row.tolist()])
             made = np.flatnonzero((column >= 0) & (column < len(timed))).tolist()
             links += [(number[i], place[int(chunk.a[i])], place.get(int(chunk.b[i]), -1)) for i in made]
@@ -368,6 +372,7 @@ def read_site(path: Path, method: str = "auto") -> Site:
     rows = _template(draft, source)
     problem = draft.loaded.problem
     timed = next((row for row in rows if row.kind in ("toa", "tdoa")), None)
+    # Rows of the same section and kind as the first row of `toa` or `tdoa`.
     arriving = tuple(i for i, row in enumerate(rows) if timed and row[:3:2] == timed[:3:2])
     number = {name: i for i, name in enumerate(problem.stations.names)}
     hearing = {number[end] for i in arriving for end in (rows[i].a, rows[i].b) if end}

@@ -79,6 +79,7 @@ class ModeS:
 
     def __init__(self, stations: Collection[str]) -> None:
         self._stations = frozenset(stations)
+        # by message: time of the first reception, ns, and the number of earlier events with the same message
         self._seen: dict[str, tuple[int, int]] = {}
 
     def __call__(self, line: bytes) -> bytes:
@@ -91,6 +92,7 @@ class ModeS:
         if not isinstance(bits, str) or type(time) is not int:
             return line
         first, number = self._seen.pop(bits, (time, 0))
+        # nanoseconds since midnight start again each day, so the delay is within half a day of zero
         delay = (time - first + _DAY // 2) % _DAY - _DAY // 2
         if abs(delay) > _TOGETHER:
             first, number, delay = time, number + 1, 0
@@ -151,6 +153,7 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callab
     except ImportError:
         raise InvalidProblem("MQTT needs paho-mqtt", "--mqtt", "pip install 'optloc[live-mqtt]'") from None
     parts = urlsplit(address)
+    # The wildcard # of a topic is the beginning of a fragment in an address.
     topic = unquote(parts.path[1:] + (f"#{parts.fragment}" if "#" in address else ""))
     if parts.scheme not in ("mqtt", "mqtts") or not parts.hostname or not topic:
         raise InvalidProblem(f"{address!r} is not an address of a topic", "--mqtt", "write mqtt://host:1883/topic")

@@ -135,12 +135,12 @@ class Stream:
         self._format = FORMATS[settings.format]
         self._engine = self._new_engine(site)
         self._events = Events(site, self.metrics, self._emit, settings.wait, settings.revise, settings.part)
-        self._unwritten: dict[str, of_events.Event] = {}
+        self._unwritten: dict[str, of_events.Event] = {}  # closed events whose last answer may not be written yet
         # before other files are created, since a rejected checkpoint must leave none behind
         if settings.state is not None and settings.state.exists():
             restore(settings.state, self._events, self._time())
         self._record = None if settings.record is None else GrowingFile(settings.record)
-        self._recorded = bytearray()
+        self._recorded = bytearray()  # lines that are not yet in the file of the recording
         self._reload = False
         self._next_state, self._next_health = clock() + settings.every, clock() + settings.health
         self.metrics.gauges |= {
@@ -233,6 +233,7 @@ class Stream:
     def _loop(self) -> None:
         """Read lines and answer closed events until the queue of lines is closed or the output fails."""
         while not self._outbox.failed:
+            # `due` is the number of seconds until the next timed work. In a replay, only lines close events.
             due = min(self._engine.next_due, self._next_state, self._next_health) - self.clock()
             if not self._replayed:
                 due = min(due, self._events.next_due - self._time())
@@ -296,6 +297,7 @@ class Stream:
             except Exception as error:  # an error of one line must not end the stream
                 if not isinstance(error, InvalidProblem):
                     LOG.exception("line %d of %s failed", line.number, line.source)
+                # A line with an unknown name belongs to an event: record it, since it changes the answer.
                 if isinstance(error, UnknownName):
                     self._record_line(data, line.stamp)
                     self._events.refuse(error, line.stamp, line.when, track=track)
@@ -445,7 +447,7 @@ def read_lines(
     rest, number, last = b"", 0, stream.clock()
     stream.pending = pending
     while True:
-        waited = pending()
+        waited = pending()  # then the input waits for this thread, not this thread for the input
         if not (piece := read(LINE)):
             break
         now = stream.clock()

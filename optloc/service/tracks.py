@@ -98,7 +98,7 @@ class Tracks:
         clock: Callable[[], float],
     ) -> None:
         self._how, self._metrics, self._emit, self._clock = how, metrics, emit, clock
-        # in the order of their last events
+        # tracks by target, in the order of their last events, the oldest first
         self._kept: dict[str, _StoredTrack] = {}
         self._waiting, self._ends = deque[Scan](), False
         self._changed = Condition()

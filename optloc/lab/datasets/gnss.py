@@ -97,6 +97,7 @@ class Session:
         k, s = np.searchsorted(times, rows["t_gps_s"]), np.searchsorted(names, rows["sat"])
         shape = (len(times), len(names))
         z, sigma, weight = np.zeros(shape), np.ones(shape), np.zeros(shape)
+        # `k` and `s` are the epoch and the satellite of each row.
         # An absent satellite has weight zero and the position of its first epoch, because no row may be NaN.
         position = np.empty((*shape, 3))
         position[:] = places(rows.groupby("sat")[list(_XYZ)].first().loc[names], _XYZ)
@@ -125,12 +126,14 @@ class Session:
     def three(self) -> Problem:
         """Return the problem of three satellites that are present in all epochs: differences, and the exact height.
 
-        Of all such GPS satellites these are the three with the best horizontal geometry at the first epoch.
+        Of all such GPS satellites these are the three with the best horizontal geometry at the first epoch. The
+        differences are against the first of the three.
         """
         times = np.unique(self.rows["t_gps_s"])
         rows = self.rows[self.rows["sat"].str.startswith("G")]
         present = [str(name) for name, count in rows.groupby("sat").size().items() if count == len(times)]
         table = rows[rows["sat"].isin(present)].pivot_table([*_XYZ, self.column], "t_gps_s", "sat")
+        # (k, satellites, 3), ECEF metres
         position = np.stack([table[column][present].to_numpy() for column in _XYZ], axis=-1)
         triples = np.array(list(combinations(range(len(present)), 3)))
         best = triples[np.argmax(conditioning(position[0, triples], self.truth, self.geodetic))]

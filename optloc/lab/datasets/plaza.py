@@ -46,11 +46,13 @@ def load(folder: Path, form: str) -> Windows:
     a = pd.Index(beacons["beacon"]).get_indexer(rows["beacon"])
     distance = np.linalg.norm(along(rows["t_s"].to_numpy(), truth) - stations[a], axis=1)
     rows = rows.assign(a=a, distance=distance, z=_calibrate(form, rows["range_m"].to_numpy(), distance, a))
+    # Centres of the windows. Rows outside of all windows are dropped, and so are windows with few beacons.
     times = np.arange(rows["t_s"].iloc[0] + LEAD, truth["t_s"].iloc[-1], STEP)
     rows, centres = cut_windows(rows, times, WIDTH), along(times, truth)
     rows = rows[rows.groupby("window")["a"].transform("nunique") >= LEAST]
     kept, epoch = np.unique(rows["window"], return_inverse=True)
     a, z = rows["a"].to_numpy(), rows["z"].to_numpy()
+    # True range at the row's time minus true range at the centre of its window.
     correction = rows["distance"].to_numpy() - np.linalg.norm(centres[rows["window"]] - stations[a], axis=1)
     inside = [np.flatnonzero(epoch == k) for k in range(len(kept))]
     windows = tuple(

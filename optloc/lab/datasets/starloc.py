@@ -142,7 +142,8 @@ def dataset(
     """Return the problem of a run, and the true positions (n, 3), metres.
 
     `form` is "groups", a batch of `count` groups of six bearings of one marker. Or it is "run", the whole run with the
-    markers that have at least six bearings.
+    markers that have at least six bearings. `seed` is the seed of the groups; `count` and `seed` have no effect on
+    "run". `attitude` of the mount is "nom" (by design) or "cal" (calibrated). `without` are markers to leave out.
     """
     choose(form, ("groups", "run"), "form")
     data = read_run(folder, run, attitude, without=without)

@@ -60,6 +60,7 @@ def load(folder: Path, flight: str, *, shared: bool = True) -> Windows:
     rows, centres = cut_windows(rows, times, width), along(times, truth)
     rows = rows[centres[rows["window"], 2] > AIRBORNE]
     kept, epoch = np.unique(rows["window"], return_inverse=True)
+    # Exchanged, because the file subtracts the range of anchor_a.
     a, b, z = rows["anchor_b"].to_numpy(), rows["anchor_a"].to_numpy(), rows["rdiff_m"].to_numpy()
     inside = [np.flatnonzero(epoch == k) for k in range(len(kept))]
     covariances = [_covariance(a[i], b[i], len(stations), shared=shared) for i in inside]
@@ -89,7 +90,7 @@ def course(
     # Adjacent windows that contain rows, at the mean time of the rows.
     _, epoch = np.unique(np.floor(rows["t_s"] / width), return_inverse=True)
     times = np.bincount(epoch, rows["t_s"]) / np.bincount(epoch)
-    a, b = rows["anchor_b"].to_numpy(), rows["anchor_a"].to_numpy()
+    a, b = rows["anchor_b"].to_numpy(), rows["anchor_a"].to_numpy()  # exchanged, as in `load`
     problem = _problem(stations, a, b, rows["rdiff_m"].to_numpy(), epoch, times)
     inside = [np.flatnonzero(epoch == k) for k in range(len(times))]
     noise = _noise(inside, [_covariance(a[i], b[i], len(stations), shared=True) for i in inside])

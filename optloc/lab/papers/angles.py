@@ -281,8 +281,8 @@ def fixes(drawn: AnglesDraw) -> tuple[Array, Array]:
 def linear_track(places: tuple[Array, Array], start: State, dynamics: Dynamics) -> Array:
     """Return the states (trials, k, n) of a linear Kalman filter whose measurements are fixes.
 
-    `places` are the fixes (trials, k, d) at 1, 2, ... seconds and their covariances; `start` is the state before the
-    first fix that is used.
+    `places` are the fixes (trials, k, d) at 1, 2, ... seconds and their covariances (trials, k, d, d), SI units.
+    `start` is the state before the first fix that is used, at a whole second.
     """
     # Written out, because measurements of the position need no linearisation.
     mean, cov, states = start.mean, start.cov, []
@@ -437,13 +437,15 @@ def whole_track_errors(drawn: AnglesDraw, tick: Tick) -> list[tuple[str, Array]]
     """Return the errors (3,) at the end of simulation 1, by method.
 
     The methods are three fits to the whole track in closed form, the most likely track, and the filter with two values
-    of a_max. The errors are root mean squares over trials of position, velocity and acceleration, SI units.
+    of a_max. a_max is the largest acceleration of the filter's model in m/s^2. The errors are root mean squares over
+    trials of position, velocity and acceleration, SI units. The function calls `tick` at its end.
     """
     problem = replace(drawn.problem, motions=(Motion(2, reference=float(STRAIGHT.epochs)),))
     true_state, scale_of_order = (
         STRAIGHT.truth[-1],
         np.array([1.0, 1.0, 2.0])[:, None],
     )  # the last coefficient is half of a
+    # Fits are polynomials about the last epoch: coefficients (trials, 3, d).
     fits = courses(problem)
     assert fits is not None
     fits_by_name = {"plain": fits.plain, "weighted": fits.weighted, "instrumental variables": fits.instrumental}
@@ -463,7 +465,7 @@ def whole_track_errors(drawn: AnglesDraw, tick: Tick) -> list[tuple[str, Array]]
 def run_rays(count: int, seed: int, key: int, tick: Tick) -> list[SimulatedRays]:
     """Return the errors of `count` fixes of a fixed target, for few and for many stations.
 
-    `key` is the number of the first draw in the reproduction.
+    `key` is the number of the first draw in the reproduction: with `seed`, it decides the random numbers.
     """
     results = []
     # Noise of 0.02 and 0.05 rad is four and ten times the noise of simulation 3: the bias of plain fixes grows with it.

@@ -487,7 +487,7 @@ _SIZES: dict[Size, AnglesSample] = {"quick": AnglesSample(200, 200, 60, 10), "fu
 
 
 def _run(sample: AnglesSample, seed: int, tick: Tick) -> Report:
-    """Run all simulations of the paper, and return the report."""
+    """Return the report of all simulations with the sizes `sample`; call `tick` after each simulation."""
     straight_draw = draw(STRAIGHT, sample.trials, seed, 0)
     straight = run_straight(straight_draw, tick)
     whole_tracks = whole_track_errors(straight_draw, tick)

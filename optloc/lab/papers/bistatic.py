@@ -217,7 +217,7 @@ def run_batches(
     sequence : SeedSequence
         Seed of the draws.
     path : float
-        Standard deviation of the excess path, metres.
+        Standard deviation of a measured excess path, metres.
     whole : int, optional
         Number of epochs drawn, so that shorter records are the first parts of longer ones.
     """
@@ -229,8 +229,8 @@ def run_batches(
     fix = solve(run, "lsr", start=course.reshape(trials, 6))
     last = np.array([epochs])
     return {
-        "pseudo-linear course": _errors(course[:, None, 0], True, last),
-        "batch maximum likelihood": _errors(fix.position[:, None], True, last),
+        "pseudo-linear course": _errors(course[:, None, 0], slow=True, epochs=last),
+        "batch maximum likelihood": _errors(fix.position[:, None], slow=True, epochs=last),
     }
 
 
@@ -529,7 +529,7 @@ _SIZES: dict[Size, BistaticSample] = {"quick": BistaticSample(1000, 150, 200), "
 
 
 def _run(sample: BistaticSample, seed: int, tick: Tick) -> Report:
-    """Run all simulations of the paper, and return the report."""
+    """Return the report of all simulations with the sizes `sample`; call `tick` after each simulation."""
 
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))

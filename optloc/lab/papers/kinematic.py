@@ -163,7 +163,8 @@ def strip_labels(drawn: KinematicDraw, detection: float, false: float, key: tupl
     detection : float
         Probability that a row is detected.
     false : float
-        Mean number of false rows of a channel and epoch, uniform over the baseline.
+        Mean number of false rows of a channel and epoch. Their values are uniform from minus to plus the longest
+        baseline.
     key : tuple of int
         Seed of missing and false rows.
     """
@@ -272,6 +273,7 @@ def batch(drawn: KinematicDraw, order: int) -> KinematicScore:
     `order` is the order of the motion, as in `start_from_fix`.
     """
     sizes = {"velocity": drawn.scenario.speed, "acceleration": drawn.scenario.rate}
+    # Priors of mean zero with the standard deviations that the filters use for unknown velocities and accelerations.
     priors = [Prior(name, np.zeros(2), size**2 * np.eye(2)) for name, size in list(sizes.items())[:order]]
     estimate = solve(replace(drawn.runs, motions=(Motion(order),), priors=tuple(priors)))
     # Estimates are states at time zero; tracks are scored at the last epoch.
@@ -349,6 +351,7 @@ class PaperFilter:
 
     def run(self, drawn: KinematicDraw) -> KinematicScore:
         """Return the errors of the filter on a draw."""
+        # One model; or several in parallel, of which the best is used; or several with switches between them (IMM).
         scene = drawn.scenario
         if len(self.models) == 1:
             return score_track(drawn, track_all(drawn, self.models[0]))
@@ -476,7 +479,7 @@ def predict_twice(dynamics: Dynamics, interval: float, dimension: int) -> Update
     def update(scan: Problem, mean: Array, cov: Array) -> Updated:
         white = whitened(scan, mean)
         H = white.H @ F  # the printed error: `mean` and `cov` are predictions already
-        S = H @ cov @ np.swapaxes(H, -1, -2) + np.eye(H.shape[-2])
+        S = H @ cov @ np.swapaxes(H, -1, -2) + np.eye(H.shape[-2])  # whitened rows have the variance 1
         gain = np.swapaxes(linalg.solve(S, H @ cov)[0], -1, -2)
         solved = linalg.solve(S, white.residual[..., None])[0][..., 0]
         nis = (white.residual * solved).sum(-1)

@@ -167,6 +167,7 @@ def table_equations(
 ) -> TextTable:
     """Return a table of the effects of the printed equations and of their corrected form.
 
+    A matched filter has the model of the target's motion: static, CV (constant velocity) or CA (constant acceleration).
     `drawn` and `matched` are the draws and the errors of the matched filters, by motion. `tests` are the association
     tests.
     """
@@ -184,6 +185,7 @@ def table_equations(
         what = "29: H times the transition"
         rows.append((what, f"mean error of {name}, km", km(printed.mean), km(score.mean)))
         rows.append((what, f"NEES of {name} at the last step", f"{printed.level:.2f}", f"{score.level:.2f}"))
+    # The first two rules of the test differ only in the treatment of a missed row.
     levels = [f"{score.level:.2f}" for score in list(tests["static"].scores.values())[:2]]
     rows.append(("12: missed row := prediction", "NEES of the static filter at the last step", *levels))
     return tabulate("equations", ("equation", "measured", "as printed", "corrected"), rows)
@@ -321,13 +323,14 @@ _WORK = 11  # calls of `tick` below
 
 
 def _run(sample: KinematicSample, seed: int, tick: Tick) -> Report:
-    """Run all simulations of the paper, and return the report."""
+    """Return the report of all simulations with the sizes `sample`; call `tick` after each simulation."""
     scene = KinematicScenario()
 
     def done(value: T) -> T:
         tick()
         return value
 
+    # Motions: static, CV (constant velocity), CA (constant acceleration), with the order 0, 1 or 2.
     drawn = {name: done(draw(scene, scene.course(i), sample.trials, (seed, i))) for name, i in ORDERS.items()}
     # Keys 0 to 2 draw the motions, 3 the changing motion, 4 and 5 the association test, 9 the random starts.
     half = float(scene.times[_HALFWAY])

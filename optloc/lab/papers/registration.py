@@ -174,7 +174,7 @@ def problem(
     kinds = {"tdoa": arrival_sigma} if gain_sigma is None else {"tdoa": arrival_sigma, "groa": gain_sigma}
     rows = [measured(kind, a=a, b=0, epoch=epoch, sigma=size) for kind, size in kinds.items()]
     covariance = np.broadcast_to(station_sigma**2 * np.eye(3), (stations, 3, 3)) if station_sigma else None
-    # The reference is station 0; a station error that lasts one epoch is noise of its rows.
+    # The reference is station 0. With span="noise", each station has a new position error at each epoch.
     problem = assemble(
         Stations(scenario.track(epochs), scenario.names, covariance=covariance, span="noise"),
         *rows,
@@ -354,10 +354,12 @@ def wander(
 ) -> tuple[RegistrationScore, ...]:
     """Return the scores of the paper's recursion after each of the numbers of epochs `epochs`.
 
-    `drawn` are the measurements of all trials. `bounds` are the bounds (n, n) at these epochs. `width` is the width of
-    the starts in one-shot standard deviations, and `first` is the number of epochs of the first estimate.
+    `drawn` are the measurements of all trials. `bounds` are the bounds (n, n) of all n unknowns after these epochs, in
+    squared SI units. `width` is the width of the starts in one-shot standard deviations, see `starts`. `first` is the
+    number of epochs of the first estimate.
     """
     scene, last = setting.scenario, max(epochs)
+    # Rows of each kind as (trials, last, s - 1). Gain ratios are present only with `gain_sigma`.
     z, *gains = (rows.z.reshape(setting.trials, drawn.epochs, -1)[:, :last] for rows in drawn.rows)
     track, times, start = scene.track(last), scene.times(last), setting.starts(width)
     if setting.gain_sigma is None:
@@ -427,7 +429,7 @@ def ghost(
     """
     without_rows = problem(scenario, epochs, sigma=sigma, station_sigma=station_sigma)
     exact = truth(scenario, without_rows)
-    position, velocity = mirror(scenario)
+    position, velocity = mirror(scenario)  # of the image at time zero
     if scenario.course is None:
         # The image drifts with the stations; the best fixed target is at the middle of its path.
         state = position + 0.5 * scenario.times(epochs)[-1] * velocity
@@ -486,6 +488,7 @@ def files() -> Mapping[str, str]:
     times = _INTERVAL * np.arange(_EPOCHS)
     track = SPATIAL.position + times[:, None, None] * SPATIAL.velocity
     displaced = track + _STATION * rng.standard_normal(track.shape)
+    # Nanoseconds. The delays are constant errors of all stations but the first, which is the reference.
     arrival = 1e9 / SPEED_OF_LIGHT * np.sqrt(((SPATIAL.target - displaced) ** 2).sum(-1))
     arrival += _ARRIVAL * rng.standard_normal(arrival.shape) + np.array([0.0, *DELAYS])
     rows = [

@@ -44,7 +44,7 @@ def recursion(track: Array, times: Array, z: Array, start: Array, *, first: int 
     estimates = np.empty((trials, epochs - first + 1, start.shape[-1] + z.shape[-1]))
     arrivals = np.zeros((trials, z.shape[-1] + 1, epochs))
     arrivals[:, 1:] = z.swapaxes(1, 2)
-    track = np.ascontiguousarray(track.T)
+    track = np.ascontiguousarray(track.T)  # (3, s, k), as `step` needs it
     with np.errstate(all="ignore"):  # steps that diverge overflow, and stay lost
         for first_trial in range(0, trials, _BLOCK):
             block = slice(first_trial, first_trial + _BLOCK)
@@ -62,12 +62,12 @@ def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Arr
 
     The step uses the sums of eq. 11 and 12 over the epochs. The covariance R of an epoch is proportional to I + 11', so
     its inverse removes the mean of each epoch from the arrivals. Elimination of the unknown biases removes the mean of
-    each channel over the run. Outer products remain. The step is NaN if the equations are singular.
+    each channel over the run. The sums are computed from the remainders. The step is NaN if the equations are singular.
 
     Parameters
     ----------
     state : array (trials, n)
-        Position, or position and velocity at time zero.
+        Position (n = 3), or position and velocity at time zero (n = 6), SI units.
     arrivals : array (trials, s, k)
         Range differences against the first station, metres; the first station has zero.
     track : array (3, s, k)
@@ -88,12 +88,14 @@ def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Arr
     slope -= slope.mean(2, keepdims=True)
     if n > 3:
         slope = np.concatenate([slope, slope * times], axis=1)
+    # To subtract k times the product of the means is the same as to remove the mean of each channel first.
     rows, mean, offset = slope.reshape(trials, n, -1), slope.mean(3), misfit.mean(2)
     information = rows @ rows.swapaxes(1, 2) - len(times) * (mean @ mean.swapaxes(1, 2))
     vector = rows @ misfit.reshape(trials, -1, 1) - len(times) * (mean @ offset[..., None])
     solved, ok = linalg.solve(information, vector)
     # A singular system has no step: return NaN, which counts as lost, instead of an arbitrary solution.
     move = np.where(ok[:, None], solved[..., 0], np.nan)
+    # The mean misfit of each station after the step is its bias; biases are relative to the first station.
     offset = offset - (move[:, None] @ mean)[:, 0]
     return move, offset[:, 1:] - offset[:, :1]
 
@@ -144,6 +146,7 @@ def joint_recursion(
             block = slice(first_trial, first_trial + _BLOCK)
             state, weights = start[block], joint_weights(start[block], track[:first], sigma)
             weight = np.empty((len(state), epochs, *weights.shape[-2:]))
+            # `total` is the sum of the weights of all epochs so far.
             weight[:, :first], total = weights, weights.sum(1)
             for k in range(first, epochs + 1):
                 if k > first:
@@ -191,14 +194,15 @@ def joint_step(state: Array, measured: Array, track: Array, weight: Array, total
     track : array (k, s, 3)
         Stations, metres.
     weight : array (trials, k, 2 m, 2 m)
-        Inverse covariances.
+        Inverse covariances of the measurements of each epoch.
     total : array (trials, 2 m, 2 m)
-        Their sum over the epochs.
+        Sum of `weight` over the epochs.
     """
     line = state[:, None, None] - track
     distance = np.linalg.norm(line, axis=-1, keepdims=True)
     sight = line / distance
     ratio = distance[..., 1:, :] / distance[..., :1, :]
+    # Derivatives (trials, k, 2 m, 3) of the range differences and of the gain ratios by the position.
     slope = np.concatenate(
         [sight[..., 1:, :] - sight[..., :1, :], (sight[..., 1:, :] - ratio * sight[..., :1, :]) / distance[..., :1, :]],
         axis=-2,
@@ -209,6 +213,8 @@ def joint_step(state: Array, measured: Array, track: Array, weight: Array, total
     trials, columns = len(state), slope_and_misfit.shape[-1]
     sums = slope_and_misfit.reshape(trials, -1, columns).swapaxes(1, 2) @ weighted.reshape(trials, -1, columns)
     shared = weighted.sum(1)
+    # Eliminate the biases (Schur complement). The first three columns of `bias_of` are the change of the biases by the
+    # position; the last column is the biases without a step.
     bias_of, total_ok = linalg.solve(total, shared)
     reduced = sums - shared.swapaxes(1, 2) @ bias_of
     solution, ok = linalg.solve(reduced[:, :-1, :-1], reduced[:, :-1, -1:])

@@ -120,7 +120,7 @@ class History:
     epochs : tuple of int
         Numbers of epochs (t).
     bounds : array (t, n, n)
-        Cramer-Rao bound of the n unknowns at each, SI units.
+        Cramer-Rao bound of the n unknowns after each number of epochs, squared SI units.
     plain : tuple of RegistrationScore
         The paper's recursion on the same data.
     found : tuple of RegistrationScore
@@ -220,7 +220,8 @@ def accuracy(error: Array, bias: Array) -> Array:
 def table_biases(name: str, history: History, rows: Mapping[int, Sequence[float]]) -> TextTable:
     """Return a table of bias accuracies at the printed seconds (tables 2, 5 and 6 of the paper).
 
-    `history` contains scores at these epochs; `rows` are the printed accuracies of the channels, by second.
+    `history` contains scores at these epochs. `rows` are the printed accuracies of the channels by second; the biases
+    are the last unknowns of a vector.
     """
     true_vector = truth(history.setting.scenario, history.setting.problem(1))
     lines = []
@@ -505,7 +506,7 @@ def _work(sample: RegistrationSample) -> int:
 
 
 def _run(sample: RegistrationSample, seed: int, tick: Tick) -> Report:
-    """Run all simulations of the paper, and return the report."""
+    """Return the report of all simulations with the sizes `sample`; call `tick` after each simulation."""
     fixed = {
         name: run_history(
             RegistrationSetting(PRINTED, sample.trials, seed, key, station_sigma=size), sample.fixed, tick
@@ -551,7 +552,7 @@ def _run(sample: RegistrationSample, seed: int, tick: Tick) -> Report:
 def _score_case(setting: RegistrationSetting, epochs: int, width: float, tick: Tick, label: float = 0.0) -> TableCase:
     """Return the scores of the recursion and of the fix on the same draw.
 
-    `width` is the width of the recursion's starts in sigma0, and by default the `label` of the case.
+    `width` is the width of the recursion's starts in sigma0, and the label of the case if `label` is 0.
     """
     drawn, bound = setting.draw(epochs), setting.bound(epochs)
     (recursion_score,) = wander(setting, drawn, (epochs,), (bound,), width=width)

@@ -162,6 +162,7 @@ def render(name: str, tables: Mapping[str, TextTable], *, made: str, seed: int, 
     # Markdown needs no escapes of HTML. A misspelt name raises an error instead of leaving a gap in a sentence.
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, autoescape=False)  # noqa: S701
     environment.filters["digits"] = digits
+    # Functions that a page calls in its text.
     environment.globals.update(
         table=lambda key: tables[key].markdown(),
         cell=lambda key, *key_path: tables[key].cell(*key_path),

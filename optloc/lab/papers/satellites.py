@@ -232,7 +232,7 @@ def run_wild(
     """Return the errors of each filter from distant starts, by name, and the posterior bound (steps,) in metres.
 
     The starts have errors of `width` metres (standard deviation) in each coordinate. The filter "quartic + ekf" tracks
-    the same data from the first two fixes.
+    the same data from the first two fixes. `steps` is the number of epochs, and `sequence` is the seed of the draws.
     """
     draws, errors = sequence.spawn(2)
     exact = truth(steps)
@@ -263,7 +263,10 @@ def run_moving(satellites: Array, trials: int, sequence: np.random.SeedSequence)
 
 
 def run_heights(steps: int, trials: int, sequence: np.random.SeedSequence) -> dict[str, SatelliteRun]:
-    """Return the errors of the IEKF on a target at sea level, by the filter's model of the height."""
+    """Return the errors of the iterated extended Kalman filter on a target at sea level, by its model of the height.
+
+    `steps` is the number of updates after the two fixes of the start, and `sequence` is the seed of the draws.
+    """
     exact, epochs = truth(steps + 2, surface_course()), steps + 2
     keys = sequence.spawn(5)
     runs = {}
@@ -273,14 +276,14 @@ def run_heights(steps: int, trials: int, sequence: np.random.SeedSequence) -> di
     known = simulate(problem(epochs, height=None), exact[0], keys[2], trials)
     track = followed(with_height_rows(known), from_fixes(known), dynamics())
     runs["known: the ellipsoid itself"] = score(track, exact)
-    # Truth of the last two: a constant error of the height for the whole run, and a metre of noise.
+    # The last two runs have the same truth: a constant error of the height for the whole run, and a metre of noise.
     assumed = with_bias(problem(epochs, height=1.0), "height", per="kind", kind="height", sigma=HEIGHT)
     height_error = HEIGHT * np.random.default_rng(keys[3]).standard_normal((trials, 1))
     vectors = np.concatenate([np.broadcast_to(exact[0], (trials, 6)), height_error], axis=1)
     drawn = simulate(assumed, vectors, keys[4])
     white = problem(epochs).with_rows(z=drawn.z)
     runs["constant error of 500 m, taken for white"] = score(followed(white, from_fixes(white), dynamics()), exact)
-    start = begun_with_constants(drawn, dynamics(), 2)
+    start = begun_with_constants(drawn, dynamics(), epochs=2)
     runs["constant error of 500 m, as a state"] = score(followed_with_constants(drawn, start, dynamics()), exact)
     return runs
 
@@ -354,7 +357,11 @@ def metres(value: float) -> str:
 
 
 def table_fixed(found: Mapping[str, SatelliteRun], bound: Array) -> TextTable:
-    """Return the table of filters that start from fixes; `bound` (steps,) is the posterior bound, metres."""
+    """Return the table of filters that start from fixes; `bound` (steps,) is the posterior bound, metres.
+
+    `found` has the runs by filter. The last column is the largest distance of the estimates from the estimates of
+    the EKF.
+    """
     steps = [step for step in _STEPS if step <= len(bound)]
     plain = found["ekf"].position
     lines = []
@@ -542,7 +549,7 @@ _SIZES: dict[Size, SatellitesSample] = {"quick": SatellitesSample(200, 100), "fu
 
 
 def _run(sample: SatellitesSample, seed: int, tick: Tick) -> Report:
-    """Run all simulations of the paper, and return the report."""
+    """Return the report of all simulations with the sizes `sample`; call `tick` after each simulation."""
 
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))

@@ -95,7 +95,7 @@ def accuracy(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
             ratio, half = selected["ratio"].to_numpy(dtype=float), selected["ratio_half"].to_numpy(dtype=float)
             if not np.isfinite(ratio).any():
                 continue
-            # On a logarithmic axis a bar must end above zero.
+            # On a logarithmic axis a bar must end above zero. The half width is NaN for a single trial.
             low = np.minimum(np.nan_to_num(half), 0.9 * ratio)
             _line(axes, mark, x, ratio, marker=True)
             axes.errorbar(x, ratio, yerr=[low, np.nan_to_num(half)], fmt="none", ecolor=mark.colour, lw=0.8, capsize=2)
@@ -179,7 +179,7 @@ def distributions(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
             selected = part[part["method"] == mark.name]
             if len(selected):
                 values = selected["deviation"].to_numpy(dtype=float)[accuracy_rows(selected)]
-                # Zero has no logarithm, and the axis begins at a tenth.
+                # Zero has no logarithm; 0.01 is below the axis, which begins at 0.1.
                 _line(axes, mark, *distribution(np.maximum(values, 1e-2), len(selected)), marker=False, steps=True)
         x = np.geomspace(0.1, 10.0, 120)
         # The squared error of an efficient estimate in units of its bound has a chi-square distribution.
@@ -273,6 +273,7 @@ def history_picture(result: Histories, looks: Looks) -> Figure:
     for axes, (by, label) in zip(panel_axes, COUNTS.items(), strict=True):
         for name, width in zip(result.methods, np.linspace(*_WIDTHS, len(result.methods)), strict=True):
             counts = result.frame.loc[result.frame["method"] == name, by].to_numpy(dtype=float)
+            # The method does not have this count.
             if np.isnan(counts).any():
                 continue
             at = np.unique(counts)

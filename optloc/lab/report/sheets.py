@@ -1,7 +1,9 @@
 """Tables of a study's report: as numbers for programs, and as short text for people.
 
 A `Sheet` contains a table twice: a frame of numbers and a table of text. The variable `columns` in this module is a
-list of headings, each with a function from a row of the frame to the text of a cell.
+list of headings, each with a function from a row of the frame to the text of a cell. `frame` contains judged rows
+(`optloc.lab.study.summary.judged`). `cells` are the statistics of a study by cell (`optloc.lab.study.summary.cells`).
+`order` are the names of the methods, best first.
 """
 
 from __future__ import annotations

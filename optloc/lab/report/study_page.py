@@ -117,6 +117,7 @@ def _scenario_map(title: str, case: Case, rows: pd.DataFrame) -> BoundMapOfCase:
     bounds = bound_map(
         problem, trial.truth[0], np.linspace(west, east, _POINTS), np.linspace(south, north, _POINTS), height
     )
+    # Trials in which some method was wrong but ok.
     off = per_trial["off"].to_numpy(dtype=bool)[:_MOST_DOTS]
     return BoundMapOfCase(f"{title}, {noise_text(case.label)}", bounds, map_position[:, :2], off)
 

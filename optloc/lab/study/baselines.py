@@ -179,12 +179,13 @@ def least_squares(problem: Problem, start: Array, limit: int = _EVALUATIONS) -> 
     """Return the fixes of `scipy.optimize.least_squares` with exact derivatives, problem by problem.
 
     `problem` is a flat batch of N problems without constraints, `start` are vectors (N, size), and `limit` is the
-    greatest number of evaluations. The fixes are judged like refined ones; a failed problem has the status of the
-    failure.
+    greatest number of evaluations. The fixes get their status in the same way as fixes of optloc's refinement. A failed
+    problem has the status of the failure.
     """
     from scipy import optimize
 
     began = perf_counter()
+    # Shape (N, 1, size): one candidate for each problem. Cost and code mark a failure until a run succeeds.
     pool = np.array(start, dtype=float)[:, None]
     cost, code = np.full(pool.shape[:2], np.inf), np.full(pool.shape[:2], int(Status.NUMERICAL), dtype=np.int8)
     for _ in range(weighings(problem)):
@@ -222,6 +223,7 @@ def whiten_one(
 
     def jacobian(x: Array) -> Array:
         H = differentiate(one, x[None])[1]
+        # A residual is measured minus predicted, so its derivative has the opposite sign.
         return -np.concatenate([*(block.apply(H)[0] for block in whitening), prior_matrix])
 
     return residual, jacobian
@@ -261,6 +263,7 @@ def lifted_sdp(problem: Problem) -> Fix:
     position = np.full((size, 1, d), np.nan)
     models = [MODELS[rows.kind] for rows in problem.rows]
     if one_position(problem) and all(model.ranges is not None and not model.emission for model in models):
+        # Shift and scale each problem, so that the relaxation has numbers near 1.
         centre, scale = spread_of(problem)
 
         def relax(i: int) -> None:
@@ -315,8 +318,9 @@ def by_nuclear_norm(network: Network, seed: int) -> NetworkResult:
 
     m, n, d = network.stations, network.pulses, network.dimension
     generator = starts_of(likelihood(network), seed)
-    starts = generator.random(0)
+    starts = generator.random(0)  # no start; with none, `refined` returns a result without a network
     if network.synchronised and network.given.all() and max(m, n) >= unknowns(d) and m > d + 1:
+        # Arrivals (n, m) less the median of each pulse, in units of their spread: numbers near 1 for the solver.
         z = (generator.z - generator.shift[:, None]) / generator.spread
         found = nuclear_offsets(z, d)
         if np.isfinite(found.value):

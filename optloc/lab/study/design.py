@@ -88,6 +88,7 @@ class Cell:
         method, case = self.method, self.case
         if method.chunk is not None:
             return method.chunk
+        # Most trials, most measurements, and fewest trials of a chunk.
         longest, numbers, least = (
             (_SLOW, _NUMBERS // _SLOWER, _LEAST) if method.slow else (_FAST, _NUMBERS, _LEAST_FAST)
         )
@@ -222,7 +223,11 @@ def design_of_text(
     seed: int | None = None,
     more: Sequence[StudyMethod] = (),
 ) -> StudyDesign:
-    """Return the design of a study file's text; `source` names it in messages, `folder` contains its problem files."""
+    """Return the design of a study file's text; `source` names it in messages, `folder` contains its problem files.
+
+    `trials` and `seed` replace the numbers of the file, if they are not None. `more` are methods that are added to the
+    methods of the file.
+    """
     study = validated(StudyFile, parse_toml(text, source), source)
     new = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     study = study.model_copy(update=new)
@@ -240,6 +245,7 @@ def design_of_text(
     except InvalidProblem as error:
         where = ", ".join(part for part in (source, error.where) if part)
         raise InvalidProblem(error.what, where, error.advice) from None
+    # Each cell has at least one part, so too many cells are found without the sum.
     parts = len(cases) * len(methods)
     if parts <= _PARTS:
         parts = sum(-(-case.trials // Cell(case, method).stretch) for case in cases for method in methods)
@@ -313,7 +319,11 @@ _Table = TypeVar("_Table", ScenarioTable, NetworkTable)
 
 
 def _sweep(table: _Table, where: str) -> Iterator[tuple[dict[str, Any], _Table]]:
-    """Yield the swept values by name and the table with these values, for each combination of the swept lists."""
+    """Yield the swept values by name and the table with these values, for each combination of the swept lists.
+
+    A name with dots, such as `layout.stations`, is a key of a table in the table. `where` is the location for error
+    messages.
+    """
     for name, values in table.sweep.items():
         if not values or name in ("name", "sweep", "noise", "trials"):
             what = "has no values" if not values else "cannot be swept"
@@ -345,6 +355,7 @@ def _template(table: ScenarioTable, folder: Path, where: str, seed: int) -> Prob
     if table.layout is not None:
         return _problem_of_layout(table, where, seed)
     assert table.problem is not None
+    # With values=False, the problem file needs no measured values.
     shipped = files("optloc") / "scenarios"
     names = sorted(entry.name.removesuffix(".toml") for entry in shipped.iterdir() if entry.name.endswith(".toml"))
     path = within(folder, table.problem, join(where, "problem"))
@@ -386,6 +397,7 @@ def _problem_of_layout(table: ScenarioTable, where: str, seed: int) -> Problem:
     spread = None if survey is None else np.tile(survey * np.eye(layout.dimension), (s, 1, 1))
     position = place_stations(layout, where, rng, 1)
     names = tuple(f"S{i + 1}" for i in range(s))
+    # With span="noise", each station has a new position error at each epoch.
     return assemble(Stations(np.array(position), names, covariance=spread, span="noise"), *rows)
 
 
@@ -414,7 +426,8 @@ def _noise(problem: Problem, level: Level, from_file: bool, where: str) -> tuple
     """Return the noise of a problem at a level, the level as a number, and its unit.
 
     `from_file` is True if the problem has its noise from a problem file. Then a bare number is a factor on this noise,
-    with the unit "x". Otherwise the number is the standard deviation of the first kind, in its SI unit.
+    with the unit "x". Otherwise the number is the standard deviation of the first kind, in its SI unit. `level` is a
+    number, a text with its unit for all kinds, or such texts by kind.
     """
     kinds = [rows.kind for rows in problem.rows]
     if isinstance(level, int | float):

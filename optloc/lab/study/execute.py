@@ -88,7 +88,8 @@ def run_design(
     by : Executor
         Executor of the tasks.
     tell : callable, optional
-        Called after every part, and first with the existing parts.
+        Called with the number of new rows and their numbers by status: first for the existing parts, then after every
+        part.
     say : callable
         Called with a sentence for each damaged part, which is then computed again.
 
@@ -143,8 +144,8 @@ def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[TrialPart]:
                 for result in _parallel(work.hand_out(), running):
                     yield from work.take(result)
             except running.deaths:
-                # A cluster has lost several workers. The chunks that they had are computed here, the others on the
-                # cluster.
+                # A cluster has lost several workers. Their chunks are computed in a process of this machine, the others
+                # on the cluster.
                 for task in list(work.running.values()):
                     yield from work.take(local.compute(task.chunk, by.limit))
 
@@ -235,6 +236,7 @@ class _Work:
         trial, and a task of an abandoned cell, gets the failure in its rows.
         """
         chunk, cell = task.chunk, task.chunk.cell.key
+        # `_lost` sums the failures of a cell, in time limits of a whole chunk.
         if cell not in self._given_up:
             self._lost[cell] = self._lost.get(cell, 0.0) + (task.share if lost.status == LATE else _DEATH)
             if self._lost[cell] >= _PATIENCE:

@@ -124,6 +124,7 @@ def joined(existing: StudyManifest, wanted: StudyManifest) -> StudyManifest | No
         return None
     names = set(wanted.methods.values())
     kept = {key: name for key, name in existing.methods.items() if name not in names}
+    # The key of a chunk begins with the key of its cell.
     chunks = {key: count for key, count in existing.chunks.items() if key.partition("-")[0] in kept}
     return replace(existing, chunks=chunks | wanted.chunks, methods=kept | wanted.methods)
 
@@ -180,6 +181,7 @@ def begin(design: StudyDesign, folder: Path) -> StudyManifest:
     if (folder / MANIFEST).exists():
         before = read_manifest(folder)
         same = before.fingerprint == wanted.fingerprint and wanted.chunks.keys() <= before.chunks.keys()
+        # `joined` returns None if the data differ. Then the manifest is `wanted` itself, which is an error here.
         manifest = before if same else joined(before, wanted) or wanted
         if manifest is wanted:
             what = f"the folder contains another study ({before.name!r}, or other trials, seed or settings)"
@@ -511,6 +513,7 @@ def with_gap(table: Any) -> Any:
     """
     import pyarrow as pa
 
+    # A trial has the same digest `data` and number `trial` in the rows of all methods.
     cells = table["data"].combine_chunks()
     data = np.asarray(cells.indices) if len(table) else np.zeros(0, dtype=np.int64)
     trial, cost = np.asarray(table["trial"]), np.asarray(table["cost"], dtype=float)

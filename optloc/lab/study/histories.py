@@ -150,6 +150,7 @@ def histories(trials: Trials) -> Histories:
     if not traces:
         reason = remarks[0] if remarks else "there is no method"
         raise InvalidProblem(f"no method has a history ({reason})", trials.title, "name a minimizer with --method")
+    # A history may reach a cost below the lowest known cost. `fmin` ignores NaN, the mark of an unknown cost.
     least = np.array(trials.least, dtype=float)
     for of_method in traces.values():
         least = np.fmin(least, [np.min(trace.cost, initial=np.inf) for trace in of_method])
@@ -238,6 +239,7 @@ def reach(found: Histories, tau: float) -> list[Reach]:
         first = rows[rows["above"] <= tau].groupby("trial")[list(COUNTS)].first()
         work = {by: np.full(trials, np.inf) for by in COUNTS}
         for by in COUNTS:
+            # The other trials stay infinite. The order does not matter for quartiles.
             work[by][: len(first)] = first[by]
         quartiles = {
             by: None
@@ -316,9 +318,11 @@ def _record_stopped_runs(
     """Return the costs of runs that stop after growing numbers of iterations, trial by trial, and a remark.
 
     `start` are the starting vectors (n, size) of a baseline; with None, the first stage of the method makes the
-    candidates. `choice` is the nonlinear solver.
+    candidates. `choice` is the nonlinear solver. `problem` is a batch of n trials. Histories without points mean that
+    the method has no history.
     """
     stages, n = list(method.words), problem.batch_shape[0]
+    # A pool contains the candidates of all trials. `known` are the names of stages that need no start.
     pool = None if start is None else begin(problem, start)
     known = {word for formulation in FORMULATIONS.values() for word in formulation.starts}
     if pool is None and stages[0] in known:
@@ -326,6 +330,7 @@ def _record_stopped_runs(
         stages = stages[1:]
     if pool is None:
         return [_empty_trace()] * n, f"{stages[0]} has no history"
+    # Record a stage from the candidates of the stage before, then run it in full. End at a stage without a history.
     parts: list[list[ConvergenceTrace]] = []
     while stages and stages[0] in _STAGES and (steps := _STAGES[stages[0]](problem, pool, choice)) is not None:
         parts.append(_traces(n, pool, steps))
@@ -352,6 +357,7 @@ def _traces(n: int, pool: Pool, steps: _Steps) -> list[ConvergenceTrace]:
 
     All candidates of a trial advance at the same time.
     """
+    # `item` (m,) is the trial of each candidate.
     item, _ = pool.occupied
     traces = []
     for i in range(n):
@@ -360,6 +366,7 @@ def _traces(n: int, pool: Pool, steps: _Steps) -> list[ConvergenceTrace]:
             traces.append(_empty_trace())
             continue
         longest = steps.took[members].max()
+        # The points up to the first count at which all candidates of the trial have ended.
         last = int(np.searchsorted(steps.at, longest)) + 1
         at, cost = np.minimum(steps.at[:last], longest), np.nan_to_num(steps.cost[:last, members], nan=np.inf)
         # Each step is one evaluation, and so is the start of each candidate.
@@ -378,6 +385,7 @@ def _joined(parts: Sequence[ConvergenceTrace]) -> ConvergenceTrace:
     for part in parts[1:]:
         last_counts = [values[-1] if len(values) else 0.0 for values in joined[1:]]
         shifted = [values + offset for values, offset in zip(part[1:], last_counts, strict=True)]
+        # Costs are joined as they are; counts that are NaN stay NaN.
         joined = ConvergenceTrace(*(np.concatenate(pair) for pair in zip(joined, (part.cost, *shifted), strict=True)))
     return joined
 
@@ -409,6 +417,7 @@ def _least_squares(problem: Problem, pool: Pool, choice: Choice, *, damped: bool
 
     `limit` is the greatest number of steps. `choice` is not used: all recorders of `_STAGES` have it.
     """
+    # `item` (m,) is the trial of each candidate, and `slot` (m,) its place in the pool.
     item, slot = pool.occupied
     x = pool.x[item, slot]
     run = partial(refine, problem, x, item=item, damped=damped)
@@ -435,6 +444,7 @@ def _nonlinear(problem: Problem, pool: Pool, choice: Choice) -> _Steps | None:
         # If least squares follows, the solver minimises the cost of another problem; evaluate the cost of this one.
         return _cost(flat, x), [count if name == choice.name else -1 for name, count in tally]
 
+    # One count for each candidate, if the stage has solved one program for each. A count of -1 marks another solver.
     _, iterations = run_until(None)
     if len(iterations) != len(item) or min(iterations, default=0) < 0:
         return None
@@ -500,6 +510,7 @@ def _trials_of_study(folder: Path, names: Sequence[str], count: int, case: str |
     methods = {cell.method.name: cell.method for cell in design.cells if not cell.method.reference}
     methods |= {method.name: method for method in added(names)}
     known = {*methods, *(cell.method.name for cell in design.cells)}
+    # Methods of the folder that are neither in the study file nor among `names`.
     missing = tuple(
         f"{name}: the method was added to the folder; name it with --method to include it"
         for name in dict.fromkeys(manifest.methods.values())
@@ -529,6 +540,7 @@ def _finished_trials(folder: Path, case: Case, count: int) -> tuple[DrawnCase, A
     ]
     if not len(rows):
         raise InvalidProblem("this case has no finished part yet", str(folder), "run the study")
+    # Cost less gap is the lowest cost of all methods, and the truth also counts.
     rows = rows.assign(least=np.fmin(rows["cost"] - rows["gap"], rows["cost_truth"]))
     by_trial = rows.groupby("trial", sort=True).agg(data=("data", "first"), least=("least", "min"))[:count]
     if list(by_trial.index) != list(range(len(by_trial))):
@@ -550,7 +562,7 @@ def _trials_of_file(file: Path, names: Sequence[str], count: int) -> Trials:
     if len(positions) != 1:
         what = f"it has {len(positions)} unknown positions"
         raise InvalidProblem(what, str(file), "give one target, static or with one motion for the whole run")
-    # A fixed point near the stations' centre, for methods that need a start.
+    # A fixed point near the stations' centre, for methods that need a start. The truth is unknown: NaN.
     wild = np.random.default_rng(0).uniform(-0.5, 0.5, (n, problem.dimension))
     truth = np.full((n, problem.layout.size), np.nan)
     drawn = DrawnCase(problem, truth, wild, ("",) * n, ("",) * n, np.zeros(n, dtype=int), positions[0])

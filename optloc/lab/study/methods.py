@@ -140,6 +140,7 @@ def methods_of(table: MethodTable, number: int) -> Iterator[StudyMethod]:
             from optloc.solvers import Method as Pipeline
 
             try:
+                # Parse only to find errors. The method of networks, `CALIBRATE`, is not a pipeline of stages.
                 _ = name == CALIBRATE or Pipeline.parse(name)
             except InvalidProblem as error:
                 raise InvalidProblem(error.what, where, error.advice) from None
@@ -247,6 +248,7 @@ def run(method: StudyMethod, drawn: DrawnCase | Networks) -> MethodRun:
         seconds, processor = perf_counter() - began, process_time() - processor
     if not isinstance(drawn, Networks):
         _check_fix(fix, drawn)
+    # `tally` has the name of a solver and its number of iterations for each program that was solved.
     used = choice is None or choice.name in {name for name, _ in tally}
     iterations = float(sum(n for _, n in tally)) if tally else np.nan
     return MethodRun(fix, seconds, processor, np.where(evaluations > 0.0, evaluations, np.nan), iterations, used)
@@ -287,11 +289,15 @@ _ROUNDING = 1e-8
 
 
 def _check_fix(fix: Any, drawn: DrawnCase) -> None:
-    """Raise Nonsense if a value is not a valid fix of the trials: wrong type, shape, kind of numbers, or answers."""
+    """Raise Nonsense if a value is not a valid fix of the trials: wrong type, shape, kind of numbers, or answers.
+
+    `fix` is the value that the method has returned for the trials `drawn`.
+    """
     if not isinstance(fix, Fix):
         raise Nonsense(f"it returned {type(fix).__name__} instead of a fix")
     n, size = drawn.truth.shape
     shared, listed = drawn.problem.layout.n_shared, np.shape(fix.alternatives.gap)[-1:]
+    # By name: value, shape, and allowed kinds of its NumPy type: f float, i and u integer, O object, U text.
     expected: dict[str, tuple[Any, tuple[int, ...], str]] = {
         "x": (fix.x, (n, size), "f"),
         "cov": (fix.cov, (n, shared, shared), "f"),

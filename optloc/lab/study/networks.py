@@ -175,7 +175,10 @@ def _gross_size(table: NetworkTable, where: str) -> float:
 
 
 def _trial(case: NetworkCase, number: int) -> tuple[Network, NetworkEstimate, int]:
-    """Return the network of the trial `number`, its true values, and the number of its arrivals with a gross error."""
+    """Return the network of the trial `number`, its true values, and the number of its arrivals with a gross error.
+
+    Emission times, clocks and arrivals are multiplied by the propagation speed, so all are in metres.
+    """
     # A seed sequence mixes words of 32 bits. Positions, noise and gross errors have separate streams: a change of one
     # does not shift the others.
     key = [int(case.key[:8], 16), int(case.key[8:], 16)]
@@ -199,8 +202,11 @@ def _trial(case: NetworkCase, number: int) -> tuple[Network, NetworkEstimate, in
     gross = np.zeros((n, m), dtype=bool)
     if table.outliers is not None:
         gross = error_rng.random((n, m)) < table.outliers.share
+        # With `late`, no sign is negative.
         sign = np.where(error_rng.random((n, m)) < 0.5 - 0.5 * table.outliers.late, -1.0, 1.0)
         z = z + gross * sign * _gross_size(table, case.where)
+    # An arrival is missing with the probability `table.missing`. But each pulse keeps the `least` arrivals with its
+    # largest draws. The double argsort is the rank of a draw: 0 for the largest draw of the pulse.
     missing_draw = error_rng.random((n, m))
     least = min(m, d + 1 + _SPARE)
     kept = (missing_draw >= table.missing) | (np.argsort(np.argsort(-missing_draw, axis=1), axis=1) < least)
@@ -284,6 +290,7 @@ def refined(network: Network, starts: NetworkEstimate) -> NetworkResult:
     if not np.isfinite(cost).any():
         return NetworkResult(Status.NUMERICAL, "No start led to a network.", *missing, np.nan, 0)
     best = minima.take(np.array([int(np.nanargmin(cost))]))
+    # `free` is the number of motions of the frame: they change no predicted arrival, so they use no row.
     covariance, free = _covariance(network, best)
     dof = network.rows - network.unknowns + free
     if not np.isfinite(covariance).all():
@@ -300,6 +307,7 @@ def _covariance(network: Network, estimate: NetworkEstimate) -> tuple[Array, int
     The covariance is given in the frame of all stations, and is NaN if the arrivals do not determine the network. The
     motions are the rigid motions and clock shifts that no arrival measures; they add to the degrees of freedom.
     """
+    # `free` are the motions of the frame. `open` are other motions that change no arrival: then no covariance exists.
     frame = determined(likelihood(network), estimate)
     p, free = frame.jacobian.shape[1], frame.free.shape[1]
     if not frame.open.shape[1]:
@@ -401,12 +409,16 @@ def found_columns(known: KnownNetworks, results: tuple[NetworkResult, ...]) -> d
 
 
 def _result_columns(result: NetworkResult, network: Network, truth: NetworkEstimate, bound: Array) -> dict[str, Any]:
-    """Return the columns of the result for one network, by name; `bound` (p, p) is the bound of its true network."""
+    """Return the columns of the result for one network, by name; `bound` (p, p) is the bound of its true network.
+
+    The p unknowns begin with the coordinates of all stations.
+    """
     error = distances_apart(result.stations, truth.stations[0])
     unknowns, located = error.size, bool(np.isfinite(result.stations).all())
     # A covariance belongs to the frame of its network. So the error for `nees` is computed in the frame of the result,
     # and the error for `deviation` in the frame of the truth.
     error_in_result_frame = distances_apart(truth.stations[0], result.stations)
+    # The arrivals do not determine a common offset of all clocks. The standard deviation in `error_bias` removes it.
     return {
         "status": result.status.label,
         "reason": result.reason,

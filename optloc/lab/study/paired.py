@@ -121,11 +121,13 @@ def _pair(both: pd.DataFrame, case: str, noise: str, method: str, against: str) 
 
     right, other = (both[name].to_numpy(dtype=bool) for name in ("right", "right_other"))
     alone, other_alone = int((right & ~other).sum()), int((other & ~right).sum())
+    # Without a trial that only one method solves, the share is unknown: it may be between 0 and 1.
     share, low, high, p = float("nan"), 0.0, 1.0, 1.0
     if alone + other_alone:
         test = binomtest(alone, alone + other_alone)
         interval = test.proportion_ci(LEVEL, method="exact")
         share, low, high, p = float(test.statistic), float(interval.low), float(interval.high), float(test.pvalue)
+    # Errors are compared by differences in metres, times by the logarithm of their ratio.
     error = median_of(both["error"].to_numpy(dtype=float) - both["error_other"].to_numpy(dtype=float))
     with np.errstate(divide="ignore", invalid="ignore"):
         time = median_of(np.log(both["seconds"].to_numpy(dtype=float) / both["seconds_other"].to_numpy(dtype=float)))

@@ -154,6 +154,7 @@ def profiles(frame: pd.DataFrame, *, tau: float = TAU, work: str = "processor", 
     counted = rows[rows["method"].astype(str).isin(methods)].fillna({"work": np.inf})
     spent, solved, total = instances(counted, methods, "work", "solved")
     solved &= np.isfinite(spent)
+    # Most solved trials first; then the least median work; then the name.
     order = sorted(range(len(methods)), key=lambda i: (-int(solved[i].sum()), _median(spent[i][solved[i]]), methods[i]))
     silent = tuple(str(name) for name in known.index[known == 0])
     return Profiles(tau, work, tuple(methods[i] for i in order), silent, spent[order], solved[order], total)

@@ -158,6 +158,7 @@ def block_size(case: Case) -> int:
 
 def draw(case: Case, first: int, count: int) -> DrawnCase:
     """Return `count` trials of a case, from the trial `first` on; they do not depend on other draws."""
+    # Draw whole blocks, then select the wanted trials. So a trial does not depend on `first` and `count`.
     per_block = block_size(case)
     blocks = range(first // per_block, -(-(first + count) // per_block))
     parts = [_block(case, number, per_block) for number in blocks]
@@ -199,6 +200,7 @@ def _block(case: Case, number: int, n: int) -> tuple[Array, Array, Array, Array,
             stations = place_stations(table.layout, case.where, rng, n)
         problem = _with_stations(problem, stations)
     true_problem, injected = add_injected_errors(problem, table, case.where)
+    # `names` are the names of the position and, if the target moves, of the velocity.
     place, names = join(case.where, "truth"), case.state
     # The order of these draws decides the data, like the seed.
     values = {names[0]: place_targets(table.truth, problem.frame, stations, place, rng)}
@@ -455,10 +457,14 @@ def _biases(case: Case, bias: Bias, rng: Rng, n: int) -> Array:
 
 
 def _bias_value(case: Case, bias: Bias, value: Amount, where: str) -> float:
-    """Return a value of a bias in SI units; an offset has the unit of its rows, a boresight is an angle."""
+    """Return a value of a bias in SI units; an offset has the unit of its rows, a boresight is an angle.
+
+    `value` is a number in SI units, or a text with a unit and perhaps a sign.
+    """
     if isinstance(value, int | float):
         return float(value)
     form = form_of(bias)
+    # The value has the quantity of the rows: its unit is a unit of the kind of the first row that the bias affects.
     if form.quantity is None and not form.rate:
         starts = np.array(case.template.starts)
         kind = case.template.rows[int(np.searchsorted(starts, bias.row[0], side="right")) - 1].kind

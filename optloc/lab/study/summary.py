@@ -173,7 +173,7 @@ def cells(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _cell(part: pd.DataFrame) -> dict[str, Any]:
-    """Return the statistics of the rows of one cell, by the column names of `cells`."""
+    """Return the statistics of the judged rows of one cell, by the column names of `cells`; NaN without a value."""
     accurate = accuracy_rows(part)
     error, bound, deviation = (part[n].to_numpy(dtype=float)[accurate] for n in ("error", "crlb", "deviation"))
     ratio, half = over_bound(error, bound)
@@ -287,7 +287,7 @@ def instances(
     table = frame.assign(data=data, method=names).pivot_table(
         index=["data", "trial"], columns="method", values=[work, success], aggfunc="first"
     )
-    # In an unfinished study, some methods have not run all trials yet.
+    # In an unfinished study, some methods have not run all trials yet: they have NaN there.
     common = table.dropna()
     times, solved = (np.stack([common[column][name] for name in order]) for column in (work, success))
     return times.astype(float), solved.astype(bool), len(table)
@@ -307,6 +307,7 @@ def ranking(frame: pd.DataFrame, order: list[str], shift: float) -> pd.DataFrame
     """
     import pandas as pd
 
+    # `limit` is the time of a failure, seconds.
     times, solved, _ = instances(frame, order)
     limit = _PENALTY * times.max(initial=0.0)
     mean = np.array([shifted_mean(np.where(ok, t, limit), shift) for t, ok in zip(times, solved, strict=True)])

@@ -378,7 +378,7 @@ def _part(chunk: Chunk, known: KnownTrials | KnownNetworks, solved: Values, buil
     import pyarrow as pa
 
     case, method, n = chunk.cell.case, chunk.cell.method, chunk.count
-    # In this order: a failed trial has NaN for all numbers, but its truth and its bound are known.
+    # The values of `truth_values` replace equal names: a failed trial has NaN there, but its truth and bound are known.
     values = solved | truth_values(case, known)
     values |= {
         "key": chunk.cell.key,
@@ -485,7 +485,10 @@ def truth_values(case: Case | NetworkCase, known: KnownTrials | KnownNetworks) -
 def fix_values(
     case: Case | NetworkCase, known: KnownTrials | KnownNetworks, fix: Fix | tuple[NetworkResult, ...]
 ) -> Values:
-    """Return the columns of the fixes of n trials, or of the results for n networks."""
+    """Return the columns of the fixes of n trials, or of the results for n networks; `known` are their data.
+
+    Numbers that a trial lacks are NaN. An estimate with a number that is not finite counts as NaN in all its numbers.
+    """
     if isinstance(known, KnownNetworks):
         assert isinstance(fix, tuple)
         return found_columns(known, fix)

@@ -109,7 +109,10 @@ class WorkerProcess:
         return reply
 
     def end(self, seconds: float = 0.0) -> str:
-        """Kill the process and its children, after at most `seconds`, and return its exit code as text."""
+        """Kill the process and its children, and return its exit code as text.
+
+        First wait at most `seconds` until the process ends without a signal, because a killed process has another code.
+        """
         with self._ended:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(seconds)
@@ -183,6 +186,7 @@ class WorkerPool:
         except EOFError as error:
             return Lost(chunk.key, DIED, str(error))
         finally:
+            # A living worker becomes idle, and a dead one is removed.
             with self._lock:
                 (self._idle.append if worker.lives() else self._all.discard)(worker)
 
@@ -253,8 +257,8 @@ def limit_memory(memory: int | None) -> None:
 def serve(memory: int | None, die_with: Callable[[IO[bytes], bool], None]) -> NoReturn:
     """Compute chunks from standard input one by one, and write replies to standard output, until the input closes.
 
-    `memory` is the limit of this process in bytes. `die_with` is the function of `_BEGIN`. The first reply is True, and
-    reports that the worker is ready.
+    `memory` is the limit of this process in bytes. `die_with` is the function in the text `_BEGIN`, which switches the
+    signal of the pipe on or off. The first reply is True, and reports that the worker is ready.
     """
     limit_memory(memory)
     # A method may read and print, so standard streams go to the null device. This comes first: otherwise a copy of a
@@ -269,6 +273,7 @@ def serve(memory: int | None, die_with: Callable[[IO[bytes], bool], None]) -> No
         while True:
             if os.getpid() != pid:
                 os._exit(0)  # a method forked, and its copy has returned here too
+            # Off before the reply, because the next message of the parent would also cause the signal.
             die_with(tasks, False)
             _send(replies, reply)
             key, names, packed = pickle.loads(messages.get(timeout=_IDLE))  # noqa: S301
