@@ -204,8 +204,9 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
         dtype=values.dtype if values.dtype.kind == "M" else float,
     )
     seen: set[tuple[int, int]] = set()
-    # Subtract the minimum from integers, so that recent times in nanoseconds keep their digits as floats.
-    values = values - values.min() if values.dtype.kind in "iu" else values
+    # Subtract the minimum from integer times of arrival, so that recent times in nanoseconds keep their digits as
+    # floats. Only times of arrival have an origin that does not matter.
+    values = values - values.min() if word == "toa" and values.dtype.kind in "iu" else values
     for value, key, label in zip(values, ends, labels, strict=True):
         place = (rows[label], keys[key])
         if place in seen:

@@ -49,3 +49,14 @@ def test_values_of_no_station_are_refused(given, words):
 
 def test_every_argument_is_a_kind_with_its_unit():
     assert all(argument.kind in MODELS for argument in ARGUMENTS.values())
+
+
+@pytest.mark.parametrize("word", sorted(ARGUMENTS))
+def test_integers_of_a_long_frame_are_the_values_of_the_table(word):
+    """Only times of arrival have a free origin: a shift of other values moves the fix."""
+    frame = pd.DataFrame({"station": ["B", "C", "A"], "value": [50, 60, 70]})
+    found, exact = (
+        station_values(word, frame.astype({"value": number}), ["A", "B", "C"], "A").values for number in (int, float)
+    )
+    np.testing.assert_array_equal(found - exact, found[0] - exact[0])
+    assert found[0] == exact[0] or word == "toa"
