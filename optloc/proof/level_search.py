@@ -1,4 +1,4 @@
-"""The search of boxes for minima below a list of cost levels: one loop for costs with and without unknown scales.
+"""The search of boxes for minima below a list of cost levels: one loop for costs with and without unknown factors.
 
 A box is finished if its cost is at least the first level. It is also finished if it contains no minimum, because a
 component of the gradient or the curvature has a fixed sign: the least cost over all positions is then attained
@@ -192,7 +192,7 @@ def _meet(
 ) -> tuple[int, int, Space]:
     """Descend from the current centre; if the descent ends in an unknown minimum, store it and push boxes around it.
 
-    Returns the number of rivals (-1 if no boxes can be made around the minimum), the size of the stack, and the space.
+    Return the number of rivals (-1 if no boxes can be made around the minimum), the size of the stack, and the space.
     The arguments are as in `search_levels`; `first` is the index of the first level that can still be shown, and `met`
     the number of rivals before.
     """

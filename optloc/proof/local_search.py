@@ -229,12 +229,27 @@ def _follow(cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array,
 
 @inlined
 def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, rows: Array, inside: bool) -> int:
-    """Return the coordinate across which halving a box reduces the remainders in its bound most.
+    """Return the coordinate (0, 1 or 2) across which halving a box reduces the remainders in its bound most.
 
-    The remainder of a range is nearly ``s'N s / 2``, so coordinate k has the share ``h_k sum_m |N_km| h_m`` in it. Its
-    weight is the pull ``|K_j.v|`` on the bound, with v the direction of the bound (`optloc.proof.box.least_residual`).
-    N is the Hessian of the range, and h the half-widths. If the centre is below the level (`inside`), no bound
+    The remainder of a range is the range minus its linear approximation at the centre of the box, nearly ``s'N s / 2``.
+    N is the Hessian of the range, and h (`half`) the half-widths. So coordinate k has the share ``h_k sum_m |N_km|
+    h_m`` in the remainder. These shares are scaled to sum to the width of the remainder's interval. The weight of
+    range j is its pull ``|K_j.v|`` on the bound, with v the direction of the bound
+    (`optloc.proof.box.least_residual`). Only ranges count. If the centre is below the level (`inside`), no bound
     suffices. In this case, and if ranges have no part in the bound, the result is the widest side.
+
+    Parameters
+    ----------
+    kinds, K : array (J,), (q, J)
+        Codes of the nodes, and whitened rows over the nodes.
+    gram : array (3, 3)
+        T'T of the search coordinates: x = origin + T s.
+    half : array (3,)
+        Half-widths of the box.
+    nodes, rows : array (J, NODE_WIDTH), (q, ROW_WIDTH)
+        Filled tables of the box: intervals and slopes of the nodes, and the direction v in column DIRECTION of `rows`.
+    inside : bool
+        Whether the cost at the centre is below the level.
     """
     if inside:
         return widest(half)
@@ -245,6 +260,7 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
             pull = 0.0
             for i in range(K.shape[0]):
                 pull += K[i, j] * rows[i, DIRECTION]
+            # Times the range r, N is T'T minus the square of the slopes. The factor 1/r cancels in the shares.
             e0, e1, e2 = nodes[j, SLOPE0] * h0, nodes[j, SLOPE1] * h1, nodes[j, SLOPE2] * h2
             a, b = abs(gram[0, 1] * h0 * h1 - e0 * e1), abs(gram[0, 2] * h0 * h2 - e0 * e2)
             c = abs(gram[1, 2] * h1 * h2 - e1 * e2)

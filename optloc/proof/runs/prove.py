@@ -1,7 +1,11 @@
 """The proof of a run: no position costs less than a fix, and no other minimum is within a gap.
 
 A run has many rows, which are sparse (`optloc.proof.runs.rows`). The search is over all space (functions `..._far`), or
-in search coordinates around the fix (functions `..._near`). The last functions prove fixes of moving targets.
+in search coordinates around the fix (functions `..._near`). The last functions prove fixes of moving targets. Around
+each known minimum there are boxes with half-widths (3,) in standard deviations: the *hull* is the greatest allowed box,
+in the *convex box* (`sides`) the cost is convex, and the *core* is a wider box that is searched along the axes of the
+minimum. A *piece* is a part of the atlas of all space, with a number (`optloc.proof.atlas`). `RunTables` are working
+memory.
 """
 
 from __future__ import annotations
@@ -132,10 +136,11 @@ def _margin(tables: RunTables, noise: float, eps: float) -> float:
 def _set_far(
     run: RunCost, space: Space, tables: RunTables, i: int, x: Array, value: float, eps: float, limit: float
 ) -> bool:
-    """Write minimum i, at x (D,), and the boxes around it into an atlas.
+    """Write minimum i, at x (d,), metres, and the boxes around it into the atlas of `space`; d is 2 or 3.
 
-    Return False if x is no minimum or costs less than `value`. For `eps` and `limit` see
-    `optloc.proof.convex_boxes.set_minimum`.
+    Return False if x is no minimum or costs less than `value`: the search leaves the convex box out, so no cheaper
+    point may be in it. In the convex box the cost falls at most `eps` below the cost of x. No box reaches farther than
+    `limit` metres along any coordinate; infinity means no limit. `tables` is overwritten.
     """
     atlas, box, d, hull = space.atlas, tables.box, space.atlas.dimension, np.zeros(3)
     minima, piece = atlas.minima, 2 * d + 1 + i
@@ -151,6 +156,7 @@ def _set_far(
         for m in range(d):
             minima.axes[i, m, k] /= sqrt(own)
             minima.back[i, k, m] *= sqrt(own)
+    # Again in the new axes, because the margin needs the gradient along them. `hull` is still zero: the minimum itself.
     cost_at_coordinates(run, space, tables, piece, hull)
     margin = _margin(tables, rounding_at_place(run, space, tables, floor_of(space, run.cost)), eps)
     set_hull(atlas, i, hull, limit)
@@ -174,10 +180,11 @@ def _set_near(
     eps: float,
     hidden: bool,
 ) -> bool:
-    """Write minimum i, at x (D,), in search coordinates, and the sides of a convex box around it.
+    """Write minimum i, at x (D,), metres, into the minima of `space`, and the sides of a convex box around it.
 
-    `corners` (2, 3) limit the box, in which the cost falls at most eps below the cost of x. If `hidden`, the size of
-    the box is limited to `HIDDEN_REACH`. Return False if x is no minimum or costs less than `value`.
+    Both are in search coordinates, and `corners` (2, 3) of the region limit the box. In the box the cost falls at most
+    `eps` below the cost of x. If `hidden`, no coordinate is farther than `HIDDEN_REACH` metres from x. Return False if
+    x is no minimum or costs less than `value`. `tables` is overwritten.
     """
     chart, box, hull, shift, at = space.chart, tables.box, np.zeros(3), np.zeros(3), space.minima[i]
     for k in range(3):
@@ -185,7 +192,7 @@ def _set_near(
         for m in range(x.shape[0]):
             at[k] += chart.back[k, m] * (x[m] - chart.origin[m])
         hull[k] = max(corners[1, k] - at[k], at[k] - corners[0, k], 0.0)
-    if chart.surface.shape[0] > 0:
+    if chart.surface.shape[0] > 0:  # the surface has two coordinates, and gives the third one
         at[2] = 0.0
     if not cost_at_coordinates(run, space, tables, 0, at) >= value:
         return False
