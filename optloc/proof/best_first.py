@@ -105,13 +105,15 @@ class SearchGoal(NamedTuple):
 
 @compiled
 def _add(cost: Cost, near: Box, aim: SearchGoal, x: Array, count: int, level: float) -> int:
-    """Descend from a position (D,) to a minimum, and list it if it is new; return the number of known minima.
+    """Descend from a position x (D,), metres, to a minimum, and list it if it is new; return the number of minima.
 
-    `x` is overwritten by the end of the descent. A minimum that costs `level` or more is not added.
+    `x` is overwritten by the end of the descent. The list is in `aim`, and `count` is its length before. `near` is
+    working memory. A minimum that costs `level` or more is not added. If the list is full, a new minimum replaces the
+    most expensive one if it costs less.
     """
     D, value, arrived = x.shape[0], inf, 0
-    # Until two rounds have converged: one in the axes of a nearby point, one in the axes of the minimum, in which the
-    # unit is a standard deviation.
+    # Until two rounds in succession (`arrived`) have converged: one in the axes of a nearby point, one in the axes of
+    # the minimum, in which the unit is a standard deviation.
     for _ in range(_ROUNDS):
         chart, _ = chart_on(cost, x, near, aim.planes, aim.surface)
         near.at[:] = 0.0
@@ -183,6 +185,7 @@ def search_minima(
     atlas, none, nowhere = atlas_of(middle, radius, d, 0), np.empty((0, 3)), np.full(d, nan)
     stack, corners = np.zeros((2 * budget + 4 * (d + 1) + 6 * aim.points.shape[0], DEPTH)), np.empty((2, 3))
     chart, count, boxes = around, zero(), zero()
+    # On a surface, a short search of each side comes first: a cheap minimum from any side lowers the level for all.
     for look in range(2 * SIDES if bent else 1):
         most = min(_LOOK, budget - boxes) if bent and look < SIDES else budget - boxes
         if bent:
@@ -376,7 +379,7 @@ class FoundPlaces(NamedTuple):
 
 
 def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: int, most: int) -> tuple[Array, Array]:
-    """Return the minima of n costs that a best-first search meets without any candidate.
+    """Return the minima of n costs that a best-first search finds without starting points.
 
     Parameters
     ----------
@@ -385,7 +388,7 @@ def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: i
     places : FoundPlaces
         Data of the searches: positions, regions, planes or surfaces.
     gap : float
-        Greatest cost of a minimum above the best one.
+        Greatest difference between the cost of a minimum and the least cost found.
     budget : int
         Greatest number of boxes for each cost.
     most : int

@@ -45,7 +45,7 @@ def around_node(
     c0, c1, c2, radius = data[0], data[1], data[2], most
     if kind != RANGE:  # ranges skip the call, because they are the common case
         c0, c1, c2, radius = ball_of(kind, data, least, most)
-        if radius == inf:
+        if radius == inf:  # no ball contains these points
             return
     radius = max(radius, 0.0) * (1.0 + _WIDER)
     c0, c1, c2 = c0 - x[0], c1 - x[1], c2 - x[2]
@@ -131,18 +131,18 @@ def around_squares(
 
     Parameters
     ----------
-    kinds, data, A, nodes, sense
+    kinds, data, A, nodes, sense : arrays (J,), (J, width), (J, J), (J, NODE_WIDTH), (3, 3)
         Nodes of the cost, ``A = K'K``, the table of nodes at the fix, and T with x = origin + T s.
     rho : float
         Longest residual of points inside the box.
     member, reference : int array, int
         Nodes of the group without the reference, and the reference; negative without a reference.
-    R, tie : array
-        Covariance of the errors of the group, and the factors n_j of all nodes.
+    R, tie : array (n, n), (J,)
+        Covariance of the errors of the n nodes `member`, and the factors n_j of all nodes: -1, 0 or 1.
     ties : array (J, TIE_WIDTH)
         Table with the errors at the fix; the other columns are written.
     lower, upper : array (3,)
-        Corners of the box, contracted in place.
+        Corners of the box, contracted in place; they stay if the rows give no bound.
     """
     count, ranges = _rows(kinds, data, nodes, sense, member, reference, tie, ties)
     for k in range(3):

@@ -360,6 +360,7 @@ def prove_globally(
     verdict, boxes, bound = prove_locally(
         cost, box, x, beside, gaps[0], eps, first, reach, nowhere, nowhere, False, found
     )
+    # The atlas may decide these cases. OTHER with a known minimum means that the axes of the fix did not suit it.
     again = verdict in (OPEN, BUDGET, STATIONARY, SINGULAR) or (verdict == OTHER and _listed(x, beside.points, found))
     if not open_end or not again or boxes >= budget:
         return verdict, boxes, bound, gaps[0], 0
@@ -412,6 +413,7 @@ def prove_atlas(
     known, place = zero(), np.empty(x.shape[0])
     for p in range(atlas.minima.home.shape[0]):
         put(x if p == 0 else others[p - 1], place)
+        # The last minima are hidden: they may have any cost, but only points near them are left out.
         hidden = p > others.shape[0] - beside.hidden
         least_here, limit = (-inf, HIDDEN_REACH) if hidden else (least - 0.5 * eps, inf)
         if set_minimum(cost, box, atlas, known, place, least_here, 0.5 * eps, limit):

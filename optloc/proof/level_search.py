@@ -65,8 +65,8 @@ def set_rival(
 ) -> bool:
     """Write minimum i, at x (D,), and the boxes around it into an atlas.
 
-    Return False if x is no minimum or costs too little. For `value` and `eps` see
-    `optloc.proof.convex_boxes.set_minimum`; rho is the root of the first level.
+    Return False if x is no minimum or costs less than `value`. In its convex box the cost falls at most `eps` below the
+    cost of x. `rho` is the root of the first level, and `chart` the search coordinates around the fix.
     """
     raise NotImplementedError
 

@@ -140,6 +140,7 @@ def search_boxes(
     gram = box.gram if bent else chart.gram  # a box on a surface has other axes
     sense, at, half, centre, line = chart.sense, box.at, box.half, box.centre, box.line
     nodes, rows, curves, sums, solve, cut = box.nodes, box.rows, box.curves, box.sums, box.solve, box.cut
+    # `unique`: the claim is about other minima, too, and not about the value alone.
     weight, origin, floor, unique = cost.weight, chart.origin, chart.floor, aim.level > aim.value
     rho = sqrt(max(aim.level, 0.0))
     boxes, low_points = 0, 0
@@ -170,6 +171,7 @@ def search_boxes(
         # Parts with residuals longer than rho, and parts that contain no minimum, are cut off from all sides.
         reset_cut(half, cut)
         contract_box(K, weight, rho + noise, half, half[2] == 0.0, nodes, rows, cut, solve)
+        # `sound`: the box may be dropped if it contains no minimum.
         sound = aim.whole or exceeds_level(low, aim.value)
         if _is_done(at, half, minima, sides, aim, (unique or aim.whole) and sound):
             continue

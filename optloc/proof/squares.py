@@ -232,7 +232,7 @@ def _fill_rows(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> tuple
     rows[:], squares.K[:] = 0.0, 0.0
     wider, size = 0.0, squares.floor
     for g in range(squares.groups):
-        reference = -1
+        reference = -1  # the range of the group that is closest to linear over the box
         for j in range(lines.shape[0]):
             if squares.group[j] == g and (reference < 0 or lines[j, BEND] < lines[reference, BEND]):
                 reference = j
@@ -240,6 +240,8 @@ def _fill_rows(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> tuple
         for j in range(lines.shape[0]):
             if squares.group[j] != g or j == reference:
                 continue
+            # The measured difference z_j, and bounds of the sum of two ranges by which the right side is divided, all
+            # in half sides of the cube.
             late = (squares.late[j] - squares.late[reference]) / radius
             low = lines[j, LEAST] + lines[reference, LEAST] + scale[0] * late - swing * abs(late)
             high = lines[j, MOST] + lines[reference, MOST] + scale[0] * late + swing * abs(late)

@@ -282,7 +282,9 @@ def prove_run(
     """
     tables, D = tables_of(run), x.shape[0]
     chart, good = chart_on(run.look, x, tables.small, beside.planes, beside.surface)
-    chart = without_differences(chart)  # few rows may be balanced although all rows are not
+    # Without a reference position for ranges: it needs a cost that stays the same if all ranges change by the same
+    # length. The cost of the few rows may have this property although the cost of all rows does not.
+    chart = without_differences(chart)
     least = cost_of_place(run, x, tables)
     middle, radius = station_cube(run.cost.kinds, run.cost.data, x)
     bound_to = beside.planes.shape[0] + beside.surface.shape[0] > 0 or not isnan(lower[0])
@@ -324,6 +326,7 @@ def _prove_far(
         hidden = p > others.shape[0] - task.beside.hidden
         if p > 0 and not (hidden or aim.level > aim.value):
             continue
+        # A hidden minimum may have any cost, but only points near it are left out.
         least, limit = (-inf, HIDDEN_REACH) if hidden else (aim.better, inf)
         if _set_far(run, space, tables, known, place, least, 0.5 * task.eps, limit):
             known += 1

@@ -43,7 +43,7 @@ def sum_scaled(scaled: Scaled, squares: bool, box: Box, sheet: ScaledWorkspace) 
     scaled : Scaled
         The cost.
     squares : bool
-        Whether the positive part of the change of ``E'E`` counts.
+        Whether the positive part of the change of ``E'E`` counts. A test of convexity may leave it out.
     box : Box
         Its nodes and their curves are filled; the sums are written.
     sheet : ScaledWorkspace

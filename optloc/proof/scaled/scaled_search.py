@@ -205,9 +205,9 @@ def set_scaled_minimum(
 ) -> bool:
     """Write minimum i, at x, and the boxes around it into an atlas.
 
-    Return False if x is no minimum or costs less than `value`. The boxes have half-widths in standard deviations along the axes of the minimum. `hull` has the greatest allowed
-    half-widths, `sides` the half-widths of the convex box, and `core` the corners of the wider box that is searched
-    along these axes.
+    Return False if x is no minimum or costs less than `value`. The boxes have half-widths in standard deviations along
+    the axes of the minimum. `hull` has the greatest allowed half-widths, `sides` the half-widths of the convex box, and
+    `core` the corners of the wider box that is searched along these axes.
 
     Parameters
     ----------
