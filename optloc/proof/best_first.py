@@ -221,6 +221,7 @@ def _search(
     """Search the boxes of a stack for minima; return the number of known minima, and the number of boxes.
 
     `corners` (2, 3) are the corners of the region in search coordinates, and `budget` is the greatest number of boxes.
+    New minima are written into `aim`, which has `count` minima before. `near` is working memory.
     """
     at, boxes, lows, cheapest, floor = np.empty(aim.points.shape[1]), zero(), zero(), inf, floor_of(space, cost)
     queue = [(0.0, i) for i in range(size)]
@@ -268,6 +269,7 @@ def _split(
     """Push the halves of the remaining part of a box; return the size of the stack.
 
     `side` is the side to halve, and `low` a lower bound of the cost over the box, by which the queue is ordered.
+    `piece` is the number of the box's piece of the atlas, 0 around a fix, and `size` the size of the stack before.
     """
     if not cut_out(box.cut, box.at, box.half) > 0.0:
         return size
@@ -288,7 +290,8 @@ def _look(cost: Cost, space: Space, box: Box, piece: int, level: float, floor: f
     """Return the bound of the cost over a box with bounded nodes, the cost at its centre, and the side to halve.
 
     The side is -1 if the box contains no minimum below a level. Otherwise the ends of the part that may contain a
-    minimum are written into ``box.cut``. `floor` is the result of `optloc.proof.space.floor_of`.
+    minimum are written into ``box.cut``. `piece` is the number of the box's piece of the atlas, and `floor` the result
+    of `optloc.proof.space.floor_of`.
     """
     linearise_rows(cost.K, cost.w, box.nodes, box.rows)
     low = least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
@@ -303,11 +306,12 @@ def _look(cost: Cost, space: Space, box: Box, piece: int, level: float, floor: f
 def _side_far(cost: Cost, space: Space, box: Box, piece: int, level: float, here: float, floor: float) -> int:
     """Return the side to halve of a box of the atlas, or -1 if it contains no minimum; the box is not contracted.
 
-    `here` is the cost at the centre of the box, and `floor` the result of `optloc.proof.space.floor_of`.
+    `piece` is the number of the box's piece of the atlas, `here` the cost at the centre of the box, and `floor` the
+    result of `optloc.proof.space.floor_of`. `level` is infinite as long as no minimum is known.
     """
     atlas, d = space.atlas, space.atlas.dimension
     touching = piece < 2 * d and box.at[d - 1] <= box.half[d - 1]
-    if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY:
+    if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY:  # so small that halving would hardly change it
         return -1
     if level < inf and here < _NEAR * (level + 1.0) and excludes_infimum(cost, atlas, box, touching, floor):
         return -1
@@ -431,7 +435,8 @@ def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: i
 def _minima_of(costs: PositionCosts, place: FoundPlaces, gap: float, budget: int, most: int) -> tuple[Array, int]:
     """Return the minima (most, d), metres, of one cost in order of cost, and the number of boxes.
 
-    `place` has no first axis. Rows of NaN follow the last minimum.
+    `place` has no first axis. Only minima that cost less than the least cost plus `gap` count. Rows of NaN follow the
+    last minimum. `budget` is the greatest number of boxes.
     """
     cost = without_unused_nodes(cost_of(costs.kinds, costs.data[0], costs.K[0], costs.w[0]))
     _, radius = station_cube(cost.kinds, cost.data, place.x)

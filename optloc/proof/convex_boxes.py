@@ -293,7 +293,7 @@ def set_hull(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
 
 @compiled
 def _draw_in(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
-    """Reduce half-widths (3,) around minimum i so that no coordinate is farther than `limit` metres."""
+    """Reduce half-widths `hull` (3,) around minimum i so that no coordinate is farther than `limit` metres from it."""
     minima, d = atlas.minima, atlas.dimension
     beside, out, scale = 0.0, 0.0, 1.0  # greatest changes of p and v, and v
     for k in range(d):

@@ -218,7 +218,8 @@ def _rows(
 def _left_inverse(A: Array, member: Array, ties: Array, ranges: bool, lower: Array, upper: Array) -> bool:
     """Write the left inverse of the rows that has the least errors at the fix; return False if it does not exist.
 
-    `ranges` is the second result of `_rows`. Coordinates with lower = upper = 0 do not exist.
+    `ranges` is the second result of `_rows`, and other arguments are as in `around_squares`. The columns WEIGHTED and
+    LEFT of `ties` are written. Coordinates with lower = upper = 0 do not exist.
     """
     normal = np.zeros((4, 4))
     for j in member:
@@ -293,10 +294,10 @@ def _inverts_well(member: Array, ties: Array, bound: Array, last: float, more: f
 def _sums(R: Array, member: Array, ties: Array, near: float, middle: float) -> tuple[float, float, float, float]:
     """Return the value of a weighted sum of squared rows at the fix, and three numbers that bound its errors.
 
-    The weights are in column WEIGHT of `ties`, `near` is the reference range at the fix, and `middle` the middle of its
-    interval. The second and third number are ``sqrt(m'R m)``, for weights times (first + middle second) and for weights
-    times second. Times rho, they bound the linear part of the errors. The last number bounds the quadratic part, times
-    rho squared: it is the sum of ``|weight| third R_ii``.
+    `member` are the nodes of the group. The weights are in column WEIGHT of `ties`, `near` is the reference range at
+    the fix, and `middle` the middle of its interval. The second and third number are ``sqrt(m'R m)``, for weights times
+    (first + middle second) and for weights times second. Times rho, they bound the linear part of the errors. The last
+    number bounds the quadratic part, times rho squared: it is the sum of ``|weight| third R_ii``.
     """
     value = linear = slope = square = 0.0
     for i in range(member.shape[0]):
@@ -445,7 +446,7 @@ def _weighted_inverse(rows: Array, reach: Array, far: Array, count: int, span: i
 def _inverts(gamma: Array, rows: Array, count: int, span: int, off: Array) -> bool:
     """Write bounds of the entries of |gamma rows - 1| into `off` (3, 3).
 
-    Return whether all are as small as rounding.
+    Return whether all are as small as rounding. The arguments are as in `_weighted_inverse`.
     """
     off[:] = 0.0
     for k in range(span):

@@ -393,7 +393,7 @@ def prove_atlas(
     rivals: Array,
     found: Array,
 ) -> tuple[int, int, float, float, int]:
-    """Prove the same as `prove_globally` with the atlas alone, and return the same results.
+    """Prove the same as `prove_globally` with the atlas alone; arguments and results are the same.
 
     The cost must stay finite at infinity (`optloc.proof.box.reaches_infinity`).
     """

@@ -200,10 +200,11 @@ def search_boxes(
 def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Goal, enough: bool) -> bool:
     """Return whether a box needs no further search because it is in the convex box of a known minimum.
 
-    `minima` and `sides` (P, 3) are the known minima and the half-widths of their convex boxes. A convex box contains no
-    second minimum, but it may contain a point of lower cost. If `enough`, the convex box of any known minimum finishes
-    the box. Otherwise only convex boxes of the fix and of hidden minima do. If the search has no open boundary, the box
-    of the fix contains nothing cheaper.
+    `at` and `half` (3,) are the centre and half-widths of the box. `minima` and `sides` (P, 3) are the known minima and
+    the half-widths of their convex boxes: the fix first, then hidden minima, as `aim` counts them. A convex box
+    contains no second minimum, but it may contain a point of lower cost. If `enough`, the convex box of any known
+    minimum finishes the box. Otherwise only convex boxes of the fix and of hidden minima do. If the search has no open
+    boundary, the box of the fix contains nothing cheaper.
     """
     first = 0 if aim.whole else aim.own
     if is_known(at, half, minima[first : aim.free], sides[first : aim.free]):
@@ -499,8 +500,9 @@ def _search_sides(
 ) -> tuple[int, int]:
     """Search all pieces of a surface other than the piece of the fix; return the outcome and the boxes in total.
 
-    `around` are the search coordinates of the fix, and `boxes` is the number of boxes before. The search ends at the
-    first piece with an outcome other than CLEAR.
+    `around` are the search coordinates of the fix, `boxes` is the number of boxes before, and `budget` the greatest
+    number in all. Other arguments are as in `search_boxes` and `prove_locally`. The search ends at the first piece with
+    an outcome other than CLEAR.
     """
     corners, outcome = np.empty((2, 3)), CLEAR
     for side in range(1, SIDES):

@@ -318,7 +318,7 @@ def _blur(run: RunCost, chart: LocalAxes, x: Array, far: bool, tables: RunTables
 def _prove_far(
     run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalAxes, tables: RunTables
 ) -> tuple[int, int, float]:
-    """Prove the claim over all space; return verdict, number of boxes, and lower bound of the cost."""
+    """Prove the claim of `task` over all space; return verdict, number of boxes, and lower bound of the cost."""
     none, known, place, aim = np.empty((0, 3)), zero(), np.empty(task.x.shape[0]), task.aim
     space, stack, others = Space(True, atlas, chart, none, none), np.zeros((CAPACITY, DEPTH)), task.beside.points
     for p in range(1 + others.shape[0]):
@@ -356,8 +356,8 @@ def _prove_near(
 ) -> tuple[int, int, float]:
     """Prove the claim in search coordinates around a fix: in a region, in an enclosure, or around a surface.
 
-    `lower` and `upper` (D,) are the corners of the region, metres; NaN for an enclosure. Return verdict, number of
-    boxes, and lower bound of the cost.
+    `around` are the search coordinates around the fix. `lower` and `upper` (D,) are the corners of the region, metres;
+    NaN for an enclosure. Return verdict, number of boxes, and lower bound of the cost.
     """
     corners, bent, aim = np.empty((2, 3)), around.surface.shape[0] > 0, task.aim
     stack, total, bound = np.zeros((CAPACITY, DEPTH)), 0, aim.value

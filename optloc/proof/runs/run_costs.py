@@ -349,7 +349,7 @@ def _rows_of_single_nodes(nodes: list[int], size: int) -> Any:
 
 
 def _whitening(problem: Problem, present: Array) -> Any:
-    """Return the sparse matrix (q, m) that whitens the rows; absent rows become zero."""
+    """Return the sparse matrix (q, m) that whitens the rows; rows that are not `present` (m,) become zero."""
     from scipy import sparse
 
     blocks = []

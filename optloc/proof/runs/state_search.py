@@ -256,9 +256,9 @@ _STEPS, _CLOSE = 40, 1e-3
 
 @compiled
 def _descends(search: Search, level: float, found: Array) -> bool:
-    """Return whether the centre of a box descends to an unknown minimum below the level, and write this minimum.
+    """Return whether the centre of the box `search.table` descends to an unknown minimum below the level.
 
-    The minimum (n,) is a state in m and m/s.
+    If so, `found` (n,) is this minimum, a state in m and m/s.
     """
     table = search.table
     before, damping = table.at.copy(), 1e-3
@@ -303,7 +303,8 @@ def _linearise(search: Search, table: StateTable) -> float:
 def _step(table: StateTable, damping: float) -> float:
     """Write a damped Gauss-Newton step into `table.move`; return its squared length in standard deviations, or -1.
 
-    The result is -1 if the rows do not determine a step. The step is subtracted from the coordinates.
+    `damping` is the share by which the diagonal of the normal matrix grows. The result is -1 if the rows do not
+    determine a step. The step is subtracted from the coordinates.
     """
     n, matrix, lines = table.at.shape[0], table.solve, table.lines
     for m in range(n):

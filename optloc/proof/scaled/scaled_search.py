@@ -369,7 +369,8 @@ def _bound_rest(work: ScaledSearchWorkspace, space: Space, box: Box) -> float:
 def _bound_row(work: ScaledSearchWorkspace, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
     """Return a bound of the residual in a box of the stack, infinite if excluded, and the cost at its centre.
 
-    This is `optloc.proof.level_search.bound_row` for a cost with unknown factors.
+    `row` is the row of the box in the stack, and `level` the cost from which a box is excluded. This is
+    `optloc.proof.level_search.bound_row` for a cost with unknown factors.
     """
     scaled, box, sheet, piece = work.scaled, work.box, work.tables.sheet, int(stack[row, PIECE])
     pop(stack, row, box.at, box.half)
