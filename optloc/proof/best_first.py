@@ -306,7 +306,7 @@ def _look(cost: Cost, space: Space, box: Box, piece: int, level: float, floor: f
 def _side_far(cost: Cost, space: Space, box: Box, piece: int, level: float, here: float, floor: float) -> int:
     """Return the side to halve of a box of the atlas, or -1 if it contains no minimum; the box is not contracted.
 
-    `piece` is the number of the box's piece of the atlas, `here` the cost at the centre of the box, and `floor` the
+    `piece` is the number of the box's piece of the atlas, and `here` the cost at the centre of the box. `floor` is the
     result of `optloc.proof.space.floor_of`. `level` is infinite as long as no minimum is known.
     """
     atlas, d = space.atlas, space.atlas.dimension
@@ -392,7 +392,7 @@ def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: i
     places : FoundPlaces
         Data of the searches: positions, regions, planes or surfaces.
     gap : float
-        Greatest difference between the cost of a minimum and the least cost found.
+        Greatest difference between the cost of a listed minimum and the least cost found.
     budget : int
         Greatest number of boxes for each cost.
     most : int

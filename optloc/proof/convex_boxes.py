@@ -194,8 +194,8 @@ def accuracy_floor_far(cost: Cost, atlas: Atlas) -> float:
 
 # Boxes around a known minimum in an atlas: principal axes, and a box in which it is the only minimum.
 
-# Greatest half-width of convex boxes, standard deviations: a fix with such small deviations needs no wider box. And
-# the greatest share of the way to infinity, where the coordinates of the minimum end.
+# Greatest half-width of convex boxes, standard deviations: a fix with smaller deviations needs no wider box. And the
+# greatest share of the way to infinity, where the coordinates of the minimum end.
 _WIDEST, _SHARE = 1e4, 0.9
 # Half-widths of the box searched along the axes of a minimum: in units of the convex box, and at least this many
 # standard deviations. Outside, the cost is high enough for boxes along the axes of space.

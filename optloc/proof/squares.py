@@ -5,9 +5,10 @@ v, in half sides of the cube, the error obeys
 
     (q_j - q_p - v z_j) (q_j + q_p + v z_j) / v = N_j - N_p - 2 z_j q_p - v z_j^2,
 
-with ``q_j = |p - v a_j|`` and the linear function ``N_j = -2 a_j.p + v |a_j|^2``. So an error is the right side
-divided by a sum of two ranges. On the right side only q_p is not linear over a box. In the rows themselves, no range
-is linear. Any station of a group can be the reference. The module takes the station whose range is closest to linear.
+with ``q_j = |p - v a_j|`` and the linear function ``N_j = -2 a_j.p + v |a_j|^2``. So an error is the right side divided
+by the sum of both ranges and v z_j. On the right side only q_p is not linear over a box. In the rows themselves, no
+range is linear. Any station of a group can be the reference. The module takes the station whose range is closest to
+linear.
 """
 
 from __future__ import annotations
@@ -240,8 +241,8 @@ def _fill_rows(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> tuple
         for j in range(lines.shape[0]):
             if squares.group[j] != g or j == reference:
                 continue
-            # The measured difference z_j, and bounds of the sum of two ranges by which the right side is divided, all
-            # in half sides of the cube.
+            # The measured difference z_j, and bounds of the divisor: two ranges plus v z_j. All are in half sides of the
+            # cube.
             late = (squares.late[j] - squares.late[reference]) / radius
             low = lines[j, LEAST] + lines[reference, LEAST] + scale[0] * late - swing * abs(late)
             high = lines[j, MOST] + lines[reference, MOST] + scale[0] * late + swing * abs(late)

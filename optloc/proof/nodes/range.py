@@ -221,8 +221,8 @@ def curve_difference(
 ) -> tuple[Symmetric, Triple, float]:
     """Return Hessian and bounds of changes over a box of a range minus the distance to the centre.
 
-    The results are the entries of the Hessian at the centre of the box, a bound of the change of each component of the
-    gradient, and a bound of the spectral norm of the Hessian's change. Bounds are infinite if none is known.
+    The first result is the Hessian at the centre of the box. The second bounds the change of each component of the
+    gradient, and the third the spectral norm of the Hessian's change. An infinite number means that no bound is known.
 
     Parameters
     ----------

@@ -2,8 +2,8 @@
 
 A run has many rows, which are sparse (`optloc.proof.runs.rows`). The search is over all space (functions `..._far`), or
 in search coordinates around the fix (functions `..._near`). The last functions prove fixes of moving targets. Around
-each known minimum there are boxes with half-widths (3,) in standard deviations: the *hull* is the greatest allowed box,
-in the *convex box* (`sides`) the cost is convex, and the *core* is a wider box that is searched along the axes of the
+each known minimum there are boxes with half-widths (3,) in standard deviations. The *hull* is the greatest allowed box.
+In the *convex box* (`sides`) the cost is convex. The *core* is a wider box that is searched along the axes of the
 minimum. A *piece* is a part of the atlas of all space, with a number (`optloc.proof.atlas`). `RunTables` are working
 memory.
 """
@@ -278,7 +278,8 @@ def prove_run(
     """Prove the claim of `optloc.proof.local_search.prove_locally` for a run; for arguments and result see there.
 
     If the cost stays finite at infinity, the search is over all space. Otherwise it is within a region, around a
-    surface, or within an enclosure of all positions at which the few rows cost less than the level.
+    surface, or within an enclosure. The enclosure contains all positions at which the few rows cost less than the
+    level.
     """
     tables, D = tables_of(run), x.shape[0]
     chart, good = chart_on(run.look, x, tables.small, beside.planes, beside.surface)

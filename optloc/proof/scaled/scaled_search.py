@@ -206,8 +206,8 @@ def set_scaled_minimum(
     """Write minimum i, at x, and the boxes around it into an atlas.
 
     Return False if x is no minimum or costs less than `value`. The boxes have half-widths in standard deviations along
-    the axes of the minimum. `hull` has the greatest allowed half-widths, `sides` the half-widths of the convex box, and
-    `core` the corners of the wider box that is searched along these axes.
+    the axes of the minimum. `hull` has the greatest allowed half-widths, and `sides` the half-widths of the convex box.
+    `core` has the corners of the wider box that is searched along these axes.
 
     Parameters
     ----------
