@@ -241,8 +241,8 @@ def _fill_rows(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> tuple
         for j in range(lines.shape[0]):
             if squares.group[j] != g or j == reference:
                 continue
-            # The measured difference z_j, and bounds of the divisor: two ranges plus v z_j. All are in half sides of the
-            # cube.
+            # The measured difference z_j, and bounds of the divisor: two ranges plus v z_j. The unit is half a side
+            # of the cube.
             late = (squares.late[j] - squares.late[reference]) / radius
             low = lines[j, LEAST] + lines[reference, LEAST] + scale[0] * late - swing * abs(late)
             high = lines[j, MOST] + lines[reference, MOST] + scale[0] * late + swing * abs(late)
