@@ -94,7 +94,10 @@ class Atlas(NamedTuple):
 
 @compiled
 def atlas_of(middle: Array, radius: float, dimension: int, count: int) -> Atlas:
-    """Return the pieces around a cube, centre `middle` (3,) and half-width `radius`, with space for `count` minima."""
+    """Return the pieces around a cube, centre `middle` (3,) and half-width `radius`, m, with space for `count` minima.
+
+    `dimension` is 2 or 3. The minima are zeros until they are written.
+    """
     minima = AtlasMinima(
         np.zeros(count, dtype=np.int64),
         np.zeros((count, 3)),
@@ -108,7 +111,10 @@ def atlas_of(middle: Array, radius: float, dimension: int, count: int) -> Atlas:
 
 @compiled
 def with_minima(middle: Array, radius: float, dimension: int, minima: AtlasMinima) -> Atlas:
-    """Return the pieces around a cube (centre `middle` (3,), half-width `radius`, m) and around known minima."""
+    """Return the pieces around a cube (centre `middle` (3,), half-width `radius`, m) and around known minima.
+
+    `dimension` is 2 or 3.
+    """
     # One array for all vectors and one for all matrices: each fix needs an atlas, and allocations take time.
     vectors, matrices = np.zeros((3, 3)), np.zeros((5, 3, 3))
     return Atlas(

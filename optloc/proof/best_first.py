@@ -105,13 +105,15 @@ class SearchGoal(NamedTuple):
 
 @compiled
 def _add(cost: Cost, near: Box, aim: SearchGoal, x: Array, count: int, level: float) -> int:
-    """Descend from a position (D,) to a minimum, and list it if it is new; return the number of known minima.
+    """Descend from a position x (D,), metres, to a minimum, and list it if it is new; return the number of minima.
 
-    `x` is overwritten by the end of the descent. A minimum that costs `level` or more is not added.
+    `x` is overwritten by the end of the descent. The list is in `aim`, and `count` is its length before. `near` is
+    working memory. A minimum that costs `level` or more is not added. If the list is full, a new minimum replaces the
+    most expensive one if it costs less.
     """
     D, value, arrived = x.shape[0], inf, 0
-    # Until two rounds have converged: one in the axes of a nearby point, one in the axes of the minimum, in which the
-    # unit is a standard deviation.
+    # Until two rounds in succession (`arrived`) have converged: one in the axes of a nearby point, one in the axes of
+    # the minimum, in which the unit is a standard deviation.
     for _ in range(_ROUNDS):
         chart, _ = chart_on(cost, x, near, aim.planes, aim.surface)
         near.at[:] = 0.0
@@ -183,6 +185,7 @@ def search_minima(
     atlas, none, nowhere = atlas_of(middle, radius, d, 0), np.empty((0, 3)), np.full(d, nan)
     stack, corners = np.zeros((2 * budget + 4 * (d + 1) + 6 * aim.points.shape[0], DEPTH)), np.empty((2, 3))
     chart, count, boxes = around, zero(), zero()
+    # On a surface, a short search of each side comes first: a cheap minimum from any side lowers the level for all.
     for look in range(2 * SIDES if bent else 1):
         most = min(_LOOK, budget - boxes) if bent and look < SIDES else budget - boxes
         if bent:
@@ -218,6 +221,7 @@ def _search(
     """Search the boxes of a stack for minima; return the number of known minima, and the number of boxes.
 
     `corners` (2, 3) are the corners of the region in search coordinates, and `budget` is the greatest number of boxes.
+    New minima are written into `aim`, which has `count` minima before. `near` is working memory.
     """
     at, boxes, lows, cheapest, floor = np.empty(aim.points.shape[1]), zero(), zero(), inf, floor_of(space, cost)
     queue = [(0.0, i) for i in range(size)]
@@ -265,6 +269,7 @@ def _split(
     """Push the halves of the remaining part of a box; return the size of the stack.
 
     `side` is the side to halve, and `low` a lower bound of the cost over the box, by which the queue is ordered.
+    `piece` is the number of the box's piece of the atlas, 0 around a fix, and `size` the size of the stack before.
     """
     if not cut_out(box.cut, box.at, box.half) > 0.0:
         return size
@@ -285,7 +290,8 @@ def _look(cost: Cost, space: Space, box: Box, piece: int, level: float, floor: f
     """Return the bound of the cost over a box with bounded nodes, the cost at its centre, and the side to halve.
 
     The side is -1 if the box contains no minimum below a level. Otherwise the ends of the part that may contain a
-    minimum are written into ``box.cut``. `floor` is the result of `optloc.proof.space.floor_of`.
+    minimum are written into ``box.cut``. `piece` is the number of the box's piece of the atlas, and `floor` the result
+    of `optloc.proof.space.floor_of`.
     """
     linearise_rows(cost.K, cost.w, box.nodes, box.rows)
     low = least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
@@ -300,11 +306,12 @@ def _look(cost: Cost, space: Space, box: Box, piece: int, level: float, floor: f
 def _side_far(cost: Cost, space: Space, box: Box, piece: int, level: float, here: float, floor: float) -> int:
     """Return the side to halve of a box of the atlas, or -1 if it contains no minimum; the box is not contracted.
 
-    `here` is the cost at the centre of the box, and `floor` the result of `optloc.proof.space.floor_of`.
+    `piece` is the number of the box's piece of the atlas, and `here` the cost at the centre of the box. `floor` is the
+    result of `optloc.proof.space.floor_of`. `level` is infinite as long as no minimum is known.
     """
     atlas, d = space.atlas, space.atlas.dimension
     touching = piece < 2 * d and box.at[d - 1] <= box.half[d - 1]
-    if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY:
+    if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY:  # so small that halving would hardly change it
         return -1
     if level < inf and here < _NEAR * (level + 1.0) and excludes_infimum(cost, atlas, box, touching, floor):
         return -1
@@ -376,7 +383,7 @@ class FoundPlaces(NamedTuple):
 
 
 def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: int, most: int) -> tuple[Array, Array]:
-    """Return the minima of n costs that a best-first search meets without any candidate.
+    """Return the minima of n costs that a best-first search finds without starting points.
 
     Parameters
     ----------
@@ -385,7 +392,7 @@ def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: i
     places : FoundPlaces
         Data of the searches: positions, regions, planes or surfaces.
     gap : float
-        Greatest cost of a minimum above the best one.
+        Greatest difference between the cost of a listed minimum and the least cost found.
     budget : int
         Greatest number of boxes for each cost.
     most : int
@@ -428,7 +435,8 @@ def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: i
 def _minima_of(costs: PositionCosts, place: FoundPlaces, gap: float, budget: int, most: int) -> tuple[Array, int]:
     """Return the minima (most, d), metres, of one cost in order of cost, and the number of boxes.
 
-    `place` has no first axis. Rows of NaN follow the last minimum.
+    `place` has no first axis. Only minima that cost less than the least cost plus `gap` count. Rows of NaN follow the
+    last minimum. `budget` is the greatest number of boxes.
     """
     cost = without_unused_nodes(cost_of(costs.kinds, costs.data[0], costs.K[0], costs.w[0]))
     _, radius = station_cube(cost.kinds, cost.data, place.x)

@@ -407,7 +407,7 @@ _ALIKE = 0.1
 
 @compiled
 def steepest_side(half: Array, rows: Array, dimension: int) -> int:
-    """Return the number k of the side along which the residual changes most over the box: the best side to halve.
+    """Return the number k < dimension of the side along which the residual changes most: the best side to halve.
 
     Each side also counts with a share of the greatest change. Nodes that are only enclosed have no slope, although they
     depend on the position.
@@ -450,8 +450,8 @@ CENTRE, HALF, LEAST, PIECE, DEPTH = 0, 3, 6, 7, 8
 def push_around(stack: Array, size: int, low: Array, high: Array, hole: Array, piece: int) -> int:
     """Push the box between two corners without the box |s_k| <= hole_k around the origin; return the size of the stack.
 
-    The corners are `low` and `high`, and the hole is the convex box around a minimum, all (3,). The hole is cut out
-    along its faces, which leaves at most two slabs for each dimension. The slabs overlap the hole by a rounding error.
+    The corners are `low` and `high`, and the hole is the convex box around a minimum, all (3,). It is cut out along its
+    faces, which leaves at most two slabs in each dimension. Slabs overlap the hole by rounding, and belong to `piece`.
     """
     low, high = low.copy(), high.copy()
     for k in range(3):

@@ -96,6 +96,7 @@ def known_minima(
     count, free, size = 0, 0, 1 + others.shape[0]
     minima, sides, hull, shift = np.zeros((size, 3)), np.zeros((size, 3)), np.empty(3), np.zeros(3)
     for i in range(0 if own else 1, size):
+        # Minimum p is the fix for 0, else point p - 1. The order is: the fix, hidden minima (the last points), others.
         hidden = 0 < i <= known.hidden
         p = size - i if hidden else (i - known.hidden if i > 0 else 0)
         box.at[:] = 0.0
@@ -193,8 +194,8 @@ def accuracy_floor_far(cost: Cost, atlas: Atlas) -> float:
 
 # Boxes around a known minimum in an atlas: principal axes, and a box in which it is the only minimum.
 
-# Greatest half-width of convex boxes, standard deviations: a fix with such small deviations needs no wider box. And
-# the greatest share of the way to infinity, where the coordinates of the minimum end.
+# Greatest half-width of convex boxes, standard deviations: a fix with smaller deviations needs no wider box. And the
+# greatest share of the way to infinity, where the coordinates of the minimum end.
 _WIDEST, _SHARE = 1e4, 0.9
 # Half-widths of the box searched along the axes of a minimum: in units of the convex box, and at least this many
 # standard deviations. Outside, the cost is high enough for boxes along the axes of space.
@@ -211,7 +212,9 @@ _FIRST, _GROWTH = 3.0, 2.0
 
 @compiled
 def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, value: float, eps: float, limit: float) -> bool:
-    """Write a minimum and the boxes around it into an atlas; return False if x is no minimum or costs too little.
+    """Write minimum i, at x, and the boxes around it into an atlas.
+
+    Return False if x is no minimum or costs less than `value`.
 
     Parameters
     ----------
@@ -226,11 +229,11 @@ def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, value: flo
     x : array (D,)
         Polished position of the minimum, metres.
     value : float
-        Least allowed cost: the convex box is not searched.
+        Least allowed cost of the minimum: the search leaves its convex box out. -inf allows any cost.
     eps : float
         Greatest fall of the cost below the cost of x in the convex box.
     limit : float
-        Greatest reach of the boxes along any coordinate, metres.
+        Greatest distance of points of the boxes from the minimum along any coordinate, metres; infinity for no limit.
     """
     minima, d = atlas.minima, atlas.dimension
     minima.home[i] = piece_of(atlas, x, minima.start[i])
@@ -290,7 +293,7 @@ def set_hull(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
 
 @compiled
 def _draw_in(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
-    """Reduce half-widths (3,) around minimum i so that no coordinate is farther than `limit` metres."""
+    """Reduce half-widths `hull` (3,) around minimum i so that no coordinate is farther than `limit` metres from it."""
     minima, d = atlas.minima, atlas.dimension
     beside, out, scale = 0.0, 0.0, 1.0  # greatest changes of p and v, and v
     for k in range(d):

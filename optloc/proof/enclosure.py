@@ -45,7 +45,7 @@ def around_node(
     c0, c1, c2, radius = data[0], data[1], data[2], most
     if kind != RANGE:  # ranges skip the call, because they are the common case
         c0, c1, c2, radius = ball_of(kind, data, least, most)
-        if radius == inf:
+        if radius == inf:  # no ball contains these points
             return
     radius = max(radius, 0.0) * (1.0 + _WIDER)
     c0, c1, c2 = c0 - x[0], c1 - x[1], c2 - x[2]
@@ -131,18 +131,18 @@ def around_squares(
 
     Parameters
     ----------
-    kinds, data, A, nodes, sense
+    kinds, data, A, nodes, sense : arrays (J,), (J, width), (J, J), (J, NODE_WIDTH), (3, 3)
         Nodes of the cost, ``A = K'K``, the table of nodes at the fix, and T with x = origin + T s.
     rho : float
         Longest residual of points inside the box.
     member, reference : int array, int
         Nodes of the group without the reference, and the reference; negative without a reference.
-    R, tie : array
-        Covariance of the errors of the group, and the factors n_j of all nodes.
+    R, tie : array (n, n), (J,)
+        Covariance of the errors of the n nodes `member`, and the factors n_j of all nodes: -1, 0 or 1.
     ties : array (J, TIE_WIDTH)
         Table with the errors at the fix; the other columns are written.
     lower, upper : array (3,)
-        Corners of the box, contracted in place.
+        Corners of the box, contracted in place; they stay if the rows give no bound.
     """
     count, ranges = _rows(kinds, data, nodes, sense, member, reference, tie, ties)
     for k in range(3):
@@ -218,7 +218,8 @@ def _rows(
 def _left_inverse(A: Array, member: Array, ties: Array, ranges: bool, lower: Array, upper: Array) -> bool:
     """Write the left inverse of the rows that has the least errors at the fix; return False if it does not exist.
 
-    `ranges` is the second result of `_rows`. Coordinates with lower = upper = 0 do not exist.
+    `ranges` is the second result of `_rows`, and other arguments are as in `around_squares`. The columns WEIGHTED and
+    LEFT of `ties` are written. Coordinates with lower = upper = 0 do not exist.
     """
     normal = np.zeros((4, 4))
     for j in member:
@@ -293,10 +294,10 @@ def _inverts_well(member: Array, ties: Array, bound: Array, last: float, more: f
 def _sums(R: Array, member: Array, ties: Array, near: float, middle: float) -> tuple[float, float, float, float]:
     """Return the value of a weighted sum of squared rows at the fix, and three numbers that bound its errors.
 
-    The weights are in column WEIGHT of `ties`, `near` is the reference range at the fix, and `middle` the middle of its
-    interval. The second and third number are ``sqrt(m'R m)``, for weights times (first + middle second) and for weights
-    times second. Times rho, they bound the linear part of the errors. The last number bounds the quadratic part, times
-    rho squared: it is the sum of ``|weight| third R_ii``.
+    `member` are the nodes of the group. The weights are in column WEIGHT of `ties`, `near` is the reference range at
+    the fix, and `middle` the middle of its interval. The second and third number are ``sqrt(m'R m)``, for weights times
+    (first + middle second) and for weights times second. Times rho, they bound the linear part of the errors. The last
+    number bounds the quadratic part, times rho squared: it is the sum of ``|weight| third R_ii``.
     """
     value = linear = slope = square = 0.0
     for i in range(member.shape[0]):
@@ -445,7 +446,7 @@ def _weighted_inverse(rows: Array, reach: Array, far: Array, count: int, span: i
 def _inverts(gamma: Array, rows: Array, count: int, span: int, off: Array) -> bool:
     """Write bounds of the entries of |gamma rows - 1| into `off` (3, 3).
 
-    Return whether all are as small as rounding.
+    Return whether all are as small as rounding. The arguments are as in `_weighted_inverse`.
     """
     off[:] = 0.0
     for k in range(span):

@@ -206,22 +206,25 @@ def _take(stack: Array, row: int, atlas: Atlas, chart: LocalAxes, corners: Array
 
 @compiled
 def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box, piece: int) -> bool:
-    """Contract a box with a set centre by its squared rows, as often as that helps.
+    """Contract a box of an atlas by its squared rows; return False if the whole box costs at least `level`.
 
-    Return whether any part remains in which the cost may be below `level`.
+    `piece` is the number of the box's piece of the atlas (`optloc.proof.atlas`), and the centre of the box must be set
+    in the atlas. Parts that cost at least `level` are cut off, at most `_LOOKS` times. The rest of the box is written
+    into `box`, and its centre is set. If squared rows cannot help, the box stays as it is.
     """
+    # There are no squared rows, or ranges are so close to linear over the box that the plain rows contract it as well.
     if squares.groups == 0 or change_of_residual(atlas, squares, box.half) ** 2 <= _BENT * level:
         return True
     for _ in range(_LOOKS):
         if not clip_to_squares(cost, atlas, squares, sqrt(max(level, 0.0)), box):
             return False
-        share = cut_out(box.cut, box.at, box.half)
+        share = cut_out(box.cut, box.at, box.half)  # the share of the box that remains
         if not share > 0.0:
             return False
-        if share < 1.0:
+        if share < 1.0:  # the box has a new centre
             contract_at_infinity(box, atlas.dimension - 1, infinity_coordinate(atlas, piece))
             set_centre(atlas, piece, box.at)
-        if share > SHRUNK:
+        if share > SHRUNK:  # too little was cut off for a further contraction
             break
     return True
 
@@ -357,6 +360,7 @@ def prove_globally(
     verdict, boxes, bound = prove_locally(
         cost, box, x, beside, gaps[0], eps, first, reach, nowhere, nowhere, False, found
     )
+    # The atlas may decide these cases. OTHER with a known minimum means that the axes of the fix did not suit it.
     again = verdict in (OPEN, BUDGET, STATIONARY, SINGULAR) or (verdict == OTHER and _listed(x, beside.points, found))
     if not open_end or not again or boxes >= budget:
         return verdict, boxes, bound, gaps[0], 0
@@ -389,7 +393,7 @@ def prove_atlas(
     rivals: Array,
     found: Array,
 ) -> tuple[int, int, float, float, int]:
-    """Prove the same as `prove_globally` with the atlas alone, and return the same results.
+    """Prove the same as `prove_globally` with the atlas alone; arguments and results are the same.
 
     The cost must stay finite at infinity (`optloc.proof.box.reaches_infinity`).
     """
@@ -409,6 +413,7 @@ def prove_atlas(
     known, place = zero(), np.empty(x.shape[0])
     for p in range(atlas.minima.home.shape[0]):
         put(x if p == 0 else others[p - 1], place)
+        # The last minima are hidden: they may have any cost, but only points near them are left out.
         hidden = p > others.shape[0] - beside.hidden
         least_here, limit = (-inf, HIDDEN_REACH) if hidden else (least - 0.5 * eps, inf)
         if set_minimum(cost, box, atlas, known, place, least_here, 0.5 * eps, limit):
@@ -450,8 +455,8 @@ def verdict_of(
 def _listed(x: Array, others: Array, found: Array) -> bool:
     """Return whether the point `found` (D,) is one of the known minima `others` (P, D).
 
-    X (D,) is the fix, all in metres. A search in the axes of x may find a known minimum again, if no box along these
-    axes is convex around it.
+    The fix is `x` (D,), and all points are in metres. A search in the axes of the fix may find a known minimum again,
+    if no box along these axes is convex around it.
     """
     for p in range(others.shape[0]):
         apart = away = 0.0

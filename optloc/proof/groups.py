@@ -92,7 +92,7 @@ def _solve(kinds: Array, A: Array, member: Array, first: int, count: int, R: Arr
     """Solve the rows of a group for its nodes; return its reference, which is moved to the end of the group.
 
     The result is NONE if the group needs no reference, and LOOSE if its rows are too few. The group is
-    member[first:first + count]. `R` and `tie` are written as in `Groups`.
+    member[first:first + count], and A is K'K (J, J). `R` and `tie` are written as in `Groups`.
     """
     if _ties(kinds, A, member, first, count, count, R, tie):
         return NONE
@@ -109,7 +109,8 @@ def _solve(kinds: Array, A: Array, member: Array, first: int, count: int, R: Arr
 def _ties(kinds: Array, A: Array, member: Array, first: int, size: int, count: int, R: Array, tie: Array) -> bool:
     """Write the covariance R of the errors, and the factors n_j; return False if the rows do not have this form.
 
-    The first `size` of the `count` nodes of the group are solved. If count is larger, the last node is the reference.
+    The arguments are as in `_solve`. The first `size` of the `count` nodes of the group are solved. If `count` is
+    larger, the last node is the reference.
     """
     own = R[first : first + size, first : first + size]
     for i in range(size):

@@ -1,4 +1,4 @@
-"""The search of boxes for minima below a list of cost levels: one loop for costs with and without unknown scales.
+"""The search of boxes for minima below a list of cost levels: one loop for costs with and without unknown factors.
 
 A box is finished if its cost is at least the first level. It is also finished if it contains no minimum, because a
 component of the gradient or the curvature has a fixed sign: the least cost over all positions is then attained
@@ -65,8 +65,8 @@ def set_rival(
 ) -> bool:
     """Write minimum i, at x (D,), and the boxes around it into an atlas.
 
-    Return False if x is no minimum or costs too little. For `value` and `eps` see
-    `optloc.proof.convex_boxes.set_minimum`; rho is the root of the first level.
+    Return False if x is no minimum or costs less than `value`. In its convex box the cost falls at most `eps` below the
+    cost of x. `rho` is the root of the first level, and `chart` the search coordinates around the fix.
     """
     raise NotImplementedError
 
@@ -192,7 +192,7 @@ def _meet(
 ) -> tuple[int, int, Space]:
     """Descend from the current centre; if the descent ends in an unknown minimum, store it and push boxes around it.
 
-    Returns the number of rivals (-1 if no boxes can be made around the minimum), the size of the stack, and the space.
+    Return the number of rivals (-1 if no boxes can be made around the minimum), the size of the stack, and the space.
     The arguments are as in `search_levels`; `first` is the index of the first level that can still be shown, and `met`
     the number of rivals before.
     """

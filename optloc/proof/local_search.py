@@ -140,6 +140,7 @@ def search_boxes(
     gram = box.gram if bent else chart.gram  # a box on a surface has other axes
     sense, at, half, centre, line = chart.sense, box.at, box.half, box.centre, box.line
     nodes, rows, curves, sums, solve, cut = box.nodes, box.rows, box.curves, box.sums, box.solve, box.cut
+    # `unique`: the claim is about other minima, too, and not about the value alone.
     weight, origin, floor, unique = cost.weight, chart.origin, chart.floor, aim.level > aim.value
     rho = sqrt(max(aim.level, 0.0))
     boxes, low_points = 0, 0
@@ -170,6 +171,7 @@ def search_boxes(
         # Parts with residuals longer than rho, and parts that contain no minimum, are cut off from all sides.
         reset_cut(half, cut)
         contract_box(K, weight, rho + noise, half, half[2] == 0.0, nodes, rows, cut, solve)
+        # `sound`: the box may be dropped if it contains no minimum.
         sound = aim.whole or exceeds_level(low, aim.value)
         if _is_done(at, half, minima, sides, aim, (unique or aim.whole) and sound):
             continue
@@ -198,10 +200,11 @@ def search_boxes(
 def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Goal, enough: bool) -> bool:
     """Return whether a box needs no further search because it is in the convex box of a known minimum.
 
-    `minima` and `sides` (P, 3) are the known minima and the half-widths of their convex boxes. A convex box contains no
-    second minimum, but it may contain a point of lower cost. If `enough`, the convex box of any known minimum finishes
-    the box. Otherwise only convex boxes of the fix and of hidden minima do. If the search has no open boundary, the box
-    of the fix contains nothing cheaper.
+    `at` and `half` (3,) are the centre and half-widths of the box. `minima` and `sides` (P, 3) are the known minima and
+    the half-widths of their convex boxes: the fix first, then hidden minima, as `aim` counts them. A convex box
+    contains no second minimum, but it may contain a point of lower cost. If `enough`, the convex box of any known
+    minimum finishes the box. Otherwise only convex boxes of the fix and of hidden minima do. If the search has no open
+    boundary, the box of the fix contains nothing cheaper.
     """
     first = 0 if aim.whole else aim.own
     if is_known(at, half, minima[first : aim.free], sides[first : aim.free]):
@@ -229,12 +232,27 @@ def _follow(cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array,
 
 @inlined
 def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, rows: Array, inside: bool) -> int:
-    """Return the coordinate across which halving a box reduces the remainders in its bound most.
+    """Return the coordinate (0, 1 or 2) across which halving a box reduces the remainders in its bound most.
 
-    The remainder of a range is nearly ``s'N s / 2``, so coordinate k has the share ``h_k sum_m |N_km| h_m`` in it. Its
-    weight is the pull ``|K_j.v|`` on the bound, with v the direction of the bound (`optloc.proof.box.least_residual`).
-    N is the Hessian of the range, and h the half-widths. If the centre is below the level (`inside`), no bound
+    The remainder of a range is the range minus its linear approximation at the centre of the box, nearly ``s'N s / 2``.
+    N is the Hessian of the range, and h (`half`) the half-widths. So coordinate k has the share ``h_k sum_m |N_km|
+    h_m`` in the remainder. These shares are scaled to sum to the width of the remainder's interval. The weight of
+    range j is its pull ``|K_j.v|`` on the bound, with v the direction of the bound
+    (`optloc.proof.box.least_residual`). Only ranges count. If the centre is below the level (`inside`), no bound
     suffices. In this case, and if ranges have no part in the bound, the result is the widest side.
+
+    Parameters
+    ----------
+    kinds, K : array (J,), (q, J)
+        Codes of the nodes, and whitened rows over the nodes.
+    gram : array (3, 3)
+        T'T of the search coordinates: x = origin + T s.
+    half : array (3,)
+        Half-widths of the box.
+    nodes, rows : array (J, NODE_WIDTH), (q, ROW_WIDTH)
+        Filled tables of the box: intervals and slopes of the nodes, and the direction v in column DIRECTION of `rows`.
+    inside : bool
+        Whether the cost at the centre is below the level.
     """
     if inside:
         return widest(half)
@@ -245,6 +263,7 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
             pull = 0.0
             for i in range(K.shape[0]):
                 pull += K[i, j] * rows[i, DIRECTION]
+            # Times the range r, N is T'T minus the square of the slopes. The factor 1/r cancels in the shares.
             e0, e1, e2 = nodes[j, SLOPE0] * h0, nodes[j, SLOPE1] * h1, nodes[j, SLOPE2] * h2
             a, b = abs(gram[0, 1] * h0 * h1 - e0 * e1), abs(gram[0, 2] * h0 * h2 - e0 * e2)
             c = abs(gram[1, 2] * h1 * h2 - e1 * e2)
@@ -481,8 +500,9 @@ def _search_sides(
 ) -> tuple[int, int]:
     """Search all pieces of a surface other than the piece of the fix; return the outcome and the boxes in total.
 
-    `around` are the search coordinates of the fix, and `boxes` is the number of boxes before. The search ends at the
-    first piece with an outcome other than CLEAR.
+    `around` are the search coordinates of the fix, `boxes` is the number of boxes before, and `budget` the greatest
+    number in all. Other arguments are as in `search_boxes` and `prove_locally`. The search ends at the first piece with
+    an outcome other than CLEAR.
     """
     corners, outcome = np.empty((2, 3)), CLEAR
     for side in range(1, SIDES):

@@ -50,8 +50,8 @@ def push_or_defer(
 ) -> tuple[int, int]:
     """Push the remaining part of a box, or postpone it if it costs more than a level; return both stack sizes.
 
-    The stack `aside` with `waiting` boxes is for postponed boxes. `side` is the side to halve. If `aside` is nearly
-    full, the box is pushed at once.
+    The stack `aside` with `waiting` boxes is for postponed boxes. `side` is the side to halve, and `piece` the number
+    of the box's piece. If `aside` is nearly full, the box is pushed at once.
     """
     if low > 0.0 and low * low >= level and waiting + SPARE <= _WAITING:
         return size, push_rest(aside, waiting, box.cut, box.at, box.half, side, low, piece)

@@ -2,7 +2,9 @@
 
 Each function `_reasons_against_...` yields sentences, one for each property of the problem that the proof does not
 cover. No sentence means that the property is covered. A *node* is a scalar function of the position that rows are sums
-of, such as a range. A *run* is a problem with too many nodes for dense matrices.
+of, such as a range. A *run* is a problem with too many nodes for dense matrices. A *factor* is an unknown number that
+multiplies the nodes of a group of rows, such as an unknown speed of waves. Problem files call it a *scale*, so the
+sentences for the user do, too. A factor is *free* if it has no prior.
 """
 
 from __future__ import annotations
@@ -197,6 +199,7 @@ def _reasons_against_scale(problem: Problem) -> Iterator[str]:
     elif (factor < -1).any():
         yield "rows have several scales, or a multiple of a scale, but the proof covers one scale for each row"
     free = np.concatenate([np.full(len(bias.members), bias.sigma is None) for bias in scales])
+    # The two values False are for rows with the numbers -1 and -2 instead of a factor.
     yield from _reasons_against_factors(problem, factor, [*free, False, False])
     if problem.constraints:
         yield f"the scale {name!r} is unknown, and the proof then covers no constraints"
@@ -209,8 +212,9 @@ def _reasons_against_scale(problem: Problem) -> Iterator[str]:
 def _reasons_against_factors(problem: Problem, factor: Array, free: Sequence[bool]) -> Iterator[str]:
     """Yield the reasons against kinds of rows with unknown factors.
 
-    `factor` (m,) is the number of the factor of each row, -1 without a factor. `free` is True for each factor without a
-    prior, and ends with two values False, which the indices -1 and -2 read.
+    `factor` (m,) is the number of the factor of each row: -1 without a factor, -2 with several factors or with a
+    multiple of one (`factors_of_rows`). `free` is True for each factor without a prior. It ends with two values False,
+    so that -1 and -2, read as indices from the end, find no free factor.
     """
     emitting, kinds = set[int](), {rows.kind for rows in problem.rows}
     for rows, start in zip(problem.rows, problem.starts, strict=True):
@@ -221,6 +225,7 @@ def _reasons_against_factors(problem: Problem, factor: Array, free: Sequence[boo
             yield f"a scale is unknown; the proof then covers times, ranges and levels, but no {rows.kind} rows"
         elif model.ranges is None and without_prior and (len(kinds) > 1 or len(factors) > 1):
             yield f"the scale of {rows.kind} rows has no prior, and other rows do not have this scale"
+        # Signs of ranges that sum to zero form differences, and an unknown emission time has the same effect.
         elif without_prior and sum(model.ranges or ()) != 0 and not model.emission:
             yield f"the scale of {rows.kind} rows has no prior, so that nothing bounds the position"
     if len(emitting) > 1 and any(free[number] for number in emitting):

@@ -300,6 +300,7 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
     for k in range(count):
         length = information[k, k]
         good = good and length > DETERMINED * most
+        # An axis along which there is no information keeps the unit of one metre.
         root = sqrt(length) if length > 0.0 else 1.0
         for m in range(3):
             sense[m, k], back[k, m] = gram[m, k] / root, gram[m, k] * root

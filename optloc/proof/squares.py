@@ -5,9 +5,10 @@ v, in half sides of the cube, the error obeys
 
     (q_j - q_p - v z_j) (q_j + q_p + v z_j) / v = N_j - N_p - 2 z_j q_p - v z_j^2,
 
-with ``q_j = |p - v a_j|`` and the linear function ``N_j = -2 a_j.p + v |a_j|^2``. So an error is the right side
-divided by a sum of two ranges. On the right side only q_p is not linear over a box. In the rows themselves, no range
-is linear. Any station of a group can be the reference. The module takes the station whose range is closest to linear.
+with ``q_j = |p - v a_j|`` and the linear function ``N_j = -2 a_j.p + v |a_j|^2``. So an error is the right side divided
+by the sum of both ranges and v z_j. On the right side only q_p is not linear over a box. In the rows themselves, no
+range is linear. Any station of a group can be the reference. The module takes the station whose range is closest to
+linear.
 """
 
 from __future__ import annotations
@@ -232,7 +233,7 @@ def _fill_rows(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> tuple
     rows[:], squares.K[:] = 0.0, 0.0
     wider, size = 0.0, squares.floor
     for g in range(squares.groups):
-        reference = -1
+        reference = -1  # the range of the group that is closest to linear over the box
         for j in range(lines.shape[0]):
             if squares.group[j] == g and (reference < 0 or lines[j, BEND] < lines[reference, BEND]):
                 reference = j
@@ -240,6 +241,8 @@ def _fill_rows(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> tuple
         for j in range(lines.shape[0]):
             if squares.group[j] != g or j == reference:
                 continue
+            # The measured difference z_j, and bounds of the divisor: two ranges plus v z_j. The unit is half a side
+            # of the cube.
             late = (squares.late[j] - squares.late[reference]) / radius
             low = lines[j, LEAST] + lines[reference, LEAST] + scale[0] * late - swing * abs(late)
             high = lines[j, MOST] + lines[reference, MOST] + scale[0] * late + swing * abs(late)

@@ -163,7 +163,8 @@ def _halve(cost: Cost, space: Space, box: Box, level: float, most: int, lists: A
     """Halve the boxes of the first list by generations; return the number of final boxes, and how many are inside.
 
     `lists` (3, capacity, DEPTH) contains the present generation (`size` boxes), the next generation, and the final
-    boxes. The final boxes inside the region come first. `most` is the greatest number of boxes in all.
+    boxes. The final boxes inside the region come first. `level` is the highest cost of the region. `most` is the
+    greatest number of boxes in all.
     """
     floor, count, inside = floor_of(space, cost), zero(), zero()
     for generation in range(_GENERATIONS + 1):
@@ -319,8 +320,8 @@ def _is_bent(cost: Cost, box: Box, dimension: int) -> bool:
 def _side(cost: Cost, space: Space, box: Box, piece: int) -> int:
     """Return the side to halve: the steepest side, or if curvature dominates, the side that reduces it most.
 
-    The second choice needs the sum of remainders to fall to a share of `_STRAIGHTER`; the nodes are bounded for each
-    side.
+    `piece` is the number of the box's piece of the atlas. The second choice needs the sum of remainders to fall to a
+    share of `_STRAIGHTER`; the nodes are bounded for each side.
     """
     dimension = space.atlas.dimension
     side = steepest_side(box.half, box.rows, dimension)

@@ -190,7 +190,7 @@ def _write_graph(
 def fold_bounds(graph: Array, lean: Array, nodes: Array) -> None:
     """Turn bounds of nodes over a box of (s, t) into bounds along the surface, where -(SAG + SLIP) <= t <= SLIP.
 
-    The slopes along the upward axis are moved from `nodes` to `lean` (J,).
+    `graph` is the result of `lay_box`. The slopes along the upward axis are moved from `nodes` to `lean` (J,).
     """
     sag, slip = graph[SAG] + graph[SLIP], graph[SLIP]
     for j in range(nodes.shape[0]):
@@ -229,7 +229,9 @@ def fold_curves(graph: Array, lean: Array, nodes: Array, curves: Array) -> None:
 
 @compiled
 def reach_of_piece(surface: Array, origin: Array, sense: Array, low: Array, high: Array) -> None:
-    """Contract corners (3,) of search coordinates to this piece of the surface; set the third coordinate to 0.
+    """Contract corners `low` and `high` (3,) of search coordinates to this piece of the surface.
+
+    The third coordinate becomes 0.
 
     `origin` (m) and `sense` define the search coordinates: x = origin + sense s.
     """

@@ -379,8 +379,8 @@ def _frame_turn(
     """Write the change of an elevation's gradient and return the change of its Hessian, from the change of its frame.
 
     `frame` contains the vectors a, b and c of `curve_elevation`, and `change` bounds of their changes. `steep` is the
-    tangent of the elevation and a bound of its change. `curvature` is the Hessian at the centre, and `turn` (3,) is
-    written.
+    tangent of the elevation and a bound of its change. `h` are the half-widths of the box. `curvature` is the Hessian
+    at the centre, and `turn` (3,) is written.
     """
     (a, b, c), (da, db, dc) = frame, change
     tan = steep[0] + steep[1]

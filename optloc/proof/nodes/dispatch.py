@@ -185,9 +185,9 @@ def _near_case(node: Node, code: int, call: str) -> list[str]:
 
 
 def _far_case(node: Node, code: int, call: str) -> list[str]:
-    """Return the source lines that call `bound` or `curve` of a node over a box of an atlas; `call` as in `_near_case`.
+    """Return the source lines that call `bound` or `curve` of a node over a box of an atlas.
 
-    The list is empty if the node does not work with scaled lines.
+    `code` and `call` are as in `_near_case`. The list is empty if the node does not work with scaled lines.
     """
     if node.infinity not in (SCALED, BALANCED):
         return []

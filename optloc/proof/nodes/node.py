@@ -167,8 +167,8 @@ class Node:
     most : float
         Greatest size of the node, for kinds with a period: residuals are wrapped, nodes are not.
     mark : callable, optional
-        ``(numbers, alone)``: marks nodes that share no row with other nodes and have their least cost at zero.
-        `numbers` (B, n, width) is changed, and `alone` (B, n) says for which nodes.
+        ``(numbers, alone)``: marks nodes that share no row with other nodes and have their least cost at zero. The
+        numbers (B, n, width) of the nodes are changed where `alone` (B, n) is True.
     """
 
     name: str

@@ -221,6 +221,9 @@ def curve_difference(
 ) -> tuple[Symmetric, Triple, float]:
     """Return Hessian and bounds of changes over a box of a range minus the distance to the centre.
 
+    The first result is the Hessian at the centre of the box. The second bounds the change of each component of the
+    gradient, and the third the spectral norm of the Hessian's change. An infinite number means that no bound is known.
+
     Parameters
     ----------
     frame, data, centre, h, away, sense

@@ -1,7 +1,11 @@
 """The proof of a run: no position costs less than a fix, and no other minimum is within a gap.
 
 A run has many rows, which are sparse (`optloc.proof.runs.rows`). The search is over all space (functions `..._far`), or
-in search coordinates around the fix (functions `..._near`). The last functions prove fixes of moving targets.
+in search coordinates around the fix (functions `..._near`). The last functions prove fixes of moving targets. Around
+each known minimum there are boxes with half-widths (3,) in standard deviations. The *hull* is the greatest allowed box.
+In the *convex box* (`sides`) the cost is convex. The *core* is a wider box that is searched along the axes of the
+minimum. A *piece* is a part of the atlas of all space, with a number (`optloc.proof.atlas`). `RunTables` are working
+memory.
 """
 
 from __future__ import annotations
@@ -132,10 +136,11 @@ def _margin(tables: RunTables, noise: float, eps: float) -> float:
 def _set_far(
     run: RunCost, space: Space, tables: RunTables, i: int, x: Array, value: float, eps: float, limit: float
 ) -> bool:
-    """Write minimum i, at x (D,), and the boxes around it into an atlas.
+    """Write minimum i, at x (d,), metres, and the boxes around it into the atlas of `space`; d is 2 or 3.
 
-    Return False if x is no minimum or costs less than `value`. For `eps` and `limit` see
-    `optloc.proof.convex_boxes.set_minimum`.
+    Return False if x is no minimum or costs less than `value`: the search leaves the convex box out, so no cheaper
+    point may be in it. In the convex box the cost falls at most `eps` below the cost of x. No box reaches farther than
+    `limit` metres along any coordinate; infinity means no limit. `tables` is overwritten.
     """
     atlas, box, d, hull = space.atlas, tables.box, space.atlas.dimension, np.zeros(3)
     minima, piece = atlas.minima, 2 * d + 1 + i
@@ -151,6 +156,7 @@ def _set_far(
         for m in range(d):
             minima.axes[i, m, k] /= sqrt(own)
             minima.back[i, k, m] *= sqrt(own)
+    # Again in the new axes, because the margin needs the gradient along them. `hull` is still zero: the minimum itself.
     cost_at_coordinates(run, space, tables, piece, hull)
     margin = _margin(tables, rounding_at_place(run, space, tables, floor_of(space, run.cost)), eps)
     set_hull(atlas, i, hull, limit)
@@ -174,10 +180,11 @@ def _set_near(
     eps: float,
     hidden: bool,
 ) -> bool:
-    """Write minimum i, at x (D,), in search coordinates, and the sides of a convex box around it.
+    """Write minimum i, at x (D,), metres, into the minima of `space`, and the sides of a convex box around it.
 
-    `corners` (2, 3) limit the box, in which the cost falls at most eps below the cost of x. If `hidden`, the size of
-    the box is limited to `HIDDEN_REACH`. Return False if x is no minimum or costs less than `value`.
+    Both are in search coordinates, and `corners` (2, 3) of the region limit the box. In the box the cost falls at most
+    `eps` below the cost of x. If `hidden`, no coordinate is farther than `HIDDEN_REACH` metres from x. Return False if
+    x is no minimum or costs less than `value`. `tables` is overwritten.
     """
     chart, box, hull, shift, at = space.chart, tables.box, np.zeros(3), np.zeros(3), space.minima[i]
     for k in range(3):
@@ -185,7 +192,7 @@ def _set_near(
         for m in range(x.shape[0]):
             at[k] += chart.back[k, m] * (x[m] - chart.origin[m])
         hull[k] = max(corners[1, k] - at[k], at[k] - corners[0, k], 0.0)
-    if chart.surface.shape[0] > 0:
+    if chart.surface.shape[0] > 0:  # the surface has two coordinates, and gives the third one
         at[2] = 0.0
     if not cost_at_coordinates(run, space, tables, 0, at) >= value:
         return False
@@ -271,11 +278,14 @@ def prove_run(
     """Prove the claim of `optloc.proof.local_search.prove_locally` for a run; for arguments and result see there.
 
     If the cost stays finite at infinity, the search is over all space. Otherwise it is within a region, around a
-    surface, or within an enclosure of all positions at which the few rows cost less than the level.
+    surface, or within an enclosure. The enclosure contains all positions at which the few rows cost less than the
+    level.
     """
     tables, D = tables_of(run), x.shape[0]
     chart, good = chart_on(run.look, x, tables.small, beside.planes, beside.surface)
-    chart = without_differences(chart)  # few rows may be balanced although all rows are not
+    # Without a reference position for ranges: it needs a cost that stays the same if all ranges change by the same
+    # length. The cost of the few rows may have this property although the cost of all rows does not.
+    chart = without_differences(chart)
     least = cost_of_place(run, x, tables)
     middle, radius = station_cube(run.cost.kinds, run.cost.data, x)
     bound_to = beside.planes.shape[0] + beside.surface.shape[0] > 0 or not isnan(lower[0])
@@ -309,7 +319,7 @@ def _blur(run: RunCost, chart: LocalAxes, x: Array, far: bool, tables: RunTables
 def _prove_far(
     run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalAxes, tables: RunTables
 ) -> tuple[int, int, float]:
-    """Prove the claim over all space; return verdict, number of boxes, and lower bound of the cost."""
+    """Prove the claim of `task` over all space; return verdict, number of boxes, and lower bound of the cost."""
     none, known, place, aim = np.empty((0, 3)), zero(), np.empty(task.x.shape[0]), task.aim
     space, stack, others = Space(True, atlas, chart, none, none), np.zeros((CAPACITY, DEPTH)), task.beside.points
     for p in range(1 + others.shape[0]):
@@ -317,6 +327,7 @@ def _prove_far(
         hidden = p > others.shape[0] - task.beside.hidden
         if p > 0 and not (hidden or aim.level > aim.value):
             continue
+        # A hidden minimum may have any cost, but only points near it are left out.
         least, limit = (-inf, HIDDEN_REACH) if hidden else (aim.better, inf)
         if _set_far(run, space, tables, known, place, least, 0.5 * task.eps, limit):
             known += 1
@@ -346,8 +357,8 @@ def _prove_near(
 ) -> tuple[int, int, float]:
     """Prove the claim in search coordinates around a fix: in a region, in an enclosure, or around a surface.
 
-    `lower` and `upper` (D,) are the corners of the region, metres; NaN for an enclosure. Return verdict, number of
-    boxes, and lower bound of the cost.
+    `around` are the search coordinates around the fix. `lower` and `upper` (D,) are the corners of the region, metres;
+    NaN for an enclosure. Return verdict, number of boxes, and lower bound of the cost.
     """
     corners, bent, aim = np.empty((2, 3)), around.surface.shape[0] > 0, task.aim
     stack, total, bound = np.zeros((CAPACITY, DEPTH)), 0, aim.value

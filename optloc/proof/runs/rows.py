@@ -145,7 +145,7 @@ def project_out_unknowns(rows: RunRows, values: Array) -> None:
 def greatest_length(rows: RunRows, values: Array, out: Array) -> float:
     """Return a bound of the length of ``S y`` over all y with ``|y_j| <= values_j``.
 
-    `out` (q,) only has the right length.
+    `values` (J,) are the greatest sizes of changes of the nodes. Of `out` (q,), only the length is read.
     """
     total = 0.0
     for i in range(out.shape[0]):

@@ -233,6 +233,8 @@ def _state_prior(problem: Problem, nodes: CostColumns, span: float) -> tuple[Any
         if name not in ("position", "velocity"):
             continue
         root, centre = roots(precision.reshape(problem.dimension, -1)), mean.reshape(1, -1)
+        # A node is `root` times the position at a time minus an origin. With the origin time * mean, the difference of
+        # two nodes divided by the span is `root` times the velocity minus its mean.
         for time, share in ((0.0, 1.0),) if name == "position" else ((span, 1.0 / span), (0.0, -1.0 / span)):
             node += add_linear(nodes, root[None], centre if name == "position" else time * centre)
             row += range(count, count + problem.dimension)
@@ -347,7 +349,7 @@ def _rows_of_single_nodes(nodes: list[int], size: int) -> Any:
 
 
 def _whitening(problem: Problem, present: Array) -> Any:
-    """Return the sparse matrix (q, m) that whitens the rows; absent rows become zero."""
+    """Return the sparse matrix (q, m) that whitens the rows; rows that are not `present` (m,) become zero."""
     from scipy import sparse
 
     blocks = []

@@ -252,7 +252,10 @@ _ASIDE = 1.5
 
 @compiled
 def _descends(run: RunCost, space: Space, tables: RunTables, level: float, found: Array) -> bool:
-    """Return whether the centre of a box descends to an unknown minimum below the level, and write this minimum, m."""
+    """Return whether the centre of a box descends to an unknown minimum below the level.
+
+    If so, `found` (D,) is this minimum, metres.
+    """
     box, d, home = tables.box, found.shape[0], 0
     u, before, face = box.at.copy(), np.zeros(3), False
     if space.far:
@@ -303,7 +306,8 @@ def cost_at_coordinates(run: RunCost, space: Space, tables: RunTables, home: int
 def rounding_at_place(run: RunCost, space: Space, tables: RunTables, floor: float) -> float:
     """Return a bound of the rounding of a residual, as a length, at a point whose nodes are bounded.
 
-    On a surface, the rounding of the height is included, see `optloc.proof.search_space.rounding_at_centre`.
+    On a surface, the rounding of the height is included, see `optloc.proof.search_space.rounding_at_centre`. `floor` is
+    the result of `floor_of`.
     """
     box, values, total = tables.box, tables.sheet.length, 0.0
     multiply(run.rows, box.lean, values)  # zero except on a surface
@@ -317,7 +321,8 @@ def rounding_at_place(run: RunCost, space: Space, tables: RunTables, floor: floa
 def _step(box: Box, damping: float) -> float:
     """Write a damped Newton step into box.solve[0]; return its squared length in squared standard deviations.
 
-    The result is NaN if the Hessian is not positive definite.
+    `damping` is the share by which the diagonal of the Hessian grows. The result is NaN if the Hessian is not positive
+    definite.
     """
     sums = box.sums
     h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]

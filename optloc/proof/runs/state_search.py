@@ -115,7 +115,7 @@ def search_courses(search: Search, stack: Array, size: int, aim: Goal, budget: i
         size -= 1
         looks += 1
         put(small, stack[size, :n], stack[size, n:])
-        where = _where(axes, small.at, small.half)
+        where = _where(axes, small.at, small.half)  # -1: outside the region, 0: across its edge, 1: inside
         if where < 0 or _is_known(search, small.at, small.half):
             continue
         here, low = _look(search.few, axes, small, search.floors[1], aim.level)
@@ -256,9 +256,9 @@ _STEPS, _CLOSE = 40, 1e-3
 
 @compiled
 def _descends(search: Search, level: float, found: Array) -> bool:
-    """Return whether the centre of a box descends to an unknown minimum below the level, and write this minimum.
+    """Return whether the centre of the box `search.table` descends to an unknown minimum below the level.
 
-    The minimum (n,) is a state in m and m/s.
+    If so, `found` (n,) is this minimum, a state in m and m/s.
     """
     table = search.table
     before, damping = table.at.copy(), 1e-3
@@ -303,7 +303,8 @@ def _linearise(search: Search, table: StateTable) -> float:
 def _step(table: StateTable, damping: float) -> float:
     """Write a damped Gauss-Newton step into `table.move`; return its squared length in standard deviations, or -1.
 
-    The result is -1 if the rows do not determine a step. The step is subtracted from the coordinates.
+    `damping` is the share by which the diagonal of the normal matrix grows. The result is -1 if the rows do not
+    determine a step. The step is subtracted from the coordinates.
     """
     n, matrix, lines = table.at.shape[0], table.solve, table.lines
     for m in range(n):
@@ -336,10 +337,10 @@ _WIDEST, _SMALLER, _TRIALS = 100.0, 0.8, 62
 
 @compiled
 def set_minimum(search: Search, p: int, state: Array, least: float, eps: float) -> bool:
-    """Write minimum p and the sides of a convex box around it; return False if it is no minimum or costs too little.
+    """Write minimum p, at `state` (n,), and the sides of a convex box around it, into `search`.
 
-    `least` is the least cost that the minimum may have. In the box the cost is at most eps below the cost of the
-    minimum.
+    Return False if the state is no minimum or costs less than `least`. In the box the cost is at most `eps` below the
+    cost of the minimum.
     """
     axes, table, n = search.axes, search.table, state.shape[0]
     for m in range(n):

@@ -150,7 +150,7 @@ def _factor_at(scaled: Scaled, g: int, rho: float) -> float:
 
 @compiled
 def _is_of_ranges(scaled: Scaled) -> bool:
-    """Return whether all nodes are ranges."""
+    """Return whether all nodes are ranges: only then do the balls around stations apply."""
     good = True
     for j in range(scaled.cost.kinds.shape[0]):
         good = good and scaled.cost.kinds[j] == RANGE

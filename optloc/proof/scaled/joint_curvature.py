@@ -43,7 +43,7 @@ def sum_scaled(scaled: Scaled, squares: bool, box: Box, sheet: ScaledWorkspace) 
     scaled : Scaled
         The cost.
     squares : bool
-        Whether the positive part of the change of ``E'E`` counts.
+        Whether the positive part of the change of ``E'E`` counts. A test of convexity may leave it out.
     box : Box
         Its nodes and their curves are filled; the sums are written.
     sheet : ScaledWorkspace
@@ -139,7 +139,10 @@ def _derive(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorkspace) -> N
 
 @inlined
 def _reach_of(scaled: Scaled, noise: float, g: int, box: Box, sheet: ScaledWorkspace) -> float:
-    """Return the largest coordinate t_g of the factors in a box, at points whose factors are best."""
+    """Return the largest coordinate t_g of factor g in a box, at points whose factors are best.
+
+    `noise` bounds the rounding of a residual.
+    """
     nodes, half, G, reach = box.nodes, box.half, sheet.back.shape[0], sheet.spin[g] + noise
     for m in range(3):
         reach += abs(sheet.third[G + g, m]) * half[m]
@@ -234,7 +237,10 @@ def _rest_of(scaled: Scaled, noise: float, j: int, box: Box, sheet: ScaledWorksp
 
 @inlined
 def _add_node(scaled: Scaled, noise: float, j: int, box: Box, sheet: ScaledWorkspace) -> float:
-    """Add the second derivatives of node j times its force to the sums; return a bound of the norm of their change."""
+    """Add the second derivatives of node j times its force to the sums; return a bound of the norm of their change.
+
+    `noise` bounds the rounding of a residual.
+    """
     curves, sums, third, g, G = box.curves, box.sums, sheet.third, scaled.group[j], sheet.back.shape[0]
     force, rest, linear = sheet.force[j], _rest_of(scaled, noise, j, box, sheet), 0.0
     for n in range(3 + G):

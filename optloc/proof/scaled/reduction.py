@@ -292,11 +292,11 @@ def _forwards(sheet: ScaledWorkspace) -> float:
 
 @compiled
 def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> bool:
-    """Write the ranges of factors for points of a box with residuals shorter than rho; False if a range is empty.
+    """Write the ranges of factors (`least`, `most`) for points of a box with residuals shorter than rho.
 
-    The rows must be reduced. The factors obey ``k = best + R^-1 U'(residual) - R^-1 U'(change of the rows)``, and the
-    change grows with k. So the greatest factors follow from a system whose inverse has no negative entry, or from
-    priors.
+    Return False if a range is empty. `is_bounded` then tests whether all factors have bounds. The rows must be reduced.
+    The factors obey ``k = best + R^-1 U'(residual) - R^-1 U'(change of the rows)``, and the change grows with k. So the
+    greatest factors follow from a system whose inverse has no negative entry, or from priors.
     """
     G, least, most, spin = sheet.best.shape[0], sheet.least, sheet.most, sheet.spin
     blur, bounded = relative_rounding(scaled.cost.K) * sheet.span[FLOOR], True
@@ -351,7 +351,8 @@ def _swing(scaled: Scaled, blur: float, box: Box, sheet: ScaledWorkspace) -> Non
 
     `blur` bounds the rounding of a residual.
     """
-    nodes, half, V, slopes = box.nodes, box.half, sheet.V, sheet.third  # unused memory
+    # `third` is unused so far. Row h of `slopes` is for the nodes of factor h, row G for nodes without a factor.
+    nodes, half, V, slopes = box.nodes, box.half, sheet.V, sheet.third
     G, J = V.shape
     for g in range(G):
         slopes[: G + 1], sheet.fall[g], sheet.rise[g] = 0.0, 0.0, 0.0
@@ -430,7 +431,7 @@ def _solve_swing(free: bool, sheet: ScaledWorkspace, blur: float) -> bool:
         for h in range(G):
             matrix[g, h] = (1.0 if g == h else 0.0) - sheet.fall[g, h]
     for p in range(G):
-        if not (matrix[p, p] > _ROUNDED and right[p] < inf):
+        if not (matrix[p, p] > _ROUNDED and right[p] < inf):  # no M-matrix, so no bound from this system
             return True
         for g in range(p + 1, G):
             share = matrix[g, p] / matrix[p, p]

@@ -63,8 +63,12 @@ class ScaledCosts(NamedTuple):
     ----------
     kinds, data, K, w, level
         As in `optloc.proof.position_costs.PositionCosts`; priors on the factors are the last rows.
-    lift, group, free : array (B, q, G), int array (J,), bool
-        As in `optloc.proof.scaled.reduction.Scaled`.
+    lift : array (B, q, G)
+        Coefficients of the factors alone in each row, without a node. They are zero except in rows of priors.
+    group : int array (J,)
+        The factor of each node, -1 for a node without a factor.
+    free : bool
+        Whether factors may be negative: True for the components of a velocity.
     """
 
     kinds: Array
@@ -131,8 +135,8 @@ def _factor_priors(problem: Problem, count: int) -> tuple[Array, Array]:
     return np.concatenate(inverse_sigma), np.concatenate(means, axis=1)
 
 
-# Share of the longest column below which entries are rounding, in rows without a velocity: whitening loses some
-# digits.
+# Share of the longest column below which a number counts as rounding: whitening loses some digits. It applies to
+# singular values, and to entries of rows without a velocity.
 _NOTHING = 1e-12
 
 
@@ -152,29 +156,32 @@ def velocity_costs(problem: Problem) -> ScaledCosts:
 
     Rates are linear in the velocity: its components are the factors, and they multiply components of unit vectors from
     the stations. An orthogonal transform of the rows removes the factors from the last rows, which bound the position
-    at every velocity. The factors are in units of the largest rate, so that bounds of rounding do not depend on the
-    unit of length.
+    at every velocity. Rows of a prior on the velocity, if there is one, follow them. The factors are in units of the
+    largest rate, so that bounds of rounding do not depend on the unit of length.
     """
     costs, group = costs_of_velocity(problem)
     w, d, speed = costs.w, problem.dimension, largest_rate(problem)
     K = np.where(group >= 0, speed, 1.0) * costs.K
+    # The left singular vectors of the columns with factors: only the first `rank` transformed rows contain factors.
     basis, size, _ = np.linalg.svd(K[:, :, group >= 0])
     transform = np.swapaxes(basis, -1, -2)
     K, w = transform @ K, (transform @ w[..., None])[..., 0]
     rank = int((size > _NOTHING * size.max(initial=0.0)).sum(-1).max(initial=0))
+    # Exact zeros in place of rounding: `rest_of` finds the rows without factors by their zeros.
     K[:, rank:, group >= 0] = 0.0
     length = np.linalg.norm(K, axis=1, keepdims=True)
     K[:, rank:] = np.where(np.abs(K[:, rank:]) > _NOTHING * length, K[:, rank:], 0.0)
+    # Nodes that the rows without factors use come first, because `rest_of` returns these rows over the first nodes.
     order = np.argsort(~K[:, rank:].any((0, 1)), kind="stable")
     priors = [(roots(precision), mean) for name, mean, precision in prior_parts(problem) if name == "velocity"]
     lift = np.zeros((1, K.shape[1], d))
-    for root, mean in priors:
+    for root, mean in priors:  # at most one: rows without nodes, in which only `lift` is not zero
         whole = speed * (root if root.ndim == 3 else root[None])
         lift = np.concatenate([np.zeros((len(whole), K.shape[1], d)), whole], axis=1)
         K = np.concatenate([K, np.zeros((len(K), d, K.shape[2]))], axis=1)
         w = np.concatenate([w, np.broadcast_to((root @ mean[..., None])[..., 0], (len(w), d))], axis=1)
     kinds, data = plainly(costs.kinds[order]), costs.data[:, order]
-    return ScaledCosts(kinds, data, K[:, :, order], w, costs.level, lift, plainly(group[order]), True)
+    return ScaledCosts(kinds, data, K[:, :, order], w, costs.level, lift, plainly(group[order]), free=True)
 
 
 @compiled
@@ -196,7 +203,9 @@ def prove_scaled(
         As in `prove_globally`.
     """
     cost, tables, D, rest = scaled.cost, tables_of(scaled), x.shape[0], rest_of(scaled)
+    # `far`: the search is over the atlas. `endless`: nothing limits the velocity, because it has no prior.
     far, endless = stays_finite(scaled), scaled.free and not scaled.lift.any()
+    # First axes from the rows with all factors equal to one, then from the rows with the best factors at the fix.
     chart, _ = chart_at(cost, x, tables.near)
     tables.near.at[:] = 0.0
     cost_near(scaled, chart, tables)
@@ -205,6 +214,7 @@ def prove_scaled(
     tables.near.at[:] = 0.0
     least, noise = cost_near(scaled, chart, tables), rounding_of_residual(scaled, tables.sheet)
     for g in range(scaled.lift.shape[1]):
+        # False for NaN, too: the rows at the fix then do not determine the factor.
         good = good and tables.sheet.best[g] > (-inf if scaled.free else 0.0)
     if not good:
         return STATIONARY, 0, -inf, gaps[0], 0
@@ -255,8 +265,9 @@ def _with_minima(
 ) -> tuple[Space, int]:
     """Return the atlas with known minima, and the number of boxes on the stack: 0 if the fix is no minimum.
 
-    The fix x and `others` (P, D) are the minima. `levels` are the costs to exceed, `least` is the cost of the fix, and
-    `eps` the tolerance of equal costs.
+    The fix x and `others` (P, D), metres, are the minima. `levels` (in descending order) are the costs to exceed,
+    `least` is the cost of the fix, and `eps` the tolerance of equal costs. The pieces to search are pushed on `stack`.
+    The list leaves out a known minimum for which `set_scaled_minimum` returns False. The search may then find it again.
     """
     known, at, rho = zero(), np.empty(x.shape[0]), np.sqrt(max(levels[0], least))
     for p in range(atlas.minima.home.shape[0]):

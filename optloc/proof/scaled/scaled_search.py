@@ -203,22 +203,33 @@ def set_scaled_minimum(
     eps: float,
     rho: float,
 ) -> bool:
-    """Write a minimum and the boxes around it into an atlas; return False if it is no minimum or costs too little.
+    """Write minimum i, at x, and the boxes around it into an atlas.
+
+    Return False if x is no minimum or costs less than `value`. The boxes have half-widths in standard deviations along
+    the axes of the minimum. `hull` has the greatest allowed half-widths, and `sides` the half-widths of the convex box.
+    `core` has the corners of the wider box that is searched along these axes.
 
     Parameters
     ----------
     scaled, tables : Scaled, ScaledTables
         The cost, and working memory.
+    atlas, i : Atlas, int
+        Minimum i of the atlas is written.
     chart : LocalAxes
-        Search coordinates around the fix.
-    atlas, i, x, value, eps
-        As in `optloc.proof.convex_boxes.set_minimum`.
+        Search coordinates around the fix; a search in an atlas needs them only as a field of `Space`.
+    x : array (D,)
+        Polished position of the minimum, metres.
+    value : float
+        Least allowed cost of the minimum: the convex box is not searched.
+    eps : float
+        Greatest fall of the cost below the cost of x in the convex box.
     rho : float
-        Longest residual of interest.
+        Root of the greatest level. Factors with which the residual is longer than rho everywhere in a box are ignored.
     """
     minima, d, hull = atlas.minima, atlas.dimension, np.zeros(3)
     space, piece = in_atlas(atlas, chart), 2 * d + 1 + i
     minima.home[i] = piece_of(atlas, x, minima.start[i])
+    # Identity axes first: the rows at the minimum, reduced there, then give its own axes (`set_axes`).
     minima.axes[i, :], minima.back[i, :] = 0.0, 0.0
     for k in range(3):
         minima.axes[i, k, k] = minima.back[i, k, k] = 1.0
@@ -228,6 +239,7 @@ def set_scaled_minimum(
     look_at(scaled, tables.sheet, tables.box, tables.look)
     if not tables.sheet.span[HERE] >= value or not set_axes(tables.look, tables.box, atlas, i):
         return False
+    # `hull` is still zero, so this tests the point itself, and fills the sums for the margin.
     if not _convex(scaled, tables, space, piece, np.zeros(3), hull, rho, 0.0):
         return False
     margin, sides, core = slope_of(tables.box, eps), minima.sides[i], minima.core[i]
@@ -323,8 +335,8 @@ class ScaledSearchWorkspace(NamedTuple):
 def rest_of(scaled: Scaled) -> Cost:
     """Return the cost of the rows without factors, over the first nodes.
 
-    `optloc.proof.scaled.scaled_proof` orders rows and nodes accordingly. If factors may not be negative, no row is
-    returned.
+    `optloc.proof.scaled.scaled_proof.velocity_costs` orders the rows and nodes: the rows without factors follow each
+    other, and their nodes come first. If factors may not be negative, no row is returned.
     """
     K, first, count, nodes = scaled.cost.K, zero(), zero(), zero()
     for i in range(K.shape[0] if scaled.free else 0):
@@ -357,7 +369,8 @@ def _bound_rest(work: ScaledSearchWorkspace, space: Space, box: Box) -> float:
 def _bound_row(work: ScaledSearchWorkspace, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
     """Return a bound of the residual in a box of the stack, infinite if excluded, and the cost at its centre.
 
-    This is `optloc.proof.level_search.bound_row` for a cost with unknown factors.
+    `row` is the row of the box in the stack, and `level` the cost from which a box is excluded. This is
+    `optloc.proof.level_search.bound_row` for a cost with unknown factors.
     """
     scaled, box, sheet, piece = work.scaled, work.box, work.tables.sheet, int(stack[row, PIECE])
     pop(stack, row, box.at, box.half)
