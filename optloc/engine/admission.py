@@ -155,6 +155,7 @@ def evaluate(model: EngineModel, rows: Any, room: EngineWorkspace, shift: int) -
     equations(rows, room, shift)
     a, d, matrix, spare = model.admission, room.d, room.matrix[H + shift], room.scalar[SPARE]
     wide = room.scalar[RADIUS, 0] > 0.0
+    # number -1 is the sphere of the radius RADIUS about CENTRE; its gradient is the vector from the centre
     for k in range(-1 if wide else 0, a.exact):
         face = room.axes[BASE, 0] if k < 0 else room.face[shift, k]
         if k < 0:

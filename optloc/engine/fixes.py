@@ -298,8 +298,10 @@ def _examine(
 ) -> int:
     """Measure shape and cost at infinity of the settled fixes of a block, and refine their mirror images.
 
-    Fixes whose shape needs a second measurement are marked in `look`. Mirror images that need more steps are added to
-    `hidden`. Returns the number of mirror images in `hidden`.
+    The shape is kappa: the deviation of the cost from a quadratic function. It is NaN for fixes that are not settled.
+    Fixes whose shape needs a second measurement are marked in `look`: kappa exceeds STRAIGHT, or the principal axes are
+    not unique. Mirror images that need more steps are added to `hidden`. Returns the number of mirror images in
+    `hidden`.
     """
     scalar = room.scalar
     settled = scalar[FIX_GOOD]

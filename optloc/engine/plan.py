@@ -273,6 +273,7 @@ def key_of(problem: Problem) -> tuple[Hashable, ...]:
 def is_planned(problem: Problem) -> bool:
     """Return whether a plan exists for the structure and for the data that a batch shares, and saves time."""
     stations, motion = problem.stations, problem.motions[0]
+    # arrays that must be the same for the whole batch, with the number of their axes if there is no batch axis
     shared = [(array, 1) for r in problem.rows for array in (r.weight, r.correction)]
     shared += [(block.covariance, 3) for block in problem.noise.blocks]
     shared += [(covariance, 3) for _, _, covariance in stations.errors]

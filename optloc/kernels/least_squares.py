@@ -23,7 +23,10 @@ from optloc.problem.noise import Whitener, variances, whiten
 from optloc.problem.problem import Problem
 
 WEIGHINGS = 2
-"""Station errors are weighed where the target is thought to be; the weights hardly change with it."""
+"""Number of refinements in sequence if station errors enlarge the noise and this noise depends on the position.
+
+Each refinement starts at the result of the refinement before, and computes the noise there. Two are enough, because the
+noise hardly changes with the position."""
 
 
 @dataclass(frozen=True, slots=True)
