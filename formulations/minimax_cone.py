@@ -117,6 +117,7 @@ def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backen
     u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
     relaxation = _relaxation("ball", u.shape[0], u.shape[1], backend)
     answer = relaxation.solve(_cone_data(u, S, theta, ball=True))
+    # the program minimises minus the radius
     point, margin = answer.values["point"], -answer.primal
     inside = bool((angles(point, u, S) <= theta).all())
     meet = True if inside else (False if -answer.bound < 0.0 else None)

@@ -381,7 +381,7 @@ def admission_of(problem: Problem) -> Admission | None:
     d, bands = problem.dimension, list(problem.constraints)
     if not all(isinstance(band, Band) and band.coefficients.ndim == 1 for band in bands):
         return None
-    bands.sort(key=lambda band: not is_exact(band))
+    bands.sort(key=lambda band: not is_exact(band))  # kernels loop over the first `Admission.exact` constraints
     traced = [_trace(problem, band) for band in bands if isinstance(band, Band)]
     found = [one for one in traced if one is not None]
     if len(found) < len(bands):

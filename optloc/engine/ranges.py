@@ -134,7 +134,7 @@ def keep(model: EngineModel, rows: RangeRows, stations: int, d: int, size: int) 
 
 @compiled
 def load(block: RangeBlock, z: Array, room: EngineWorkspace, anew: bool) -> None:
-    """Write the cost of the loops to LOOP; if `anew` is True, also the map from directions at infinity."""
+    """Write the cost of the loops to LOOP; for new stations (`anew`) also the map from directions at infinity."""
     first, loop = len(room.place) + len(block.rows.K) + len(block.rows.start), room.scalar[LOOP]
     for lane in range(LANES):
         loop[lane] = 0.0

@@ -204,7 +204,7 @@ def _span(vector: Array, base: Array, r: Array) -> None:
 
 @compiled
 def _axes(room: EngineWorkspace, inverse: bool, held: bool, spare: Array) -> None:
-    """Write the principal axes of the position's information, each one sigma long, to AXES.
+    """Write the principal axes of the position's information, each as long as one sigma, to AXES.
 
     If `inverse` is True, the information is expressed in inverse range. If `held` is True, exact surfaces constrain the
     fix, and the axes come from the covariance. `spare` (W,) is scratch.

@@ -50,9 +50,9 @@ from optloc.kernels.trace import ADD, ATAN2, COS, DIV, HYPOT, LOG, MUL, NEG, SIN
 # Working memory of a block of lanes, and the addresses of its parts.
 
 LENGTH = 128
-"""Length of a register: rows of one kind are put behind each other, lanes of one and then of the next.
+"""Length of a register, in numbers: it contains several rows of one kind, each with a number for each lane.
 
-A few lanes share the choice of an operation over several rows; twice the most lanes, so that full blocks take two.
+So an operation is selected once for several rows. The length is two rows of a full block of 64 lanes.
 """
 
 
@@ -82,7 +82,7 @@ class LaneCells(NamedTuple):
 
 
 STATE = 8
-"""Cells that a refinement keeps of every problem."""
+"""Number of cells of a lane for the state of a refinement."""
 _EPSILON = float(np.finfo(float).eps)
 
 # Lanes of a block: so few that the frequently used cells (2**18 doubles, 2 MB) stay in the cache, and that all cells
@@ -433,7 +433,7 @@ def write_cost(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, lanes
 
 
 ALL = -1
-"""In the place of an epoch: the groups of all of them."""
+"""Value of the argument `epoch` that selects the groups of all epochs."""
 
 
 @compiled

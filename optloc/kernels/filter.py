@@ -340,7 +340,7 @@ def _gate(rows: ScanRows, item: int, how: Filtering, s: _Space, values: Array) -
                 total += s.rows[i, k] * s.rows[i, k]
             square = s.rows[i, n] * s.rows[i, n] / total
             values[PRESENT] += 1.0
-            # a large innovation counts at most with the limit, and a NaN with the limit too
+            # innovations above the limit count as the limit, and NaN too
             values[INNOVATION] += min(how.most, square)
             if how.gate < np.inf and not sqrt(square) <= how.gate:
                 values[REJECTED_ROWS] += 1.0
@@ -441,7 +441,8 @@ def _remember(rows: ScanRows, item: int, s: _Space, memory: Array, values: Array
 
     Both results are numbers of standard deviations, over about the last fifty scans. The scores for the errors of the
     stations are ``a = D' S^-1 nu``: innovations nu, their covariance S, derivatives D. The product with the scores b of
-    the scan before has the mean zero and, for a given b, the variance ``(D b)' S^-1 (D b)``.
+    the scan before has the mean zero and, for a given b, the variance ``(D b)' S^-1 (D b)``. `left` is whitened nu
+    after the update, `seen` is whitened ``D b``.
     """
     n, m, own = len(s.x), len(s.used), _of(len(rows.covariance), item)
     left, seen, back = np.zeros(m), np.zeros(m), np.zeros(n)

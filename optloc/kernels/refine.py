@@ -55,11 +55,11 @@ class Answers(NamedTuple):
 # Cells with the state of the refinement of every lane, from `room.state` on. Their number is
 # `optloc.kernels.batched_rows.STATE`.
 DAMPING, GROWTH, BLUR, GAIN, SOLVABLE, BETTER, COST, CLOSED = range(8)
-# Integer state of every lane: the number of the start; FRESH (1 while only the start is evaluated, 2 before it is
-# loaded); the steps tried; the status.
+# Integer state of every lane: the number of the start; FRESH (2 before the start is loaded, 1 until it is evaluated,
+# then 0); the steps tried; the status.
 START, FRESH, STEPS, STATUS = range(4)
 _TAGS = 4
-# The lane waits for its start.
+# Value of FRESH of a lane that waits for its start.
 EMPTY = 2
 
 

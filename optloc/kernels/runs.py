@@ -318,7 +318,7 @@ def _spread(
     out.regular[start] = _factor_shared(m, room, n, matrix) and closed
     weakest = 1.0
     for i in range(n):
-        pivot = m[room.shared + i * n + i, 0]
+        pivot = m[room.shared + i * n + i, 0]  # `factor` stores inverse pivots
         weakest = min(weakest, 1.0 / (pivot * pivot))
         for j in range(n):
             matrix[i, j] = matrix[max(i, j), min(i, j)]

@@ -205,7 +205,7 @@ def complete(m: Array, room: LaneCells, n: int, local: int, lanes: int) -> None:
 # Systems of one unit, in arrays whose last axis is the lane.
 
 LANES = 64
-"""Problems side by side where only lengths are unknown: a fix takes the same time from 16 to 256, with 8 twice."""
+"""Number of lanes of a block if all unknowns are lengths. A fix takes the same time with 16 to 256, twice with 8."""
 
 
 @compiled

@@ -20,7 +20,8 @@ from optloc.problem.problem import Problem
 
 # The order in which rows are evaluated, and the unknowns of each group of rows.
 
-# Approximate number of derivatives per lane that are computed together, so that they stay in the cache.
+# Approximate number of derivatives per lane that are computed together, so that they stay in the cache; most and least
+# rows of a packet.
 _NUMBERS, _MOST, _LEAST = 512, 128, 8
 
 
@@ -133,7 +134,7 @@ class RowColumns:
     def of(cls, problem: Problem, groups: RowGroups, entries: list[Entries]) -> tuple[RowColumns, list[Array]]:
         """Return the columns of each group, and the index of each entry in the columns of its group."""
         n, length = problem.layout.n_shared, problem.layout.n_local
-        keys = []
+        keys = []  # group and column as one number, so that one sort finds the different columns of all groups
         for part in entries:
             # The local columns of all epochs have the same numbers, because a group has rows of a single epoch.
             folded = np.where(part.column < n, part.column, n + (part.column - n) % max(length, 1))
