@@ -386,7 +386,8 @@ def _no_start(dimension: int, design: tuple[int, ...], answer: ConicAnswer | Non
 def _nodes_of_rows(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
     """Return three arrays (m,): the node whose range multiplies a row, the node whose rate is an unknown, and the sign.
 
-    A node is -1 if there is none. The sign is the coefficient of the first node.
+    `rates` (m, M) are the coefficients of range rates in the rows, `speed` (M, d) the velocities of the nodes. A node
+    is -1 if there is none. The sign is the coefficient of the first node.
     """
     if (np.abs(rates).sum(axis=1) > 2.0).any() or (np.abs(rates.sum(axis=1)) > 1.0).any():
         raise ValueError("a row of rates must be one rate, or the difference of two")
@@ -425,7 +426,8 @@ def _forms(
 ) -> Array:
     """Return the rows (m, length of y) as linear forms in y: measured values z minus predicted values.
 
-    The form of a row of rates is multiplied by the range of its node `first`.
+    `first` and `second` (m,) are the results of `_nodes_of_rows`, `design` (m, p) the coefficients of b. The form of a
+    row of rates is multiplied by the range of its node `first`.
     """
     beta, r, w, size = shape.places
     at = {pair: w + k for k, pair in enumerate(shape.product)}

@@ -322,10 +322,10 @@ def _cones(point: Any, radius: Any, count: int, dim: int) -> list[Any]:
 
 
 def _cone_data(u: Array, S: Array, theta: Array, *, ball: bool) -> dict[str, Array]:
-    """Return the parameters of both problems at half-angles (N,) below pi/2; an infinite angle drops its cone.
+    """Return the parameters of both problems at half-angles `theta` (N,) below pi/2; an infinite angle drops its cone.
 
-    `ball` is True for the problem with a ball. Each cone is multiplied by the cosine of its half-angle, so that wide
-    cones have small numbers.
+    `u` (N, d) are the measured directions, `S` (N, d) the stations. `ball` is True for the problem with a ball. Each
+    cone is multiplied by the cosine of its half-angle, so that wide cones have small numbers.
     """
     _count, dim = u.shape
     held = np.isfinite(theta)

@@ -506,7 +506,7 @@ def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array
     """Return the results (t, mu) of Newton's iteration on the two conics, from starts (N, K).
 
     Slots that did not converge are not marked; the caller finds them by their residuals. See `quartic` for the
-    coefficients.
+    coefficients `square`, E, L and alpha.
     """
     go = np.isfinite(t)
     for _ in range(_NEWTON):

@@ -196,8 +196,8 @@ def _least_squares(rows: Array, course: RegistrationCourse, bias: Array | None, 
 def _solve(matrix: Array, vector: Array, cut: float) -> Array:
     """Return the solution (N, n) of normal equations scaled to a unit diagonal; NaN if the input is not finite.
 
-    It is zero along eigenvectors whose eigenvalue is at most `cut` times the largest: these directions have (almost) no
-    information.
+    The equations are ``matrix y = vector``. The solution is zero along eigenvectors whose eigenvalue is at most `cut`
+    times the largest: these directions have (almost) no information.
     """
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))

@@ -255,7 +255,7 @@ def _parts(rows: Array, right: Array) -> Iterator[tuple[slice, Array, Array, Mas
 def _points(rows: Array, right: Array, quadric: Quadric, find: Finder) -> tuple[Array, Array, Mask]:
     """Return points (N, K, n), costs (N, K) and validity (N, K) of every slot by the secular equation.
 
-    `find` is `largest` (K = 1, the global minimiser) or `everything`.
+    `rows` (N, q, n) are B, `right` (N, q) are g. `find` is `largest` (K = 1, the global minimiser) or `everything`.
     """
     slots = 1 if find is largest else 2 * quadric.size - 1
     count, n = len(rows), quadric.size

@@ -175,9 +175,9 @@ def _turn(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) -
 def _span(vector: Array, base: Array, r: Array) -> None:
     """Write the derivatives of positions by (p, w) at the fix, ``[r B, -r u0]``, to the columns of `base` (d, d, W).
 
-    (p, w) are the coordinates in inverse range: direction and inverse range, relative to the fix. r and u0 are range
-    and direction of the fix from the centre. B is from T. Duff et al., "Building an orthonormal basis, revisited", J.
-    Computer Graphics Techniques 6 (2017).
+    `vector` contains the rows X and CENTRE. (p, w) are the coordinates in inverse range: direction and inverse range,
+    relative to the fix. r and u0 are range and direction of the fix from the centre. B is from T. Duff et al.,
+    "Building an orthonormal basis, revisited", J. Computer Graphics Techniques 6 (2017).
     """
     d = len(base)
     for lane in range(LANES):

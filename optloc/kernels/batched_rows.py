@@ -193,7 +193,7 @@ def memory(t: Tables, room: LaneCells, lanes: Constant) -> tuple[Array, Array]:
 
 @compiled
 def run_operations(code: Array, first: int, last: int, r: Array, count: Constant) -> None:
-    """Run operations first <= i < last on the first `count` columns of the registers; see `Tape` and `OPERATIONS`."""
+    """Run operations first <= i < last of `code` on the first `count` columns of the registers, see `Tape.code`."""
     # The operation is selected once for all lanes, and the compiler turns each loop into vector instructions.
     for step in range(first, last):
         operation, to, u, v = code[step, 0], code[step, 1], code[step, 2], code[step, 3]
@@ -520,7 +520,10 @@ def _whiten(
     to: int,
     lanes: Constant,
 ) -> None:
-    """Write `size` rows of `columns` cells, from cell `first` on, times the whitening matrix, to cell `to`."""
+    """Write `size` rows of `columns` cells, from cell `first` on, times the whitening matrix, to cell `to`.
+
+    Rows are `width` cells apart. `full` is 0 if the matrix is lower triangular, else 1.
+    """
     for i in range(size):
         for s in range(columns):
             cell = to + i * width + s
@@ -575,7 +578,7 @@ def _square(
 def _add_prior(
     common: Array, place: int, size: int, m: Array, room: LaneCells, x: int, start: int, last: int, lanes: Constant
 ) -> None:
-    """Add a Gaussian prior of the `size` unknowns from cell x on, whose first column is `start`."""
+    """Add a Gaussian prior of the `size` unknowns from cell x on, whose first column of `last` columns is `start`."""
     error, pull, to = room.error, room.error + size, room.after
     vector = to + last * (last + 1)
     for i in range(size):

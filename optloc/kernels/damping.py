@@ -125,7 +125,7 @@ def judge_lane(
 ) -> tuple[bool, bool, bool, float, float]:
     """Return the five fields of `Judged` for one step of one fix: `judge` as machine code, with identical rounding.
 
-    The order is better, small, stuck, damping, growth; see `judge` for the arguments.
+    The order is better, small, stuck, damping, growth. The arguments are the arguments of `judge`, as numbers.
     """
     achieved, floor = cost - after, _ROUNDING * (1.0 + cost)
     rounding = floor + 2.0 * blur * np.sqrt(1.0 + cost)

@@ -3,7 +3,9 @@
 States are ``x = mean + L y`` with ``L L' = P`` the predicted covariance, so that the prior is ``|y|^2``. The update is
 the minimum of the prior and the cost of the rows: ``(I + B' B) y = B' e``. B contains the whitened derivatives of the
 rows times L, and e the whitened residuals. For a state that is known exactly in some direction, L has a column of
-zeros. `item` is the number of the scan in `rows`, s is the workspace of one state of n components.
+zeros. `item` is the number of the scan in `rows`, s is the workspace of one state of n components. `how` are the
+settings, `cov` are covariances, and `values` are the numbers of one state in `Filtered.values`. `memory` is the memory
+of one track, see the constants from _PRODUCT on; empty for none.
 """
 
 from __future__ import annotations
@@ -508,10 +510,7 @@ def _size(rows: ScanRows, own: int, i: int) -> float:
 
 @compiled
 def _iterate(rows: ScanRows, how: Filtering, s: _Space, cost: float) -> None:
-    """Take steps until one is short, and write the minimiser to y with its equations.
-
-    Steps that would raise the cost are halved.
-    """
+    """Take steps until a step is short, halve steps that raise the cost; write the minimiser to y, and its equations."""
     n, place = len(s.x), np.empty(len(s.x))
     put(s.y, place)
     for _ in range(how.limit):

@@ -206,7 +206,10 @@ def _iterate(
     folded: Folded | None,
     limits: Limits | None,
 ) -> Refined:
-    """Return the refinement by numpy with fixed weights; `face`, `folded` and `limits`: see `refine`."""
+    """Return the refinement by numpy from `start` (N, size) with fixed weights.
+
+    The `rules` end a refinement. See `refine` for `face`, `folded` and `limits`.
+    """
     with np.errstate(all="ignore"):
         start = Equalities.of(problem, face).restore(start) if face else start
         start = start if limits is None else limits.clip(start)
@@ -419,7 +422,7 @@ def _refine_with_weights(
 ) -> Refined | None:
     """Return the refinement by machine code with the weights `noise`, or None if machine code is not supported.
 
-    `start` (M, size) are the starts, `item` (M,) is the problem of each start.
+    `start` (M, size) are the starts, `item` (M,) is the problem of each start. The `rules` end a refinement.
     """
     found = packed(problem, noise)
     if found is None:

@@ -147,8 +147,8 @@ def factor_local(
 ) -> None:
     """Factor the damped system of the local unknowns of the equations at cell `source`.
 
-    The coupling with the shared unknowns and the right side, multiplied by the inverse factor, are written to
-    `room.half`.
+    The coupling with the n shared unknowns and the right side, multiplied by the inverse factor, are written to
+    `room.half`. See `step` for `damping`, and `factor` for `ok` and `least`.
     """
     line, half = n + local + 1, room.half
     for i in range(local):

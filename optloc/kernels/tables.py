@@ -335,7 +335,7 @@ def tables(problem: Problem, groups: tuple[Array, ...]) -> CachedTables | None:
 
 
 def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> CachedTables | None:
-    """Return the tables of a problem, see `tables`, without the cache."""
+    """Return the tables of a problem with the data arrays `sources`, see `tables`, without the cache."""
     layout = problem.layout
     if layout.n_shared + layout.n_local == 0 or _spanning(problem, groups):
         return None
@@ -453,8 +453,8 @@ def _sort_by_owner(
 ) -> tuple[Array, Array, list[Array]]:
     """Return entries sorted by owner (an input or a row): indices, factors, and the first entry of each owner.
 
-    For each part, `slots` has the columns of its entries in their group, `owners` the owner of each entry, and `counts`
-    the number of owners.
+    `parts` are the entries of feeds, scales and addends. For each part, `slots` has the columns of its entries in their
+    group, `owners` the owner of each entry, and `counts` the number of owners.
     """
     terms, factors, at, start = [], [], [], 0
     for part, slot, owner, count in zip(parts, slots, owners, counts, strict=True):
@@ -467,7 +467,7 @@ def _sort_by_owner(
 
 
 def _tapes(found: list[_TracedRows]) -> tuple[Array, dict[str, Array]]:
-    """Return the constants of the tapes of all kinds, and four tables by name: code, kind, constant, input."""
+    """Return the constants of the tapes of the blocks `found`, and four tables by name: code, kind, constant, input."""
     tapes = [kind.trace.tape for kind in found]
     constants = [pair for tape in tapes for pair in tape.constants]
     inputs: list[tuple[int, int]] = []

@@ -58,7 +58,7 @@ def solve(block: Array, link: Array, right: Array) -> tuple[Array, Array]:
 def _banded(block: Array, link: Array, right: Array) -> Array | None:
     """Return the solution (k, l, p) of one chain by a banded factor, or None if the chain is not safely regular.
 
-    See `solve` for the arguments, without batch axes.
+    See `solve` for the arguments `block`, `link` and `right`, without batch axes.
     """
     from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
