@@ -398,8 +398,7 @@ def _nodes_of_rows(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
     first = np.where(rates.any(axis=1), held.argmin(axis=1), -1)
     rest = np.where(np.arange(rates.shape[1]) == first[:, None], 0.0, np.abs(rates) * often)
     second = np.where(rest.any(axis=1), rest.argmax(axis=1), -1)
-    # If one station moves and the other rests, the row is multiplied by the range of the moving station. The rate of
-    # the other is zero and needs no unknown.
+    # if only one station moves, its range multiplies the row; the rate of the station at rest needs no unknown
     still = (first >= 0) & (second >= 0) & ~moving[first]
     first, second = np.where(still, second, first), np.where(still, -1, second)
     return first, second, np.where(first < 0, 1.0, rates[np.arange(len(rates)), first])

@@ -59,7 +59,7 @@ _NEAREST = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class RegistrationCourse:
-    """Range offsets of a batch of N problems at B times, with S stations besides the reference, and q biases.
+    """Range offsets of a batch of N problems at B times, with S stations and the reference station, and q biases.
 
     Parameters
     ----------

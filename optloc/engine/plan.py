@@ -296,7 +296,7 @@ def is_planned(problem: Problem) -> bool:
 
 
 def _is_ranged(problem: Problem) -> bool:
-    """Return whether all rows are sums of ranges to fixed stations, and only emission times are unknown besides."""
+    """Return whether all rows are sums of ranges to fixed stations, and the only other unknowns are emission times."""
     stations = problem.stations
     # Isotropic station errors of one epoch are noise of ranges. Errors that last for the run are unknowns with a
     # covariance.

@@ -442,9 +442,9 @@ def _remember(rows: ScanRows, item: int, s: _Space, memory: Array, values: Array
     """Test whether errors of the stations repeat from scan to scan, and whether the innovations are too large.
 
     Both results are numbers of standard deviations, over about the last fifty scans. The scores for the errors of the
-    stations are ``a = D' S^-1 nu``: innovations nu, their covariance S, derivatives D. The product with the scores b of
-    the scan before has the mean zero and, for a given b, the variance ``(D b)' S^-1 (D b)``. `left` is whitened nu
-    after the update, `seen` is whitened ``D b``.
+    stations are ``a = D' S^-1 nu``: innovations nu, their covariance S, derivatives D. Let b be the scores of the scan
+    before. The product of a and b has the mean zero and, for a given b, the variance ``(D b)' S^-1 (D b)``. `left` is
+    the whitened nu after the update, `seen` is the whitened ``D b``.
     """
     n, m, own = len(s.x), len(s.used), _of(len(rows.covariance), item)
     left, seen, back = np.zeros(m), np.zeros(m), np.zeros(n)
@@ -510,7 +510,7 @@ def _size(rows: ScanRows, own: int, i: int) -> float:
 
 @compiled
 def _iterate(rows: ScanRows, how: Filtering, s: _Space, cost: float) -> None:
-    """Take steps until a step is short, halve steps that raise the cost; write the minimiser to y, and its equations."""
+    """Take steps until one is short; halve steps that raise the cost. Write the minimiser to y with its equations."""
     n, place = len(s.x), np.empty(len(s.x))
     put(s.y, place)
     for _ in range(how.limit):

@@ -41,7 +41,7 @@ class Feed:
     Parameters
     ----------
     seed : int
-        Number of the component of an input of the measurement function.
+        Number of the input of the measurement function, see TARGET to RISE.
     column : int array (m,)
         Column of the full parameter vector.
     gain : float or array (m,)
