@@ -29,7 +29,9 @@ _WEAK = 1e-7
 # Relative change of y below which the last Newton step squares the error to 1e-14.
 _SETTLED = 1e-7
 
-# Scalars of each lane in the scratch of `minimise`, after its matrices and vectors.
+# Scalars of each lane in the scratch of `minimise`, after its matrices and vectors. BEND: minus the derivative of half
+# the constraint by the multiplier. TODO: 1.0 until the iteration has converged. LEAST: least valid pivot. VALUE: half
+# the constraint. LAST: last multiplier with a definite matrix. DEFINITE: 1.0 if the present matrix is definite.
 MULTIPLIER, BEND, TODO, LEAST, VALUE, LAST, DEFINITE = range(7)
 _NUMBERS = 7
 

@@ -324,7 +324,8 @@ def _blur_of_face(problem: Problem, face: Face, equations: Normal) -> Array | fl
 def _advance(part: _ActiveProblems, state: _DescentState, active: Array, rules: StopRules, iteration: int) -> None:
     """Try one step of every active problem, and write the result to `state`.
 
-    `active` are the numbers of the problems of `part` in `state`. `iteration` is the number of this step, from 0.
+    `active` are the numbers of the problems of `part` in `state`. The `rules` end a refinement. `iteration` is the
+    number of this step, from 0.
     """
     # In most batches all problems end together: while all are active, arrays are not copied.
     everything = len(active) == len(state.x)

@@ -78,10 +78,10 @@ class Equalities:
         x : array (M, size)
             Vectors before the steps.
         """
-        # with equalities of local states, the unknowns become coefficients of a basis of the admitted steps
         along = tangent_at(self.problem, self.lasting, x) if self.lasting else None
         if self.single is None:
             return step(equations, damping, along)
+        # the local unknowns of these equations are coefficients of a basis of the steps that stay on the equalities
         basis = self._local_space(x)
         move, ok = step(_within(equations, basis), damping, along)
         n, (m, k, _, free) = self.problem.layout.n_shared, basis.shape

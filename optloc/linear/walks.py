@@ -67,7 +67,7 @@ def chain_at(problem: Problem, x: Array) -> Chain:
     vector, cost = np.zeros(local.shape), np.zeros(x.shape[:-1])
     for bias, place, F, Q in _steps(problem):
         W = linalg.inverse(Q, 0.0)[0]
-        # at the equality x_{j+1} = F x_j the step is zero; `pull` is W e
+        # `error` is the step e, `pull` is W e
         state = local[..., place]  # (..., k, q, o)
         error = state[..., 1:, :, :] - (F[:, None] @ state[..., :-1, :, :, None])[..., 0]
         pull = (W @ error[..., None])[..., 0]
