@@ -160,6 +160,7 @@ def sight(
     S = np.asarray(station, dtype=np.float64)
     wA = np.asarray(weight, dtype=np.float64)
     use = wA > 0.0
+    # the values of absent angles may be NaN; zeros replace them
     A = np.where(use, azimuth, 0.0)
     E, wE = None, np.zeros_like(wA)
     if S.shape[-1] == 3:
@@ -299,6 +300,7 @@ def _weighted_solution(Z: Array, G: Array, b: Array, W: Array) -> Array:
 
     Z are the instruments, G the rows, b the right sides, W the weights. With Z = G it is weighted least squares.
     """
+    # only ratios of weights matter; the largest weight becomes one, so that no square overflows
     left = Z * np.where(W > 0.0, W / W.max(axis=-1, keepdims=True), 0.0)[..., None] ** 2
     inverse = _inverse(np.einsum("...ki,...kj->...ij", left, G))
     point = np.zeros(inverse.shape[:-1])

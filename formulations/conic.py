@@ -167,7 +167,7 @@ class Relaxation:
         bound: bool,
         reach: float | None,
     ) -> ConicAnswer:
-        """Return the solution by Clarabel, without cvxpy."""
+        """Return the solution by Clarabel, without cvxpy; see `solve` for `values`, `bound` and `reach`."""
         data.feed(values)
         try:
             solution = _solver(data, settings).solve()

@@ -190,9 +190,11 @@ def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minor
     Minorant
         One quadratic for each direction.
 
-    Notes ----- Let :math:`\hat v` (azimuth :math:`\hat A`, elevation :math:`\hat E`) be the direction that a fix
-    predicts, and `v` any direction, with :math:`\eta = A_v - \hat A` and :math:`\epsilon = E_v - \hat E`. The errors of
-    the fix against the measured angles are :math:`\hat\delta` and :math:`\hat\varepsilon`, so that the cost of `v` is
+    Notes
+    -----
+    Let :math:`\hat v` (azimuth :math:`\hat A`, elevation :math:`\hat E`) be the direction that a fix predicts, and `v`
+    any direction, with :math:`\eta = A_v - \hat A` and :math:`\epsilon = E_v - \hat E`. The errors of the fix against
+    the measured angles are :math:`\hat\delta` and :math:`\hat\varepsilon`, so that the cost of `v` is
 
     .. math:: f(v) = \frac{(\hat\delta + \eta)^2}{\sigma_A^2} + \frac{(\hat\varepsilon + \epsilon)^2}{\sigma_E^2} .
 
@@ -340,6 +342,7 @@ def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
     base = S[pairs[:, 1]] - S[pairs[:, 0]]
     base = base / np.linalg.norm(base, axis=1, keepdims=True)
     across = np.cross(base[:, None], frame[pairs[:, 1]])
+    # for each pair in both frames: the form v_i' [base]x v_j, and the products of the directions with the base line
     turn = np.einsum("pai,pbi->pab", frame[pairs[:, 0]], across)
     near = np.einsum("pai,pi->pa", frame[pairs[:, 0]], base)
     far = np.einsum("pai,pi->pa", frame[pairs[:, 1]], base)

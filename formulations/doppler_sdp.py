@@ -234,6 +234,7 @@ class DopplerScene:
             values["limit"] = limit**2
         if shape.second:
             values |= {"rate": speed[list(shape.second)], "level": own[list(shape.second)]}
+        # swaps with the product of a range and its own rate, a linear form in x
         mixed = -1 - swap[swap[:, 0] < 0, 0]
         if len(mixed):
             values |= {"turned rate": speed[mixed], "turned level": own[mixed]}
@@ -343,6 +344,7 @@ def doppler(
         lift = answer.values["lift"]
         if not np.isfinite(lift).all():
             return _no_start(S.shape[1], A.shape, answer)
+        # value and bound of a pass belong to the ranges that divided its rows
         weighted, point = far, lift[0, 1 : 1 + S.shape[1]]
         apart = np.sqrt(((point - scene.place) ** 2).sum(axis=1))
         far = np.where(scene.pivot < 0, 1.0, np.maximum(apart[scene.pivot], _NEAREST))
@@ -384,7 +386,8 @@ def _no_start(dimension: int, design: tuple[int, ...], answer: ConicAnswer | Non
 def _nodes_of_rows(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
     """Return three arrays (m,): the node whose range multiplies a row, the node whose rate is an unknown, and the sign.
 
-    A node is -1 if there is none. The sign is the coefficient of the first node.
+    `rates` (m, M) are the coefficients of range rates in the rows, `speed` (M, d) the velocities of the nodes. A node
+    is -1 if there is none. The sign is the coefficient of the first node.
     """
     if (np.abs(rates).sum(axis=1) > 2.0).any() or (np.abs(rates.sum(axis=1)) > 1.0).any():
         raise ValueError("a row of rates must be one rate, or the difference of two")
@@ -395,7 +398,7 @@ def _nodes_of_rows(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
     first = np.where(rates.any(axis=1), held.argmin(axis=1), -1)
     rest = np.where(np.arange(rates.shape[1]) == first[:, None], 0.0, np.abs(rates) * often)
     second = np.where(rest.any(axis=1), rest.argmax(axis=1), -1)
-    # if one station moves and the other rests, the row is multiplied by the range of the moving one
+    # if only one station moves, its range multiplies the row; the rate of the station at rest needs no unknown
     still = (first >= 0) & (second >= 0) & ~moving[first]
     first, second = np.where(still, second, first), np.where(still, -1, second)
     return first, second, np.where(first < 0, 1.0, rates[np.arange(len(rates)), first])
@@ -422,7 +425,8 @@ def _forms(
 ) -> Array:
     """Return the rows (m, length of y) as linear forms in y: measured values z minus predicted values.
 
-    The form of a row of rates is multiplied by the range of its node `first`.
+    `first` and `second` (m,) are the results of `_nodes_of_rows`, `design` (m, p) the coefficients of b. The form of a
+    row of rates is multiplied by the range of its node `first`.
     """
     beta, r, w, size = shape.places
     at = {pair: w + k for k, pair in enumerate(shape.product)}

@@ -225,7 +225,8 @@ class _NetworkFit:
             columns.append(2.0 * (self.z - at.b[:, None] - here.pulses.o[:, :, None])[..., None])
         c = here.scale[..., None] * np.concatenate(columns, axis=-1)
         p = c.shape[-1]
-        # sum over pulses of C'(I - QQ')C: one block for each station, less the product of the parts in the span of Q
+        # Sum over pulses of C'(I - QQ')C, with the derivatives C by the unknowns of the stations: one block for each
+        # station, less the product of the parts in the span of Q.
         inner = np.einsum("snik,snia->snkia", here.q, c).reshape(count, -1, m * p)
         normal = -np.swapaxes(inner, 1, 2) @ inner
         blocks = normal.reshape(count, m, p, m, p)
@@ -233,6 +234,7 @@ class _NetworkFit:
         blocks[:, every, :, every, :] += np.einsum("snia,snib->isab", c, c)
         gradient = np.einsum("snia,sni->sia", c, here.residual).reshape(count, m * p, 1)
         diagonal = np.einsum("sii->si", normal)
+        # Marquardt's damping, with a floor for unknowns without information, whose diagonal is zero
         diagonal += damping[:, None] * (diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-300)
         step = np.linalg.solve(normal, gradient).reshape(count, m, p)
         b = at.b + step[..., -1] if self.clocks else at.b

@@ -117,6 +117,7 @@ def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backen
     u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
     relaxation = _relaxation("ball", u.shape[0], u.shape[1], backend)
     answer = relaxation.solve(_cone_data(u, S, theta, ball=True))
+    # the program minimises minus the radius
     point, margin = answer.values["point"], -answer.primal
     inside = bool((angles(point, u, S) <= theta).all())
     meet = True if inside else (False if -answer.bound < 0.0 else None)
@@ -321,10 +322,10 @@ def _cones(point: Any, radius: Any, count: int, dim: int) -> list[Any]:
 
 
 def _cone_data(u: Array, S: Array, theta: Array, *, ball: bool) -> dict[str, Array]:
-    """Return the parameters of both problems at half-angles (N,) below pi/2; an infinite angle drops its cone.
+    """Return the parameters of both problems at half-angles `theta` (N,) below pi/2; an infinite angle drops its cone.
 
-    `ball` is True for the problem with a ball. Each cone is multiplied by the cosine of its half-angle, so that wide
-    cones have small numbers.
+    `u` (N, d) are the measured directions, `S` (N, d) the stations. `ball` is True for the problem with a ball. Each
+    cone is multiplied by the cosine of its half-angle, so that wide cones have small numbers.
     """
     _count, dim = u.shape
     held = np.isfinite(theta)

@@ -323,7 +323,10 @@ def _numbers(value: Any) -> Array:
 
 
 def _compile(name: str, solver: Any, options: dict[str, Any]) -> Any:
-    """Return a CasADi solver with its functions compiled to machine code, or None if no compiler succeeds."""
+    """Return a CasADi solver with its functions compiled to machine code, or None if no compiler succeeds.
+
+    `name` and `options` are the plugin and the options of `solver`.
+    """
     import casadi as ca
 
     compiler = next((found for found in map(shutil.which, _COMPILERS) if found), None)

@@ -110,6 +110,7 @@ def gradients(design: Design, w: Array, criterion: Criterion) -> tuple[Array, Ar
     inverse = np.linalg.inv(information)
     d = design.dimension
     covariance = inverse[:, :d, :d]
+    # `turn` is the matrix W of the gradient in the text of the module
     c = inverse[:, None, :d] @ design.rows
     if criterion == "A":
         turn = np.broadcast_to(np.eye(d), covariance.shape)
@@ -224,13 +225,14 @@ def outer_approximation(
 
     places, n = len(design.weight), design.rows.shape[-1]
     begun, best, chosen, bound, rounds = monotonic(), np.inf, np.full(n, np.nan), -np.inf, 0
+    # the unknowns are w, then one t for the maximum over places, or one t for each place
     columns = 1 if worst else places
     goal = np.concatenate([np.zeros(n), [1.0] if worst else design.weight])
     cuts: list[Array] = []
     levels: list[Array] = []
 
     def cut(at: Array) -> None:
-        """Add the tangents of the criterion at a point (n,)."""
+        """Add the tangents of the criterion at a point (n,), as rows ``slope w - t <= slope at - f``."""
         f, slope = gradients(design, at, criterion)
         column = np.zeros((places, 1)) if worst else -np.eye(places)
         cuts.append(np.hstack([slope, column - (1.0 if worst else 0.0)]))

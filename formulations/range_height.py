@@ -241,7 +241,7 @@ def _reshape(found: HeightCandidates, lead: tuple[int, ...]) -> HeightCandidates
 def _curve_points(curve: HeightCurve, stations: Array, A: Array, centre: Array, *, positive: bool) -> HeightCandidates:
     """Return all common points of N curves and their ellipsoids; shapes A (N, 3, 3), centres (N, 3).
 
-    If `positive` is True, points with a negative range to one of the `stations` are dropped.
+    If `positive` is True, points with a negative range to one of the `stations` (N, s, 3) are dropped.
     """
     with np.errstate(all="ignore"):
         E, L, alpha = curve.on_ellipsoid(A, centre)
@@ -261,6 +261,7 @@ def _curve_points(curve: HeightCurve, stations: Array, A: Array, centre: Array, 
     same = (same <= _SAME * size[:, :, None]) & valid[:, None]
     # drop points that an earlier slot contains
     valid &= ~np.tril(same, -1).any(axis=-1)
+    # valid points first: at most four of the eight slots contain different points
     order = np.argsort(~valid, axis=-1, kind="stable")[:, :_SLOTS]
     valid = np.take_along_axis(valid, order, axis=1)
     x, ranges = (np.take_along_axis(v, order[..., None], axis=1) for v in (x, ranges))
@@ -357,6 +358,7 @@ def three_stations(stations: Array, sign: Array, offset: Array) -> HeightCurve:
     -----
     Ho and Chan (1997), section III.
     """
+    # ranges as functions of the first: r_i = turn_i r_1 + gap_i
     turn = sign * sign[:, :1]
     gap = offset - turn * offset[:, :1]
     a = stations[:, 1:] - stations[:, :1]
@@ -365,6 +367,7 @@ def three_stations(stations: Array, sign: Array, offset: Array) -> HeightCurve:
     size = np.sum(normal * normal, axis=-1)
     ok = np.isfinite(gap).all(axis=-1)
     ok &= size > _THIN**2 * length[:, 0] * length[:, 1]
+    # items that are not ok get valid numbers, so that no result is infinite or NaN
     size, gap = np.where(ok, size, 1.0), np.where(ok[:, None], gap, 0.0)
     a = np.where(ok[:, None, None], a, np.eye(3)[1:])
     normal = np.where(ok[:, None], normal, np.eye(3)[0])
@@ -374,6 +377,7 @@ def three_stations(stations: Array, sign: Array, offset: Array) -> HeightCurve:
     fixed, slope = 0.5 * (length - gap[:, 1:] ** 2), -turn[:, 1:] * gap[:, 1:]
     p = slope[:, :1] * first + slope[:, 1:] * second
     start = fixed[:, :1] * first + fixed[:, 1:] * second
+    # r_1 = scale t + shift: p becomes at most a unit long, and b is near the stations
     long = np.maximum(dot(p, p), 1.0)
     shift = -dot(start, p) / long
     start, scale = start + p * shift[:, None], 1.0 / np.sqrt(long)
@@ -411,6 +415,7 @@ def two_stations(stations: Array, ranges: Array, towards: Array) -> HeightCurve:
     usable = np.isfinite(ranges).all(axis=-1) & np.isfinite(towards).all(axis=-1) & (length > 0.0)
     axis = np.where(usable[:, None], a, np.eye(3)[0]) / np.where(usable, length, 1.0)[:, None]
     length, ranges = np.where(usable, length, 1.0), np.where(usable[:, None], ranges, 0.0)
+    # centre of the circle on the line from the first station, and squared radius; factored, so that no digits cancel
     foot = 0.5 * (length + (ranges[:, 0] - ranges[:, 1]) * (ranges[:, 0] + ranges[:, 1]) / length)
     radius = (ranges[:, 0] - foot) * (ranges[:, 0] + foot)
     ok = usable & (radius >= 0.0)
@@ -423,7 +428,10 @@ def two_stations(stations: Array, ranges: Array, towards: Array) -> HeightCurve:
 
 
 def _perpendicular(axis: Array, hint: Array) -> Array:
-    """Return unit vectors (N, 3) normal to the axes (N, 3), towards the hint (N, 3) if the hint is off the axis."""
+    """Return unit vectors (N, 3) normal to the axes (N, 3), towards the hint (N, 3) if the hint is off the axis.
+
+    Otherwise they point towards the coordinate axis that is farthest from the axis.
+    """
     least = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
     off = hint - axis * dot(axis, hint)[:, None]
     weak = dot(off, off) <= _AXIAL * dot(hint, hint)
@@ -466,7 +474,8 @@ def _times(a: Array, b: Array) -> Array:
 
 
 def _roots(c: Array) -> Array:
-    """Return the four complex roots (N, 4) of quartics (N, 5)."""
+    """Return the four complex roots (N, 4) of quartics (N, 5); coefficients are constant first."""
+    # coefficients that are not finite are replaced by 1 + t^4, which has no real root
     c = np.where(np.isfinite(c).all(axis=-1, keepdims=True), c, [1.0, 0.0, 0.0, 0.0, 1.0])
     size = np.max(np.abs(c), axis=-1)
     c = c / np.where(size > 0.0, size, 1.0)[:, None]
@@ -497,10 +506,11 @@ def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array
     """Return the results (t, mu) of Newton's iteration on the two conics, from starts (N, K).
 
     Slots that did not converge are not marked; the caller finds them by their residuals. See `quartic` for the
-    coefficients.
+    coefficients `square`, E, L and alpha.
     """
     go = np.isfinite(t)
     for _ in range(_NEWTON):
+        # residuals of the two conics, and their derivatives by t and mu
         one = mu * mu - _value(square, t)
         cross = L[:, :1] + L[:, 1:] * t
         two = _value(E, t) + (cross + alpha[:, None] * mu) * mu

@@ -59,7 +59,7 @@ _NEAREST = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class RegistrationCourse:
-    """Range offsets of a batch of N problems at B times, with S stations besides the reference, and q biases.
+    """Range offsets of a batch of N problems at B times, with S stations and the reference station, and q biases.
 
     Parameters
     ----------
@@ -162,7 +162,8 @@ def _free_ranges(course: RegistrationCourse, order: int) -> _Guess:
         if turn:
             columns.append(np.broadcast_to(-course.bias, (*right.shape, q)))
         seen = course.whiten @ np.concatenate([*columns, gain[..., None], right[..., None]], axis=-1)
-        # the column of the free reference range is projected out of the whitened rows of every epoch
+        # The column of the free reference range (the last but one) is projected out of the whitened rows of every
+        # epoch. Afterwards the best reference range follows from the remaining residuals `rest`.
         free = seen[..., -2]
         norm = (free**2).sum(-1, keepdims=True)
         unit = free / np.sqrt(np.where(norm > 0.0, norm, 1.0))
@@ -195,8 +196,8 @@ def _least_squares(rows: Array, course: RegistrationCourse, bias: Array | None, 
 def _solve(matrix: Array, vector: Array, cut: float) -> Array:
     """Return the solution (N, n) of normal equations scaled to a unit diagonal; NaN if the input is not finite.
 
-    It is zero along eigenvectors whose eigenvalue is at most `cut` times the largest: these directions have (almost) no
-    information.
+    The equations are ``matrix y = vector``. The solution is zero along eigenvectors whose eigenvalue is at most `cut`
+    times the largest: these directions have (almost) no information.
     """
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
@@ -229,7 +230,8 @@ def _tie_ranges(course: RegistrationCourse, guess: _Guess, order: int) -> tuple[
     """
     q, d, n = course.bias.shape[-1], course.station.shape[-1], (order + 1) * course.station.shape[-1]
     _, place, gain, right = _rows(course, guess)
-    # rows in (bias, course, lifts): the tangent parabola at the guess replaces the reference range
+    # Rows in (bias, course, lifts). At the guess r, r_0 is replaced by (r^2 + r_0^2) / (2 r), which is linear in the
+    # unknowns of r_0^2.
     first, r = course.station[..., :1, :], guess.reference[..., None]
     square = (first**2).sum(-1)
     lifts = (gain / (2.0 * r))[..., None] * _powers(course, 2 * order + 1)[:, None, :]
@@ -299,7 +301,8 @@ def _reference(course: RegistrationCourse, theta: Array, lifts: Array, order: in
 def _plane_branches(course: RegistrationCourse, state: Array, reference: Array) -> Array:
     """Return two courses (N, 2, order + 1, d), one on each side of the plane in which the stations spread most.
 
-    The distance from the plane follows from the reference ranges (N, B); the part of `state` along the plane stays.
+    The distance from the plane follows from the reference ranges (N, B). The part of the courses `state` (N, order + 1,
+    d) along the plane does not change.
     """
     first = course.station[..., 0, :]
     # the normal is the direction in which the stations spread least; the reference range gives the distance from the
@@ -311,10 +314,11 @@ def _plane_branches(course: RegistrationCourse, state: Array, reference: Array) 
     powers = _powers(course, state.shape[1])
     away = powers @ state - first
     height = (away * normal).sum(-1)
-    inside = (away**2).sum(-1) - height**2
-    beside = np.sqrt(np.maximum(reference**2 - inside, 0.0))
+    inside = (away**2).sum(-1) - height**2  # squared distance along the plane
+    distance = np.sqrt(np.maximum(reference**2 - inside, 0.0))  # from the plane through the reference station
     level = (first * normal).sum(-1)
+    # the distances at all times become a polynomial course along the normal by least squares
     fit = np.linalg.pinv(powers)
     flat = state - ((state * normal).sum(-1, keepdims=True)) * normal
-    sides = [flat + ((level + side * beside) @ fit.T)[..., None] * normal for side in (1.0, -1.0)]
+    sides = [flat + ((level + side * distance) @ fit.T)[..., None] * normal for side in (1.0, -1.0)]
     return np.stack(sides, axis=1)

@@ -197,6 +197,7 @@ def sparse_fit(
     left, size, across = np.linalg.svd(B, full_matrices=False)
     if size[-1] <= _RANK * size[0]:
         return nothing
+    # y = centre + back z, with the least-squares fit at the centre
     back, centre = across.T / size, (across.T / size) @ (left.T @ g)
     off = g - B @ centre
     scale = max(float(np.abs(off).max()), 1.0)

@@ -255,7 +255,7 @@ def _parts(rows: Array, right: Array) -> Iterator[tuple[slice, Array, Array, Mas
 def _points(rows: Array, right: Array, quadric: Quadric, find: Finder) -> tuple[Array, Array, Mask]:
     """Return points (N, K, n), costs (N, K) and validity (N, K) of every slot by the secular equation.
 
-    `find` is `largest` (K = 1, the global minimiser) or `everything`.
+    `rows` (N, q, n) are B, `right` (N, q) are g. `find` is `largest` (K = 1, the global minimiser) or `everything`.
     """
     slots = 1 if find is largest else 2 * quadric.size - 1
     count, n = len(rows), quadric.size
@@ -391,6 +391,7 @@ def _cone_points(B: Array, g: Array, find: Finder) -> tuple[Array, Mask]:
     tall = 1.0 + ratio
     gap = (ratio[None] - ratio[:, None]) / (tall[None] * tall[:, None])
     weight, level = ratio * (f[1:] / tall) ** 2, f[0] ** 2
+    # without weight a pole vanishes, and with it the root on this pole
     floor = _FLOOR**2 * (weight.max(axis=0) + level) + _LEAST
     weight, level = np.maximum(weight, floor), np.maximum(level, floor)
     roots = find(Secular(gap, ratio / tall, weight, level, np.zeros_like(level)))
@@ -482,7 +483,10 @@ def _rank(A: Array, size: Array) -> NDArray[np.int64]:
 
 
 def _paraboloid_points(B: Array, g: Array, find: Finder) -> tuple[Array, Mask]:
-    """Return stationary points (n, K, N) on ``|x|^2 = w``, and whether each slot contains one (K, N)."""
+    """Return stationary points (n, K, N) on ``|x|^2 = w``, and whether each slot contains one (K, N).
+
+    B (q, n, N) and g (q, N) are finite. `find` is `largest` (one slot) or `everything` (K = 2n - 1 slots).
+    """
     A, b = normal(B, g)
     d = A.shape[0] - 1
     trace = np.einsum("iiN->N", A[:d, :d])
@@ -493,6 +497,7 @@ def _paraboloid_points(B: Array, g: Array, find: Finder) -> tuple[Array, Mask]:
     s, V = eigen(S)
     # poles ascend as the eigenvalues descend
     s, V = np.maximum(s[::-1], 0.0), V[:, ::-1]
+    # directions that the rows leave undetermined: with two of them the rank of A is less than n - 1
     missing = (s <= _FLAT * trace).sum(axis=0) + free
     alpha = across(V, half)
     c = across(V, b[:d] - 2.0 * half * b[d]) + s * alpha
@@ -521,11 +526,13 @@ def _paraboloid_points(B: Array, g: Array, find: Finder) -> tuple[Array, Mask]:
 def _line_points(B: Array, g: Array, square: Array, linear: Array) -> tuple[Array, Mask]:
     """Return both points (N, 2, n) of the solution line on the quadric, and whether they exist (N, 2).
 
-    The batch is the first axis here. The function uses the stable form of the quadratic formula; a vanishing leading
-    coefficient leaves one point.
+    The batch is the first axis here: B (N, q, n), g (N, q). `square` and `linear` (n,) are the diagonal of C and the
+    vector h. The function uses the stable form of the quadratic formula; a vanishing leading coefficient leaves one
+    point.
     """
     n = B.shape[-1]
     with np.errstate(all="ignore"):
+        # rows of zeros give n singular values also if there are fewer rows than unknowns
         u, s, vt = np.linalg.svd(np.concatenate([B, np.zeros((len(B), n, n))], axis=1), full_matrices=False)
         weak = vt[:, -1]
         share = np.einsum("Nqk,Nq->Nk", u[:, : B.shape[1], :-1], g) / s[:, :-1]

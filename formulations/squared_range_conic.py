@@ -221,6 +221,8 @@ def mixed_points(lift: Array, quadric: Quadric) -> Array:
     if not values[-2] > _TIGHT * values[-1]:
         return out
     first, second = (np.sqrt(values[i]) * vectors[:, i] for i in (-1, -2))
+    # The lift satisfies the constraint, so the forms of its two parts have the sum zero. Their signs differ, and two
+    # combinations of the parts have the form zero: they are the points.
     a, b, c = _form(first, first, quadric), _form(first, second, quadric), _form(second, second, quadric)
     if not a * c < 0.0:
         return out

@@ -155,6 +155,7 @@ def evaluate(model: EngineModel, rows: Any, room: EngineWorkspace, shift: int) -
     equations(rows, room, shift)
     a, d, matrix, spare = model.admission, room.d, room.matrix[H + shift], room.scalar[SPARE]
     wide = room.scalar[RADIUS, 0] > 0.0
+    # number -1 is the sphere of the radius RADIUS about CENTRE; its gradient is the vector from the centre
     for k in range(-1 if wide else 0, a.exact):
         face = room.axes[BASE, 0] if k < 0 else room.face[shift, k]
         if k < 0:
@@ -380,7 +381,7 @@ def admission_of(problem: Problem) -> Admission | None:
     d, bands = problem.dimension, list(problem.constraints)
     if not all(isinstance(band, Band) and band.coefficients.ndim == 1 for band in bands):
         return None
-    bands.sort(key=lambda band: not is_exact(band))
+    bands.sort(key=lambda band: not is_exact(band))  # kernels loop over the first `Admission.exact` constraints
     traced = [_trace(problem, band) for band in bands if isinstance(band, Band)]
     found = [one for one in traced if one is not None]
     if len(found) < len(bands):

@@ -61,7 +61,8 @@ def refine_candidates(model: EngineModel, rows: Any, room: EngineWorkspace, spot
     room : EngineWorkspace
         Workspace of the block; lanes without an admitted candidate become not good.
     spot : array (CANDIDATES, d + 1, W)
-        Candidates relative to the origin, metres; NaN if absent. The costs are written after the coordinates.
+        In: candidates relative to the origin, metres; the first coordinate is NaN if the candidate is absent. Out: the
+        refined candidates, and after the coordinates their costs; infinite if the candidate is not valid.
     """
     vector, scalar, d = room.vector, room.scalar, room.d
     for lane in range(LANES):
@@ -159,7 +160,7 @@ def look_around(model: EngineModel, rows: Any, room: EngineWorkspace, spot: Arra
     """Write the cheapest position of each sector about the stations, and its cost, to `spot`, see `refine_candidates`.
 
     `rings` is the number of distances that are tried, from the nearest. Each position is first projected onto the exact
-    surfaces.
+    surfaces. If no position of a sector has a finite cost, its coordinates are NaN and its cost is infinite.
     """
     vector, scalar, d = room.vector, room.scalar, room.d
     each = len(model.ahead) // CANDIDATES

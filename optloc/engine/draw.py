@@ -276,6 +276,7 @@ def _range_rows(one: Problem, station: Array) -> tuple[Array, RangeRows]:
     bare = project_out(times, alone)
     basis, upper = np.linalg.qr(bare @ design, mode="complete")
     inside = min(upper.shape)
+    # K is upper triangular: a rotation of the whitened rows does not change the cost
     turned = basis.T @ bare
     loops = turned[inside:]
     # Combinations of rows that no range changes: their cost is the misfit of loops.

@@ -14,6 +14,9 @@ share:
 - `hidden` (N,) are the numbers of the problems whose mirror image needs more steps; `images` is their count.
 - `course` (3, N) contains damping, growth and steps of these mirror images.
 - `given` is True if the starts come from elsewhere, see `fixes`.
+- `z` (N, m) are the measurements, SI units or radians; `station` (N or 1, s, d) are the station positions, metres.
+- `tolerance` ends a refinement, see `optloc.engine.refinement.refine`.
+- `answer` receives the results.
 """
 
 from __future__ import annotations
@@ -118,7 +121,7 @@ def fixes(
     rows : named tuple
         Rows of the evaluator (`RangeRows` or `TapeRows`).
     z : array (N, m)
-        Measurements, metres.
+        Measurements, SI units or radians.
     station : array (N or 1, s, d)
         Positions of the stations that have rows, metres. Their mean is the centre of the coordinates in inverse range.
     tolerance, most : float, int
@@ -298,8 +301,10 @@ def _examine(
 ) -> int:
     """Measure shape and cost at infinity of the settled fixes of a block, and refine their mirror images.
 
-    Fixes whose shape needs a second measurement are marked in `look`. Mirror images that need more steps are added to
-    `hidden`. Returns the number of mirror images in `hidden`.
+    The shape is kappa: the deviation of the cost from a quadratic function. It is NaN for fixes that are not settled.
+    Fixes whose shape needs a second measurement are marked in `look`: kappa exceeds STRAIGHT, or the principal axes are
+    not unique. Mirror images that need more steps are added to `hidden`. Returns the number of mirror images in
+    `hidden`.
     """
     scalar = room.scalar
     settled = scalar[FIX_GOOD]

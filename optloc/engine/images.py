@@ -121,13 +121,15 @@ def keep_fix(room: EngineWorkspace) -> None:
 
 @compiled
 def reflect(model: EngineModel, room: EngineWorkspace) -> None:
-    """Set row X to the mirror image of the stored fix, or to its second start, and reset the refinement.
+    """Set row X to the point from which a second minimum is searched, and reset the refinement.
 
-    Lanes that are not good are not refined.
+    If SECOND is 1.0, the point is OTHER: the squared ranges or the candidates gave a second start, which the fix did
+    not use. Otherwise the point is the mirror image of the fix in the plane of the stations. Lanes whose GOOD is 0.0
+    are not refined. At the end, the exact constraints are restored at row X (the argument 0 selects X, not TRIAL).
     """
     vector, scalar, d = room.vector, room.scalar, room.d
     for i in range(vector.shape[1]):
-        # the other unknowns keep their values: their entries of the normal are zero
+        # unknowns after the first d (the position) keep the values of the fix: their entries of NORMAL are zero
         for lane in range(LANES):
             image = vector[FIX, i, lane] - 2.0 * scalar[HEIGHT, lane] * vector[NORMAL, i, lane]
             vector[X, i, lane] = vector[OTHER, i, lane] if i < d and scalar[SECOND, lane] != 0.0 else image
@@ -194,10 +196,11 @@ def _note_nearest(rows: Any, room: EngineWorkspace, nearest: Array, every: bool)
 def stop_hopeless(bow: float, room: EngineWorkspace, nearest: Array, every: bool) -> float:
     """Abandon refinements that cannot lead to a rival, and return the number of active lanes.
 
-    A refinement ends for one of two reasons. First: no position in a ball of radius D about it has a cost as low as a
-    rival's. (After a step of length D, all residuals together differ from their linear prediction by at most
-    ``bow D^2 / r``.) Second: it has returned to the fix. That is, it is within three standard deviations, and the cost
-    has risen as the curvature at the fix predicts.
+    A refinement ends for one of three reasons. First: no position in a ball about it has a cost as low as a rival's.
+    The radius D is `_BALL` times the height of the fix above the plane. After a step of length D, the residuals differ
+    from their linear prediction by at most ``bow D^2 / r``. Here r is the range to the nearest station.
+    Second: the refinement has returned to the fix. Then it is within three standard deviations, and the cost has risen
+    as the curvature at the fix predicts. Third: it has taken `_MOST` steps.
 
     Parameters
     ----------
@@ -226,7 +229,8 @@ def stop_hopeless(bow: float, room: EngineWorkspace, nearest: Array, every: bool
     alive = 0.0
     for lane in range(LANES):
         ball = _BALL * _BALL * scalar[HEIGHT, lane] * scalar[HEIGHT, lane]
-        # the gain belongs to the damped step: within the ball, the damping changes the cost by at most the last term
+        # lower bound of the linear prediction in the ball: COST - GAIN is the least sum of prediction and damping
+        # term, and the damping term in the ball is at most the last term
         least = scalar[COST, lane] - scalar[GAIN, lane] - scalar[DAMPING, lane] * trace[lane] * ball
         far = np.sqrt(max(least, 0.0)) >= np.sqrt(scalar[FIX_COST, lane] + LISTED) + bow * ball / nearest[lane]
         near = spare[lane] < NEAR and scalar[COST, lane] - scalar[FIX_COST, lane] > RISEN * spare[lane]

@@ -50,6 +50,7 @@ def search_sphere(model: EngineModel, rows: Any, room: EngineWorkspace, spot: Ar
         scalar[BEYOND, lane] = np.inf
         scalar[RADIUS, lane] = _INFINITE * scalar[SPREAD, lane]
     look_around(model, rows, room, spot, 1)
+    # start -1 is the fix, from which the search leaves in its direction; the others are the candidates
     for k in range(-1, len(spot)):
         for lane in range(LANES):
             scalar[GOOD, lane] = 1.0 if k < 0 or spot[k, 0, lane] < np.inf else 0.0

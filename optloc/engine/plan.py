@@ -273,6 +273,7 @@ def key_of(problem: Problem) -> tuple[Hashable, ...]:
 def is_planned(problem: Problem) -> bool:
     """Return whether a plan exists for the structure and for the data that a batch shares, and saves time."""
     stations, motion = problem.stations, problem.motions[0]
+    # arrays that must be the same for the whole batch, with the number of their axes if there is no batch axis
     shared = [(array, 1) for r in problem.rows for array in (r.weight, r.correction)]
     shared += [(block.covariance, 3) for block in problem.noise.blocks]
     shared += [(covariance, 3) for _, _, covariance in stations.errors]
@@ -295,7 +296,7 @@ def is_planned(problem: Problem) -> bool:
 
 
 def _is_ranged(problem: Problem) -> bool:
-    """Return whether all rows are sums of ranges to fixed stations, and only emission times are unknown besides."""
+    """Return whether all rows are sums of ranges to fixed stations, and the only other unknowns are emission times."""
     stations = problem.stations
     # Isotropic station errors of one epoch are noise of ranges. Errors that last for the run are unknowns with a
     # covariance.

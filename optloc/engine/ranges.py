@@ -134,7 +134,7 @@ def keep(model: EngineModel, rows: RangeRows, stations: int, d: int, size: int) 
 
 @compiled
 def load(block: RangeBlock, z: Array, room: EngineWorkspace, anew: bool) -> None:
-    """Write the cost of the loops to LOOP; if `anew` is True, also the map from directions at infinity."""
+    """Write the cost of the loops to LOOP; for new stations (`anew`) also the map from directions at infinity."""
     first, loop = len(room.place) + len(block.rows.K) + len(block.rows.start), room.scalar[LOOP]
     for lane in range(LANES):
         loop[lane] = 0.0
@@ -191,9 +191,12 @@ def costs(block: RangeBlock, room: EngineWorkspace) -> None:
 
 @compiled
 def bow_of(block: RangeBlock, room: EngineWorkspace) -> float:
-    """Return a bound b of the curvature of all residuals, 1/metres: over a step D at range r they differ by b D^2 / r.
+    """Return a bound b of the curvature of all residuals, 1/metres.
 
-    A range exceeds its linear prediction by 0 to ``D^2 / 2 r``, and all residuals together theirs by at most ``norm(K)
+    After a step D, the whitened residuals differ from their linear prediction by at most ``b D^2 / r``, see `bow_of` in
+    `optloc.engine.evaluator`. r is the range to the nearest station, metres.
+
+    A range exceeds its linear prediction by 0 to ``D^2 / 2 r``. So all residuals together differ by at most ``norm(K)
     sqrt(s) D^2 / 2 r``. If a common error of all ranges has no effect, half of this bound is valid.
     """
     return float(block.rows.norm * np.sqrt(len(block.r)) * (0.25 if block.rows.level else 0.5))

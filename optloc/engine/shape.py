@@ -175,9 +175,9 @@ def _turn(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) -
 def _span(vector: Array, base: Array, r: Array) -> None:
     """Write the derivatives of positions by (p, w) at the fix, ``[r B, -r u0]``, to the columns of `base` (d, d, W).
 
-    (p, w) are the coordinates in inverse range: direction and inverse range, relative to the fix. r and u0 are range
-    and direction of the fix from the centre. B is from T. Duff et al., "Building an orthonormal basis, revisited", J.
-    Computer Graphics Techniques 6 (2017).
+    `vector` contains the rows X and CENTRE. (p, w) are the coordinates in inverse range: direction and inverse range,
+    relative to the fix. r and u0 are range and direction of the fix from the centre. B is from T. Duff et al.,
+    "Building an orthonormal basis, revisited", J. Computer Graphics Techniques 6 (2017).
     """
     d = len(base)
     for lane in range(LANES):
@@ -204,7 +204,7 @@ def _span(vector: Array, base: Array, r: Array) -> None:
 
 @compiled
 def _axes(room: EngineWorkspace, inverse: bool, held: bool, spare: Array) -> None:
-    """Write the principal axes of the position's information, each one sigma long, to AXES.
+    """Write the principal axes of the position's information, each as long as one sigma, to AXES.
 
     If `inverse` is True, the information is expressed in inverse range. If `held` is True, exact surfaces constrain the
     fix, and the axes come from the covariance. `spare` (W,) is scratch.
@@ -257,7 +257,8 @@ def _drop_exact(variance: Array, most: Array) -> None:
 def _probe(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) -> None:
     """Write the cost after a step MOVE from the fix to COST_TRIAL, and one over the quadratic rise there to SHARE.
 
-    In inverse range, a step beyond `_HORIZON` is shortened.
+    If `inverse` is True, MOVE is a step in inverse range (`_span` defines these coordinates); a step beyond `_HORIZON`
+    is shortened.
     """
     vector, scalar, base = room.vector, room.scalar, room.axes[BASE]
     d, move, trial, share, w = room.d, vector[MOVE], vector[TRIAL], scalar[SHARE], scalar[SPARE]
@@ -266,6 +267,7 @@ def _probe(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) 
             down = move[d - 1, lane]
             cut = (_HORIZON - 1.0) / down if 1.0 + down < _HORIZON else 1.0
             share[lane] = 1.0 / (_REACH * _REACH * cut * cut)
+            # the last component of the step is the change of the inverse range, relative to the fix
             w[lane] = 1.0 / (1.0 + cut * down)
             for j in range(d - 1):
                 move[j, lane] *= cut
@@ -283,6 +285,7 @@ def _probe(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) 
         for i in range(d):
             for lane in range(LANES):
                 trial[i, lane] = vector[X, i, lane] + move[i, lane]
+    # the other unknowns follow the position linearly, so that they minimise the quadratic cost
     for k in range(d, vector.shape[1]):
         for lane in range(LANES):
             trial[k, lane] = vector[X, k, lane]

@@ -83,7 +83,7 @@ def load_measurements(
     Parameters
     ----------
     z : array (N, m)
-        Measurements, metres.
+        Measurements, SI units or radians.
     item : int64 array (W,)
         Problem of each lane.
     row : array (3, m)

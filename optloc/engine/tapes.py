@@ -168,7 +168,7 @@ def _lift(block: TapeBlock, room: EngineWorkspace, first: bool) -> None:
     """
     lifts, r = block.rows.lifts, block.r
     s, scale, spare = len(room.place), room.scalar[SCALE], room.scalar[SPARE]
-    together = max(1, r.shape[1] // LANES)
+    together = max(1, r.shape[1] // LANES)  # number of linear rows in a run of a tape
     for lane in range(LANES):
         spare[lane] = 1.0 / scale[lane]
     for b in range(len(lifts.first) - 1):

@@ -50,9 +50,9 @@ from optloc.kernels.trace import ADD, ATAN2, COS, DIV, HYPOT, LOG, MUL, NEG, SIN
 # Working memory of a block of lanes, and the addresses of its parts.
 
 LENGTH = 128
-"""Length of a register: rows of one kind are put behind each other, lanes of one and then of the next.
+"""Length of a register, in numbers: it contains several rows of one kind, each with a number for each lane.
 
-A few lanes share the choice of an operation over several rows; twice the most lanes, so that full blocks take two.
+So an operation is selected once for several rows. The length is two rows of a full block of 64 lanes.
 """
 
 
@@ -82,7 +82,7 @@ class LaneCells(NamedTuple):
 
 
 STATE = 8
-"""Cells that a refinement keeps of every problem."""
+"""Number of cells of a lane for the state of a refinement."""
 _EPSILON = float(np.finfo(float).eps)
 
 # Lanes of a block: so few that the frequently used cells (2**18 doubles, 2 MB) stay in the cache, and that all cells
@@ -193,7 +193,7 @@ def memory(t: Tables, room: LaneCells, lanes: Constant) -> tuple[Array, Array]:
 
 @compiled
 def run_operations(code: Array, first: int, last: int, r: Array, count: Constant) -> None:
-    """Run operations first <= i < last on the first `count` columns of the registers; see `Tape` and `OPERATIONS`."""
+    """Run operations first <= i < last of `code` on the first `count` columns of the registers, see `Tape.code`."""
     # The operation is selected once for all lanes, and the compiler turns each loop into vector instructions.
     for step in range(first, last):
         operation, to, u, v = code[step, 0], code[step, 1], code[step, 2], code[step, 3]
@@ -433,7 +433,7 @@ def write_cost(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, lanes
 
 
 ALL = -1
-"""In the place of an epoch: the groups of all of them."""
+"""Value of the argument `epoch` that selects the groups of all epochs."""
 
 
 @compiled
@@ -520,7 +520,10 @@ def _whiten(
     to: int,
     lanes: Constant,
 ) -> None:
-    """Write `size` rows of `columns` cells, from cell `first` on, times the whitening matrix, to cell `to`."""
+    """Write `size` rows of `columns` cells, from cell `first` on, times the whitening matrix, to cell `to`.
+
+    Rows are `width` cells apart. `full` is 0 if the matrix is lower triangular, else 1.
+    """
     for i in range(size):
         for s in range(columns):
             cell = to + i * width + s
@@ -575,7 +578,7 @@ def _square(
 def _add_prior(
     common: Array, place: int, size: int, m: Array, room: LaneCells, x: int, start: int, last: int, lanes: Constant
 ) -> None:
-    """Add a Gaussian prior of the `size` unknowns from cell x on, whose first column is `start`."""
+    """Add a Gaussian prior of the `size` unknowns from cell x on, whose first column of `last` columns is `start`."""
     error, pull, to = room.error, room.error + size, room.after
     vector = to + last * (last + 1)
     for i in range(size):

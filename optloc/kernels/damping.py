@@ -103,6 +103,7 @@ def judge(
     rounding = floor + 2.0 * blur * np.sqrt(1.0 + cost)
     better = solvable & np.isfinite(after) & ((achieved >= -rounding) if damped else True)
     small = solvable & (np.abs(gain) * (1.0 + damping) <= np.maximum(tolerance * tolerance, floor + blur * blur))
+    # Nielsen's factor of the damping after an accepted step: 1 - (2 ratio - 1)^3, limited from below
     ratio = achieved / np.where(gain > 0.0, gain, 1.0)
     middle = 2.0 * np.clip(ratio, 0.0, 1.0) - 1.0
     change = np.where(ratio > _AGREED, _QUICK_FALL, np.maximum(_FALL, 1.0 - middle * middle * middle))
@@ -124,7 +125,7 @@ def judge_lane(
 ) -> tuple[bool, bool, bool, float, float]:
     """Return the five fields of `Judged` for one step of one fix: `judge` as machine code, with identical rounding.
 
-    The order is better, small, stuck, damping, growth; see `judge` for the arguments.
+    The order is better, small, stuck, damping, growth. The arguments are the arguments of `judge`, as numbers.
     """
     achieved, floor = cost - after, _ROUNDING * (1.0 + cost)
     rounding = floor + 2.0 * blur * np.sqrt(1.0 + cost)

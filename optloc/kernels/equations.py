@@ -2,8 +2,8 @@
 
 The equations are summed over the epochs of a run; the unknowns of each epoch keep separate blocks. Letters: n shared
 unknowns, `local` (or `size`) local unknowns of an epoch, B lanes. `m` is the memory (cells, B), `room` its addresses, r
-are registers, see `optloc.kernels.batched_rows`. `used` is the number of lanes in use; lane b contains vector `begin` +
-b.
+are registers, t the tables and c the numbers of the problems, see `optloc.kernels.batched_rows`. `used` is the number
+of lanes in use; lane b contains vector `begin` + b. If `priors` is True, Gaussian priors are added.
 """
 
 from __future__ import annotations

@@ -3,7 +3,9 @@
 States are ``x = mean + L y`` with ``L L' = P`` the predicted covariance, so that the prior is ``|y|^2``. The update is
 the minimum of the prior and the cost of the rows: ``(I + B' B) y = B' e``. B contains the whitened derivatives of the
 rows times L, and e the whitened residuals. For a state that is known exactly in some direction, L has a column of
-zeros. `item` is the number of the scan in `rows`, s is the workspace of one state of n components.
+zeros. `item` is the number of the scan in `rows`, s is the workspace of one state of n components. `how` are the
+settings, `cov` are covariances, and `values` are the numbers of one state in `Filtered.values`. `memory` is the memory
+of one track, see the constants from _PRODUCT on; empty for none.
 """
 
 from __future__ import annotations
@@ -340,7 +342,7 @@ def _gate(rows: ScanRows, item: int, how: Filtering, s: _Space, values: Array) -
                 total += s.rows[i, k] * s.rows[i, k]
             square = s.rows[i, n] * s.rows[i, n] / total
             values[PRESENT] += 1.0
-            # a large innovation counts at most with the limit, and a NaN with the limit too
+            # innovations above the limit count as the limit, and NaN too
             values[INNOVATION] += min(how.most, square)
             if how.gate < np.inf and not sqrt(square) <= how.gate:
                 values[REJECTED_ROWS] += 1.0
@@ -440,8 +442,9 @@ def _remember(rows: ScanRows, item: int, s: _Space, memory: Array, values: Array
     """Test whether errors of the stations repeat from scan to scan, and whether the innovations are too large.
 
     Both results are numbers of standard deviations, over about the last fifty scans. The scores for the errors of the
-    stations are ``a = D' S^-1 nu``: innovations nu, their covariance S, derivatives D. The product with the scores b of
-    the scan before has the mean zero and, for a given b, the variance ``(D b)' S^-1 (D b)``.
+    stations are ``a = D' S^-1 nu``: innovations nu, their covariance S, derivatives D. Let b be the scores of the scan
+    before. The product of a and b has the mean zero and, for a given b, the variance ``(D b)' S^-1 (D b)``. `left` is
+    the whitened nu after the update, `seen` is the whitened ``D b``.
     """
     n, m, own = len(s.x), len(s.used), _of(len(rows.covariance), item)
     left, seen, back = np.zeros(m), np.zeros(m), np.zeros(n)
@@ -507,10 +510,7 @@ def _size(rows: ScanRows, own: int, i: int) -> float:
 
 @compiled
 def _iterate(rows: ScanRows, how: Filtering, s: _Space, cost: float) -> None:
-    """Take steps until one is short, and write the minimiser to y with its equations.
-
-    Steps that would raise the cost are halved.
-    """
+    """Take steps until one is short; halve steps that raise the cost. Write the minimiser to y with its equations."""
     n, place = len(s.x), np.empty(len(s.x))
     put(s.y, place)
     for _ in range(how.limit):

@@ -29,7 +29,9 @@ _WEAK = 1e-7
 # Relative change of y below which the last Newton step squares the error to 1e-14.
 _SETTLED = 1e-7
 
-# Scalars of each lane in the scratch of `minimise`, after its matrices and vectors.
+# Scalars of each lane in the scratch of `minimise`, after its matrices and vectors. BEND: minus the derivative of half
+# the constraint by the multiplier. TODO: 1.0 until the iteration has converged. LEAST: least valid pivot. VALUE: half
+# the constraint. LAST: last multiplier with a definite matrix. DEFINITE: 1.0 if the present matrix is definite.
 MULTIPLIER, BEND, TODO, LEAST, VALUE, LAST, DEFINITE = range(7)
 _NUMBERS = 7
 
@@ -173,8 +175,9 @@ def _meet_lane(
 ) -> None:
     """Write the points of `meet` for one lane, as `y` and `other`.
 
-    The eigenvalues of the normal matrix are on the diagonal of A, the eigenvectors in the columns of `axes`; b is the
-    right side. `along` and `base` are scratch: direction and a point of the line of minimisers.
+    See `meet` for `on_cone`, `settled` and `two`. The eigenvalues of the normal matrix are on the diagonal of A, the
+    eigenvectors in the columns of `axes`; b is the right side. `along` and `base` are scratch: direction and a point of
+    the line of minimisers.
     """
     n, first = len(y), _open_axis(A, lane)
     if first < 0:
@@ -279,9 +282,9 @@ def _value(y: Array, across: Array, on_cone: bool, out: Array) -> None:
 def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, free: Array) -> bool:
     """Update the multipliers of the lanes that have not converged, and return whether there are any.
 
-    The update is Newton's step; a step out of the interval where the matrix is definite is halved. `across` is ``C y +
-    h``, `p` is the solution for this right side. `spare` contains the scalars of each lane, named by the constants from
-    MULTIPLIER on. `free` is scratch.
+    See `minimise` for `on_cone`. The update is Newton's step; a step out of the interval where the matrix is definite
+    is halved. `across` is ``C y + h``, `p` is the solution for this right side. `spare` contains the scalars of each
+    lane, named by the constants from MULTIPLIER on. `free` is scratch.
     """
     n = len(y)
     multiplier, todo, value = spare[MULTIPLIER], spare[TODO], spare[VALUE]

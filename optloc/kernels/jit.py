@@ -79,12 +79,13 @@ class _Kernel(Compilable):
     """A function of scalars and arrays in three forms: plain, compiled for Python, and compiled for calling kernels.
 
     `taken_in` is True if every caller inlines the function. `ready` is True if this process has used the machine code.
+    `seen` is True if the machine code was found on disk. `asked` counts the problems requested so far.
     """
 
     def __init__(self, function: Callable[..., Any], *, taken_in: bool) -> None:
         super().__init__(function, taken_in=taken_in)
         self.ready = False
-        self.seen, self.asked = False, 0  # whether machine code is on disk; number of problems requested so far
+        self.seen, self.asked = False, 0
         self._forms: dict[bool, Any] = {}
         update_wrapper(self, function)
         _KERNELS.append(self)
@@ -241,12 +242,18 @@ def named(name: str) -> Compilable:
 
 # Greatest number of problems for which plain Python is faster than compiling first.
 FEW = 16
-# Settings if machine code is missing: wait until it is compiled, compile it in a background process, or never compile.
+# Name of the environment variable, and its values; see `compile_mode`.
 _VARIABLE, _WAYS = "OPTLOC_COMPILE", ("wait", "child", "never")
 
 
 def compile_mode() -> str:
-    """Return the value of OPTLOC_COMPILE: "wait", "child", "never", or "" if it is not set."""
+    """Return the value of OPTLOC_COMPILE, which applies if machine code is not on disk yet.
+
+    - "wait": compile now, and continue when the machine code is ready.
+    - "child": run plain Python; for more than `FEW` problems, a background process compiles meanwhile.
+    - "never": run plain Python.
+    - "" (not set): compile now for more than `FEW` problems; run plain Python for fewer.
+    """
     given = os.environ.get(_VARIABLE, "").strip()
     if given and given not in _WAYS:
         raise InvalidProblem(f"{given!r} is not a setting for machine code", _VARIABLE, f"one of {', '.join(_WAYS)}")
@@ -390,7 +397,10 @@ def specialise(
     made = dict[_Kernel, tuple[_Kernel, frozenset[tuple[str, Any]], bool]]()
 
     def copy(one: _Kernel) -> tuple[_Kernel, frozenset[tuple[str, Any]], bool]:
-        """Return a copy of a kernel, the constants that differ in it or below, and whether it calls a replaced one."""
+        """Return a copy of a kernel, the changed constants in it or in its callees, and whether it calls a replacement.
+
+        Without changes, the kernel itself is returned. The last result is also True if the kernel is a replacement.
+        """
         one, other = others.get(one, one), one in others
         if one in made:
             return made[one][0], made[one][1], made[one][2] or other

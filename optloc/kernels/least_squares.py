@@ -23,7 +23,10 @@ from optloc.problem.noise import Whitener, variances, whiten
 from optloc.problem.problem import Problem
 
 WEIGHINGS = 2
-"""Station errors are weighed where the target is thought to be; the weights hardly change with it."""
+"""Number of refinements in sequence if station errors enlarge the noise and this noise depends on the position.
+
+Each refinement starts at the result of the refinement before, and computes the noise there. Two are enough, because the
+noise hardly changes with the position."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +206,10 @@ def _iterate(
     folded: Folded | None,
     limits: Limits | None,
 ) -> Refined:
-    """Return the refinement by numpy with fixed weights; `face`, `folded` and `limits`: see `refine`."""
+    """Return the refinement by numpy from `start` (N, size) with fixed weights.
+
+    The `rules` end a refinement. See `refine` for `face`, `folded` and `limits`.
+    """
     with np.errstate(all="ignore"):
         start = Equalities.of(problem, face).restore(start) if face else start
         start = start if limits is None else limits.clip(start)
@@ -318,7 +324,8 @@ def _blur_of_face(problem: Problem, face: Face, equations: Normal) -> Array | fl
 def _advance(part: _ActiveProblems, state: _DescentState, active: Array, rules: StopRules, iteration: int) -> None:
     """Try one step of every active problem, and write the result to `state`.
 
-    `active` are the numbers of the problems of `part` in `state`. `iteration` is the number of this step, from 0.
+    `active` are the numbers of the problems of `part` in `state`. The `rules` end a refinement. `iteration` is the
+    number of this step, from 0.
     """
     # In most batches all problems end together: while all are active, arrays are not copied.
     everything = len(active) == len(state.x)
@@ -416,7 +423,7 @@ def _refine_with_weights(
 ) -> Refined | None:
     """Return the refinement by machine code with the weights `noise`, or None if machine code is not supported.
 
-    `start` (M, size) are the starts, `item` (M,) is the problem of each start.
+    `start` (M, size) are the starts, `item` (M,) is the problem of each start. The `rules` end a refinement.
     """
     found = packed(problem, noise)
     if found is None:

@@ -325,15 +325,21 @@ def fold(problem: Problem, found: Folding) -> Problem:
     count, k = problem.batch_shape[0], problem.epochs
 
     def spread(array: Array | None, core: int) -> Array | None:
-        """Return an array for the batch of epochs, from an array with an axis of epochs."""
-        # numbers of each epoch, with an axis of epochs of length 1 or k
+        """Return an array for the batch of epochs, from an array with an axis of epochs of length 1 or k.
+
+        `core` is the number of axes of one run, of which the axis of epochs is the first. A result without batch axis
+        is shared by all epochs.
+        """
         if array is None or (array.ndim == core and array.shape[0] == 1):
             return array
         whole = np.broadcast_to(array, (count, k, *array.shape[array.ndim - core + 1 :]))
         return whole.reshape(count * k, 1, *whole.shape[2:])
 
     def repeat(array: Array | None, core: int) -> Array | None:
-        """Return an array for the batch of epochs, repeated for the epochs of each run."""
+        """Return an array for the batch of epochs, repeated for the epochs of each run.
+
+        `core` is the number of axes of one run. Arrays that all runs share are returned unchanged.
+        """
         return array if array is None or array.ndim == core or len(array) == 1 else np.repeat(array, k, axis=0)
 
     s = problem.stations

@@ -34,9 +34,9 @@ def real_roots(c: Array, low: float, high: float, work: Array, out: Array) -> in
     """
     slope, edge = work[0], work[1]
     count = 0
-    for order in range(
-        DEGREE - 1, -1, -1
-    ):  # the derivative of this order; `out` contains the roots of the next higher derivative
+    # derivatives from the linear one down to the polynomial itself: `out` contains the roots of the derivative before,
+    # between which a root is bracketed
+    for order in range(DEGREE - 1, -1, -1):
         degree = DEGREE - order
         for i in range(degree + 1):
             slope[i] = c[i + order]

@@ -2,8 +2,9 @@
 
 When a problem in a lane has ended, the lane takes the next problem, so that all lanes work until no problem is left.
 Letters: n shared unknowns, `local` local unknowns of an epoch, B lanes. `m` is the memory (cells, B), `room` its
-addresses, r are registers, see `optloc.kernels.batched_rows`. `tag` (4, B) is the integer state of every lane, `used`
-is the number of open lanes. A *fresh* lane has a start that was not evaluated yet.
+addresses, r are registers, t the tables and c the numbers of the problems, see `optloc.kernels.batched_rows`. `tag`
+(4, B) is the integer state of every lane, `used` is the number of open lanes. A *fresh* lane has a start that was not
+evaluated yet. `limit` and `damped` are fields of the rules, see `StopRules`.
 """
 
 from __future__ import annotations
@@ -55,11 +56,11 @@ class Answers(NamedTuple):
 # Cells with the state of the refinement of every lane, from `room.state` on. Their number is
 # `optloc.kernels.batched_rows.STATE`.
 DAMPING, GROWTH, BLUR, GAIN, SOLVABLE, BETTER, COST, CLOSED = range(8)
-# Integer state of every lane: the number of the start; FRESH (1 while only the start is evaluated, 2 before it is
-# loaded); the steps tried; the status.
+# Integer state of every lane: the number of the start; FRESH (2 before the start is loaded, 1 until it is evaluated,
+# then 0); the steps tried; the status.
 START, FRESH, STEPS, STATUS = range(4)
 _TAGS = 4
-# The lane waits for its start.
+# Value of FRESH of a lane that waits for its start.
 EMPTY = 2
 
 
@@ -302,7 +303,10 @@ def _advance_run(
 
 @compiled
 def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, tag: Array, summing: bool, lanes: int) -> None:
-    """Process all epochs at `room.best`: sum the shared system (undamped in `room.now`), or compute the local steps."""
+    """Process all epochs at `room.best`.
+
+    If `summing` is True, sum the shared system (undamped in `room.now`). Otherwise compute the local steps.
+    """
     n, local, last = t.shared, t.local, t.shared + t.local
     group, packet, line = 0, 0, last + 1
     if summing:

@@ -7,7 +7,8 @@ epochs.
 
 Letters: n shared unknowns, `local` (l) local unknowns of each of k epochs, B lanes. `m` is the memory (cells, B),
 `room` its addresses, r are registers, see `optloc.kernels.batched_rows`. `used` is the number of lanes in use, and
-`now` the equations at the present vector.
+`now` the equations at the present vector. `packed` are the epochs of all runs as problems. `damping` is Marquardt's
+factor f, which multiplies diagonals by 1 + f.
 """
 
 from __future__ import annotations
@@ -318,7 +319,7 @@ def _spread(
     out.regular[start] = _factor_shared(m, room, n, matrix) and closed
     weakest = 1.0
     for i in range(n):
-        pivot = m[room.shared + i * n + i, 0]
+        pivot = m[room.shared + i * n + i, 0]  # `factor` stores inverse pivots
         weakest = min(weakest, 1.0 / (pivot * pivot))
         for j in range(n):
             matrix[i, j] = matrix[max(i, j), min(i, j)]
@@ -474,7 +475,8 @@ def fixed_runs(
 ) -> tuple[Answers, Spread]:
     """Return the refined starts (M, size), and their covariances; `item` (M,) is the run of each start.
 
-    The covariances contain the first `size` local unknowns of each epoch. If `size` is None, they are empty.
+    The `rules` end a refinement. The covariances contain the first `size` local unknowns of each epoch. If `size` is
+    None, they are empty.
     """
     n, out, item = runs.packed.tables.shared, new_answers(start, 0), np.ascontiguousarray(item)
     count, wanted = len(start), 0 if size is None else len(start)

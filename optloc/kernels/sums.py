@@ -75,6 +75,7 @@ def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | N
     found = packed(problem, whitener_at(problem, x) if noise is None else noise)
     if found is None:
         return None
+    # the last leading axis of x counts the problems, so that successive vectors belong to successive problems
     sums = sums_at(found, x.reshape(count, x.shape[-1]), np.arange(count) % max(1, *problem.batch_shape, 1))
     if x.ndim == 2:
         return sums

@@ -147,8 +147,8 @@ def factor_local(
 ) -> None:
     """Factor the damped system of the local unknowns of the equations at cell `source`.
 
-    The coupling with the shared unknowns and the right side, multiplied by the inverse factor, are written to
-    `room.half`.
+    The coupling with the n shared unknowns and the right side, multiplied by the inverse factor, are written to
+    `room.half`. See `step` for `damping`, and `factor` for `ok` and `least`.
     """
     line, half = n + local + 1, room.half
     for i in range(local):
@@ -205,7 +205,7 @@ def complete(m: Array, room: LaneCells, n: int, local: int, lanes: int) -> None:
 # Systems of one unit, in arrays whose last axis is the lane.
 
 LANES = 64
-"""Problems side by side where only lengths are unknown: a fix takes the same time from 16 to 256, with 8 twice."""
+"""Number of lanes of a block if all unknowns are lengths. A fix takes the same time with 16 to 256, twice with 8."""
 
 
 @compiled

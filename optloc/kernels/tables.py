@@ -20,7 +20,8 @@ from optloc.problem.problem import Problem
 
 # The order in which rows are evaluated, and the unknowns of each group of rows.
 
-# Approximate number of derivatives per lane that are computed together, so that they stay in the cache.
+# Approximate number of derivatives per lane that are computed together, so that they stay in the cache; most and least
+# rows of a packet.
 _NUMBERS, _MOST, _LEAST = 512, 128, 8
 
 
@@ -133,7 +134,7 @@ class RowColumns:
     def of(cls, problem: Problem, groups: RowGroups, entries: list[Entries]) -> tuple[RowColumns, list[Array]]:
         """Return the columns of each group, and the index of each entry in the columns of its group."""
         n, length = problem.layout.n_shared, problem.layout.n_local
-        keys = []
+        keys = []  # group and column as one number, so that one sort finds the different columns of all groups
         for part in entries:
             # The local columns of all epochs have the same numbers, because a group has rows of a single epoch.
             folded = np.where(part.column < n, part.column, n + (part.column - n) % max(length, 1))
@@ -334,7 +335,7 @@ def tables(problem: Problem, groups: tuple[Array, ...]) -> CachedTables | None:
 
 
 def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> CachedTables | None:
-    """Return the tables of a problem, see `tables`, without the cache."""
+    """Return the tables of a problem with the data arrays `sources`, see `tables`, without the cache."""
     layout = problem.layout
     if layout.n_shared + layout.n_local == 0 or _spanning(problem, groups):
         return None
@@ -452,8 +453,8 @@ def _sort_by_owner(
 ) -> tuple[Array, Array, list[Array]]:
     """Return entries sorted by owner (an input or a row): indices, factors, and the first entry of each owner.
 
-    For each part, `slots` has the columns of its entries in their group, `owners` the owner of each entry, and `counts`
-    the number of owners.
+    `parts` are the entries of feeds, scales and addends. For each part, `slots` has the columns of its entries in their
+    group, `owners` the owner of each entry, and `counts` the number of owners.
     """
     terms, factors, at, start = [], [], [], 0
     for part, slot, owner, count in zip(parts, slots, owners, counts, strict=True):
@@ -466,7 +467,7 @@ def _sort_by_owner(
 
 
 def _tapes(found: list[_TracedRows]) -> tuple[Array, dict[str, Array]]:
-    """Return the constants of the tapes of all kinds, and four tables by name: code, kind, constant, input."""
+    """Return the constants of the tapes of the blocks `found`, and four tables by name: code, kind, constant, input."""
     tapes = [kind.trace.tape for kind in found]
     constants = [pair for tape in tapes for pair in tape.constants]
     inputs: list[tuple[int, int]] = []

@@ -58,7 +58,7 @@ def solve(block: Array, link: Array, right: Array) -> tuple[Array, Array]:
 def _banded(block: Array, link: Array, right: Array) -> Array | None:
     """Return the solution (k, l, p) of one chain by a banded factor, or None if the chain is not safely regular.
 
-    See `solve` for the arguments, without batch axes.
+    See `solve` for the arguments `block`, `link` and `right`, without batch axes.
     """
     from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
@@ -84,11 +84,23 @@ def _banded(block: Array, link: Array, right: Array) -> Array | None:
 
 
 def inverse_blocks(block: Array, link: Array) -> tuple[Array, Array]:
-    """Return the diagonal blocks (..., k, l, l) of the inverse of a chain, and whether the chain is regular.
+    """Return the diagonal blocks of the inverse of a chain, and whether the chain is regular.
 
-    The blocks are NaN if the chain is singular.
+    Parameters
+    ----------
+    block : array (..., k, l, l)
+        Blocks on the diagonal; the whole matrix is symmetric and positive semidefinite.
+    link : array (..., k - 1, l, l)
+        Blocks above the diagonal: rows of a block, columns of the next block.
+
+    Returns
+    -------
+    inner : array (..., k, l, l)
+        Diagonal blocks of the inverse; NaN if the chain is singular.
+    ok : bool array (...)
+        False if the chain is singular.
     """
-    none = np.zeros((*block.shape[:-1], 0))
+    none = np.zeros((*block.shape[:-1], 0))  # no right sides
     _, (inner, _), ok = _reduce(block, link, none, np.abs(block).max((-1, -2, -3)), inverse=True)
     return inner, ok
 
@@ -107,8 +119,9 @@ class _ChainParts(NamedTuple):
 def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool) -> tuple[Array, _ChainParts, Array]:
     """Return the solutions, blocks of the inverse, and whether the chain is regular, by cyclic reduction.
 
-    `size` is the largest absolute entry of the blocks; a remainder that is rounding relative to it counts as zero. The
-    blocks of the inverse are computed only if `inverse` is True. The function calls itself for the even blocks.
+    `block`, `link` and `right` are as in `solve`. `size` (...) is the largest absolute entry of the blocks; a remainder
+    that is rounding relative to it counts as zero. The blocks of the inverse are computed only if `inverse` is True;
+    else they have no columns. The function calls itself for the even blocks. Blocks are counted from 0.
     """
     k, length = block.shape[-3:-1]
     eye = np.broadcast_to(np.eye(length) if inverse else np.zeros((length, 0)), (*block.shape[:-1], length * inverse))
@@ -118,7 +131,8 @@ def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool)
         ok = good.all(-1) & (left > _ROUNDING * size)
         inner = np.where(ok[..., None, None, None], both[..., right.shape[-1] :], np.nan)
         return both[..., : right.shape[-1]], _ChainParts(inner, link), ok
-    # an odd block is coupled to the blocks before and after it; the last block of an even number has none after it
+    # An odd block is coupled to the blocks before and after it. If k is even, the last block is odd and has no block
+    # after it: its entry of `after` stays zero.
     after = np.zeros((*block.shape[:-3], k // 2, length, length))
     after[..., : (k - 1) // 2, :, :] = link[..., 1::2, :, :]
     before = link[..., ::2, :, :].mT
@@ -127,7 +141,8 @@ def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool)
     gain_before, gain_after, solved_right, own_inverse = np.split(
         solved, np.cumsum([length, length, right.shape[-1]]), axis=-1
     )
-    # the reduced system of the even blocks
+    # The system of the even blocks after elimination of the odd blocks. There are m odd blocks; `follow` of them have
+    # an even block after them.
     rest, vector = block[..., ::2, :, :].copy(), right[..., ::2, :, :].copy()
     m = k // 2
     rest[..., :m, :, :] -= before.mT @ gain_before
@@ -154,14 +169,16 @@ def _following_even(even: Array, count: int) -> Array:
 def _inverse_blocks_of_chain(
     parts: _ChainParts, gain_before: Array, gain_after: Array, own_inverse: Array, k: int
 ) -> _ChainParts:
-    """Return the blocks of the inverse of the whole chain of k epochs, from the blocks of the even epochs.
+    """Return the blocks of the inverse of the whole chain of k epochs, from the blocks `parts` of the even epochs.
 
-    The odd unknowns are ``x_odd = own - back x_before - on x_after``: `own` is the inverse of the odd blocks, `back`
-    and `on` are the coefficients of the even blocks before and after.
+    An odd block A with right side b has the unknowns ``x = own_inverse b - gain_before x_before - gain_after x_after``.
+    `own_inverse` is the inverse of A. The gains (..., k // 2, l, l) multiply the unknowns of the even blocks before and
+    after.
     """
     m, first = k // 2, parts.inner[..., : k // 2, :, :]
     second, across = _following_even(parts.inner, m), np.zeros_like(gain_before)
     across[..., : parts.beside.shape[-3], :, :] = parts.beside
+    # blocks of the inverse: rows of an odd block, columns of the even block before or after it
     with_before = -(gain_before @ first + gain_after @ across.mT)
     with_after = -(gain_before @ across + gain_after @ second)
     inner = np.empty((*gain_before.shape[:-3], k, *gain_before.shape[-2:]))

@@ -125,17 +125,17 @@ def reported(
     if times.ndim != 1 or heights.shape[-1:] != times.shape or not (np.diff(times) > 0.0).all():
         what = f"heights of shape {heights.shape} for times of shape {times.shape}"
         raise InvalidProblem(what, "reported heights", "give one height for each epoch, and ascending times")
-    # linear between epochs, if the reference time is not an epoch
+    # height at the reference time: linear between epochs `before` and `before` + 1, outside the times constant
     last = len(times) - 1
     place = float(np.interp(times[0] if reference is None else reference, times, np.arange(last + 1.0)))
     before = min(int(place), last)
     share = place - before
-    level = heights[..., before] * (1.0 - share) + heights[..., min(before + 1, last)] * share
+    at_reference = heights[..., before] * (1.0 - share) + heights[..., min(before + 1, last)] * share
     rate = np.gradient(heights, times, axis=-1) if last else np.zeros_like(heights)
     half = float(in_si(within, "length", "within", place=True))
-    rise = np.stack([heights - level[..., None], rate], axis=-1)
+    rise = np.stack([heights - at_reference[..., None], rate], axis=-1)
     motion = Motion(order, reference=reference, over="ground", rise=rise)
-    return motion, height(level - half, level + half, target=target)
+    return motion, height(at_reference - half, at_reference + half, target=target)
 
 
 def visible(points: ArrayLike, *, elevation: Amount = 0.0, target: int = 0) -> tuple[Band, ...]:
@@ -222,8 +222,8 @@ def exact(problem: Problem) -> Face:
 def decisive_epochs(problem: Problem, constraint: Band | Polygon) -> list[int | None]:
     """Return the epochs at which a constraint along a course decides about all epochs; None is the reference time.
 
-    The bounded quantity is a polynomial of time of the motion's order n. It is constant if it is equal at n + 1 epochs,
-    and a linear one is between bounds if its ends are.
+    The bounded quantity is a polynomial of time of the motion's order n. An equality at n + 1 epochs makes it constant.
+    If n = 1, bounds at the first and the last epoch are enough.
     """
     if not isinstance(constraint, Band) or not holds_along(problem, constraint):
         return [None]

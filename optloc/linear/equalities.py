@@ -1,7 +1,8 @@
 """Equality constraints of a run, for states that last for the run and for states of each epoch.
 
-M problems have k epochs. A vector has `size` unknowns: n shared unknowns, and l local ones for each epoch. A state has
-c equalities.
+M problems have k epochs. A vector has `size` unknowns: n shared unknowns, and l local ones for each epoch. A state
+(position, velocity and acceleration of a target) has c equalities. A *level* is the surface on which a constrained
+quantity equals one of its bounds. A `Face` is a tuple of levels that an estimate satisfies together.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class Equalities:
     problem : Problem
         The batch: runs of k epochs with l local unknowns in each.
     lasting : Face
-        Equalities of states that all epochs share.
+        Equalities of states that all epochs share; empty if there are none.
     single : Problem, optional
         The states of one epoch, with their equalities and bounds (M or 1, k or 1). None if every constrained state
         lasts for the run.
@@ -45,6 +46,7 @@ class Equalities:
     def of(cls, problem: Problem, face: Face | None = None) -> Equalities:
         """Return the equalities of a problem: by default the stated ones, else the levels of a face."""
         face = exact(problem) if face is None else face
+        # numbers of the constraints whose target has a separate state in each epoch
         own = {i for level in face if problem.motions[_target(problem, i := level.constraint)].span == "epoch"}
         lasting = tuple(level for level in face if level.constraint not in own)
         if not own:
@@ -79,6 +81,7 @@ class Equalities:
         along = tangent_at(self.problem, self.lasting, x) if self.lasting else None
         if self.single is None:
             return step(equations, damping, along)
+        # the local unknowns of these equations are coefficients of a basis of the steps that stay on the equalities
         basis = self._local_space(x)
         move, ok = step(_within(equations, basis), damping, along)
         n, (m, k, _, free) = self.problem.layout.n_shared, basis.shape
@@ -105,6 +108,7 @@ class Equalities:
         """Return bases (M, k, l, l - c) of the steps of the local unknowns that stay on the equalities."""
         layout = self.problem.layout
         _, gradients = levels(self._single(x), self.each, self._states(x))
+        # local unknowns that are not states, such as clocks, have zero gradients and move freely
         local = np.zeros((*gradients.shape[:2], layout.n_local))
         for here, there in self._slots():
             local[..., here] = gradients[..., there]

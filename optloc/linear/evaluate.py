@@ -41,7 +41,7 @@ class Feed:
     Parameters
     ----------
     seed : int
-        Number of the component of an input of the measurement function.
+        Number of the input of the measurement function, see TARGET to RISE.
     column : int array (m,)
         Column of the full parameter vector.
     gain : float or array (m,)
@@ -196,7 +196,11 @@ def _terms(problem: Problem, block: Rows, start: int, enters: str) -> Terms:
 
 
 def _entering(problem: Problem, enters: str) -> list[Bias]:
-    """Return the biases that enter rows in the way `enters`: "adds", "scales", "turns" or "moves", see `BiasForm`."""
+    """Return the biases that enter rows in the way `enters`, see `BiasForm`.
+
+    "adds": the bias is added to the measurement. "scales": the measurement is multiplied by one plus the bias. "turns":
+    the bias rotates the axes of a station. "moves": the bias is a clock error that shifts a station along its track.
+    """
     return [bias for bias in problem.biases if form_of(bias).enters == enters]
 
 
@@ -254,9 +258,8 @@ def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
     for bias in _entering(problem, "turns"):
         left = np.flatnonzero((bias.row >= start) & (bias.row < start + block.count))
         angles = 1 if problem.dimension == 2 else 3
-        while (
-            left.size
-        ):  # a row rotated by several members takes one pass for each, since a feed contains a row only once
+        # a row rotated by several members takes one pass for each, since a feed contains a row only once
+        while left.size:
             rows, first = np.unique(bias.row[left] - start, return_index=True)
             entries, left = left[first], np.delete(left, first)
             column = columns(problem.layout, bias.name, rows)
@@ -267,20 +270,22 @@ def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
 
 
 def _course_feeds(problem: Problem, block: Rows, model: Model, start: int) -> list[Feed]:
-    """Return the contributions of time offsets along a course to positions and rates of stations, to first order.
+    """Return the contributions of clock errors of moving stations to their positions and rates, to first order.
 
-    `start` is the number of the first row of the block. Rows contain the offset with factor +1 for the first station
-    and -1 for the second.
+    A clock error of t seconds shifts a station along its track: the position by velocity times t, and the velocity by
+    acceleration times t. `start` is the number of the first row of the block. In a row, the coefficient of the bias is
+    +1 for an error of the first station, and -1 for an error of the second.
     """
     feeds: list[Feed] = []
     for bias in _entering(problem, "moves"):
-        rates = course(problem)
+        rates = course(problem)  # velocities and accelerations of the stations, each (k or 1, s, d)
         inside = (bias.row >= start) & (bias.row < start + block.count)
         for sign, station, place, rate in ((1.0, block.a, A, RATE_A), (-1.0, block.b, B, RATE_B)):
             entries = np.flatnonzero(inside & (bias.coefficient == sign))
             rows = bias.row[entries] - start
             column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), bias.member[entries]]
             epoch = block.epoch[rows] if len(rates[0]) > 1 else np.zeros_like(rows)
+            # only kinds that use velocities need the second pair
             for seed, grows in ((place, rates[0]), (rate, rates[1]))[: 1 + model.velocity if len(rows) else 0]:
                 picked = grows[epoch, station[rows]]
                 feeds += [Feed(seed + c, column, picked[:, c], rows) for c in range(problem.dimension)]

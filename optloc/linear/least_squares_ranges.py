@@ -220,6 +220,7 @@ def _reduced_rows(found: Ranges, shape: tuple[int, ...]) -> tuple[list[Rows], Ar
 
 def _patterns(present: Array) -> tuple[Array, Array]:
     """Return the distinct rows of a mask (N, m), and for each problem (N,) the number of its row."""
+    # the usual case of one pattern needs no sort
     if present.all() or (present == present[:1]).all():
         return present[:1], np.zeros(len(present), dtype=int)
     patterns, pattern = np.unique(present, axis=0, return_inverse=True)
@@ -234,6 +235,8 @@ def _stays(problem: Problem) -> bool:
 def _design(problem: Problem) -> tuple[Array, Array, Array]:
     """Return D (m, q), and station and epoch (s,) of the nodes that are ranges."""
     moving = problem.stations.position.shape[-3] > 1 or (problem.epochs > 1 and not _stays(problem))
+    # (row, node, coefficient); a node is (0, station, epoch) for a range, or (1, target, epoch) for an emission time,
+    # so that the sort below puts the ranges first
     entries: list[tuple[int, tuple[int, int, int], float]] = []
     coefficient: float
     for rows, start in zip(problem.rows, problem.starts, strict=True):
@@ -265,7 +268,7 @@ def _graph(rows: bytes, count: int, stations: int) -> Graph:
     ranges. Bytes are hashable, so that graphs are cached.
     """
     group, sign = _connect(np.frombuffer(rows).reshape(-1, count))
-    names = np.unique(group[group >= 0])
+    names = np.unique(group[group >= 0])  # numbers of the groups
     members = tuple(np.flatnonzero(group[:stations] == name) for name in names)
     # The group with most stations; of equal groups the first, so that the same rows always give the same group.
     main = max(range(len(names)), key=lambda i: (len(members[i]), -i)) if len(names) else -1
@@ -281,9 +284,10 @@ def _graph(rows: bytes, count: int, stations: int) -> Graph:
 
 
 def _connect(design: Array) -> tuple[Array, Array]:
-    """Return the connected group of each node (q,), -1 without rows, and the sign of its unknown in its range.
+    """Return the group of each node (q,), and the sign (q,) of the group's unknown t in the node's value.
 
-    The sign is 0 if ranges are determined.
+    The group is the number of its first node. It is -1 for nodes without rows, and q for all nodes whose values are
+    determined. The sign of these nodes is 0. `design` (rows, q) is D.
     """
     count = design.shape[1]
     # nodes that share a row; signs do not matter
@@ -317,7 +321,8 @@ def _connect(design: Array) -> tuple[Array, Array]:
 def _least_squares(problem: Problem, design: Array, pinned: Array) -> tuple[Array, Array, Array]:
     """Return the values of all nodes (N, q), metres, their covariance (N or 1, q, q), m^2, and the misfit (N,).
 
-    `pinned` (N, q) marks nodes whose value is set to zero. The misfit is the chi-square of the redundant rows.
+    `design` (m, q) is D; rows of other kinds are zero there and are not used. `pinned` (N, q) marks nodes whose value
+    is set to zero. The misfit is the chi-square of the redundant rows.
     """
     q = design.shape[1]
     used = np.any(design != 0.0, axis=1)

@@ -24,7 +24,7 @@ from optloc.problem.forms import form_of
 from optloc.problem.noise import Block, Noise, Whitener, arrivals, gathered, group_members, whiten
 from optloc.problem.problem import Problem
 
-# Station errors that are independent in each epoch and not estimated: they enlarge the noise of the rows.
+# Station errors of span "noise" are independent in each epoch and not estimated. They enlarge the noise of the rows.
 
 
 def with_station_noise(problem: Problem, x: Array | None = None) -> Problem:

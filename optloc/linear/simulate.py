@@ -44,6 +44,7 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
     # `Portable` computes sines and other functions without the C library, whose last bit depends on the platform.
     z = noise + np.asarray(predict(real, x.view(arrays.Portable)))
     values = []
+    # measurements of angles are wrapped, and contain the known corrections that the model leaves out
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         part = z[..., start : start + rows.count]
         turned = np.asarray(wrap(part.view(arrays.Portable))) if MODELS[rows.kind].period is not None else part
@@ -54,13 +55,27 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
 def _displace(
     problem: Problem, truth: Array, shape: tuple[int, ...], rng: np.random.Generator
 ) -> tuple[Problem, Array]:
-    """Return the problem with stations moved by drawn errors of span "noise", and the truth for this problem.
+    """Return the problem with randomly drawn station errors, and the true vectors that contain these errors.
 
-    `shape` contains the leading axes of the draws. Without these errors, problem and truth are returned unchanged.
+    Station errors of span "noise" are independent in each epoch and not estimated. In the returned problem they are
+    unknowns of each epoch, so that `predict` adds them to the stations. Without these errors, problem and truth are
+    returned unchanged.
+
+    Parameters
+    ----------
+    problem : Problem
+        k epochs, s stations, d dimensions.
+    truth : array (..., size)
+        True parameter vectors of `problem`.
+    shape : tuple of int
+        Leading axes of the draws.
+    rng : Generator
+        Source of the random numbers.
     """
     stations = problem.stations
     if not stations.weighed:
         return problem, truth
+    # one draw for each epoch and station, of positions, then of velocities
     drawn = [
         samples(covariance[..., None, :, :, :], (*shape, problem.epochs, stations.count), rng)
         for _, _, covariance in stations.errors
@@ -70,14 +85,20 @@ def _displace(
 
 
 def samples(covariance: Array, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-    """Return normal samples (*shape, r) of covariances (..., r, r) whose leading axes fit the shape."""
+    """Return samples (*shape, r) of normal distributions with mean zero and covariances (..., r, r).
+
+    The leading axes of the covariances must be broadcastable to `shape`.
+    """
     # Not by eigenvectors: for equal eigenvalues they depend on the BLAS library, and so would the data.
     factor = linalg.factor_semidefinite(covariance)
     return arrays.product(rng.standard_normal((*shape, covariance.shape[-1])), np.swapaxes(factor, -1, -2))
 
 
 def draw(noise: Noise, count: int, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-    """Return noise samples (*shape, count) with the covariance of a problem's rows."""
+    """Return noise samples (*shape, count) with the covariance of a problem's rows.
+
+    `count` is the number of rows, and `shape` contains the leading axes.
+    """
     out = np.zeros((*shape, count))
     for block in noise.blocks:
         out[..., block.row] = samples(block.covariance, (*shape, len(block.row)), rng)

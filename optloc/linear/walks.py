@@ -67,6 +67,7 @@ def chain_at(problem: Problem, x: Array) -> Chain:
     vector, cost = np.zeros(local.shape), np.zeros(x.shape[:-1])
     for bias, place, F, Q in _steps(problem):
         W = linalg.inverse(Q, 0.0)[0]
+        # `error` is the step e, `pull` is W e
         state = local[..., place]  # (..., k, q, o)
         error = state[..., 1:, :, :] - (F[:, None] @ state[..., :-1, :, :, None])[..., 0]
         pull = (W @ error[..., None])[..., 0]
@@ -78,7 +79,7 @@ def chain_at(problem: Problem, x: Array) -> Chain:
         vector[..., :-1, place] += (F.mT[:, None] @ pull[..., None])[..., 0]
         vector[..., 1:, place] -= pull
         cost = cost + (error * pull).sum((-1, -2, -3))
-        if bias.sigma is not None:
+        if bias.sigma is not None:  # the prior applies to the value at the first epoch, not to its rate
             first, precision = place[:, 0], np.ravel(bias.sigma) ** -2.0
             off = np.ravel(bias.mean) - local[..., 0, first]
             block[0, first, first] += precision
