@@ -340,6 +340,7 @@ class _Legs(NamedTuple):
 
 
 _Function = Callable[[Any], Any]
+_Layered = tuple[Array, Array, Array, Array]  # y0, y1, c0, c1, see `_layers`
 
 
 def _sum(parts: Array) -> Array:
@@ -362,19 +363,15 @@ def _asinh_over(u: Array, logarithm: _Function) -> Array:
 class _FoundRay:
     """Rays (k,) that connect their points.
 
-    `index` (k,) is the number of the pair. `sine` and `cosine` (k,) belong to the angle at the top speed. `turns` (k,)
-    is 0 without a turn, 1 for a turn below both ends, and -1 for a turn above both ends.
+    `index` (k,) is the number of the pair. `sine` and `cosine` (k,) are of the angle from the vertical at the depth of
+    the top speed. `turns` (k,) is 0 without a turn, 1 for a turn below both ends, and -1 for a turn above both ends.
     """
 
     index: Array
     legs: _Legs
     sine: Array
     cosine: Array
-    # 0: no turn; 1: turn below both ends; -1: turn above both ends.
     turns: Array
-
-
-_Layered = tuple[Array, Array, Array, Array]
 
 
 @np.errstate(all="ignore")  # rays that do not exist give NaN
@@ -417,12 +414,15 @@ def first_arrival(table: Layers, across: Array, yt: Array, ya: Array, logarithm:
 
 
 def _keep_earlier(best: Array, index: Array, rays: Array) -> None:
-    """Write rays that arrive earlier than the best rays so far into `best` (4, n).
+    """Replace columns of `best` (4, n) in place by new `rays` (4, k) that arrive earlier; `index` (k,) are their pairs.
 
-    `index` (k,) is the pair of each new ray. The rows of `best` and of the new `rays` (4, k) are time (NaN for no ray),
-    p, derivative of p with respect to the distance, and turns.
+    The rows of both arrays are the travel time (s), the ray parameter p (s/m), the derivative of p with respect to the
+    distance, and `turns` as in `_FoundRay`. In `best` the time is infinite for a pair without a ray so far. In `rays`
+    the time is NaN if the ray does not exist.
     """
-    order = np.argsort(-rays[0], kind="stable")  # for several rays of a pair, the first arrival is written last
+    # Sort the latest first: of several rays of a pair, the last write, which is the first arrival, remains.
+    order = np.argsort(-rays[0], kind="stable")
+    # Comparisons with NaN are false, so rays that do not exist are left out.
     order = order[rays[0, order] < best[0, index[order]]]
     best[:, index[order]] = rays[:, order]
 
@@ -472,7 +472,7 @@ def _direct_rays(layers: _Layered, across: Array, high: Array, low: Array) -> _F
     for _ in range(_STEPS):
         cosine = 1.0 / np.sqrt(1.0 + t[remaining] * t[remaining])
         reached, rate = remaining_legs.across(t[remaining] * cosine, cosine)
-        step = (distance[remaining] - reached) * remaining_legs.top / (rate * cosine**3)
+        step = (distance[remaining] - reached) * remaining_legs.top / (rate * cosine**3)  # dp/dt = cosine^3 / top
         t[remaining] += np.where(np.isfinite(step), step, 0.0)
         unfinished = np.flatnonzero(np.abs(step) > _ARRIVED * t[remaining])
         if not len(unfinished):
@@ -523,6 +523,7 @@ def _turning_in(
     depths (n,). The rays turn below the pairs. `turns` is the number to store in the result.
     """
     across, high, low = pairs
+    # Legs between the two ends are passed once. Legs from the lower end to the `start` of the turn are passed twice.
     start = np.maximum(low, layers[0][j])
     h, c1, c2 = _legs_between(layers, high, low)
     heights_below, d1, d2 = _legs_between(layers, low, start)
@@ -534,7 +535,8 @@ def _turning_in(
     times = np.repeat([1.0, 2.0], len(h))[:, None]
     both = (np.concatenate([h, heights_below]), np.concatenate([c1, d1]), np.concatenate([c2, d2]))
     legs = _Legs.of(both, times, top, speed_at_start, np.full(len(top), slope)).take(index)
-    # In terms of the cotangent of the angle at the top speed, the distance in the turning leg is linear.
+    # In terms of the cotangent of the angle at the top speed, the distance in the turning leg is linear. The ray turns
+    # at the bottom of layer j for the greatest cotangent, `most`.
     most, distance = np.sqrt((speed_at_end - legs.top) * (speed_at_end + legs.top)) / legs.top, across[index]
     marks = [most * part / _PARTS for part in range(_PARTS + 1)]
     short = [legs.distance(*_of_cotangent(k)) <= distance for k in marks]

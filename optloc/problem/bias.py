@@ -240,7 +240,12 @@ def _by_kind(blocks: list[tuple[Rows, int]]) -> list[_Entries]:
 def _by_pair(
     blocks: list[tuple[Rows, int]], stations: Sequence[str], members: Members, where: str
 ) -> tuple[tuple[str, ...], list[_Entries]]:
-    """Return the member names and the entries of a family with one member for each pair of stations."""
+    """Return the member names and the entries of a family with one member for each pair of stations.
+
+    `blocks` are the result of `_select_rows`. `members` are the pairs to use, such as "A-B", or None for all pairs that
+    have rows. `where` is the location that error messages name. `_by_target` and `_by_station` have these arguments
+    too.
+    """
     named = (*stations, "")  # the last entry is index -1, no station
     # Each pair has one number. A missing second station (-1) counts as an extra station with an empty name.
     codes = [block.a * len(named) + block.b % len(named) for block, _ in blocks]

@@ -102,7 +102,7 @@ def rows_by_epoch(problem: Problem) -> Array:
 
 
 def _joined(parts: Sequence[tuple[Array, Array]]) -> tuple[Array, int]:
-    """Return the row number in the batch of each row (m,) of all kinds, and the number of rows of the batch."""
+    """Return the batch row of each row (m,), and the number of batch rows; `parts` is `_distinct_rows` of each kind."""
     starts = np.cumsum([0, *(len(keys) for keys, _ in parts)])
     return np.concatenate([start + row_in_kind for (_, row_in_kind), start in zip(parts, starts, strict=False)]), int(
         starts[-1]
@@ -189,14 +189,14 @@ def _occurrences(values: Array) -> Array:
 
 def _split_epochs(array: Array, core: int) -> Array:
     """Return a per-epoch array (..., k or 1, s, ...) as (..., k, 1, s, ...); unchanged if all epochs share it."""
-    # A value that all epochs and problems share broadcasts without a new axis.
+    # `core` is the number of axes without batch axes. A value that all epochs and problems share needs no new axis.
     if array.ndim == core and array.shape[0] == 1:
         return array
     return np.expand_dims(array, array.ndim - core + 1)
 
 
 def _add_epoch_axis(array: Array, core: int) -> Array:
-    """Return an array of the run with a new batch axis for the epochs; unchanged if the whole batch shares it."""
+    """Return an array with a new batch axis for the epochs, unless all share it; `core` is as for `_split_epochs`."""
     return array if array.ndim == core else np.expand_dims(array, array.ndim - core)
 
 
@@ -562,7 +562,7 @@ def _motions(problem: Problem, more: Problem) -> tuple[Motion, ...]:
 def _join_epochs(one: Array, first: int, two: Array, second: int, core: int) -> Array:
     """Return an array with the values of both runs at each epoch (..., k, ...); unchanged if it is constant in both.
 
-    `first` and `second` are their numbers of epochs.
+    `first` and `second` are the numbers of epochs of the runs. `core` counts the axes from the epoch axis to the last.
     """
     if one.shape[-core] == 1 and two.shape[-core] == 1 and np.array_equal(one, two):
         return one

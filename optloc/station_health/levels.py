@@ -325,7 +325,12 @@ def _all_or_none(shown: Array, common: Array, by: By | None) -> Array:
 
 
 def _report(linearised: Elements, by: By, fit_result: VarianceFit, no_evidence: Array, *, tails: bool) -> NoiseLevels:
-    """Return the levels of all groups with errors, from a fit and the mask `no_evidence` (G,) of common errors."""
+    """Return the levels of all groups that have errors.
+
+    `linearised` are the fixes, and `by` is the grouping of their errors. `fit_result` and `no_evidence` are the results
+    of `fitted`: variance factors, and a mask (G,) of common errors without evidence. `tails` is whether to add factors
+    for long tails; without them these factors are 1.
+    """
     size = len(linearised.names)
     count, gross = total(linearised.of_effect, size), total(linearised.of_effect, size, fit_result.gross)
     with_errors = np.flatnonzero(count)

@@ -173,6 +173,7 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
         slice(linearised.effect.shape[-1], None),
         OUTLIER,
     )
+    # One entry for each residual: its fix (`item`), its column among the offsets of the fix, and its group.
     item, column = np.nonzero(np.isfinite(tests.sigma) & (linearised.of_offset >= 0))
     group = linearised.of_offset[item, column]
     outlying = tests.gross[item, column]
@@ -181,6 +182,7 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
     number = np.full(len(linearised.names), -1)
     number[with_residuals] = np.arange(len(with_residuals))
     names = tuple(linearised.names[g] for g in with_residuals)
+    # A group without a level (-1) selects the NaN that is appended to the levels.
     level_of = [levels.names.index(name) if name in levels.names else -1 for name in names]
     noise, noise_error = (np.append(v, np.nan)[level_of] for v in (levels.sigma, levels.sigma_error))
     return Health(
@@ -226,7 +228,8 @@ def _estimate_jointly(linearised: Elements, by: By) -> tuple[NoiseLevels, Offset
 
 
 def _subtract(linearised: Elements, offsets: Offsets) -> Elements:
-    """Return the elements with the offsets subtracted from the residuals."""
+    """Return the elements with the offsets subtracted from the residuals; an offset of NaN counts as zero."""
+    # The appended zero is for index -1, an unused column.
     value = np.append(np.nan_to_num(offsets.value), 0.0)[linearised.of_offset]
     return replace(linearised, residual=linearised.residual - (linearised.offset @ value[..., None])[..., 0])
 
