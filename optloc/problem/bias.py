@@ -419,6 +419,7 @@ def _correct_rows(problem: Problem, bias: Bias, known: Array) -> Problem:
     `known` (q,) are the values of the members. For a walk, `known` (k, q) has one row for each epoch.
     """
     form, amount, epoch = form_of(bias), np.zeros(problem.count), problem.epoch[bias.row]
+    # `entry` are the numbers of the values that enter each row, and `factor` their factors. Rows without entries get 0.
     entry, factor = form.effects(bias, problem.times, problem.origin, epoch)
     values = known.ravel()[entry] if form.steps is None else known[epoch[:, None], entry]
     np.add.at(amount, bias.row, (factor * values).sum(1))
@@ -450,6 +451,7 @@ def _turn_axes(problem: Problem, bias: Bias, known: Array) -> Problem:
 def _move_stations(problem: Problem, bias: Bias, known: Array) -> Problem:
     """Return the problem with its stations moved along their courses by the known times (q,), seconds."""
     stations, seconds = problem.stations, np.zeros((problem.stations.count, 1))
+    # A coefficient of 1 means the first station of a row, -1 the second. Other stations stay: their time is zero.
     for index, sign in (("a", 1.0), ("b", -1.0)):
         selected = bias.coefficient == sign
         station = np.concatenate([getattr(block, index) for block in problem.rows])[bias.row[selected]]
@@ -492,6 +494,7 @@ def course(problem: Problem) -> tuple[Array, Array]:
     rotation = problem.frame.rotation_to_ecef()
     ecef, ecef_velocity, axis = problem.frame.to_ecef(position), velocity @ rotation.T, np.array([0.0, 0.0, _TURN])
     radius = np.linalg.norm(ecef, axis=-1, keepdims=True)
+    # The limit of the radius avoids a division by zero near the centre. Results below `_SKY` are not used.
     gravity = -_GM * ecef / np.maximum(radius, _RADIUS) ** 3
     acceleration = gravity - 2.0 * np.cross(axis, ecef_velocity) - np.cross(axis, np.cross(axis, ecef))
     return velocity, np.where(radius > _RADIUS + _SKY, acceleration @ rotation, 0.0)

@@ -180,11 +180,13 @@ def measured(
     )
     count = _count(kind, (z, sigma, covariance, a, b, epoch, target, weight, correction), covariance)
 
+    # The station number -1 means that the kind has no such station.
     def index(values: Array | None, needed: bool, name: str) -> Array:
         if needed and values is None:
             raise InvalidProblem(f"{kind} needs station {name}", where=name, advice="give station indices")
         return _filled(values if needed and values is not None else -1, (count,), np.int64)
 
+    # One value per row; NaN for rows that are simulated later.
     def row(values: Array | None) -> Array:
         return _filled(np.nan, (count,)) if values is None else _filled(values, (*values.shape[:-1], count))
 

@@ -278,6 +278,7 @@ class Chart:
             form, known = self._along_surface(step, form, known & ~on_surface)
         inverse = self.kind == INVERSE_RANGE
         behind = inverse & ~((dy[..., -1] > -1.0) & np.isfinite(dy).all(-1))
+        # NaN for curved fixes, and for fixes without a valid covariance.
         form = np.array(np.where(known & (self.kind != CURVED), np.where(behind, np.inf, form), np.nan))
         away = np.broadcast_to(away, (*form.shape, away.shape[-1]))
         for i, distribution in self._truncated_fixes():
@@ -305,6 +306,7 @@ class Chart:
         from scipy.special import gammainc, gammaincinv
 
         finite, d = np.asarray(np.isfinite(self.covariance).all((-1, -2))), step.shape[-1]
+        # `within` is chi-square distributed with `rank` degrees of freedom, and `level` is its probability.
         covariance = np.where(finite[..., None, None], self.covariance, 0.0)
         inverse = np.linalg.pinv(covariance, HELD, hermitian=True)
         projector = covariance @ inverse
@@ -408,6 +410,8 @@ class Chart:
         if extent == "elevation":
             return lambda away: np.asarray(np.arcsin(distance_and_direction(start + away, centre)[1][..., 2]))
         middle = np.arctan2(self.direction[i][1], self.direction[i][0])
+
+        # Bearings are within half a turn of the bearing of the fix, so that an interval has no jump at 180 degrees.
 
         def bearing(away: Array) -> Array:
             there = start + away - centre
@@ -514,6 +518,7 @@ def _angle_interval(chart: Chart, z: float, side: Array, ahead: Array) -> tuple[
     denominator = np.where(inverse, ahead - (ahead * u0).sum(-1, keepdims=True) * u0, ahead)
     variance = z**2 * _bilinear(chart.covariance, side, side)
     covariance = z**2 * _bilinear(chart.covariance, side, denominator)
+    # Coefficient of t^2 in Fieller's inequality. If it is not positive, the solutions are not one finite interval.
     lead = middle**2 - z**2 * _bilinear(chart.covariance, denominator, denominator)
     with np.errstate(divide="ignore", invalid="ignore"):
         root = np.sqrt(np.maximum(covariance**2 + lead * variance, 0.0))

@@ -267,10 +267,10 @@ def _finite(*values: float) -> list[float | None]:
 def bearing_of(azimuth: tuple[float, float, float]) -> tuple[float, float, float]:
     """Return the bearing and its interval, degrees clockwise from north, of an azimuth with its interval, radians.
 
-    The bearing is from 0 to 360 degrees.
-
-    The ends of the interval are not wrapped, the lower end first.
+    `azimuth` is the value, its lower end and its upper end. The bearing is from 0 to 360 degrees. The ends of the
+    interval are not wrapped, so that the interval contains the bearing; the lower end is first.
     """
+    # A bearing decreases when the azimuth increases, so the ends change places.
     middle, low, high = (90.0 - np.degrees(each) for each in azimuth)
     turn = middle - middle % 360.0
     return float(middle - turn), float(high - turn), float(low - turn)

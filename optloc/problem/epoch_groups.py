@@ -55,6 +55,8 @@ class EpochGroup:
         if self.rows is None or self.ends is None:
             return by_epoch(self.run).take(self.epochs)
         epochs = self.epochs
+        # The stations, states, priors and constraints of these epochs, without rows. An array with only its own axes
+        # (`core`) has no epoch axis: all epochs share it.
         bare = map_numbers(
             states_by_epoch(self.run), lambda array, core: array if array.ndim == core else array[epochs]
         )
@@ -206,6 +208,7 @@ class _RowTable:
 
     def alike(self) -> Iterator[tuple[Array, Array]]:
         """Yield the epochs (n,) of each structure, and the row numbers (n, r) of these epochs."""
+        # Number of rows of each epoch, and its first entry in `order`, which is sorted by epoch.
         size = np.bincount(self.epoch, minlength=self.epochs)
         start = np.cumsum(size) - size
         for count in np.unique(size).tolist():
@@ -316,6 +319,7 @@ def _batch_noise(noise: Noise, rows: Array) -> Noise:
     first_member = np.full(1 + max(int(block.row.max()) for block in noise.blocks), -1)
     for block in noise.blocks:
         first_member[block.row] = block.row[:, :1]
+    # Rows with equal labels are in one group of correlated rows. `alone` are rows that are independent of all others.
     label, blocks = first_member[rows[0]], []
     alone = np.flatnonzero((label[:, None] == label).sum(1) == 1)
     if len(alone):

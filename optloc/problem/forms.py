@@ -53,7 +53,7 @@ class BiasForm:
         Name of the form with its article, for use in sentences.
     enters : "adds", "scales", "turns" or "moves"
         How a value acts: it is added to a measurement, multiplies the measured quantity, turns the axes of a station,
-        or moves a station along its course.
+        or moves a station along its course (its track): the displacement is velocity times value, which is a time.
     quantity : Quantity, optional
         Physical quantity of the values; None: the quantity of the rows.
     rate : bool

@@ -199,6 +199,7 @@ def late_loss(share: float, delay: float) -> Loss:
     log_density_at_mode = _late_density(np.array(mode), share, delay)[0]
     curvature = float(_late_density(np.array(mode + _STEP), share, delay)[1]) / _STEP
 
+    # A loss has two arguments, the residuals and its constant. This loss has no constant, so it ignores the second.
     def cost(u: Array, _: float) -> Array:
         """Return the loss of residuals u, in standard deviations."""
         log_density = _late_density(np.maximum(u, 0.0) + mode, share, delay)[0]
@@ -225,6 +226,8 @@ def _late_density(u: Array, share: float, delay: float) -> tuple[Array, Array]:
     """
     from scipy.special import log_ndtr
 
+    # Logarithms of both terms of the density: late rows and prompt rows. `p_late` is the probability that a row with
+    # this residual is late.
     late = np.log(share / delay) + 0.5 / delay**2 - u / delay + log_ndtr(u - 1.0 / delay)
     prompt = np.log1p(-share) - 0.5 * u**2 - _LOG_ROOT
     density = np.logaddexp(late, prompt)

@@ -133,7 +133,8 @@ def noise_levels(
         Problem whose fixes are its epochs if they share no unknown, or its batch; otherwise it is one fix of many rows.
         The size of its stated noise may be wrong. Ratios of the noise within a group are kept.
     by : "station", "pair" or "kind"
-        What has a level: each station (the error of an arrival if rows combine arrivals), each pair or each kind.
+        Groups of errors with one level each: the errors of a station (of its arrivals, if rows combine arrivals), of a
+        pair of stations, or of a kind.
     common : "station", "pair" or "kind", optional
         Grouping of rows that share an additional error in every epoch. Examples are errors of an attitude, of a
         position taken as known, or of refraction. True: the same as `by`. The data determine it if a group has several

@@ -290,6 +290,7 @@ def _sentences(offsets: Offsets, names: tuple[str, ...], with_residuals: Array) 
     `names` are the names of all groups. `with_residuals` (g,) are the numbers of the groups with residuals.
     """
     sentences = []
+    # Groups with a share above `_PART` in an undetermined combination are named. Equal shares are a common bias.
     for direction in offsets.open:
         involved = np.abs(direction[with_residuals]) > _PART * np.abs(direction).max()
         involved_names = [names[g] for g in with_residuals[involved]]
@@ -364,6 +365,7 @@ def offsets_of(linearised: Elements, tests: Tested) -> Offsets:
     item, column = np.nonzero((size > 0.0) & (linearised.of_offset >= 0))
     scale = np.sqrt(size[item, column])
     # One equation of unit variance for every valid test, in terms of its own offset and the offsets of the others.
+    # `item` is the problem of each test, `column` its column in this problem, and `group` its group.
     y = vector[item, column] / scale
     other = linearised.of_offset[item]
     design = _sparse(matrix[item, column] / scale[:, None], other, count)
