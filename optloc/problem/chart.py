@@ -62,6 +62,7 @@ def basis(direction: Array) -> Array:
     if u.shape[-1] == 2:
         return np.stack([-u[..., 1], u[..., 0]], axis=-1)[..., None]
     x, y, z = u[..., 0], u[..., 1], u[..., 2]
+    # With the sign of z, the denominator is never near zero.
     sign = np.copysign(1.0, z)
     a = -1.0 / (sign + z)
     first = np.stack([1.0 + sign * a * x * x, sign * a * x * y, -sign * x], axis=-1)
@@ -377,6 +378,7 @@ class Chart:
         self._require_gaussian(f"interval of the {extent}")
         if extent in {"elevation", "height", "z"} and self.position.shape[-1] != 3:
             raise InvalidProblem(f"a fix in the plane has no {extent}", "extent", "use x, y, range or bearing")
+        # The second argument is the half-width z of the interval, in standard deviations.
         low, high = map(np.array, _EXTENTS[extent](self, float(np.sqrt(quantile(level, 1)))))
         for i, distribution in self._truncated_fixes():
             low[i], high[i] = distribution.interval(self._coordinate_function(extent, i), level)

@@ -101,7 +101,7 @@ class BiasForm:
 
     @property
     def of_readings(self) -> bool:
-        """Return whether values have the sign and the quantity of the measurements; False for a time along a course."""
+        """Return whether values have the sign and the quantity of the measurements; False for the form "time"."""
         return self.enters != "moves"
 
     def touches(self, model: Model) -> bool:

@@ -196,6 +196,7 @@ def late_loss(share: float, delay: float) -> Loss:
         advice = "write the share of late rows and their mean delay in sigma, such as late(0.1,8)"
         raise InvalidProblem(f"there is no loss {name}", "method", advice)
     mode = _mode(share, delay)
+    # Slope of psi at the mode: the limit of the weight psi(u) / u for u = 0. psi is zero at the mode.
     log_density_at_mode = _late_density(np.array(mode), share, delay)[0]
     curvature = float(_late_density(np.array(mode + _STEP), share, delay)[1]) / _STEP
 

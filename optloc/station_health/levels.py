@@ -43,7 +43,7 @@ class NoiseLevels:
     Parameters
     ----------
     by : "station", "pair" or "kind"
-        What forms a group.
+        Grouping of the errors.
     names : tuple of G str
         Names of the groups. If common errors were requested, they follow: the error that all rows of a group share in
         an epoch.
@@ -212,6 +212,7 @@ def _scale_block(problem: Problem, block: Block, by: By, factor: dict[str, float
     `factor` maps names of groups to factors; other groups have the factor 1. `present` (..., m) marks the rows that are
     present.
     """
+    # The noise of the block is effect effect': each column is one error, with its group in `names`.
     effect, names, _ = split(problem, block, by, present)
     factors = np.array([[factor.get(name, 1.0) for name in row] for row in names.tolist()])
     scaled = effect * factors[:, None, :]
@@ -306,6 +307,7 @@ def fitted(linearised: Elements, shared_by: By | None) -> tuple[VarianceFit, Arr
     common = linearised.common[:-1]
     # Threads do not speed up products of small matrices. On a busy machine, waiting for them takes ten times as long.
     with threadpool_limits(1):
+        # Second argument of `fit`: groups whose factor is zero. Third: groups that keep a separate factor.
         without_common = fit(linearised, common, common)
         # The problem states no noise for common errors, so without evidence they are zero.
         evident = _all_or_none(visible(linearised, without_common, common), common, shared_by)
@@ -343,6 +345,7 @@ def _report(linearised: Elements, by: By, fit_result: VarianceFit, no_evidence: 
     # Errors that are gross for the fitted noise are left out of both ratios, so that the ratios are comparable.
     is_zero = np.append(no_evidence, False)[linearised.of_effect]
     stated = without(tested(linearised, np.where(is_zero, 0.0, 1.0)), fit_result.gross)
+    # The fit gives factors of variances. Levels are factors of standard deviations, hence the square roots.
     low, high = (np.where(no_evidence, np.nan, np.sqrt(end)) for end in (fit_result.low, fit_result.high))
     names = np.array(linearised.names, dtype=object)
     tail_factor = np.where(np.isnan(fit_result.low), 1.0, tail_factors(linearised, fit_result) if tails else 1.0)

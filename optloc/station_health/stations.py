@@ -59,7 +59,7 @@ class Health:
     Parameters
     ----------
     by : "station", "pair" or "kind"
-        What forms a group.
+        Grouping of the errors.
     names, units : tuple of G str
         Names of the groups, and units of their measurements.
     count : int array (G,)
