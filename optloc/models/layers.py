@@ -1,7 +1,8 @@
 """Layered media: speed as a function of depth (constant or linear in each layer), and first arrivals of the rays.
 
 Letters: n pairs of points, L layers, k rays that were found. y is a depth and c a speed; y0, y1, c0, c1 are the depths
-and the speeds at the top and the bottom of a layer.
+and the speeds at the top and the bottom of a layer. In functions (n,), metres: `across` is the horizontal distance of a
+pair, `high` and `low` are the depths of its upper and lower end, `yt` and `ya` of its target and station.
 """
 
 from __future__ import annotations
@@ -420,9 +421,8 @@ def _keep_earlier(best: Array, index: Array, rays: Array) -> None:
     distance, and `turns` as in `_FoundRay`. In `best` the time is infinite for a pair without a ray so far. In `rays`
     the time is NaN if the ray does not exist.
     """
-    # Sort the latest first: of several rays of a pair, the last write, which is the first arrival, remains.
+    # Latest first: the last write to a pair is its first arrival. Comparisons with NaN are false, so NaN is left out.
     order = np.argsort(-rays[0], kind="stable")
-    # Comparisons with NaN are false, so rays that do not exist are left out.
     order = order[rays[0, order] < best[0, index[order]]]
     best[:, index[order]] = rays[:, order]
 

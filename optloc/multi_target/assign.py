@@ -5,6 +5,9 @@ worthwhile at these prices. Both steps alternate until there is no new set.
 
 Letters: m channels of a scene, q sets, n emitters, d coordinates. The picks (q, m) of sets are the numbers of the
 values that they take from each channel; -1 for none.
+
+Arguments of functions: `scene` has the rows of one epoch. `region` is the box that contains the emitters. `solved` is
+the best assignment, `fixes` are the fixes of its emitters, and `ghosts` other positions with about the same cost.
 """
 
 from __future__ import annotations

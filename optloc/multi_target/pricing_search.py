@@ -3,6 +3,8 @@
 Letters: q boxes or positions, m channels with up to c values each, d coordinates. `centre` and `half` (q, d) are the
 centres and half-widths of boxes, metres. `option` (q, m, c) is the cost of each value, and `picks` (q, m) the number of
 the chosen value in each channel, or -1.
+
+`scene` has the rows of one epoch, and `prices` are the prices of these rows and of an emitter.
 """
 
 from __future__ import annotations
@@ -238,8 +240,9 @@ def _sure_rows(scene: Scene, option: Array, worst: Array, low: Array) -> Array:
 def _bound_jointly(scene: Scene, picks: Array, apart: Array, slope: Array, remainder: Array) -> Array:
     """Return lower bounds (q,) of the chi-squares of sure rows in boxes.
 
-    r is z - h at the centre, J the derivatives (`slope`), s the displacement, and q the remainders. Then |r - J s - q|
-    >= min_s |r - J s| - |q|, all whitened. `picks` (q, m) are the sure values, and `apart` (q, m, c) all residuals.
+    r is z - h at the centre, J the derivatives (`slope`), s the displacement, and q the remainders of the first-order
+    expansion (`remainder`). Then |r - J s - q| >= min_s |r - J s| - |q|, all whitened. `picks` (q, m) are the sure
+    values, and `apart` (q, m, c) all residuals.
     """
     in_set = picks >= 0
     known = in_set & np.isfinite(slope).all(-1) & np.isfinite(remainder)

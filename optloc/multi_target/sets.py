@@ -169,7 +169,11 @@ def scenes(problem: Problem, clutter: Clutter, penalty: float | None) -> Iterato
 
 
 def _scene(scan: Problem, z: Array, row: Array, clutter: Clutter, penalty: float | None) -> Scene:
-    """Return the scene of one epoch, see `Scene`; raise InvalidProblem if some rows are sums of others."""
+    """Return the scene of one epoch; raise InvalidProblem if some rows are sums of others.
+
+    `scan`, `z`, `row` and `penalty` are as for `Scene`, but a `penalty` of None is replaced by the default. `clutter`
+    has the probability of detection and the density of false rows.
+    """
     R = noises.dense(scan.noise, np.arange(scan.count))
     variance, density = np.diagonal(R), clutter.of(scan)
     if not np.linalg.eigvalsh(correlation(R))[0] > _LEAST_INDEPENDENT:

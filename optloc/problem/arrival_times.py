@@ -140,7 +140,8 @@ def _find_arrivals(problem: Problem, differences: _DifferenceSet) -> tuple[Array
 def _are_uncorrelated(noise: Noise, sets: list[_DifferenceSet], absent: Array) -> bool:
     """Return whether the differences of each epoch and target are uncorrelated with all other present rows.
 
-    `absent` (n,) are the global numbers of the absent range differences. Their correlations do not count.
+    `sets` are the results of `_difference_sets`. `absent` (n,) are the global numbers of the absent range differences.
+    Their correlations do not count.
     """
     for differences in sets:
         for block in noise.blocks:

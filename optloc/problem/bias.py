@@ -2,6 +2,9 @@
 
 A family consists of q members. Each member is one unknown error, or three angles for a rotation in space. A list of
 entries (row, member, coefficient) links members to rows: the row contains the coefficient times the error.
+
+Arguments of functions: `form` is the `BiasForm`; `members` are the names that the caller gave, or None for all; `where`
+is the location that messages name. `blocks` are blocks of rows, each with the global number of its first row.
 """
 
 from __future__ import annotations
@@ -59,10 +62,10 @@ def with_bias(
         of a target, for instance the frequency offset of an emitter.
     form : "offset", "scale", "drift", "rotation", "time", "walk" or "spline"
         How the error enters the measurement. "offset": the error is added. "scale": the error is multiplied by the
-        measured quantity. "drift": the error is multiplied by the seconds since the first epoch. "rotation": the axes
-        of the station are turned. "time": the station is ahead on its course by this number of seconds. "walk": an
-        added error that changes between epochs as a random walk, for instance a clock. "spline": an added error that is
-        a smooth function of time.
+        measured quantity. "drift": the error is multiplied by the seconds since the reference time of the first target
+        (default: the first epoch). "rotation": the axes of the station are turned. "time": the station is ahead on its
+        course by this number of seconds. "walk": an added error that changes between epochs as a random walk, for
+        instance a clock. "spline": an added error that is a smooth function of time.
     kind : str, optional
         Kind of the affected rows. Default: all kinds; for a rotation all kinds that are measured in station axes, for a
         time all kinds that involve stations.
@@ -320,7 +323,7 @@ def _owners(members: Mapping[str, Sequence[str]], stations: Sequence[str], where
 def _check_names(given: Sequence[str], known: Sequence[str], noun: str, where: str) -> tuple[str, ...]:
     """Return the given names as a tuple; raise if the list is empty, or if a name is unknown or repeated.
 
-    `noun` is the word for a name in messages, such as "station". `where` is the location that messages name.
+    `known` are the valid names. `noun` is the word for a name in messages, such as "station".
     """
     names = (given,) if isinstance(given, str) else tuple(given)
     place = f"{where}, members"

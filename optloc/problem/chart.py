@@ -401,7 +401,8 @@ class Chart:
     def _coordinate_function(self, extent: Extent, i: tuple[int, ...]) -> Callable[[Array], Array]:
         """Return the function of points (..., d) that returns one coordinate (...) of each point, metres or radians.
 
-        The points are metres relative to fix i. A truncated distribution needs this function for its interval.
+        The points are metres relative to fix i. `extent` is the name of the coordinate, as for `interval`. A truncated
+        distribution needs this function for its interval.
         """
         start, centre = self.position[i], self.centre[i]
         if extent in _COORDINATES:

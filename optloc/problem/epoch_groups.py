@@ -138,7 +138,8 @@ def epoch_groups(problem: Problem) -> tuple[EpochGroup, ...]:
 def problem_of(groups: Sequence[EpochGroup], epoch: int) -> Problem:
     """Return the problem of one epoch, as a flat batch of one, with the station names of the run.
 
-    `epoch` is the number of the epoch in the run. Raise LookupError if no group contains it.
+    `groups` are the groups of the run. `epoch` is the number of the epoch in the run. Raise LookupError if no group
+    contains it.
     """
     for one in groups:
         item = int(np.searchsorted(one.epochs, epoch))

@@ -61,7 +61,8 @@ class Explanation:
     p_value : float
         Chi-square probability of this fit; NaN without redundancy.
     score : float
-        The cost plus a penalty for each suspect, 16 for one row. The weight of an explanation is exp(-score / 2).
+        The cost plus a penalty for each suspect, 16 for one row. The weight of an explanation is exp(-score / 2): a low
+        score is a likely explanation.
     """
 
     suspects: tuple[Suspect, ...]

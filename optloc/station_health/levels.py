@@ -3,6 +3,10 @@
 The residuals of N fixes are sums of errors. Each error belongs to one of G groups, and each group has one level.
 `Elements` are the linearised fixes with these errors. q is the number of errors of a fix, m of its rows, and c of its
 offsets.
+
+Arguments of functions: `linearised` are the `Elements`. `by` is the grouping of errors: "station", "pair" or "kind".
+`shared_by` is the grouping of common errors, or None. `names` are the G groups. `fit_result` has the estimated variance
+factors.
 """
 
 from __future__ import annotations

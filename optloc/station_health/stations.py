@@ -2,6 +2,9 @@
 
 Letters: N fixes, G groups (stations, pairs or kinds), q errors and c offsets of a fix, n residuals. `Elements` are the
 linearised fixes, and `Tested` are the tests of their errors and offsets.
+
+Arguments of functions: `batch` are the problems of the fixes, one for each. `by` is the grouping: "station", "pair" or
+"kind". `names` are the groups.
 """
 
 from __future__ import annotations
@@ -462,7 +465,8 @@ def _pseudo_inverse(matrix: sparse.csr_array, number: Array) -> tuple[Array, Arr
 def _split_by_groups(basis: Array, weigh: Array, has_rows: Array) -> Array:
     """Return unit vectors (r, p) that span an undetermined space (p, r), with few groups in each vector.
 
-    `weigh` (p,) is the scale of each coefficient, and `has_rows` (p,) marks coefficients with rows.
+    `basis` (p, r) has orthonormal columns, in scaled coefficients. `weigh` (p,) is the scale of each coefficient, and
+    `has_rows` (p,) marks coefficients with rows.
     """
     # Every basis of the space is valid. Groups that the space does not connect get separate vectors.
     projector = basis @ basis.T * np.outer(has_rows, has_rows)

@@ -2,6 +2,9 @@
 
 A common error is shared by the rows of a group in one epoch. A lasting error is correlated between successive epochs.
 Letters: N fixes, G groups, q errors of a fix.
+
+Arguments of functions: `batch` are the N problems of the fixes, and `x` (N, size) their parameter vectors. `method` is
+the method of the fixes. `tried` are the fitted structures, the best first.
 """
 
 from __future__ import annotations
@@ -304,7 +307,10 @@ def _words(structure: Tried) -> str:
 
 
 def _absorbed(candidate: _Candidate) -> dict[str, float]:
-    """Return the share of each common error that fixes absorb, by name, if it is more than half."""
+    """Return the share of each common error that fixes absorb, by name, if it is more than half.
+
+    `candidate` is a fitted structure with common errors.
+    """
     q = candidate.linearised.of_effect.shape[1]
     shares = {}
     for g in np.flatnonzero(candidate.linearised.common[:-1] & (np.nan_to_num(candidate.fit.low) > 0.0)):
