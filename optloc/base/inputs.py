@@ -406,6 +406,7 @@ def _check_data(data: Any, source: str) -> None:
 
     `data` is the content of a document. `source` is the location that messages name.
     """
+    # `level` are all values at one depth of nesting. The loop goes from level to level, so that it can count the depth.
     level, depth = [data], 0
     while level:
         check_budget("nesting", depth, source)

@@ -229,6 +229,7 @@ def propose_sets(scene: Scene, seed: int = 0) -> Tuples:
     fix = solve(problem, "roots", refine=False)
     # All roots of the closed form, because d rows can have several common positions.
     x = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
+    # The set (`item`) and the number of the root (`slot`) of each finite position.
     item, slot = np.nonzero(np.isfinite(x).all(-1))
     with np.errstate(all="ignore"):  # some points of the closed form coincide with stations
         equations = equations_at(problem.take(item), x[item, slot])

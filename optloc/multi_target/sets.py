@@ -385,6 +385,7 @@ def values_in_balls(scan: Problem, centre: Array, radius: Array) -> tuple[Array,
     """
     # At a station the derivatives are not finite. The bounds are then infinite, and the box is halved.
     with np.errstate(all="ignore"):
+        # With measurements of zero, the residual z - h is -h.
         residual, slope = differentiate(scan.with_rows(z=np.zeros(scan.count)), centre)
         value, steep = -residual, np.sqrt((slope**2).sum(-1))
         parts = []

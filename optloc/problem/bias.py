@@ -3,8 +3,8 @@
 A family consists of q members. Each member is one unknown error, or three angles for a rotation in space. A list of
 entries (row, member, coefficient) links members to rows: the row contains the coefficient times the error.
 
-Arguments of functions: `form` is the `BiasForm`; `members` are the names that the caller gave, or None for all; `where`
-is the location that messages name. `blocks` are blocks of rows, each with the global number of its first row.
+Arguments of private functions: `form` is the `BiasForm`. `members` are the names that the caller gave, or None for all.
+`where` is the location that messages name. `blocks` are blocks of rows, each with the global number of its first row.
 """
 
 from __future__ import annotations
@@ -57,15 +57,16 @@ def with_bias(
     name : str
         Name of the family, for instance "clock".
     per : "station", "pair", "kind" or "target"
-        Which rows share one error. "station": all rows of a station; the error has the sign with which the station's
+        Rows that share one error. "station": all rows of a station; the error has the sign with which the station's
         arrival enters the row. "pair": all rows of a pair of stations. "kind": all rows of a kind. "target": all rows
         of a target, for instance the frequency offset of an emitter.
     form : "offset", "scale", "drift", "rotation", "time", "walk" or "spline"
         How the error enters the measurement. "offset": the error is added. "scale": the error is multiplied by the
         measured quantity. "drift": the error is multiplied by the seconds since the reference time of the first target
         (default: the first epoch). "rotation": the axes of the station are turned. "time": the station is ahead on its
-        course by this number of seconds. "walk": an added error that changes between epochs as a random walk, for
-        instance a clock. "spline": an added error that is a smooth function of time.
+        course by this number of seconds, so its position error is velocity times this time. "walk": an added error that
+        changes between epochs as a random walk, for instance a clock. "spline": an added error that is a smooth
+        function of time.
     kind : str, optional
         Kind of the affected rows. Default: all kinds; for a rotation all kinds that are measured in station axes, for a
         time all kinds that involve stations.

@@ -236,6 +236,7 @@ def _number_by_appearance(values: Array) -> Array:
     out = np.full(values.shape, -1, dtype=np.int32)
     count = np.zeros(len(values), dtype=np.int32)
     for j in range(values.shape[1]):
+        # An entry that occurs in an earlier column gets the number of its first occurrence, other entries a new number.
         same = values[:, :j] == values[:, j : j + 1]
         earlier = same.any(1) if j else np.zeros(len(values), dtype=bool)
         is_new = ~earlier & (values[:, j] >= 0)
@@ -248,6 +249,7 @@ def _number_by_appearance(values: Array) -> Array:
 
 def _equal_rows(table: Array) -> list[Array]:
     """Return the indices of equal rows of a table (n, c), one array per group, in the order of first appearance."""
+    # Columns with equal entries do not distinguish rows. Without them the search is faster.
     varying = table[:, (table != table[:1]).any(0)]
     if not varying.shape[1]:
         return [np.arange(len(table))]
@@ -264,6 +266,8 @@ def _epoch_group(problem: Problem, table: _RowTable, epochs: Array, rows: Array)
     ends = np.stack([table.a[rows], table.b[rows]], axis=1)
     if (ends == ends[:1]).all():
         return EpochGroup(epochs, problem, rows, ends[0])
+    # `local` is the station number in the batch of each end of a row; all epochs have the same. `first` is the column
+    # in which each station occurs first.
     local = _number_by_appearance(ends[:1].reshape(1, -1))[0].astype(np.int64)
     first = [int(np.flatnonzero(local == i)[0]) for i in range(int(local.max(initial=-1)) + 1)]
     return EpochGroup(epochs, problem, rows, local.reshape(2, -1), ends.reshape(len(ends), -1)[:, first])

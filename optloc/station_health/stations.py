@@ -266,6 +266,7 @@ def _suspect_shares(batch: Problem, explained: Array | None, by: By, names: tupl
     for explanations, present in zip(np.ravel(explained), weight > 0.0, strict=True):
         for name in {*ends[present].ravel().tolist()} & total.keys():
             total[name] += 1
+        # The first explanation is the best, and the fix uses it.
         suspects = explanations[0].suspects if explanations else ()
         for name in {
             n for s in suspects for n in _suspect_groups(s.name, s.group, ends[list(s.rows)], by)

@@ -365,6 +365,7 @@ def with_estimated_noise(
     _check_lasting(structure.lasting, {*map(str, kinds_of(batch))})
     levels = noise_fixes.levels(batch)
     if (structure.by, structure.common) != ("kind", None):
+        # `plain` are the levels by kind without common errors. Common errors that last must not reduce them.
         plain, noise_fixes = levels, _alternate(problem, batch, structure.by, structure.common, method, noise_fixes)
         levels = _at_least(noise_fixes.levels(batch), plain, structure.lasting if ordered else None)
     levels = _widened(levels, structure.lasting)
