@@ -129,7 +129,7 @@ class Layers:
         )
         ups = []
         for end, at, bends in ((zt, ray.at_t, ray.bends_t), (za, ray.at_a, ray.bends_a)):
-            # at^2 = 1 / c^2 - p^2
+            # at^2 = 1 / c^2 - p^2, so the differential of `at` is (bends d(end) - p dp) / at.
             with np.errstate(all="ignore"):  # a ray horizontal at an end has no derivative of its slope
                 dependences_of_slope = [*((other, -ray.p * slope / at) for other, slope in grows), (end, bends / at)]
             ups.append(differential(c * at, [(other, c * slope) for other, slope in dependences_of_slope]))
@@ -199,7 +199,7 @@ def _mean(table: Layers) -> float:
     """Return the mean speed, m/s: depth over vertical travel time. A bottomless layer counts as deep as the rest."""
     y0, y1, c0, c1 = _layers(table)
     span = np.where(np.isfinite(y1), y1 - y0, max(y0[-1] - y0[0], 1.0))
-    u = np.log(c1 / c0)
+    u = np.log(c1 / c0)  # the time through a layer of linear speed is span u / (c1 - c0)
     time = span / c0 * np.where(np.abs(u) > 1e-9, u / np.where(u == 0.0, 1.0, np.expm1(u)), 1.0)
     return float(span.sum() / time.sum())
 
@@ -399,8 +399,8 @@ def first_arrival(table: Layers, across: Array, yt: Array, ya: Array, logarithm:
         known = known & (y >= layers[0][0]) & (y <= layers[1][-1])
     pairs = np.flatnonzero(known)
     distance, high, low = across[pairs], np.minimum(yt, ya)[pairs], np.maximum(yt, ya)[pairs]
-    best = np.full((4, len(across)), np.nan)
-    best[0] = np.inf
+    best = np.full((4, len(across)), np.nan)  # rows as for `_keep_earlier`
+    best[0] = np.inf  # no ray so far
     _keep_earlier(best, pairs, _horizontal_rays(layers, distance, high, low))
     for rays in (_direct_rays(layers, distance, high, low), _turning_rays(layers, distance, high, low)):
         if rays is None:
@@ -539,7 +539,7 @@ def _turning_in(
     # at the bottom of layer j for the greatest cotangent, `most`.
     most, distance = np.sqrt((speed_at_end - legs.top) * (speed_at_end + legs.top)) / legs.top, across[index]
     marks = [most * part / _PARTS for part in range(_PARTS + 1)]
-    short = [legs.distance(*_of_cotangent(k)) <= distance for k in marks]
+    short = [legs.distance(*_of_cotangent(k)) <= distance for k in marks]  # whether the ray is too short
     for part in range(_PARTS):
         pick = np.flatnonzero(short[part] != short[part + 1])
         bounds = (marks[part][pick], marks[part + 1][pick])
@@ -564,7 +564,7 @@ def _solve_in_interval(legs: _Legs, distance: Array, low: Array, high: Array, ri
         current = k[remaining]
         sine, cosine = _of_cotangent(current)
         reached, rate = legs.across(sine, cosine)
-        before = (reached <= distance[remaining]) == rising[remaining]
+        before = (reached <= distance[remaining]) == rising[remaining]  # the root is at a greater cotangent
         low[remaining], high[remaining] = (
             np.where(before, current, low[remaining]),
             np.where(before, high[remaining], current),
@@ -593,7 +593,7 @@ def _derivatives_at_ends(layers: _Layered, across: Array, yt: Array, ya: Array, 
         slowness = sign * np.sqrt(np.maximum((1.0 / c - p) * (1.0 / c + p), 0.0))
         change_of_p = np.where((p == 0.0) | (sign == 0.0), 0.0, -p / slowness * by_across)
         parts.append((slowness, change_of_p, slope / c**3))
-    share = np.where(across > 0.0, p / np.where(across > 0.0, across, 1.0), by_across)
+    share = np.where(across > 0.0, p / np.where(across > 0.0, across, 1.0), by_across)  # limit: dp / d across
     (at_t, by_t, bends_t), (at_a, by_a, bends_a) = parts
     slopes = (p, share, at_t, at_a, by_across, by_t, by_a, bends_t, bends_a)
     # Without a ray only the time is NaN, so that an absent row does not make the derivatives of others NaN.

@@ -336,7 +336,7 @@ def _ghosts(scene: Scene, solved: Solved, fixes: tuple[Fix, ...], width: int, co
             for known_position, weight in known
         ):
             continue
-        # Additional cost of the best assignment that contains this set; infinite if there is none.
+        # Additional cost of the best assignment that contains this set; infinite if no assignment contains it.
         gap = cheapest_sets(tuples, width, count, forced=int(i))[1] - solved.cost
         if not gap < LISTED_GAP:
             continue

@@ -166,7 +166,7 @@ def _distinct_rows(rows: Rows) -> tuple[Array, Array]:
     """
     columns = np.stack([rows.a, rows.b, rows.target])
     # Indices begin at -1. One number for each row and epoch sorts faster than four.
-    named = np.ravel_multi_index(tuple(columns + 1), tuple(columns.max(axis=1, initial=0) + 2))
+    named = np.ravel_multi_index(tuple(columns + 1), tuple(columns.max(axis=1, initial=0) + 2))  # a, b and target
     occurrence = _occurrences(named * (1 + rows.epoch.max(initial=0)) + rows.epoch)
     each = named * (1 + occurrence.max(initial=0)) + occurrence
     _, first, index = np.unique(each, return_index=True, return_inverse=True)
@@ -181,7 +181,7 @@ def _occurrences(values: Array) -> Array:
     """Return, for each entry of values (m,), the number of equal entries before it."""
     order = np.argsort(values, kind="stable")
     number, sorted_ = np.arange(len(values)), values[order]
-    begins = np.append(True, sorted_[1:] != sorted_[:-1])[: len(values)]
+    begins = np.append(True, sorted_[1:] != sorted_[:-1])[: len(values)]  # first entry of each value
     out = np.empty_like(number)
     out[order] = number - np.maximum.accumulate(np.where(begins, number, 0))
     return out
@@ -250,7 +250,7 @@ def _group_noise(blocks: tuple[Block, ...], batch_row: Array, epoch: Array, memb
     `blocks` are the noise blocks of the run, each group in one epoch. `members` (r,) are the rows of the batch that
     form the group. `batch_row` (m,) and `epoch` (m,) refer to the rows of the run.
     """
-    slot = {int(row): i for i, row in enumerate(members)}
+    slot = {int(row): i for i, row in enumerate(members)}  # index in the group of each row of the batch
     shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in blocks))
     out = np.zeros((*shape, k, 1, len(members), len(members)))
     # A row that an epoch lacks has weight zero. Its variance of one keeps the matrix of its group regular.
@@ -402,7 +402,7 @@ def some_epochs(problem: Problem, epochs: Array) -> Problem:
 def _as_separate_run(problem: Problem, part: Problem, when: slice | Array) -> Problem:
     """Return `part`, the rows of some increasing epochs `when` of a run, as a run that has these epochs only."""
 
-    def select(values: Array | None, core: int) -> Array | None:
+    def select(values: Array | None, core: int) -> Array | None:  # `core` axes from the epoch axis to the last
         if values is None or values.shape[-core] == 1:
             return values
         return np.moveaxis(np.moveaxis(values, -core, 0)[when], 0, -core)

@@ -591,7 +591,7 @@ def _check_agreement(bands: Sequence[Band]) -> None:
     # All bands on one quantity apply: compare the highest lower bound with the lowest upper bound.
     low = np.max(np.broadcast_arrays(*(band.lower for band in bands)), axis=0)
     high = np.min(np.broadcast_arrays(*(band.upper for band in bands)), axis=0)
-    clash = np.broadcast_arrays(low, high, low > high)
+    clash = np.broadcast_arrays(low, high, low > high)  # the third array marks contradictions
     if clash[2].any():
         least, most = (f"{np.ravel(bound[clash[2]])[0]:.10g} {unit}".strip() for bound in clash[:2])
         what = f"it must be at least {least} and at most {most}"

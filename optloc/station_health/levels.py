@@ -323,10 +323,12 @@ def fitted(linearised: Elements, shared_by: By | None) -> tuple[VarianceFit, Arr
 
 
 def _all_or_none(shown: Array, common: Array, by: By | None) -> Array:
-    """Return a mask (G,) of the common errors to keep: with evidence for one station or pair, all are kept.
+    """Return a mask (G,) of the common errors to keep.
 
-    `shown` (G,) marks the common errors with evidence, and `common` (G,) all common errors. A fix can follow as many
-    common errors as it has unknowns. If only a few had a level, the others would count as exact, and the fix too.
+    `shown` (G,) marks the common errors with evidence, and `common` (G,) all common errors. If `by` is "kind", the
+    errors with evidence are kept. If `by` is "station" or "pair", all are kept as soon as one has evidence. The reason:
+    a fix with p unknowns can follow p common errors, which then leave no evidence. If only the others had a level, the
+    common errors that the fix follows would count as exact, and the fix too.
     """
     return shown if by == "kind" else common & shown.any()
 

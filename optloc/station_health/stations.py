@@ -368,7 +368,7 @@ def offsets_of(linearised: Elements, tests: Tested) -> Offsets:
     size = np.diagonal(matrix, axis1=-2, axis2=-1)
     item, column = np.nonzero((size > 0.0) & (linearised.of_offset >= 0))
     scale = np.sqrt(size[item, column])
-    # One equation of unit variance for every valid test, in terms of its own offset and the offsets of the others.
+    # One equation of unit variance for every valid test, in terms of the offsets of its group and of the other groups.
     # `item` is the problem of each test, `column` its column in this problem, and `group` its group.
     y = vector[item, column] / scale
     other = linearised.of_offset[item]
