@@ -153,7 +153,7 @@ def _late(u: Array, c: float) -> Array:
 
 
 def _late_weight(u: Array, c: float) -> Array:
-    """Return the weights of the one-sided loss: 1 for negative residuals, and Cauchy's weights for positive residuals."""
+    """Return the weights of the one-sided loss: 1 for negative residuals, Cauchy's for positive residuals."""
     return _cauchy_weight(np.maximum(u, 0.0), c)
 
 
