@@ -231,6 +231,8 @@ def atan2(y: Array, x: Array) -> Array:
     with np.errstate(invalid="ignore"):
         # Two infinite components give the angle of the diagonal, two zeros the angle of the axis.
         slope = np.where(np.isinf(rise) & np.isinf(run), 1.0, np.minimum(rise, run) / np.where(large > 0.0, large, 1.0))
+    # arctan(s) = arctan(e) + arctan((s - e) / (1 + s e)), where e is the eighth nearest to s. Reflections at the
+    # diagonal, the second axis and the first axis then give the angle of the vector.
     eighth = np.rint(8.0 * np.where(np.isnan(slope), 0.0, slope))
     arc = _ARC[eighth.astype(np.int64)]
     rest = (slope - eighth / 8.0) / (1.0 + slope * (eighth / 8.0))
@@ -243,6 +245,7 @@ def atan2(y: Array, x: Array) -> Array:
 
 def hypot(x: Array, y: Array) -> Array:
     """Return ``sqrt(x^2 + y^2)`` without overflow."""
+    # A division by a power of two is exact, and the squares of the quotients do not overflow.
     _, exponent = np.frexp(np.maximum(np.abs(x), np.abs(y)))
     u, v = np.ldexp(x, -exponent), np.ldexp(y, -exponent)
     return np.asarray(np.ldexp(np.sqrt(u * u + v * v), exponent))
@@ -252,6 +255,7 @@ def log(x: Array) -> Array:
     """Return the natural logarithms of x."""
     usable = (x > 0.0) & np.isfinite(x)
     mantissa, exponent = np.frexp(np.where(usable, x, 1.0))
+    # x = (1 + excess) 2^exponent, with 1 + excess between sqrt(1/2) and sqrt(2).
     is_low = mantissa < math.sqrt(0.5)
     excess, exponent = np.where(is_low, 2.0 * mantissa, mantissa) - 1.0, exponent - is_low
     ratio = excess / (2.0 + excess)

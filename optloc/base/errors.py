@@ -151,13 +151,13 @@ def no_station(
 ) -> InvalidProblem:
     """Return an error for a station name that does not exist, with the most similar station names as advice.
 
-    `error` is the class of the error.
+    `known` are the names of the stations. `error` is the class of the error.
     """
     return error(f"there is no station {name!r}", where, nearest(str(name), known))
 
 
 def _similar_names(word: str, known: Iterable[str]) -> list[str]:
-    """Return up to two names similar to a word; none for a single letter, which could mean any name."""
+    """Return up to two of the `known` names similar to a word; none for a single letter, which could mean any name."""
     names = list(known)
     if word.strip() in names:  # the word differs only by case, or by blanks at its ends
         return [word.strip()]

@@ -377,7 +377,11 @@ def json_of(text: str, source: str, parse_float: Callable[[str], Any] | None = N
 
 
 def _invalid_document(error: Exception, language: str, source: str) -> InvalidProblem:
-    """Return the error for a document that its parser refuses: nesting too deep, or a number with too many digits."""
+    """Return the error for a document that its parser refuses: nesting too deep, or a number with too many digits.
+
+    `error` is the exception of the parser, `language` is "TOML" or "JSON", and `source` is the location for the
+    message.
+    """
     if isinstance(error, RecursionError):
         return _too_large("nesting", "more", _current_access().budget.nesting, source)
     # The other cause is a whole number with more than 4300 digits, which Python refuses.
@@ -402,6 +406,7 @@ def _check_data(data: Any, source: str) -> None:
 
     `data` is the content of a document. `source` is the location that messages name.
     """
+    # `level` are all values at one depth of nesting. The loop goes from level to level, so that it can count the depth.
     level, depth = [data], 0
     while level:
         check_budget("nesting", depth, source)

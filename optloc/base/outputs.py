@@ -150,6 +150,7 @@ def written(path: Path) -> Iterator[Path]:
         return
     place = _place(path)
     temporary = place.with_name(f".optloc-{secrets.token_hex(8)}{path.suffix}")
+    # Temporary files of an open `replace_together` block, which renames them at its end; None outside such a block.
     waiting = _WAITING.get()
     _TEMPORARY.add(temporary)
     try:

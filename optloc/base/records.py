@@ -70,6 +70,7 @@ def overwrite(record: Record, items: Array, other: Record) -> Record:
         if old_value is None and new_value is None:
             continue
         old, new = _filled(record, old_value, new_value, layout), _filled(other, new_value, old_value, layout)
+        # Both arrays get the larger number of slots.
         width = max(old.shape[1], new.shape[1]) if layout.slots else 0
         changed[name] = np.array(_widen(old, layout, width))
         changed[name][items] = _widen(new, layout, width)

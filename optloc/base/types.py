@@ -213,10 +213,10 @@ class Bias:
     form : "offset", "scale", "drift", "rotation", "time", "walk" or "spline"
         How the error enters the measurement. "offset": it is added. "scale": it is multiplied by the measured quantity.
         "drift": it is multiplied by the seconds since the reference time of the first target (default: the first
-        epoch). "rotation": it turns the axes of the station, by one angle in the plane or a rotation vector in space; a
-        member is the mount of a station. "time": the station is ahead on its course by this number of seconds
-        (coefficient 1 for the first station of the row, -1 for the second). "walk": an added error that is a random
-        walk over the epochs. "spline": an added error that is a smooth function of time.
+        epoch). "rotation": it turns the axes of the station, by one angle in the plane or a rotation vector in space;
+        each member is one station, or a group of stations that turn together. "time": the station is ahead on its
+        course by this number of seconds (coefficient 1 for the first station of the row, -1 for the second). "walk": an
+        added error that is a random walk over the epochs. "spline": an added error that is a smooth function of time.
     mean : float array (q,) or (q, c)
         Prior mean, in the unit of the form. For a walk it applies to the value at the first epoch. For a spline it
         applies to each coefficient, in the unit of the rows.
@@ -480,7 +480,7 @@ class Certificate:
     Parameters
     ----------
     proof : "global", "region", "local" or "unknown"
-        Where no position has a lower maximum-likelihood cost: everywhere, in a region, or near the fix. "unknown":
+        Region in which no position has a lower maximum-likelihood cost: everywhere, a box, or near the fix. "unknown":
         nothing is proven.
     reason : str
         A sentence that states what is proven, and why not more.

@@ -55,7 +55,8 @@ __all__ = [
 class LiftedRow:
     """A measurement as an equation linear in position and ranges: ``x.position + ra r_a + rb r_b + constant = 0``.
 
-    Closed-form starts solve such equations.
+    The equation is linear if the ranges count as additional unknowns (lifting). Closed-form starts solve such
+    equations.
 
     Parameters
     ----------
@@ -218,7 +219,8 @@ def _lifted_azimuth(m: Any, a: Point, b: Point) -> LiftedRow:
     """Return the equation of a measured azimuth m, radians: the target is in a vertical plane through the station."""
     xp = namespace(m)
     axes = _axes_of(a)
-    # Normal of the vertical plane through the station at this azimuth. The target is in this plane.
+    # Normal of the vertical plane through the station at this azimuth. The target is in this plane, so the equation is
+    # across . (position - station) = 0.
     across = tuple(xp.cos(m) * v - xp.sin(m) * u for u, v in zip(axes[0], axes[1], strict=True))
 
     def horizontal(t: Point, a: Point, b: Point) -> Any:

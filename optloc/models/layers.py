@@ -1,7 +1,8 @@
 """Layered media: speed as a function of depth (constant or linear in each layer), and first arrivals of the rays.
 
 Letters: n pairs of points, L layers, k rays that were found. y is a depth and c a speed; y0, y1, c0, c1 are the depths
-and the speeds at the top and the bottom of a layer.
+and the speeds at the top and the bottom of a layer. In functions (n,), metres: `across` is the horizontal distance of a
+pair, `high` and `low` are the depths of its upper and lower end, `yt` and `ya` of its target and station.
 """
 
 from __future__ import annotations
@@ -128,7 +129,7 @@ class Layers:
         )
         ups = []
         for end, at, bends in ((zt, ray.at_t, ray.bends_t), (za, ray.at_a, ray.bends_a)):
-            # at^2 = 1 / c^2 - p^2
+            # at^2 = 1 / c^2 - p^2, so the differential of `at` is (bends d(end) - p dp) / at.
             with np.errstate(all="ignore"):  # a ray horizontal at an end has no derivative of its slope
                 dependences_of_slope = [*((other, -ray.p * slope / at) for other, slope in grows), (end, bends / at)]
             ups.append(differential(c * at, [(other, c * slope) for other, slope in dependences_of_slope]))
@@ -198,7 +199,7 @@ def _mean(table: Layers) -> float:
     """Return the mean speed, m/s: depth over vertical travel time. A bottomless layer counts as deep as the rest."""
     y0, y1, c0, c1 = _layers(table)
     span = np.where(np.isfinite(y1), y1 - y0, max(y0[-1] - y0[0], 1.0))
-    u = np.log(c1 / c0)
+    u = np.log(c1 / c0)  # the time through a layer of linear speed is span u / (c1 - c0)
     time = span / c0 * np.where(np.abs(u) > 1e-9, u / np.where(u == 0.0, 1.0, np.expm1(u)), 1.0)
     return float(span.sum() / time.sum())
 
@@ -340,6 +341,7 @@ class _Legs(NamedTuple):
 
 
 _Function = Callable[[Any], Any]
+_Layered = tuple[Array, Array, Array, Array]  # y0, y1, c0, c1, see `_layers`
 
 
 def _sum(parts: Array) -> Array:
@@ -362,19 +364,15 @@ def _asinh_over(u: Array, logarithm: _Function) -> Array:
 class _FoundRay:
     """Rays (k,) that connect their points.
 
-    `index` (k,) is the number of the pair. `sine` and `cosine` (k,) belong to the angle at the top speed. `turns` (k,)
-    is 0 without a turn, 1 for a turn below both ends, and -1 for a turn above both ends.
+    `index` (k,) is the number of the pair. `sine` and `cosine` (k,) are of the angle from the vertical at the depth of
+    the top speed. `turns` (k,) is 0 without a turn, 1 for a turn below both ends, and -1 for a turn above both ends.
     """
 
     index: Array
     legs: _Legs
     sine: Array
     cosine: Array
-    # 0: no turn; 1: turn below both ends; -1: turn above both ends.
     turns: Array
-
-
-_Layered = tuple[Array, Array, Array, Array]
 
 
 @np.errstate(all="ignore")  # rays that do not exist give NaN
@@ -401,8 +399,8 @@ def first_arrival(table: Layers, across: Array, yt: Array, ya: Array, logarithm:
         known = known & (y >= layers[0][0]) & (y <= layers[1][-1])
     pairs = np.flatnonzero(known)
     distance, high, low = across[pairs], np.minimum(yt, ya)[pairs], np.maximum(yt, ya)[pairs]
-    best = np.full((4, len(across)), np.nan)
-    best[0] = np.inf
+    best = np.full((4, len(across)), np.nan)  # rows as for `_keep_earlier`
+    best[0] = np.inf  # no ray so far
     _keep_earlier(best, pairs, _horizontal_rays(layers, distance, high, low))
     for rays in (_direct_rays(layers, distance, high, low), _turning_rays(layers, distance, high, low)):
         if rays is None:
@@ -417,12 +415,14 @@ def first_arrival(table: Layers, across: Array, yt: Array, ya: Array, logarithm:
 
 
 def _keep_earlier(best: Array, index: Array, rays: Array) -> None:
-    """Write rays that arrive earlier than the best rays so far into `best` (4, n).
+    """Replace columns of `best` (4, n) in place by new `rays` (4, k) that arrive earlier; `index` (k,) are their pairs.
 
-    `index` (k,) is the pair of each new ray. The rows of `best` and of the new `rays` (4, k) are time (NaN for no ray),
-    p, derivative of p with respect to the distance, and turns.
+    The rows of both arrays are the travel time (s), the ray parameter p (s/m), the derivative of p with respect to the
+    distance, and `turns` as in `_FoundRay`. In `best` the time is infinite for a pair without a ray so far. In `rays`
+    the time is NaN if the ray does not exist.
     """
-    order = np.argsort(-rays[0], kind="stable")  # for several rays of a pair, the first arrival is written last
+    # Latest first: the last write to a pair is its first arrival. Comparisons with NaN are false, so NaN is left out.
+    order = np.argsort(-rays[0], kind="stable")
     order = order[rays[0, order] < best[0, index[order]]]
     best[:, index[order]] = rays[:, order]
 
@@ -472,7 +472,7 @@ def _direct_rays(layers: _Layered, across: Array, high: Array, low: Array) -> _F
     for _ in range(_STEPS):
         cosine = 1.0 / np.sqrt(1.0 + t[remaining] * t[remaining])
         reached, rate = remaining_legs.across(t[remaining] * cosine, cosine)
-        step = (distance[remaining] - reached) * remaining_legs.top / (rate * cosine**3)
+        step = (distance[remaining] - reached) * remaining_legs.top / (rate * cosine**3)  # dp/dt = cosine^3 / top
         t[remaining] += np.where(np.isfinite(step), step, 0.0)
         unfinished = np.flatnonzero(np.abs(step) > _ARRIVED * t[remaining])
         if not len(unfinished):
@@ -523,6 +523,7 @@ def _turning_in(
     depths (n,). The rays turn below the pairs. `turns` is the number to store in the result.
     """
     across, high, low = pairs
+    # Legs between the two ends are passed once. Legs from the lower end to the `start` of the turn are passed twice.
     start = np.maximum(low, layers[0][j])
     h, c1, c2 = _legs_between(layers, high, low)
     heights_below, d1, d2 = _legs_between(layers, low, start)
@@ -534,10 +535,11 @@ def _turning_in(
     times = np.repeat([1.0, 2.0], len(h))[:, None]
     both = (np.concatenate([h, heights_below]), np.concatenate([c1, d1]), np.concatenate([c2, d2]))
     legs = _Legs.of(both, times, top, speed_at_start, np.full(len(top), slope)).take(index)
-    # In terms of the cotangent of the angle at the top speed, the distance in the turning leg is linear.
+    # In terms of the cotangent of the angle at the top speed, the distance in the turning leg is linear. The ray turns
+    # at the bottom of layer j for the greatest cotangent, `most`.
     most, distance = np.sqrt((speed_at_end - legs.top) * (speed_at_end + legs.top)) / legs.top, across[index]
     marks = [most * part / _PARTS for part in range(_PARTS + 1)]
-    short = [legs.distance(*_of_cotangent(k)) <= distance for k in marks]
+    short = [legs.distance(*_of_cotangent(k)) <= distance for k in marks]  # whether the ray is too short
     for part in range(_PARTS):
         pick = np.flatnonzero(short[part] != short[part + 1])
         bounds = (marks[part][pick], marks[part + 1][pick])
@@ -562,7 +564,7 @@ def _solve_in_interval(legs: _Legs, distance: Array, low: Array, high: Array, ri
         current = k[remaining]
         sine, cosine = _of_cotangent(current)
         reached, rate = legs.across(sine, cosine)
-        before = (reached <= distance[remaining]) == rising[remaining]
+        before = (reached <= distance[remaining]) == rising[remaining]  # the root is at a greater cotangent
         low[remaining], high[remaining] = (
             np.where(before, current, low[remaining]),
             np.where(before, high[remaining], current),
@@ -591,7 +593,7 @@ def _derivatives_at_ends(layers: _Layered, across: Array, yt: Array, ya: Array, 
         slowness = sign * np.sqrt(np.maximum((1.0 / c - p) * (1.0 / c + p), 0.0))
         change_of_p = np.where((p == 0.0) | (sign == 0.0), 0.0, -p / slowness * by_across)
         parts.append((slowness, change_of_p, slope / c**3))
-    share = np.where(across > 0.0, p / np.where(across > 0.0, across, 1.0), by_across)
+    share = np.where(across > 0.0, p / np.where(across > 0.0, across, 1.0), by_across)  # limit: dp / d across
     (at_t, by_t, bends_t), (at_a, by_a, bends_a) = parts
     slopes = (p, share, at_t, at_a, by_across, by_t, by_a, bends_t, bends_a)
     # Without a ray only the time is NaN, so that an absent row does not make the derivatives of others NaN.

@@ -65,7 +65,7 @@ class Point:
         The same position, Earth-centred Earth-fixed, metres.
     up : tuple of 3 numbers, optional
         Unit normal of the ellipsoid at the position, in the problem's frame.
-    medium : Layers or Air, optional
+    medium : Layers or Atmosphere, optional
         Medium of the waves (`optloc.models.medium`).
     """
 

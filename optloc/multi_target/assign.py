@@ -5,6 +5,9 @@ worthwhile at these prices. Both steps alternate until there is no new set.
 
 Letters: m channels of a scene, q sets, n emitters, d coordinates. The picks (q, m) of sets are the numbers of the
 values that they take from each channel; -1 for none.
+
+Arguments of functions: `scene` has the rows of one epoch. `region` is the box that contains the emitters. `solved` is
+the best assignment, `fixes` are the fixes of its emitters, and `ghosts` other positions with about the same cost.
 """
 
 from __future__ import annotations
@@ -226,6 +229,7 @@ def propose_sets(scene: Scene, seed: int = 0) -> Tuples:
     fix = solve(problem, "roots", refine=False)
     # All roots of the closed form, because d rows can have several common positions.
     x = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
+    # The set (`item`) and the number of the root (`slot`) of each finite position.
     item, slot = np.nonzero(np.isfinite(x).all(-1))
     with np.errstate(all="ignore"):  # some points of the closed form coincide with stations
         equations = equations_at(problem.take(item), x[item, slot])
@@ -235,7 +239,10 @@ def propose_sets(scene: Scene, seed: int = 0) -> Tuples:
 
 
 def _combinations(scene: Scene, rng: np.random.Generator) -> Array:
-    """Return the picks (q, m) of sets of d rows that determine a position."""
+    """Return the picks (q, m) of sets of d rows that determine a position.
+
+    The sets are in random order from `rng`. The list ends with the subset of channels that brings it to `_TRIED` sets.
+    """
     d, count = scene.scan.dimension, scene.scan.count
     ends = _ends(scene)
     values = [np.flatnonzero(np.isfinite(channel)) for channel in scene.z]
@@ -283,14 +290,16 @@ def _form_tree(pairs: list[tuple[int, int] | None]) -> bool:
 
 def emitters_of(problem: Problem, scene: Scene, solved: Solved, count: int | None) -> Emitters:
     """Return the emitters of an assignment of one epoch; `count` is the required number of emitters, or None."""
-    # Sort the emitters by evidence: the lowest cost first.
+    # Sort the emitters by evidence: the lowest cost first. The fixes and the assignment use this order.
     taken = solved.taken[np.argsort(solved.tuples.cost[solved.taken], kind="stable")]
     best, width = solved.tuples.take(taken), scene.z.shape[1]
     fixes = fix_sets(scene, best.picks)
+    # Number of the emitter of each row of the problem; -1 for false rows.
     assignment = np.full(problem.count, -1)
     for number, picks in enumerate(best.picks):
         channels = np.flatnonzero(picks >= 0)
         assignment[scene.row[channels, picks[channels]]] = number
+    # Least cost for 0, 1, ... emitters, up to one more than in the assignment.
     costs = np.array([cheapest_sets(solved.tuples, width, k)[1] for k in range(len(taken) + 2)])
     ghosts = _ghosts(scene, solved, fixes, width, count)
     numbers = [] if count is not None else [costs[k] - solved.cost for k in (len(taken) - 1, len(taken) + 1) if k >= 0]
@@ -315,16 +324,19 @@ def _ghosts(scene: Scene, solved: Solved, fixes: tuple[Fix, ...], width: int, co
     """
     tuples, ghosts = solved.tuples, list[Ghost]()
     known = [(fix.position, _information(fix.covariance())) for fix in fixes]
-    # The reduced cost is a lower bound of the additional cost of an assignment with this set.
+    # The reduced cost is a lower bound of the additional cost of an assignment with this set. In increasing order, the
+    # first set above the limit ends the search.
     lowest = solved.prices.reduced(tuples)
     for i in np.argsort(lowest, kind="stable"):
         if len(ghosts) == _LISTED or lowest[i] >= LISTED_GAP:
             break
+        # Leave out a position within four sigmas of an emitter or of a listed ghost.
         if any(
             (tuples.x[i] - known_position) @ weight @ (tuples.x[i] - known_position) < _APART
             for known_position, weight in known
         ):
             continue
+        # Additional cost of the best assignment that contains this set; infinite if no assignment contains it.
         gap = cheapest_sets(tuples, width, count, forced=int(i))[1] - solved.cost
         if not gap < LISTED_GAP:
             continue

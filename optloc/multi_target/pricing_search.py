@@ -3,6 +3,8 @@
 Letters: q boxes or positions, m channels with up to c values each, d coordinates. `centre` and `half` (q, d) are the
 centres and half-widths of boxes, metres. `option` (q, m, c) is the cost of each value, and `picks` (q, m) the number of
 the chosen value in each channel, or -1.
+
+`scene` has the rows of one epoch, and `prices` are the prices of these rows and of an emitter.
 """
 
 from __future__ import annotations
@@ -106,7 +108,8 @@ def search(scene: Scene, prices: Prices, region: PricedRegion, most: int) -> Pri
         bounds = _bound_all(scene, prices, centre, half)
         boxes += len(centre)
         open_ = bounds.low < -TOLERANCE
-        # First evaluate centres: a set found there ends the search, and new prices exclude most boxes.
+        # First evaluate the most promising centres. A set with a negative reduced cost there ends the search early: new
+        # prices exclude most boxes.
         centres_to_try = centre[np.argsort(bounds.at, kind="stable")[:_SHOWN]]
         value, picks = _cheapest_at(scene, prices, centres_to_try)
         if value.min() < -TOLERANCE:
@@ -121,7 +124,10 @@ def search(scene: Scene, prices: Prices, region: PricedRegion, most: int) -> Pri
 
 
 def _cheapest_at(scene: Scene, prices: Prices, x: Array) -> tuple[Array, Array]:
-    """Return the reduced costs (q,) and the picks (q, m) of the cheapest rows at positions (q, d), metres."""
+    """Return the reduced costs (q,) and the picks (q, m) of the cheapest rows at positions (q, d), metres.
+
+    Rows are selected one by one, as if their errors were independent. The cost includes the correlation of the errors.
+    """
     apart = misfits(scene.scan, scene.z, predict(scene.scan, x))
     s = scene.sigma[:, None]
     option = (apart / s) ** 2 + np.log(2.0 * np.pi * s**2) - scene.gain[:, None] + prices.row
@@ -165,7 +171,10 @@ def _bound_all(scene: Scene, prices: Prices, centre: Array, half: Array) -> _Bou
 
 
 def _bound(scene: Scene, prices: Prices, centre: Array, half: Array) -> _Bounds:
-    """Return the bounds of boxes: first from single rows, then jointly for boxes that single rows do not exclude."""
+    """Return the bounds of boxes: first from single rows, then jointly for boxes that single rows do not exclude.
+
+    `centre` and `half` (q, d) are the centres and the half-widths of the boxes, metres.
+    """
     radius = np.sqrt((half**2).sum(-1))
     value, slope, remainder = values_in_balls(scene.scan, centre, radius)
     change = value_changes(scene.scan, slope, remainder, half)
@@ -173,6 +182,7 @@ def _bound(scene: Scene, prices: Prices, centre: Array, half: Array) -> _Bounds:
     s, (conditional, largest_eigenvalue, _) = scene.sigma[:, None], _errors(scene)
     # Lower bound of the cost of a row, without its chi-square, for every set that contains it.
     base = np.log(2.0 * np.pi * conditional)[:, None] - scene.gain[:, None] + prices.row
+    # Least residual, in sigmas, of each value anywhere in the box. NaN is no value, so its cost is infinite.
     near = np.maximum(np.abs(apart) - change[..., None], 0.0) / s
     option = np.where(np.isnan(near), np.inf, near**2 / largest_eigenvalue + base)
     constant = scene.penalty - prices.emitter
@@ -230,8 +240,9 @@ def _sure_rows(scene: Scene, option: Array, worst: Array, low: Array) -> Array:
 def _bound_jointly(scene: Scene, picks: Array, apart: Array, slope: Array, remainder: Array) -> Array:
     """Return lower bounds (q,) of the chi-squares of sure rows in boxes.
 
-    r is z - h at the centre, J the derivatives (`slope`), s the displacement, and q the remainders. Then |r - J s - q|
-    >= min_s |r - J s| - |q|, all whitened. `picks` (q, m) are the sure values, and `apart` (q, m, c) all residuals.
+    r is z - h at the centre, J the derivatives (`slope`), s the displacement, and q the remainders of the first-order
+    expansion (`remainder`). Then |r - J s - q| >= min_s |r - J s| - |q|, all whitened. `picks` (q, m) are the sure
+    values, and `apart` (q, m, c) all residuals.
     """
     in_set = picks >= 0
     known = in_set & np.isfinite(slope).all(-1) & np.isfinite(remainder)

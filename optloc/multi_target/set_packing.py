@@ -127,7 +127,12 @@ def price_rows(tuples: Tuples, taken: Array, worth: Array, count: int | None) ->
     worth : array (m, c)
         Decrease of the cost of its set due to each row, above 0.
     count : int or None
-        Required number of sets.
+        Required number of sets; None if it is free.
+
+    Returns
+    -------
+    Prices
+        All zero if there are no sets, or if the linear program has no solution. Zero prices give a valid bound.
     """
     m, width = shape = worth.shape
     if not len(tuples.cost):
@@ -135,7 +140,9 @@ def price_rows(tuples: Tuples, taken: Array, worth: Array, count: int | None) ->
     incidence_matrix, k = incidence(tuples, width), len(taken)
     # Unknowns: a price for each row, one for an emitter, and the highest quotient of price and worth in each taken set.
     ones, zeros = sparse.csr_array(np.ones((len(tuples.cost), 1))), sparse.csr_array((len(tuples.cost), k))
+    # Constraint of each set: emitter price minus the prices of its rows <= cost, so that no reduced cost is negative.
     sets: Any = sparse.hstack([-incidence_matrix.T, ones, zeros])
+    # Constraint of each row of a taken set: its price divided by its worth <= the highest quotient of this set.
     row, number = incidence_matrix[:, taken].nonzero()
     sharing = sparse.csr_array(
         (
@@ -144,6 +151,8 @@ def price_rows(tuples: Tuples, taken: Array, worth: Array, count: int | None) ->
         ),
         shape=(len(row), m * width + 1 + k),
     )
+    # Objective: the negative bound, sum of row prices minus count times emitter price. The highest quotients enter with
+    # a small weight, so that prices are shared evenly.
     total = np.concatenate([np.ones(m * width), [-float(count or 0)], np.full(k, _EVEN)])
     # If the number is free, its constraint and the price of an emitter do not exist.
     free = (0.0, 0.0) if count is None else (None, None)

@@ -41,7 +41,10 @@ class Scene:
 
         c(T) = min_x chi2(T, x) + ln|2 pi R_T| - sum_T 2 ln(pd / density) - (m - |T|) 2 ln(1 - pd) + penalty.
 
-    It is twice the negative logarithm of the generalised likelihood ratio of Deb et al. (1997), plus a penalty.
+    R_T is the covariance of the values of T, and |T| their number. pd is the probability of detection, and density the
+    mean number of false rows per unit of the measurement.
+
+    The cost is twice the negative logarithm of the generalised likelihood ratio of Deb et al. (1997), plus a penalty.
     The penalty is the worth of the d most informative rows. A position has d coordinates, and d rows always fit it, so
     only further rows are evidence of an emitter. In other words, the d rows that determine an emitter count as likely
     as false rows (Rissanen 1978: a parameter costs the logarithm of its range over its precision).
@@ -102,6 +105,7 @@ class Scene:
         # Worth of each row if it fits perfectly, the most informative first. The least number outweighs the penalty and
         # the missing rows.
         worth = np.sort(self.missed + self.gain - np.log(2.0 * np.pi * own_variance(self.R)))[::-1]
+        # Least cost of an emitter with 1, 2, ... rows. An emitter is more likely than false rows if it is negative.
         best = self.penalty + self.missed * len(worth) - np.cumsum(worth)
         return int(np.argmax(best < 0.0)) + 1 if (best < 0.0).any() else len(worth) + 1
 
@@ -165,7 +169,11 @@ def scenes(problem: Problem, clutter: Clutter, penalty: float | None) -> Iterato
 
 
 def _scene(scan: Problem, z: Array, row: Array, clutter: Clutter, penalty: float | None) -> Scene:
-    """Return the scene of one epoch, see `Scene`; raise InvalidProblem if some rows are sums of others."""
+    """Return the scene of one epoch; raise InvalidProblem if some rows are sums of others.
+
+    `scan`, `z`, `row` and `penalty` are as for `Scene`, but a `penalty` of None is replaced by the default. `clutter`
+    has the probability of detection and the density of false rows.
+    """
     R = noises.dense(scan.noise, np.arange(scan.count))
     variance, density = np.diagonal(R), clutter.of(scan)
     if not np.linalg.eigvalsh(correlation(R))[0] > _LEAST_INDEPENDENT:
@@ -377,6 +385,7 @@ def values_in_balls(scan: Problem, centre: Array, radius: Array) -> tuple[Array,
     """
     # At a station the derivatives are not finite. The bounds are then infinite, and the box is halved.
     with np.errstate(all="ignore"):
+        # With measurements of zero, the residual z - h is -h.
         residual, slope = differentiate(scan.with_rows(z=np.zeros(scan.count)), centre)
         value, steep = -residual, np.sqrt((slope**2).sum(-1))
         parts = []

@@ -106,6 +106,7 @@ def _difference_sets(problem: Problem, numbers: Array) -> Iterator[_DifferenceSe
     for k, t in np.unique(np.column_stack([epoch, target]), axis=0).tolist():
         members = np.flatnonzero((epoch == k) & (target == t))
         stations = np.unique([a[members], b[members]])
+        # The matrix D: each difference is the arrival at station a minus the arrival at station b.
         design = np.zeros((len(members), len(stations)))
         design[np.arange(len(members)), np.searchsorted(stations, a[members])] += 1.0
         design[np.arange(len(members)), np.searchsorted(stations, b[members])] -= 1.0
@@ -139,7 +140,8 @@ def _find_arrivals(problem: Problem, differences: _DifferenceSet) -> tuple[Array
 def _are_uncorrelated(noise: Noise, sets: list[_DifferenceSet], absent: Array) -> bool:
     """Return whether the differences of each epoch and target are uncorrelated with all other present rows.
 
-    `absent` (n,) are the global numbers of the absent range differences. Their correlations do not count.
+    `sets` are the results of `_difference_sets`. `absent` (n,) are the global numbers of the absent range differences.
+    Their correlations do not count.
     """
     for differences in sets:
         for block in noise.blocks:
@@ -169,7 +171,8 @@ def _assemble(problem: Problem, sets: list[_DifferenceSet], z: Array, variance: 
         ones,
         0.0 * ones,
     )
-    # Each arrival depends on all differences that involve its station.
+    # `origin` are the original rows of each new row. `number` is the new number of each original row; -1 for range
+    # differences. Each arrival depends on all differences that involve its station.
     origin = [differences.rows[column != 0.0] for differences in sets for column in differences.design.T]
     rows, number = [arrival], np.full(problem.count, -1)
     count = len(station)

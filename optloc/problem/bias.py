@@ -2,6 +2,9 @@
 
 A family consists of q members. Each member is one unknown error, or three angles for a rotation in space. A list of
 entries (row, member, coefficient) links members to rows: the row contains the coefficient times the error.
+
+Arguments of private functions: `form` is the `BiasForm`. `members` are the names that the caller gave, or None for all.
+`where` is the location that messages name. `blocks` are blocks of rows, each with the global number of its first row.
 """
 
 from __future__ import annotations
@@ -54,15 +57,16 @@ def with_bias(
     name : str
         Name of the family, for instance "clock".
     per : "station", "pair", "kind" or "target"
-        Which rows share one error. "station": all rows of a station; the error has the sign with which the station's
+        Rows that share one error. "station": all rows of a station; the error has the sign with which the station's
         arrival enters the row. "pair": all rows of a pair of stations. "kind": all rows of a kind. "target": all rows
         of a target, for instance the frequency offset of an emitter.
     form : "offset", "scale", "drift", "rotation", "time", "walk" or "spline"
         How the error enters the measurement. "offset": the error is added. "scale": the error is multiplied by the
-        measured quantity. "drift": the error is multiplied by the seconds since the first epoch. "rotation": the axes
-        of the station are turned. "time": the station is ahead on its course by this number of seconds. "walk": an
-        added error that changes between epochs as a random walk, for instance a clock. "spline": an added error that is
-        a smooth function of time.
+        measured quantity. "drift": the error is multiplied by the seconds since the reference time of the first target
+        (default: the first epoch). "rotation": the axes of the station are turned. "time": the station is ahead on its
+        course by this number of seconds, so its position error is velocity times this time. "walk": an added error that
+        changes between epochs as a random walk, for instance a clock. "spline": an added error that is a smooth
+        function of time.
     kind : str, optional
         Kind of the affected rows. Default: all kinds; for a rotation all kinds that are measured in station axes, for a
         time all kinds that involve stations.
@@ -240,7 +244,12 @@ def _by_kind(blocks: list[tuple[Rows, int]]) -> list[_Entries]:
 def _by_pair(
     blocks: list[tuple[Rows, int]], stations: Sequence[str], members: Members, where: str
 ) -> tuple[tuple[str, ...], list[_Entries]]:
-    """Return the member names and the entries of a family with one member for each pair of stations."""
+    """Return the member names and the entries of a family with one member for each pair of stations.
+
+    `blocks` are the result of `_select_rows`. `members` are the pairs to use, such as "A-B", or None for all pairs that
+    have rows. `where` is the location that error messages name. `_by_target` and `_by_station` have these arguments
+    too.
+    """
     named = (*stations, "")  # the last entry is index -1, no station
     # Each pair has one number. A missing second station (-1) counts as an extra station with an empty name.
     codes = [block.a * len(named) + block.b % len(named) for block, _ in blocks]
@@ -315,7 +324,7 @@ def _owners(members: Mapping[str, Sequence[str]], stations: Sequence[str], where
 def _check_names(given: Sequence[str], known: Sequence[str], noun: str, where: str) -> tuple[str, ...]:
     """Return the given names as a tuple; raise if the list is empty, or if a name is unknown or repeated.
 
-    `noun` is the word for a name in messages, such as "station". `where` is the location that messages name.
+    `known` are the valid names. `noun` is the word for a name in messages, such as "station".
     """
     names = (given,) if isinstance(given, str) else tuple(given)
     place = f"{where}, members"
@@ -414,6 +423,7 @@ def _correct_rows(problem: Problem, bias: Bias, known: Array) -> Problem:
     `known` (q,) are the values of the members. For a walk, `known` (k, q) has one row for each epoch.
     """
     form, amount, epoch = form_of(bias), np.zeros(problem.count), problem.epoch[bias.row]
+    # `entry` are the numbers of the values that enter each row, and `factor` their factors. Rows without entries get 0.
     entry, factor = form.effects(bias, problem.times, problem.origin, epoch)
     values = known.ravel()[entry] if form.steps is None else known[epoch[:, None], entry]
     np.add.at(amount, bias.row, (factor * values).sum(1))
@@ -445,6 +455,7 @@ def _turn_axes(problem: Problem, bias: Bias, known: Array) -> Problem:
 def _move_stations(problem: Problem, bias: Bias, known: Array) -> Problem:
     """Return the problem with its stations moved along their courses by the known times (q,), seconds."""
     stations, seconds = problem.stations, np.zeros((problem.stations.count, 1))
+    # A coefficient of 1 means the first station of a row, -1 the second. Other stations stay: their time is zero.
     for index, sign in (("a", 1.0), ("b", -1.0)):
         selected = bias.coefficient == sign
         station = np.concatenate([getattr(block, index) for block in problem.rows])[bias.row[selected]]
@@ -487,6 +498,7 @@ def course(problem: Problem) -> tuple[Array, Array]:
     rotation = problem.frame.rotation_to_ecef()
     ecef, ecef_velocity, axis = problem.frame.to_ecef(position), velocity @ rotation.T, np.array([0.0, 0.0, _TURN])
     radius = np.linalg.norm(ecef, axis=-1, keepdims=True)
+    # The limit of the radius avoids a division by zero near the centre. Results below `_SKY` are not used.
     gravity = -_GM * ecef / np.maximum(radius, _RADIUS) ** 3
     acceleration = gravity - 2.0 * np.cross(axis, ecef_velocity) - np.cross(axis, np.cross(axis, ecef))
     return velocity, np.where(radius > _RADIUS + _SKY, acceleration @ rotation, 0.0)

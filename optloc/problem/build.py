@@ -180,11 +180,13 @@ def measured(
     )
     count = _count(kind, (z, sigma, covariance, a, b, epoch, target, weight, correction), covariance)
 
+    # The number -1 marks a station that the kind does not use.
     def index(values: Array | None, needed: bool, name: str) -> Array:
         if needed and values is None:
             raise InvalidProblem(f"{kind} needs station {name}", where=name, advice="give station indices")
         return _filled(values if needed and values is not None else -1, (count,), np.int64)
 
+    # One value per row; NaN for rows that are simulated later.
     def row(values: Array | None) -> Array:
         return _filled(np.nan, (count,)) if values is None else _filled(values, (*values.shape[:-1], count))
 
@@ -211,7 +213,7 @@ def measured(
 def _filled(values: Any, shape: tuple[int, ...], dtype: Any = float) -> Array:
     """Return a new array of the given shape with these values: a copy, since callers may change their arrays.
 
-    `values` broadcasts to the shape.
+    `values` broadcasts to the shape. `dtype` is the data type of the new array.
     """
     out = np.empty(shape, dtype)
     out[...] = values
@@ -233,7 +235,8 @@ def _check_noise(kind: str, covariance: Any, signal: Any, deviations: bool) -> N
 def _count(kind: str, given: Sequence[Array | None], covariance: Array | None) -> int:
     """Return the number of rows m of one kind; raise if the arguments have different numbers of rows.
 
-    `given` are all arguments with one value per row. A scalar or None does not affect the number.
+    `given` are all arguments with one value per row, including `covariance`, the covariance (..., m, m) of the rows. A
+    scalar or None does not affect the number.
     """
     sizes = [v.shape[-1] for v in given if v is not None and v.ndim]
     # A single number applies to all rows. Without any array there is one row.
@@ -345,7 +348,8 @@ _DERIVED = ("starts", "layout", "batch_shape", "structure")
 def _key(problem: Problem, measurements: Sequence[Measured], joint: Array | None, medium: Medium | None) -> Any:
     """Return a cache key of all content of a problem except its measured values; None for large problems.
 
-    `joint` is the joint covariance (..., m, m) of all rows, if the caller gave one.
+    `measurements` are the arguments of `assemble`, with the noise of each kind. `joint` is the joint covariance (...,
+    m, m) of all rows, if the caller gave one. `medium` is the medium of the waves, or None.
     """
     rows = [(r.kind, r.z.shape, r.a, r.b, r.epoch, r.target, r.weight, r.correction) for r in problem.rows]
     noise = [(m.variance, m.arrival, m.covariance, m.signal) for m in measurements]
@@ -365,7 +369,8 @@ def _complete(
 ) -> Problem:
     """Return the problem with its noise and medium; raise InvalidProblem if the input is invalid.
 
-    `joint` is the joint covariance (..., m, m) of all rows. If it is None, the noise of each kind applies.
+    `measurements` are the arguments of `assemble`. `joint` is the joint covariance (..., m, m) of all rows. If it is
+    None, the noise of each kind applies.
     """
     if joint is None:
         parts = zip(measurements, problem.starts, strict=True)

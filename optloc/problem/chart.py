@@ -62,6 +62,7 @@ def basis(direction: Array) -> Array:
     if u.shape[-1] == 2:
         return np.stack([-u[..., 1], u[..., 0]], axis=-1)[..., None]
     x, y, z = u[..., 0], u[..., 1], u[..., 2]
+    # With the sign of z, the denominator is never near zero.
     sign = np.copysign(1.0, z)
     a = -1.0 / (sign + z)
     first = np.stack([1.0 + sign * a * x * x, sign * a * x * y, -sign * x], axis=-1)
@@ -278,6 +279,7 @@ class Chart:
             form, known = self._along_surface(step, form, known & ~on_surface)
         inverse = self.kind == INVERSE_RANGE
         behind = inverse & ~((dy[..., -1] > -1.0) & np.isfinite(dy).all(-1))
+        # NaN for curved fixes, and for fixes without a valid covariance.
         form = np.array(np.where(known & (self.kind != CURVED), np.where(behind, np.inf, form), np.nan))
         away = np.broadcast_to(away, (*form.shape, away.shape[-1]))
         for i, distribution in self._truncated_fixes():
@@ -305,6 +307,7 @@ class Chart:
         from scipy.special import gammainc, gammaincinv
 
         finite, d = np.asarray(np.isfinite(self.covariance).all((-1, -2))), step.shape[-1]
+        # `within` is chi-square distributed with `rank` degrees of freedom, and `level` is its probability.
         covariance = np.where(finite[..., None, None], self.covariance, 0.0)
         inverse = np.linalg.pinv(covariance, HELD, hermitian=True)
         projector = covariance @ inverse
@@ -375,6 +378,7 @@ class Chart:
         self._require_gaussian(f"interval of the {extent}")
         if extent in {"elevation", "height", "z"} and self.position.shape[-1] != 3:
             raise InvalidProblem(f"a fix in the plane has no {extent}", "extent", "use x, y, range or bearing")
+        # The second argument is the half-width z of the interval, in standard deviations.
         low, high = map(np.array, _EXTENTS[extent](self, float(np.sqrt(quantile(level, 1)))))
         for i, distribution in self._truncated_fixes():
             low[i], high[i] = distribution.interval(self._coordinate_function(extent, i), level)
@@ -397,7 +401,8 @@ class Chart:
     def _coordinate_function(self, extent: Extent, i: tuple[int, ...]) -> Callable[[Array], Array]:
         """Return the function of points (..., d) that returns one coordinate (...) of each point, metres or radians.
 
-        The points are metres relative to fix i. A truncated distribution needs this function for its interval.
+        The points are metres relative to fix i. `extent` is the name of the coordinate, as for `interval`. A truncated
+        distribution needs this function for its interval.
         """
         start, centre = self.position[i], self.centre[i]
         if extent in _COORDINATES:
@@ -408,6 +413,8 @@ class Chart:
         if extent == "elevation":
             return lambda away: np.asarray(np.arcsin(distance_and_direction(start + away, centre)[1][..., 2]))
         middle = np.arctan2(self.direction[i][1], self.direction[i][0])
+
+        # Bearings are within half a turn of the bearing of the fix, so that an interval has no jump at 180 degrees.
 
         def bearing(away: Array) -> Array:
             there = start + away - centre
@@ -514,6 +521,7 @@ def _angle_interval(chart: Chart, z: float, side: Array, ahead: Array) -> tuple[
     denominator = np.where(inverse, ahead - (ahead * u0).sum(-1, keepdims=True) * u0, ahead)
     variance = z**2 * _bilinear(chart.covariance, side, side)
     covariance = z**2 * _bilinear(chart.covariance, side, denominator)
+    # Coefficient of t^2 in Fieller's inequality. If it is not positive, the solutions are not one finite interval.
     lead = middle**2 - z**2 * _bilinear(chart.covariance, denominator, denominator)
     with np.errstate(divide="ignore", invalid="ignore"):
         root = np.sqrt(np.maximum(covariance**2 + lead * variance, 0.0))

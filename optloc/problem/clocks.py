@@ -238,6 +238,7 @@ def clock_densities(tau: Any, deviation: Any, speed: float = SPEED_OF_LIGHT) -> 
         raise InvalidProblem(what, "deviation", "give one deviation for each time")
     if not (np.isfinite(times * sizes) & (times > 0.0) & (sizes > 0.0)).all():
         raise InvalidProblem("a time or a deviation is not positive", "deviation", "give such as 1.0 s and 1e-9")
+    # A single time determines one number only: h1. Then h2 is zero.
     design = np.stack([1.0 / times, times / 3.0], axis=1)[:, : min(2, len(times))]
     # Relative errors, so that a deviation of 1e-12 has the same weight as a deviation of 1e-9.
     fitted, _ = nnls(design / sizes[:, None] ** 2, np.ones(len(sizes)))

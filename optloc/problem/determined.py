@@ -117,6 +117,8 @@ def is_in_cone(axis: Array, outline: Array, vectors: Array) -> Array:
     if len(axis) == 2:
         return np.asarray((angles[..., 0] >= rim.min()) & (angles[..., 0] <= rim.max()))
     polar = np.arctan2(rim[:, 1], rim[:, 0])
+    # Sort the edge vectors by their angle about the axis. The neighbours of a vector are then number `last` and the
+    # number before it; the edge is closed, so number 0 follows the last.
     rim = rim[np.argsort(polar)]
     last = np.searchsorted(np.sort(polar), np.arctan2(angles[..., 1], angles[..., 0])) % len(rim)
     start, end = rim[last - 1], rim[last]
@@ -197,6 +199,7 @@ class Determined:
         whole : bool
             Whether the wedge begins at the mean of the stations instead of at the least range.
         """
+        # At most a full turn, so that the outline does not cover itself.
         low, high = one.azimuth[1], min(one.azimuth[2], one.azimuth[1] + 2.0 * np.pi)
         near, far = one.range[1], one.range[2] if one.mixed else max(reach, 2.0 * one.range[1])
         # Horizontal distance is slant range times cos(elevation): take its least and its greatest value.
@@ -267,10 +270,10 @@ def _finite(*values: float) -> list[float | None]:
 def bearing_of(azimuth: tuple[float, float, float]) -> tuple[float, float, float]:
     """Return the bearing and its interval, degrees clockwise from north, of an azimuth with its interval, radians.
 
-    The bearing is from 0 to 360 degrees.
-
-    The ends of the interval are not wrapped, the lower end first.
+    `azimuth` is the value, its lower end and its upper end. The bearing is from 0 to 360 degrees. The ends of the
+    interval are not wrapped, so that the interval contains the bearing; the lower end is first.
     """
+    # A bearing decreases when the azimuth increases, so the ends change places.
     middle, low, high = (90.0 - np.degrees(each) for each in azimuth)
     turn = middle - middle % 360.0
     return float(middle - turn), float(high - turn), float(low - turn)

@@ -55,6 +55,8 @@ class EpochGroup:
         if self.rows is None or self.ends is None:
             return by_epoch(self.run).take(self.epochs)
         epochs = self.epochs
+        # The stations, states, priors and constraints of these epochs, without rows. An array with only its own axes
+        # (`core`) has no epoch axis: all epochs share it.
         bare = map_numbers(
             states_by_epoch(self.run), lambda array, core: array if array.ndim == core else array[epochs]
         )
@@ -136,7 +138,8 @@ def epoch_groups(problem: Problem) -> tuple[EpochGroup, ...]:
 def problem_of(groups: Sequence[EpochGroup], epoch: int) -> Problem:
     """Return the problem of one epoch, as a flat batch of one, with the station names of the run.
 
-    `epoch` is the number of the epoch in the run. Raise LookupError if no group contains it.
+    `groups` are the groups of the run. `epoch` is the number of the epoch in the run. Raise LookupError if no group
+    contains it.
     """
     for one in groups:
         item = int(np.searchsorted(one.epochs, epoch))
@@ -206,6 +209,7 @@ class _RowTable:
 
     def alike(self) -> Iterator[tuple[Array, Array]]:
         """Yield the epochs (n,) of each structure, and the row numbers (n, r) of these epochs."""
+        # Number of rows of each epoch, and its first entry in `order`, which is sorted by epoch.
         size = np.bincount(self.epoch, minlength=self.epochs)
         start = np.cumsum(size) - size
         for count in np.unique(size).tolist():
@@ -232,6 +236,7 @@ def _number_by_appearance(values: Array) -> Array:
     out = np.full(values.shape, -1, dtype=np.int32)
     count = np.zeros(len(values), dtype=np.int32)
     for j in range(values.shape[1]):
+        # An entry that occurs in an earlier column gets the number of its first occurrence, other entries a new number.
         same = values[:, :j] == values[:, j : j + 1]
         earlier = same.any(1) if j else np.zeros(len(values), dtype=bool)
         is_new = ~earlier & (values[:, j] >= 0)
@@ -244,6 +249,7 @@ def _number_by_appearance(values: Array) -> Array:
 
 def _equal_rows(table: Array) -> list[Array]:
     """Return the indices of equal rows of a table (n, c), one array per group, in the order of first appearance."""
+    # Columns with equal entries do not distinguish rows. Without them the search is faster.
     varying = table[:, (table != table[:1]).any(0)]
     if not varying.shape[1]:
         return [np.arange(len(table))]
@@ -260,6 +266,8 @@ def _epoch_group(problem: Problem, table: _RowTable, epochs: Array, rows: Array)
     ends = np.stack([table.a[rows], table.b[rows]], axis=1)
     if (ends == ends[:1]).all():
         return EpochGroup(epochs, problem, rows, ends[0])
+    # `local` is the station number in the batch of each end of a row; all epochs have the same. `first` is the column
+    # in which each station occurs first.
     local = _number_by_appearance(ends[:1].reshape(1, -1))[0].astype(np.int64)
     first = [int(np.flatnonzero(local == i)[0]) for i in range(int(local.max(initial=-1)) + 1)]
     return EpochGroup(epochs, problem, rows, local.reshape(2, -1), ends.reshape(len(ends), -1)[:, first])
@@ -316,6 +324,7 @@ def _batch_noise(noise: Noise, rows: Array) -> Noise:
     first_member = np.full(1 + max(int(block.row.max()) for block in noise.blocks), -1)
     for block in noise.blocks:
         first_member[block.row] = block.row[:, :1]
+    # Rows with equal labels are in one group of correlated rows. `alone` are rows that are independent of all others.
     label, blocks = first_member[rows[0]], []
     alone = np.flatnonzero((label[:, None] == label).sum(1) == 1)
     if len(alone):

@@ -102,7 +102,7 @@ def rows_by_epoch(problem: Problem) -> Array:
 
 
 def _joined(parts: Sequence[tuple[Array, Array]]) -> tuple[Array, int]:
-    """Return the row number in the batch of each row (m,) of all kinds, and the number of rows of the batch."""
+    """Return the batch row of each row (m,), and the number of batch rows; `parts` is `_distinct_rows` of each kind."""
     starts = np.cumsum([0, *(len(keys) for keys, _ in parts)])
     return np.concatenate([start + row_in_kind for (_, row_in_kind), start in zip(parts, starts, strict=False)]), int(
         starts[-1]
@@ -166,7 +166,7 @@ def _distinct_rows(rows: Rows) -> tuple[Array, Array]:
     """
     columns = np.stack([rows.a, rows.b, rows.target])
     # Indices begin at -1. One number for each row and epoch sorts faster than four.
-    named = np.ravel_multi_index(tuple(columns + 1), tuple(columns.max(axis=1, initial=0) + 2))
+    named = np.ravel_multi_index(tuple(columns + 1), tuple(columns.max(axis=1, initial=0) + 2))  # a, b and target
     occurrence = _occurrences(named * (1 + rows.epoch.max(initial=0)) + rows.epoch)
     each = named * (1 + occurrence.max(initial=0)) + occurrence
     _, first, index = np.unique(each, return_index=True, return_inverse=True)
@@ -181,7 +181,7 @@ def _occurrences(values: Array) -> Array:
     """Return, for each entry of values (m,), the number of equal entries before it."""
     order = np.argsort(values, kind="stable")
     number, sorted_ = np.arange(len(values)), values[order]
-    begins = np.append(True, sorted_[1:] != sorted_[:-1])[: len(values)]
+    begins = np.append(True, sorted_[1:] != sorted_[:-1])[: len(values)]  # first entry of each value
     out = np.empty_like(number)
     out[order] = number - np.maximum.accumulate(np.where(begins, number, 0))
     return out
@@ -189,14 +189,14 @@ def _occurrences(values: Array) -> Array:
 
 def _split_epochs(array: Array, core: int) -> Array:
     """Return a per-epoch array (..., k or 1, s, ...) as (..., k, 1, s, ...); unchanged if all epochs share it."""
-    # A value that all epochs and problems share broadcasts without a new axis.
+    # `core` is the number of axes without batch axes. A value that all epochs and problems share needs no new axis.
     if array.ndim == core and array.shape[0] == 1:
         return array
     return np.expand_dims(array, array.ndim - core + 1)
 
 
 def _add_epoch_axis(array: Array, core: int) -> Array:
-    """Return an array of the run with a new batch axis for the epochs; unchanged if the whole batch shares it."""
+    """Return an array with a new batch axis for the epochs, unless all share it; `core` is as for `_split_epochs`."""
     return array if array.ndim == core else np.expand_dims(array, array.ndim - core)
 
 
@@ -250,7 +250,7 @@ def _group_noise(blocks: tuple[Block, ...], batch_row: Array, epoch: Array, memb
     `blocks` are the noise blocks of the run, each group in one epoch. `members` (r,) are the rows of the batch that
     form the group. `batch_row` (m,) and `epoch` (m,) refer to the rows of the run.
     """
-    slot = {int(row): i for i, row in enumerate(members)}
+    slot = {int(row): i for i, row in enumerate(members)}  # index in the group of each row of the batch
     shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in blocks))
     out = np.zeros((*shape, k, 1, len(members), len(members)))
     # A row that an epoch lacks has weight zero. Its variance of one keeps the matrix of its group regular.
@@ -402,7 +402,7 @@ def some_epochs(problem: Problem, epochs: Array) -> Problem:
 def _as_separate_run(problem: Problem, part: Problem, when: slice | Array) -> Problem:
     """Return `part`, the rows of some increasing epochs `when` of a run, as a run that has these epochs only."""
 
-    def select(values: Array | None, core: int) -> Array | None:
+    def select(values: Array | None, core: int) -> Array | None:  # `core` axes from the epoch axis to the last
         if values is None or values.shape[-core] == 1:
             return values
         return np.moveaxis(np.moveaxis(values, -core, 0)[when], 0, -core)
@@ -562,7 +562,7 @@ def _motions(problem: Problem, more: Problem) -> tuple[Motion, ...]:
 def _join_epochs(one: Array, first: int, two: Array, second: int, core: int) -> Array:
     """Return an array with the values of both runs at each epoch (..., k, ...); unchanged if it is constant in both.
 
-    `first` and `second` are their numbers of epochs.
+    `first` and `second` are the numbers of epochs of the runs. `core` counts the axes from the epoch axis to the last.
     """
     if one.shape[-core] == 1 and two.shape[-core] == 1 and np.array_equal(one, two):
         return one

@@ -19,8 +19,8 @@ class Suspect:
     name : str
         A phrase, for instance "station S3" or "prior of position[2]".
     group : "station", "row", "prior" or "offset"
-        What was left out: all rows of a station, one measurement, a prior, or an offset that all ranges of a kind
-        received.
+        The part that was left out: all rows of a station, one measurement, a prior, or an offset that all ranges of a
+        kind received.
     rows : tuple of int
         Global numbers of its rows; empty for a prior.
     error : array (q,)
@@ -51,7 +51,7 @@ class Explanation:
     Parameters
     ----------
     suspects : tuple of Suspect
-        What was left out; empty if the complete data agree as well as the rest.
+        The suspects that were left out; empty if the complete data agree as well as the rest.
     x : array (size,)
         Parameter vector of the fit to the rest, in the order of the problem's layout.
     cost : float
@@ -61,7 +61,8 @@ class Explanation:
     p_value : float
         Chi-square probability of this fit; NaN without redundancy.
     score : float
-        The cost plus a penalty for each suspect, 16 for one row. The weight of an explanation is exp(-score / 2).
+        The cost plus a penalty for each suspect, 16 for one row. The weight of an explanation is exp(-score / 2): a low
+        score is a likely explanation.
     """
 
     suspects: tuple[Suspect, ...]

@@ -140,8 +140,9 @@ class Fix:
         Covariance of the states of targets at each epoch of a run, in the order of the layout; NaN where an epoch does
         not determine them.
     explanations : object array (...), optional
-        For each fix with contradictory data, a tuple of `Explanation`, the best first: the fix uses the best, the
-        others are within the gap of it. Empty for other fixes. None if explanations were not requested.
+        For each fix with contradictory data, a tuple of `Explanation`, the best first: the fix uses the best. The
+        scores of the others are higher by at most `optloc.solvers.policy.AMBIGUOUS_GAP`. Empty for other fixes. None if
+        explanations were not requested.
     marks : int array (...), optional
         All findings of each fix, as one bit for each `Status`; see `findings`.
     chart : Chart, optional

@@ -53,7 +53,7 @@ class BiasForm:
         Name of the form with its article, for use in sentences.
     enters : "adds", "scales", "turns" or "moves"
         How a value acts: it is added to a measurement, multiplies the measured quantity, turns the axes of a station,
-        or moves a station along its course.
+        or moves a station along its course (its track): the displacement is velocity times value, which is a time.
     quantity : Quantity, optional
         Physical quantity of the values; None: the quantity of the rows.
     rate : bool
@@ -101,7 +101,7 @@ class BiasForm:
 
     @property
     def of_readings(self) -> bool:
-        """Return whether values have the sign and the quantity of the measurements; False for a time along a course."""
+        """Return whether values have the sign and the quantity of the measurements; False for the form "time"."""
         return self.enters != "moves"
 
     def touches(self, model: Model) -> bool:

@@ -153,7 +153,7 @@ def _late(u: Array, c: float) -> Array:
 
 
 def _late_weight(u: Array, c: float) -> Array:
-    """Return the weights of the one-sided loss: 1 for negative residuals, as for Cauchy's loss otherwise."""
+    """Return the weights of the one-sided loss: 1 for negative residuals, Cauchy's for positive residuals."""
     return _cauchy_weight(np.maximum(u, 0.0), c)
 
 
@@ -196,9 +196,11 @@ def late_loss(share: float, delay: float) -> Loss:
         advice = "write the share of late rows and their mean delay in sigma, such as late(0.1,8)"
         raise InvalidProblem(f"there is no loss {name}", "method", advice)
     mode = _mode(share, delay)
+    # Slope of psi at the mode: the limit of the weight psi(u) / u for u = 0. psi is zero at the mode.
     log_density_at_mode = _late_density(np.array(mode), share, delay)[0]
     curvature = float(_late_density(np.array(mode + _STEP), share, delay)[1]) / _STEP
 
+    # A loss has two arguments, the residuals and its constant. This loss has no constant, so it ignores the second.
     def cost(u: Array, _: float) -> Array:
         """Return the loss of residuals u, in standard deviations."""
         log_density = _late_density(np.maximum(u, 0.0) + mode, share, delay)[0]
@@ -225,6 +227,8 @@ def _late_density(u: Array, share: float, delay: float) -> tuple[Array, Array]:
     """
     from scipy.special import log_ndtr
 
+    # Logarithms of both terms of the density: late rows and prompt rows. `p_late` is the probability that a row with
+    # this residual is late.
     late = np.log(share / delay) + 0.5 / delay**2 - u / delay + log_ndtr(u - 1.0 / delay)
     prompt = np.log1p(-share) - 0.5 * u**2 - _LOG_ROOT
     density = np.logaddexp(late, prompt)

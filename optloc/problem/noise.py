@@ -181,7 +181,7 @@ def whiten(noise: Noise, weight: Array) -> tuple[Whitener, ...]:
 
 
 def _whitener(block: Block, weight: Array) -> Whitener:
-    """Return the whitening matrices of one block with row weights (..., m); see `whiten`."""
+    """Return the whitening matrices of one block; `weight` (..., m) are the weights of all rows, see `whiten`."""
     weights, xp = arrays.gather(weight, block.row), arrays.library(weight)
     # With unit weights the whitening matrices of the covariance apply; the batch shares them if it shares the
     # covariance.

@@ -95,6 +95,7 @@ class Truncated:
         """
         mean, covariance = _moments_behind_one_bound(self)
         finite = np.isfinite(self.slack)
+        # Distributions with several bounds, or with a bound that has ends: the edge of a polygon.
         several = (finite.sum(-1) != 1) | np.isfinite(np.where(finite[..., None], self.span, np.inf)).any((-1, -2))
         for i in zip(*np.nonzero(np.atleast_1d(several & self.cuts)), strict=True):
             index = tuple(map(int, i)) if several.ndim else ()
@@ -121,6 +122,7 @@ class Truncated:
         from scipy.special import gammaincinv
 
         rays, d = self._rays(), points.shape[-1]
+        # Squared deviation of the fix. The excess of a point is its squared deviation minus this value.
         least = float((rays.middle**2).sum())
         away = (points - self.shift) @ rays.whitener.T
         excess = np.maximum((away**2).sum(-1) - least, 0.0)
@@ -150,9 +152,11 @@ class Truncated:
             Probability of the interval.
         """
         rays = self._rays()
+        # Values at the fix and at the ends of the rays: they extend the table of values up to the bounds.
         ends = number(np.concatenate([np.zeros((1, len(self.shift))), rays.tip]))
         points, weight = rays.spread()
         values, weight = number(points).ravel(), weight.ravel()
+        # Table of the distribution function: sorted values, each with the probability below it plus half of its weight.
         order = np.argsort(values)
         cumulative = np.cumsum(weight[order])
         cumulative = (cumulative - 0.5 * weight[order]) / cumulative[-1]
@@ -161,6 +165,7 @@ class Truncated:
         sorted_values = np.concatenate(
             [[min(sorted_values[0], ends.min())], sorted_values, [max(sorted_values[-1], ends.max())]]
         )
+        # Candidate intervals: `first` is the probability below the lower end.
         first = np.linspace(0.0, 1.0 - level, _STARTS)
         low, high = (
             np.interp(first, probabilities, sorted_values),
@@ -203,6 +208,7 @@ class Truncated:
 
         rays = self._rays()
         excess = float(np.interp(level, *rays.levels()[::-1])) ** 2
+        # At the length s of a ray the excess is s^2 - 2 lean s. Solve for s; a ray that ends earlier keeps its end.
         share = np.minimum(1.0, (rays.lean + np.sqrt(rays.lean**2 + excess)) / np.maximum(rays.length, 1e-300))
         points = (rays.tip * share[:, None]) @ plane.T
         # In two dimensions the rays are sorted by angle.

@@ -110,6 +110,7 @@ def _check_stations(problem: Problem) -> None:
 def _check_moving(problem: Problem) -> None:
     """Raise if velocities, axes or positions per epoch do not fit the stations and epochs."""
     s, d, count = problem.stations, problem.dimension, problem.stations.count
+    # `tail` is the required shape after the epoch axis. `core` counts the epoch axis and the axes of the tail.
     for name, array, tail in (
         ("position", s.position, (count, d)),
         ("velocity", s.velocity, (count, d)),
@@ -383,10 +384,14 @@ def _check_rotation(problem: Problem, bias: Bias, where: str) -> None:
 
 
 def _check_course(problem: Problem, bias: Bias, where: str) -> None:
-    """Raise if a time along the course is invalid for the stations: it needs stations that move."""
+    """Raise if a bias of the form "time" is invalid. It moves a station along its track by velocity times time.
+
+    The coefficient of an entry is 1 for the first station of its row (`a`), and -1 for the second (`b`).
+    """
     velocity = problem.stations.velocity
     if velocity is None:
         raise InvalidProblem("a time along a course needs velocities of the stations", where, "give vx, vy and vz")
+    # Axes before the last three (epoch, station, coordinate) are batch axes.
     if np.prod(velocity.shape[:-3]) * np.prod(problem.stations.position.shape[:-3]) > 1:
         raise InvalidProblem("the stations differ from problem to problem", where, "solve them one by one")
     if not np.isin(bias.coefficient, (1.0, -1.0)).all():
@@ -394,6 +399,7 @@ def _check_course(problem: Problem, bias: Bias, where: str) -> None:
         raise InvalidProblem("a coefficient is neither 1 nor -1", where, advice)
     ends = (np.concatenate([getattr(rows, name) for rows in problem.rows])[bias.row] for name in ("a", "b"))
     station = np.where(bias.coefficient > 0.0, *ends)
+    # Two equal pairs (row, station) name a station twice in one row. The station number -1 is a missing station.
     if len(np.unique(np.stack([bias.row, station]), axis=1).T) < len(bias.row) or (station < 0).any():
         what = "a row does not have this station, or has it twice"
         raise InvalidProblem(what, where, "let each row name a station once")
@@ -528,7 +534,7 @@ def _crossing(v: Array, size: float) -> tuple[int, int] | None:
 
 
 def _rounded(area: Array, size: float) -> Array:
-    """Return signed areas with rounding errors replaced by zero."""
+    """Return signed areas (...), m^2, zero if within rounding error for a polygon of this `size`, m."""
     return np.where(np.abs(area) <= _SLIVER * size**2, 0.0, area)
 
 
@@ -585,7 +591,7 @@ def _check_agreement(bands: Sequence[Band]) -> None:
     # All bands on one quantity apply: compare the highest lower bound with the lowest upper bound.
     low = np.max(np.broadcast_arrays(*(band.lower for band in bands)), axis=0)
     high = np.min(np.broadcast_arrays(*(band.upper for band in bands)), axis=0)
-    clash = np.broadcast_arrays(low, high, low > high)
+    clash = np.broadcast_arrays(low, high, low > high)  # the third array marks contradictions
     if clash[2].any():
         least, most = (f"{np.ravel(bound[clash[2]])[0]:.10g} {unit}".strip() for bound in clash[:2])
         what = f"it must be at least {least} and at most {most}"

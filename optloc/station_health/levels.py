@@ -3,6 +3,10 @@
 The residuals of N fixes are sums of errors. Each error belongs to one of G groups, and each group has one level.
 `Elements` are the linearised fixes with these errors. q is the number of errors of a fix, m of its rows, and c of its
 offsets.
+
+Arguments of functions: `linearised` are the `Elements`. `by` is the grouping of errors: "station", "pair" or "kind".
+`shared_by` is the grouping of common errors, or None. `names` are the G groups. `fit_result` has the estimated variance
+factors.
 """
 
 from __future__ import annotations
@@ -43,7 +47,7 @@ class NoiseLevels:
     Parameters
     ----------
     by : "station", "pair" or "kind"
-        What forms a group.
+        Grouping of the errors.
     names : tuple of G str
         Names of the groups. If common errors were requested, they follow: the error that all rows of a group share in
         an epoch.
@@ -133,7 +137,8 @@ def noise_levels(
         Problem whose fixes are its epochs if they share no unknown, or its batch; otherwise it is one fix of many rows.
         The size of its stated noise may be wrong. Ratios of the noise within a group are kept.
     by : "station", "pair" or "kind"
-        What has a level: each station (the error of an arrival if rows combine arrivals), each pair or each kind.
+        Groups of errors with one level each: the errors of a station (of its arrivals, if rows combine arrivals), of a
+        pair of stations, or of a kind.
     common : "station", "pair" or "kind", optional
         Grouping of rows that share an additional error in every epoch. Examples are errors of an attitude, of a
         position taken as known, or of refraction. True: the same as `by`. The data determine it if a group has several
@@ -211,6 +216,7 @@ def _scale_block(problem: Problem, block: Block, by: By, factor: dict[str, float
     `factor` maps names of groups to factors; other groups have the factor 1. `present` (..., m) marks the rows that are
     present.
     """
+    # The noise of the block is effect effect': each column is one error, with its group in `names`.
     effect, names, _ = split(problem, block, by, present)
     factors = np.array([[factor.get(name, 1.0) for name in row] for row in names.tolist()])
     scaled = effect * factors[:, None, :]
@@ -305,6 +311,7 @@ def fitted(linearised: Elements, shared_by: By | None) -> tuple[VarianceFit, Arr
     common = linearised.common[:-1]
     # Threads do not speed up products of small matrices. On a busy machine, waiting for them takes ten times as long.
     with threadpool_limits(1):
+        # Second argument of `fit`: groups whose factor is zero. Third: groups that keep a separate factor.
         without_common = fit(linearised, common, common)
         # The problem states no noise for common errors, so without evidence they are zero.
         evident = _all_or_none(visible(linearised, without_common, common), common, shared_by)
@@ -316,16 +323,23 @@ def fitted(linearised: Elements, shared_by: By | None) -> tuple[VarianceFit, Arr
 
 
 def _all_or_none(shown: Array, common: Array, by: By | None) -> Array:
-    """Return a mask (G,) of the common errors to keep: with evidence for one station or pair, all are kept.
+    """Return a mask (G,) of the common errors to keep.
 
-    `shown` (G,) marks the common errors with evidence, and `common` (G,) all common errors. A fix can follow as many
-    common errors as it has unknowns. If only a few had a level, the others would count as exact, and the fix too.
+    `shown` (G,) marks the common errors with evidence, and `common` (G,) all common errors. If `by` is "kind", the
+    errors with evidence are kept. If `by` is "station" or "pair", all are kept as soon as one has evidence. The reason:
+    a fix with p unknowns can follow p common errors, which then leave no evidence. If only the others had a level, the
+    common errors that the fix follows would count as exact, and the fix too.
     """
     return shown if by == "kind" else common & shown.any()
 
 
 def _report(linearised: Elements, by: By, fit_result: VarianceFit, no_evidence: Array, *, tails: bool) -> NoiseLevels:
-    """Return the levels of all groups with errors, from a fit and the mask `no_evidence` (G,) of common errors."""
+    """Return the levels of all groups that have errors.
+
+    `linearised` are the fixes, and `by` is the grouping of their errors. `fit_result` and `no_evidence` are the results
+    of `fitted`: variance factors, and a mask (G,) of common errors without evidence. `tails` is whether to add factors
+    for long tails; without them these factors are 1.
+    """
     size = len(linearised.names)
     count, gross = total(linearised.of_effect, size), total(linearised.of_effect, size, fit_result.gross)
     with_errors = np.flatnonzero(count)
@@ -337,6 +351,7 @@ def _report(linearised: Elements, by: By, fit_result: VarianceFit, no_evidence: 
     # Errors that are gross for the fitted noise are left out of both ratios, so that the ratios are comparable.
     is_zero = np.append(no_evidence, False)[linearised.of_effect]
     stated = without(tested(linearised, np.where(is_zero, 0.0, 1.0)), fit_result.gross)
+    # The fit gives factors of variances. Levels are factors of standard deviations, hence the square roots.
     low, high = (np.where(no_evidence, np.nan, np.sqrt(end)) for end in (fit_result.low, fit_result.high))
     names = np.array(linearised.names, dtype=object)
     tail_factor = np.where(np.isnan(fit_result.low), 1.0, tail_factors(linearised, fit_result) if tails else 1.0)

@@ -2,6 +2,9 @@
 
 Letters: N fixes, G groups (stations, pairs or kinds), q errors and c offsets of a fix, n residuals. `Elements` are the
 linearised fixes, and `Tested` are the tests of their errors and offsets.
+
+Arguments of functions: `batch` are the problems of the fixes, one for each. `by` is the grouping: "station", "pair" or
+"kind". `names` are the groups.
 """
 
 from __future__ import annotations
@@ -59,7 +62,7 @@ class Health:
     Parameters
     ----------
     by : "station", "pair" or "kind"
-        What forms a group.
+        Grouping of the errors.
     names, units : tuple of G str
         Names of the groups, and units of their measurements.
     count : int array (G,)
@@ -173,6 +176,7 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
         slice(linearised.effect.shape[-1], None),
         OUTLIER,
     )
+    # One entry for each residual: its fix (`item`), its column among the offsets of the fix, and its group.
     item, column = np.nonzero(np.isfinite(tests.sigma) & (linearised.of_offset >= 0))
     group = linearised.of_offset[item, column]
     outlying = tests.gross[item, column]
@@ -181,6 +185,7 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
     number = np.full(len(linearised.names), -1)
     number[with_residuals] = np.arange(len(with_residuals))
     names = tuple(linearised.names[g] for g in with_residuals)
+    # A group without a level (-1) selects the NaN that is appended to the levels.
     level_of = [levels.names.index(name) if name in levels.names else -1 for name in names]
     noise, noise_error = (np.append(v, np.nan)[level_of] for v in (levels.sigma, levels.sigma_error))
     return Health(
@@ -226,7 +231,8 @@ def _estimate_jointly(linearised: Elements, by: By) -> tuple[NoiseLevels, Offset
 
 
 def _subtract(linearised: Elements, offsets: Offsets) -> Elements:
-    """Return the elements with the offsets subtracted from the residuals."""
+    """Return the elements with the offsets subtracted from the residuals; an offset of NaN counts as zero."""
+    # The appended zero is for index -1, an unused column.
     value = np.append(np.nan_to_num(offsets.value), 0.0)[linearised.of_offset]
     return replace(linearised, residual=linearised.residual - (linearised.offset @ value[..., None])[..., 0])
 
@@ -260,6 +266,7 @@ def _suspect_shares(batch: Problem, explained: Array | None, by: By, names: tupl
     for explanations, present in zip(np.ravel(explained), weight > 0.0, strict=True):
         for name in {*ends[present].ravel().tolist()} & total.keys():
             total[name] += 1
+        # The first explanation is the best, and the fix uses it.
         suspects = explanations[0].suspects if explanations else ()
         for name in {
             n for s in suspects for n in _suspect_groups(s.name, s.group, ends[list(s.rows)], by)
@@ -287,6 +294,7 @@ def _sentences(offsets: Offsets, names: tuple[str, ...], with_residuals: Array) 
     `names` are the names of all groups. `with_residuals` (g,) are the numbers of the groups with residuals.
     """
     sentences = []
+    # Groups with a share above `_PART` in an undetermined combination are named. Equal shares are a common bias.
     for direction in offsets.open:
         involved = np.abs(direction[with_residuals]) > _PART * np.abs(direction).max()
         involved_names = [names[g] for g in with_residuals[involved]]
@@ -360,7 +368,8 @@ def offsets_of(linearised: Elements, tests: Tested) -> Offsets:
     size = np.diagonal(matrix, axis1=-2, axis2=-1)
     item, column = np.nonzero((size > 0.0) & (linearised.of_offset >= 0))
     scale = np.sqrt(size[item, column])
-    # One equation of unit variance for every valid test, in terms of its own offset and the offsets of the others.
+    # One equation of unit variance for every valid test, in terms of the offsets of its group and of the other groups.
+    # `item` is the problem of each test, `column` its column in this problem, and `group` its group.
     y = vector[item, column] / scale
     other = linearised.of_offset[item]
     design = _sparse(matrix[item, column] / scale[:, None], other, count)
@@ -457,7 +466,8 @@ def _pseudo_inverse(matrix: sparse.csr_array, number: Array) -> tuple[Array, Arr
 def _split_by_groups(basis: Array, weigh: Array, has_rows: Array) -> Array:
     """Return unit vectors (r, p) that span an undetermined space (p, r), with few groups in each vector.
 
-    `weigh` (p,) is the scale of each coefficient, and `has_rows` (p,) marks coefficients with rows.
+    `basis` (p, r) has orthonormal columns, in scaled coefficients. `weigh` (p,) is the scale of each coefficient, and
+    `has_rows` (p,) marks coefficients with rows.
     """
     # Every basis of the space is valid. Groups that the space does not connect get separate vectors.
     projector = basis @ basis.T * np.outer(has_rows, has_rows)

@@ -2,6 +2,9 @@
 
 A common error is shared by the rows of a group in one epoch. A lasting error is correlated between successive epochs.
 Letters: N fixes, G groups, q errors of a fix.
+
+Arguments of functions: `batch` are the N problems of the fixes, and `x` (N, size) their parameter vectors. `method` is
+the method of the fixes. `tried` are the fitted structures, the best first.
 """
 
 from __future__ import annotations
@@ -153,12 +156,14 @@ def structure_at(batch: Problem, x: Array, number: Array, *, ordered: bool) -> N
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1):
-        # If the noise is correlated between epochs, the model has no separate error of each epoch.
+        # Prefer the common error only with evidence and a lower sum of deviance and penalty. If the noise is correlated
+        # between epochs, the model has no separate error of each epoch.
         without_common = _fit_structure(batch, x, "kind", None)
         common = without_common if has_correlated_epochs(batch) else _fit_structure(batch, x, "kind", "kind")
         best = common if common.seen and common.tried.total < without_common.tried.total else without_common
         lasting = _lasting(batch, x, number, best)
         candidates = [without_common, common] if common.seen else [without_common]
+        # Levels by station or pair assume independent errors. Only epochs in the order of time can show independence.
         if best is without_common and ordered and not lasting:
             finer = [_fit_structure(batch, x, by, None) for by in _groupings(batch)]
             candidates += [structure for structure in finer if structure.tried.levels > without_common.tried.levels]
@@ -189,6 +194,7 @@ def _fit_structure(batch: Problem, x: Array, by: By, common: By | None) -> _Cand
     """Return a structure fitted to the residuals of fixes x (N, size) of a flat batch."""
     linearised = elements(batch, x, by, common)
     fit, absent = fitted(linearised, common)
+    # Groups with a level that the data determine. Groups that share one factor count as one level.
     known = np.isfinite(fit.low) & ~absent
     levels = int((known & ~fit.shared).sum()) + int((known & fit.shared).any())
     redundancy = max(int(tested(linearised, np.ones(())).dof.sum()), 1)
@@ -215,20 +221,25 @@ def _lasting(batch: Problem, x: Array, number: Array, best: _Candidate) -> dict[
     errors.
     """
     linearised = elements(batch, x, "station", "kind" if best.tried.common else None)
+    # Levels of the best structure are by kind. A group of stations takes the level of its kind; 1 if it has no level.
     level = dict(zip(best.linearised.names, np.nan_to_num(best.fit.variance, nan=1.0).tolist(), strict=True))
     kinds = _kind_of(batch)
     kind_of = np.array([kinds.get(name, name) for name in linearised.names], dtype=object)
     level_of_group = [
         level.get(name, level.get(str(kind), 1.0)) for name, kind in zip(linearised.names, kind_of, strict=True)
     ]
+    # The last entry is for index -1, an unused error.
     variance = np.array([*level_of_group, 0.0])
     _, tests = cleaned(linearised, variance[linearised.of_effect])
+    # Positions of the fixes whose next fix is of the next epoch, in parts that limit the memory.
     follows = np.flatnonzero(np.diff(number) == 1)
     parts = [follows[i : i + _PART] for i in range(0, len(follows), _PART)]
     correlations, known = (
         {},
         {name for name, low in zip(best.linearised.names, best.fit.low, strict=True) if np.isfinite(low)},
     )
+    # Only kinds whose level the data determine. The correlation is the sum of products over its expectation at
+    # correlation one. The standard error assumes that the products have mean zero.
     for kind in sorted(known & {*kind_of.tolist()}):
         groups = np.flatnonzero(kind_of == kind)
         sums = [_products(tests, linearised.of_effect, groups, variance, part) for part in parts]
@@ -296,7 +307,10 @@ def _words(structure: Tried) -> str:
 
 
 def _absorbed(candidate: _Candidate) -> dict[str, float]:
-    """Return the share of each common error that fixes absorb, by name, if it is more than half."""
+    """Return the share of each common error that fixes absorb, by name, if it is more than half.
+
+    `candidate` is a fitted structure with common errors.
+    """
     q = candidate.linearised.of_effect.shape[1]
     shares = {}
     for g in np.flatnonzero(candidate.linearised.common[:-1] & (np.nan_to_num(candidate.fit.low) > 0.0)):
@@ -351,6 +365,7 @@ def with_estimated_noise(
     _check_lasting(structure.lasting, {*map(str, kinds_of(batch))})
     levels = noise_fixes.levels(batch)
     if (structure.by, structure.common) != ("kind", None):
+        # `plain` are the levels by kind without common errors. Common errors that last must not reduce them.
         plain, noise_fixes = levels, _alternate(problem, batch, structure.by, structure.common, method, noise_fixes)
         levels = _at_least(noise_fixes.levels(batch), plain, structure.lasting if ordered else None)
     levels = _widened(levels, structure.lasting)
