@@ -120,6 +120,7 @@ class _LastingRows:
         R = rows.covariance[item if len(rows.covariance) > 1 else 0]
         R = np.diag(R) if len(R) == m else R.reshape(m, m)
         used = line[:, n + 1] > 0.0
+        # The last number of a line is the weight of its row: it divides the variance.
         scale = np.sqrt(line[used, n + 1])
         noise = R[np.ix_(used, used)] / (scale[:, None] * scale)
         errors = _errors(R, rows.station, rows.sign, stations)[:, used]
@@ -217,13 +218,16 @@ class _Recursion:
         `rows` are the rows of the fix, and `cov` (n, n) is its covariance.
         """
         H, R, D = rows.H, rows.R, rows.D
+        # `gain` (n, m) maps the errors of the rows to the error of the fix, and `left` maps them to its residuals.
         gain = _solve_regularised(R, H @ cov).T
         left = np.eye(len(R)) - H @ gain
         apart = np.abs(rows.scan[:, None] - rows.scan)
+        # `ties` (j, m, m) is the covariance of the rows from lasting errors of unit size.
         ties = self.phi**apart * (D @ np.swapaxes(D, -1, -2))
         self.cross = -gain @ (self.phi ** (rows.scan.max() - rows.scan)[:, None] * D)
         self.lasting = gain @ ties @ gain.T
         noise, errors = left @ R @ left.T, left @ ties @ left.T
+        # Each iteration starts again from the sums before this start, so that the start counts once.
         info, score = self.info, self.score
         for turn in range(_TURNS):
             now = R if turn == 0 else R * (1.0 + max(self.excess, 0.0)) + self.size * ties[self.best]
@@ -247,6 +251,8 @@ class _Recursion:
         self._widen(rows.D.shape[-1])
         H, R, D = rows.H, rows.R, np.pad(rows.D, [(0, 0), (0, 0), (0, self.cross.shape[-1] - rows.D.shape[-1])])
         back = np.swapaxes(D, -1, -2)
+        # S is the stated covariance of the innovations. `noise` and `errors` are the derivatives of their true
+        # covariance by c^2 and s^2.
         S, noise = H @ cov @ H.T + R, H @ self.white @ H.T + R
         tied = H @ self.cross @ back
         errors = H @ self.lasting @ H.T + tied + np.swapaxes(tied, -1, -2) + D @ back
@@ -257,8 +263,11 @@ class _Recursion:
         self._add_size(unit, w, S, noise, errors)
         if self.before is not None:
             last, white, lasting, seen = self.before
+            # `here` (j, m, r) is the covariance of these innovations with the last whitened ones, per s^2.
             here = unit @ (H @ F @ lasting + D @ (self.phi * seen))
             self._add_correlation(np.clip(w, -_WILD, _WILD), last, unit @ H @ F @ white, here)
+        # `seen` (j, q, m) is the covariance of the lasting errors with the innovations. The stored tuple: clipped
+        # whitened innovations, their covariances with the updated state per c^2 and per s^2, and with the errors.
         seen = np.swapaxes(self.cross, -1, -2) @ H.T + back
         self.before = (
             np.clip(w, -_WILD, _WILD),
@@ -266,6 +275,7 @@ class _Recursion:
             (self.lasting @ H.T + self.cross @ back - gain @ errors) @ unit.T,
             seen @ unit.T,
         )
+        # The update of the module docstring: e <- (I - K H) e - K (D b + v).
         left, KD = np.eye(len(cov)) - gain @ H, gain @ D
         self.white = left @ self.white @ left.T + gain @ R @ gain.T
         part = left @ self.cross
@@ -291,6 +301,7 @@ class _Recursion:
         (m, m) is their stated covariance. `noise` (m, m) and `errors` (j, m, m) are its derivatives by c^2 and
         s^2.
         """
+        # Half weight: the symmetric matrix has each pair of rows twice, and a squared innovation has variance 2.
         w = np.clip(w, -_WILD, _WILD)
         stated, noise, errors = (unit @ each @ unit.T for each in (stated, noise, errors))
         self._accumulate(0.5, np.outer(w, w) - stated, noise[None], errors)
@@ -323,6 +334,8 @@ class _Recursion:
         Errors count only if the score is significant; otherwise `size` and `excess` are 0.
         """
         info = self.info
+        # `alone` (j,) is the information about s^2 after elimination of c^2. `value` is the estimate of s^2, and
+        # `sure` is the estimate in its standard deviations. 1e-12 avoids a division by zero without rows.
         alone = np.maximum(info[:, 1, 1] - info[:, 0, 1] ** 2 / np.maximum(info[:, 0, 0], 1e-12), 1e-12)
         value = (self.score[:, 1] - info[:, 0, 1] * self.score[:, 0] / np.maximum(info[:, 0, 0], 1e-12)) / alone
         sure = value * np.sqrt(alone)

@@ -49,6 +49,7 @@ from optloc.tracking.updates import Filter, Update, Updated, filter_of, innovati
 # If the first scan is less likely than this, it contradicts the given state. The run is then refused, so the limit is
 # small.
 _CONTRADICTORY = 1e-9
+# Screen of a scan for lasting errors: REPEATS and EXCESS (sigmas) and SPREAD (m^2) of `optloc.kernels.filter`.
 Screen = tuple[float, float, float]
 
 

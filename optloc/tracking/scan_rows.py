@@ -255,16 +255,19 @@ def _prepared(problem: Problem, order: int, epochs: Array, index: Array) -> Scan
     found = tables(scan, (np.arange(m)[None],))
     if found is None or found.tables.local:
         return None
+    # `white` are whitening matrices, and `total` is their `size_of`. Independent rows need neither: they stay empty.
     divided, white, total = sources(scan), np.zeros((1, 0)), np.zeros((1, 2))
     covariance = variances(problem.noise, problem.count)[index]
     if any(block.row.shape[1] > 1 for block in problem.noise.blocks):
         dense = gathered(problem.noise, index)
         if (dense * (1.0 - np.eye(m))).any():
             covariance = dense.reshape(len(index), m * m)
+    # Variances (G, m) or covariances (G, m m); one line if all scans have the same.
     covariance = np.ascontiguousarray(covariance[:1] if (covariance == covariance[:1]).all() else covariance)
     if covariance.shape[1] > m:
         matrix = linalg.whitening(covariance.reshape(-1, m, m))
         white, total = np.ascontiguousarray(matrix.reshape(len(matrix), m * m)), size_of(matrix)
+    # Placeholders for measurements and weights, which `Scans.of` replaces.
     none = np.zeros((1, 1, m))
     station, sign = touched(problem)
     pairs, signs = np.ascontiguousarray(station[index[0]]), sign[index[0]]

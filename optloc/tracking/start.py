@@ -330,6 +330,7 @@ def begin(
     doubtful: list[_Stretch] = []
     verdict, last = Status.TOO_FEW_ROWS, first
     observed = _scans_with_rows(problem, first)
+    # `i` is an index of `observed`: scans without a row are no start. `last` is the scan of the present attempt.
     for i in _trial_scans(len(observed) if ends else np.inf):
         if i >= len(observed):
             raise Undecided(problem.epochs + 1)
@@ -345,9 +346,11 @@ def begin(
             doubtful.append(found)
         elif verdict != Status.CONTRADICTORY:
             break  # if all later scans leave the state open, fewer scans do so too
+        # Another first scan is tried only if the rows contradict each other.
         if found is not None and found.p >= _PLAUSIBLE:
             break
     if doubtful:
+        # The stretch with the least chi-square per degree of freedom; its redundancy can be 0.
         best = min(doubtful, key=lambda each: each.fit[0] / max(each.fit[1], 1))
         start = _doubtful_start(best)
         if start.code != Status.AMBIGUOUS:

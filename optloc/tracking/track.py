@@ -262,10 +262,12 @@ def _update_each(scan: Problem, ahead: State, rule: Update, causes: list[str]) -
         n, shape = ahead.mean.shape[-1], np.broadcast_shapes(scan.batch_shape, ahead.mean.shape[:-1])
         if math.prod(shape) == 1:
             causes.append(str(error) or type(error).__name__)
+            # A mean has one axis of n numbers, a covariance has two, and the other fields have none.
             mean, cov, none = (np.full((*shape, *([n] * core)), np.nan) for core in (1, 2, 0))
             return Updated(mean, cov, none, none, np.zeros(shape))
     mean = np.broadcast_to(ahead.mean, (*shape, n)).reshape(-1, n)
     cov = np.broadcast_to(ahead.cov, (*shape, n, n)).reshape(-1, n, n)
+    # `which` is the number of the scan of each state: several states may share one scan.
     size = math.prod(scan.batch_shape)
     which, flat = np.broadcast_to(np.arange(size).reshape(scan.batch_shape), shape).ravel(), scan.flat()
     each = [

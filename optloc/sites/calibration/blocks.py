@@ -116,6 +116,7 @@ def mirrored(problem: Problem, here: Array) -> Array:
     centred = (partners - middle[:, None]) * np.sqrt(weight)[..., None]
     axes = np.linalg.eigh(np.swapaxes(centred, 1, 2) @ centred)[1]
     along = np.einsum("bd,bdk->bk", here - middle, axes)
+    # `along` are the coordinates of a block in the principal axes: a mirror image changes the sign of one of them.
     single = here[:, None] - 2.0 * along[..., None] * np.swapaxes(axes, 1, 2)
     return np.concatenate([single, (2.0 * middle - here)[:, None]], axis=1)
 
@@ -150,12 +151,14 @@ def elsewhere(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
     """
     net = lik.network
     stations, d = np.array(_inexact_stations(net), dtype=int), net.dimension
+    # Entries: True for stations, numbers, present positions, and the batch of their fixes.
     groups = [(False, np.arange(net.pulses), at.pulses[0], pulses_alone(net, at))]
     if stations.size:
         groups.append((True, stations, at.stations[0, stations], stations_alone(net, at, stations)))
     near = _APART * float(np.ptp(np.concatenate([at.stations[0], at.pulses[0]]), axis=0).max())
     found = []
     for station, which, here, problem in groups:
+        # Start 0 is the present position: its cost is the reference of the gaps.
         x, cost = minima(problem, np.concatenate([here[:, None], mirrored(problem, here)], axis=1))
         x, gap = x[:, 1:, :d], np.where(np.isfinite(cost[:, 1:]), cost[:, 1:] - cost[:, :1], np.inf)
         for n in np.flatnonzero(gap.min(axis=1) <= MOVED):
@@ -233,6 +236,7 @@ def _block_of_fix(fix: Fix, index: int, name: str, station: bool, here: Array, a
     `above` is the cost of the present position minus the cost of the fix.
     """
     claims, d = fix.claims, len(here)
+    # The candidates are the fix (gap 0) and its alternatives.
     x = np.concatenate([fix.position[None, :d], fix.alternatives.x.reshape(-1, fix.x.shape[-1])[:, :d]])
     gaps = np.concatenate([[0.0], fix.alternatives.gap.ravel()])
     kept = np.isfinite(gaps) & np.isfinite(x).all(axis=1)
@@ -319,6 +323,7 @@ def _ranges_to_pulses(net: Network, at: NetworkEstimate) -> tuple[tuple[Array, A
         weight = np.where(net.given[:, r], net.sigma[:, r] ** -2.0, 0.0)
         z = net.z[:, r]
         ends: tuple[tuple[int, Array], ...]
+        # A difference gives an arrival at one station if the distance from the other station is known.
         if slot.kind == "tdoa":
             ends = ((slot.a, z + apart[slot.b]), (slot.b, apart[slot.a] - z))
         else:

@@ -112,6 +112,7 @@ class Likelihood:
         coordinates, and the pulses.
         """
         net, problem, (j, r) = self.network, self.problem, rows_of(self.network)
+        # `far` is the prior sigma of free coordinates about their start: the tether, or very wide.
         known = np.isfinite(net.place_sigma)
         place = np.where(known, net.place, at.stations)
         exact = _EXACT * (float(np.ptp(at.stations)) or 1.0)
@@ -120,6 +121,7 @@ class Likelihood:
         covariance = deviation[..., None] ** 2 * np.eye(net.dimension)
         first, second, sign = clock_signs(net)
         clock = sign[0, r] * at.clocks[:, first[r]] + sign[1, r] * at.clocks[:, second[r]]
+        # Rows of pulses come first. Rows from `len(r)` on are distances between stations: no clock, no weight.
         rows = []
         for block, start in zip(problem.rows, problem.starts, strict=True):
             part = slice(start, start + block.count)

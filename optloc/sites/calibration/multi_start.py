@@ -85,6 +85,7 @@ def search(
             agreed = found.agreeing >= AGREEING and _fits(net, found.cost)
             if agreed or made >= limit:
                 return found
+        # No start of this round converged: stop after twice the limit.
         if made >= 2 * limit:
             return found
     return found
@@ -129,6 +130,7 @@ def _sweep_block_moves(lik: Likelihood, at: NetworkEstimate, cost: float) -> tup
         if not found:
             break
         there, costs = lik.refine(together(*(moved(lik, at, block, block.places[0]) for block in found)))
+        # Accept only a fall of the cost that is larger than rounding.
         i = int(np.argmin(costs))
         if costs[i] >= cost - _SAME - equal_cost(cost):
             break

@@ -200,6 +200,7 @@ def _tables_by_pulse(
     standard deviations. If the same stations measure a pulse several times, each repetition has its own slot.
     Cells without a measurement have an infinite standard deviation.
     """
+    # `pulse` is the pulse of each row over all sections. `seen` counts the repetitions of a row in a pulse.
     labels, _, pulse = distinct(np.concatenate([one[1] for one in rows]))
     slots: dict[tuple[str, int, int, int], int] = {}
     cells: list[tuple[int, int, float, float]] = []
@@ -243,6 +244,7 @@ def write_calibrated(found: Calibration, title: str, out: Path, source: Path) ->
             f"the network has the status {found.status.label} and cannot be written", str(out), "see its findings"
         )
     claim(out, inputs=[source])
+    # A problem file has one sigma per station: the root mean square of its coordinates.
     net, sigma = found.network, np.sqrt(np.mean(found.sigma**2, axis=1))
     stations = []
     for name, place, deviation in zip(net.names, found.stations, sigma, strict=True):

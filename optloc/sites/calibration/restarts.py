@@ -131,6 +131,7 @@ def _arrivals_of_differences(ends: Array, values: Array, weight: Array, m: int) 
     design[np.arange(len(ends)), ends[:, 0]], design[np.arange(len(ends)), ends[:, 1]] = 1.0, -1.0
     design, values, weight = design[inside], values[inside], weight[inside]
     found = np.linalg.lstsq(design * np.sqrt(weight)[:, None], values * np.sqrt(weight), rcond=None)[0]
+    # The weight of each difference is divided between its two stations.
     total = (np.abs(design) * weight[:, None]).sum(axis=0)
     return np.where(group == largest, found, 0.0), np.where(group == largest, np.sqrt(total / 2.0), 0.0)
 
@@ -163,6 +164,8 @@ class Starts:
         One fit can give several networks, or none.
         """
         net, d = self.lik.network, self.dimension
+        # `full` marks the pulses with at least d + 3 arrivals, which the fit needs. The fit has no units: lengths are
+        # divided by `spread`, and arrivals are relative to `shift`.
         full = (self.weight > 0.0).sum(axis=1) >= d + 3
         relative = self.weight / self.weight.max()
         begun = random_stations(self.rng, count, net.stations, d)
@@ -175,9 +178,11 @@ class Starts:
         stations, pulses, which = upgrade(fit.take(order[new]))
         if not len(which):
             return _no_estimates(net), np.zeros(0, dtype=int)
+        # The fit calls the clock of a station b and the offset of a pulse o.
         b = fit.stations.b[order[new]][which] * self.spread
         places = np.zeros((len(which), net.pulses, d))
         places[:, full] = pulses * self.spread
+        # Pulses outside the fit start at the centre of the stations.
         places[:, ~full] = stations.mean(axis=1, keepdims=True) * self.spread
         offsets = np.zeros((len(which), net.pulses))
         offsets[:, full] = fit.pulses.o[order[new]][which] * self.spread
@@ -202,6 +207,7 @@ class Starts:
         net, d = self.lik.network, self.dimension
         size = np.full(d, self.spread)
         box = np.ones((count, 1, d)) * size
+        # In every second network, the last axis has only 30 % of the size: stations are often nearly flat.
         box[::2, :, -1] *= 0.3
         stations = (self.rng.random((count, net.stations, d)) - 0.5) * box
         pulses = (self.rng.random((count, net.pulses, d)) - 0.5) * box
@@ -249,6 +255,7 @@ def rounds(starts: Starts) -> Iterator[tuple[int, RoundEnds]]:
     net, d = starts.lik.network, starts.dimension
     full = int(((starts.weight > 0.0).sum(axis=1) >= d + 3).sum())
     able = net.stations >= d + 3 and full > 0 and max(net.stations, full) >= unknowns(d)
+    # `able`: a low-rank fit has enough stations and pulses. `patient`: the first round has only random positions.
     begun, patient = 0, net.stations >= _MANY
     while True:
         at, start = starts.random(_RANDOM), np.arange(_RANDOM) + begun
