@@ -202,6 +202,7 @@ def _chain_of_fix(detections: tuple[Any, ...], fix: Fix, terms: ChainTerms) -> D
     x, cov = np.concatenate([fix.x[None], rivals])[:_KEPT], np.array(fix.cov)
     d = fix.position.shape[-1]
     if terms.order and terms.speed and x.shape[1] == d:
+        # The velocity is zero with the prior covariance, independent of the position.
         x, cov = np.hstack([x, np.zeros_like(x)]), np.kron(np.diag([0.0, terms.speed**2]), np.eye(d))
         cov[:d, :d] = fix.cov
     good = len(x) == 1 and is_flat(cov[:d, :d], x[0, :d], detections[-1])
@@ -220,6 +221,7 @@ def near(chains: Sequence[DetectionChain], single: DetectionChain, terms: ChainT
         i for i, c in enumerate(chains) if c.last < detection.timestamp and _same_stations(c.detections[-1], detection)
     ]
     d = len(detection.measurement_model.mapping)
+    # `known` chains end before the detection. `blind` chains have no prediction, and `sharp` chains have a Gaussian.
     blind = [i for i in known if chains[i].cov is None or chains[i].x.shape[1] != d * (terms.order + 1)]
     sharp = [i for i in known if i not in set(blind)]
     out = [(1.0, i) for i in blind]
@@ -302,6 +304,7 @@ def grown(
     chosen: dict[Any, list[tuple[DetectionChain, DetectionChain, Array]]] = {}
     for chain, single in pairs:
         key, starts = _batch_key((*chain.detections, *single.detections)), _starts(chain, single, terms)
+        # Each new batch has a fixed amount of work, and each descent adds to it.
         if not work.take((0.0 if key in chosen else _BATCH) + _DESCENT * len(starts)):
             break
         chosen.setdefault(key, []).append((chain, single, starts))
@@ -327,6 +330,7 @@ def _fit_runs(
     out: list[DetectionChain | None] = [None] * len(runs)
     begun = [i for i, start in enumerate(starts) if len(start)]
     if begun:
+        # `item` is the run of each descent: a run has one descent for each start state.
         item = np.repeat(begun, [len(starts[i]) for i in begun])
         done = refine(problem, np.concatenate([starts[i] for i in begun]), item=item, limit=_STEPS)
         p = tail_probability(done.cost, dof[item])
@@ -361,6 +365,7 @@ def _chain_of_descents(run: tuple[Any, ...], done: Refined, p: Array, cov: Array
         apart = [done.x[i] - done.x[j] for j in kept]
         if all(not (np.linalg.solve(cov[j], a) @ a < _SAME) for j, a in zip(kept, apart, strict=True)):
             kept.append(i)
+    # Without redundancy the p-value is NaN and counts as 1. A failed descent (infinite cost) gets 0.
     value = 1.0 if np.isnan(p[first]) and np.isfinite(done.cost[first]) else float(np.nan_to_num(p[first]))
     good = len(kept) == 1 and is_flat(cov[first, :d, :d], done.x[first, :d], run[-1])
     return DetectionChain(run, done.x[np.array(kept, dtype=int)], cov[first] if good else None, value)

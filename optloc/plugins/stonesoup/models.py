@@ -165,6 +165,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         NotImplementedError
             If a measurement has no clean and unique fix; initiators of Stone Soup can skip such measurements.
         """
+        # `order` sorts the values by kind, as the problem needs them.
         z = np.asarray(detection.state_vector, dtype=float)[self.order].T
         fix = solve(self.problem.with_rows(z=z if len(z) > 1 else z[0])).flat()
         bad = np.flatnonzero(~fix.answered | fix.has(*_NOT_ONE_PLACE))

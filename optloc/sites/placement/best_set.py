@@ -350,6 +350,7 @@ def _bound_node(progress: _SearchState, bound: float, state: Array, w: Array) ->
         if bound >= progress.enough:
             return
         fixed = settle(low, cost, progress.enough, state)
+        # If at least a fifth of the free sites was fixed, relax again at once; otherwise the node stays open.
         if not fixed or (state == FREE).sum() > 0.8 * ((state == FREE).sum() + fixed):
             if fixed and not propagate(task.rules, task.limits, state):
                 return
@@ -373,6 +374,8 @@ def _enumerate(
 
 def _is_small(task: SearchTask, state: Array) -> bool:
     """Return whether a node has so few sets that enumeration is faster than a relaxation; `state` (n,) is its state."""
+    # `addable` sites fit at most. `counted`: the number of sites is the only rule, so only full sets count. `at_once`:
+    # the enumeration compares all candidates of the last site at once.
     sizes = task.rules[0][state == FREE]
     left = task.limits[0] - task.rules[0][state == IN].sum()
     addable = int((np.cumsum(np.sort(sizes)) <= left + _ROOM * max(1.0, abs(task.limits[0]))).sum())
@@ -410,7 +413,7 @@ def _round_to_set(task: SearchTask, state: Array, priority: Array) -> Array | No
     if task.fits(chosen[None])[0]:
         return np.asarray(chosen)
     # The greedy set may violate a rule with a least number of sites. Then an integer programme finds a set that
-    # meets all rules.
+    # meets all rules. `_ROOM` is a small reward for sites with priority 0.
     lower, upper = (state == IN).astype(float), (state != 0).astype(float)
     rules = LinearConstraint(task.rules, -np.inf, task.limits)
     found = milp(

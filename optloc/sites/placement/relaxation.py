@@ -106,6 +106,8 @@ def cheapest(cost: Array, size: Array, most: float, at: Array) -> tuple[float, f
 
     All arrays are (n,), and no entry of `size` is negative: this is a fractional knapsack problem.
     """
+    # Sites with a negative cost are taken in the order of cost per size. The last one may be taken in part: its rate
+    # is the multiplier.
     n = cost.shape[0]
     rate = np.empty(n)
     total = 0.0
@@ -167,6 +169,7 @@ def step(
     move, change, gain : array (n,), (2 n + R,), (R,)
         Output: the changes of w, multipliers and slacks.
     """
+    # Newton equations of the barrier problem; multipliers and slacks are eliminated, so only `move` is unknown.
     n, count = w.shape[0], rules.shape[0]
     for j in range(n):
         move[j] = mu / w[j] - mu / (1.0 - w[j]) - gradient[j]
@@ -182,6 +185,7 @@ def step(
     if not cholesky(hessian, len(move), 0.0):
         return 0.0
     solve_factored(hessian, move)
+    # Multipliers and slacks follow from the move. `reach` keeps the weights and slacks positive.
     reach = 1.0
     for i in range(count):
         for j in range(n):
@@ -292,6 +296,7 @@ def relax(
     while taken < most:
         taken += 1
         value = evaluate(rows, bases, weight, d, x, off, scale, kind, worst, state, values)
+        # `size` is the scale of the criterion. A log determinant can be 0, so its scale is d.
         if not np.isfinite(value):
             break
         size = float(d) if kind == VOLUME else abs(value)
@@ -300,6 +305,7 @@ def relax(
             begin(x, left, duals, rules, limits, mu)
             barrier_weights(values[0], _ABOVE * size, share)
             level = values[0].max() + _ABOVE * size
+        # The level must stay above all items: their slacks are positive.
         level = max(level, values[0].max() + 0.5 * mu)
         low = weigh(values, level, mu, share, turns)
         derive(rows, bases, weight, d, x, off, scale, kind, worst, state, turns, slopes, hessian)
@@ -387,6 +393,8 @@ def go(
     """
     n, count, items = x.shape[0], left.shape[0], share.shape[0]
     move, change, gain = np.empty(n), np.empty(2 * n + count), np.empty(count)
+    # `turn` are the changes of the multipliers of the items. `rise` is the change of the level: a constant part, plus
+    # `pull` times the move of the weights. `grow` is the change of the slack of an item.
     turn, pull, rise = np.empty(items), np.zeros(n), 0.0
     if items > 1:
         rise, pull = share_out(values, level, mu, share, active, slopes, gradient, hessian)
