@@ -255,7 +255,7 @@ def _prepared(problem: Problem, order: int, epochs: Array, index: Array) -> Scan
     found = tables(scan, (np.arange(m)[None],))
     if found is None or found.tables.local:
         return None
-    # `white` are whitening matrices, and `total` is their `size_of`. Independent rows need neither: they stay empty.
+    # `white` are whitening matrices, and `total` is their `size_of`. Independent rows need neither: empty and zero.
     divided, white, total = sources(scan), np.zeros((1, 0)), np.zeros((1, 2))
     covariance = variances(problem.noise, problem.count)[index]
     if any(block.row.shape[1] > 1 for block in problem.noise.blocks):

@@ -138,6 +138,7 @@ def over(one: NetworkEstimate, at: NetworkEstimate) -> NetworkEstimate:
     Then the positions of two free networks can be compared.
     """
     a, b = one.stations[0], at.stations[0]
+    # The orthogonal matrix nearest to the correlation of the centred stations; it may mirror.
     u, _, v = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
     turn = u @ v
     return replace(

@@ -33,6 +33,8 @@ def bent(lik: Likelihood, at: NetworkEstimate) -> tuple[NetworkEstimate, Array] 
     if rank.open.shape[1]:
         return None
     width, axes = np.linalg.eigh(rank.covariance(rank.free.T))
+    # Eigenvalues ascend, so the last directions have the largest variance. Each direction has a copy for each distance
+    # and sign.
     weak = np.flatnonzero(width > _EXACT * width[-1])[-_WEAK:]
     deviation = np.repeat(np.sqrt(width[weak]), 2 * len(_STEPS))
     far = np.tile([*_STEPS, *(-step for step in _STEPS)], len(weak)) * deviation

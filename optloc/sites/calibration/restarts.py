@@ -315,6 +315,8 @@ def _align(points: Array, place: Array, weight: Array, rng: np.random.Generator)
     random rotations, because there can be several minima.
     """
     s, m, d = points.shape
+    # Axes: S networks, `_TURNS` starts (t), M stations, d coordinates, rotation generators (g). The random matrices are
+    # orthogonal; a change of one sign makes each of them a rotation.
     generators = np.array([_generator(i, k, d) for i in range(d) for k in range(i)])
     turn = np.linalg.qr(rng.standard_normal((_TURNS, d, d)))[0]
     turn[np.linalg.det(turn) < 0, 0] *= -1.0
@@ -325,10 +327,13 @@ def _align(points: Array, place: Array, weight: Array, rng: np.random.Generator)
     for _ in range(_LAID):
         turned = points[:, None] @ np.swapaxes(turn, -1, -2)
         residual = ((place - turned - move[:, :, None]) * weight).reshape(s, _TURNS, m * d)
+        # `spun` and `shifts` are the whitened derivatives of the stations by the rotation and by the shift.
         spun = np.einsum("gab,stmb->stmag", generators, turned) * weight[..., None]
         shifts = np.broadcast_to(np.eye(d) * weight[..., None], (s, _TURNS, m, d, d))
         columns = np.concatenate([spun, shifts], axis=-1).reshape(s, _TURNS, m * d, -1)
         normal = np.swapaxes(columns, -1, -2) @ columns
+        # `diagonal` is a view of the normal matrix. The small terms keep the matrix regular if some coordinates are
+        # unknown.
         diagonal = np.einsum("stii->sti", normal)
         diagonal += 1e-6 * diagonal + 1e-9 * diagonal.max(axis=-1, keepdims=True) + 1e-290
         gradient = np.einsum("stqp,stq->stp", columns, residual)

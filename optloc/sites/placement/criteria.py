@@ -293,6 +293,7 @@ def evaluate(
     values : array (2, Q)
         Output for each item of the maximum: smoothed value, and value of the tangent.
     """
+    # `mean` is the criterion of a scenario: over all places, or of one place for `worst`. `best` is the largest.
     places, r, m, n = rows.shape
     inverse, turn, basis, shares = state
     scaled, matrix, lower = np.empty((r, m, n)), np.empty((m, m)), np.empty((m, m))
