@@ -2,6 +2,10 @@
 
 Letters: k epochs, m rows of an epoch, d coordinates, N runs of a batch (...). A fitted polynomial has q =
 1 or 2 numbers for each row: its present value and, for an order above 0, its rate per second.
+
+Arguments of many functions: `problem` is the run, and `apart` is this run with a separate problem for
+each epoch. `window` is the number of past epochs in a fit, or None for all. `scan` is one epoch of N
+runs.
 """
 
 from __future__ import annotations

@@ -4,6 +4,9 @@ Scans have the same structure if their rows have the same kinds, stations and ta
 one `ScanRows`.
 
 Letters: m rows of a scan, n numbers of a state, G scans of one structure, N states of a batch (...).
+
+Arguments of many functions: `problem` is the run, and `order` is the order of the state (0: position, 1:
+with velocity, 2: with acceleration).
 """
 
 from __future__ import annotations

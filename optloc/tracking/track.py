@@ -1,4 +1,8 @@
-"""Prediction and update of the state of a target, scan by scan, and the types `State` and `Track`."""
+"""Prediction and update of the state of a target, scan by scan, and the types `State` and `Track`.
+
+Arguments of many functions: `problem` is a run of one target, `dynamics` is the model of motion, `rule`
+is the filter, and `ahead` is a predicted state.
+"""
 
 from __future__ import annotations
 

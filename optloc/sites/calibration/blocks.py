@@ -5,6 +5,9 @@ a block is a fix from its partners, which are the stations of this fix.
 
 Letters: M stations, N pulses, R slots (columns of measurements), S estimates, B blocks with K start
 positions each, d coordinates. A clock is an offset times the propagation speed, metres.
+
+Arguments of many functions: `net` is the network, `lik` is its likelihood, and `at` are estimates of all
+unknowns (one estimate, S = 1, unless a function says otherwise).
 """
 
 from __future__ import annotations

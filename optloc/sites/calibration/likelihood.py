@@ -6,6 +6,8 @@ over the run.
 Letters: S estimates, M stations, N pulses, R slots (columns of measurements), m rows of a run, d coordinates. P is the
 number of station unknowns: M d coordinates, then M clocks if the stations do not share a clock. A
 whitened number is divided by its standard deviation.
+
+Arguments of many functions: `net` is the network, and `at` are estimates of all unknowns.
 """
 
 from __future__ import annotations

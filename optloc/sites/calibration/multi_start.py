@@ -3,6 +3,9 @@
 Each round makes starts (`restarts.rounds`) and then moves single stations or pulses (`blocks`) of the
 cheapest networks. A block is one station or pulse. The cost is chi-square: the sum of squared whitened
 residuals.
+
+Arguments of many functions: `net` is the network, `lik` is its likelihood, and `at` is one estimate of
+all unknowns (S = 1).
 """
 
 from __future__ import annotations

@@ -9,6 +9,9 @@ Letters: S networks, N pulses, R slots, B blocks (a block is one station or puls
 
 Source: S. Geman and D. McClure, "Statistical methods for tomographic image reconstruction", Bull. Int.
 Stat. Inst. 52 (1987).
+
+Arguments of many functions: `lik` is the likelihood of the network, and `at` are estimates of all
+unknowns. `starts` provides random numbers and the size of the network.
 """
 
 from __future__ import annotations

@@ -8,6 +8,10 @@ values of all its sets.
 The search takes the open node with the lowest bound first. The bound is a relaxation
 (`optloc.sites.placement.relaxation`) that starts with the weights of the parent node. Sites whose reduced
 cost excludes one of their two values are fixed at once.
+
+Arguments of many functions: `task` is the search task, `asked` are its arguments for the enumeration, and
+`progress` is the state of the running search. `chosen` (n,) is a set, and `seed` is the seed of random
+numbers.
 """
 
 from __future__ import annotations

@@ -2,6 +2,9 @@
 
 `place` builds the candidates, searches the best set with a proven bound, and simulates fixes with it. If too
 many of these fixes are ambiguous, `place` takes the next best set.
+
+Arguments of many functions: `candidates` are the sites as arrays, `task` is the search task, and `chosen`
+(n,) is a set of sites: 1 for each taken site.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""Continuous refinement of a placement: the new sites move inside their regions to reduce the bound."""
+"""Continuous refinement of a placement: the new sites move inside their regions to reduce the bound.
+
+Arguments of many functions: `candidates` are the sites as arrays, and `places` are positions of the
+moving sites, metres.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Selection files: candidates, places, measurements and rules; output of the chosen sites as a problem file."""
+"""Selection files: candidates, places, measurements and rules; output of the chosen sites as a problem file.
+
+Arguments of many functions: `section` is a table of the file, `folder` is the folder of the file, and
+`source` or `where` is the location in the file for error messages. `frame` and `dimension` belong to the
+coordinates.
+"""
 
 from __future__ import annotations
 

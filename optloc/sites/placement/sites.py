@@ -3,6 +3,9 @@
 A site is a possible position of a station. A place is a possible position of the target. `candidates_of`
 linearises the rows of all sites at all places, so that the search (`optloc.sites.placement.best_set`) needs
 no measurement model.
+
+Arguments of many functions: `problem` has the rows of all sites, `names` are the names of the sites, and
+`vectors` are the unknowns of the target at each place.
 """
 
 from __future__ import annotations
