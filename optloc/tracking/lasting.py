@@ -203,7 +203,11 @@ class _Recursion:
         return np.asarray(0.5 * (wide + wide.T))
 
     def begin(self, rows: _LastingRows, cov: Array) -> None:
-        """Add the fix of a stretch of scans, with the covariance (n, n) of its state, and start the parts from it."""
+        """Add the fix of a stretch of scans, and start the parts of the covariance from it.
+
+        `rows` are the rows of the fix, and `cov` (n, n) is the covariance of its state. With more than `_MOST`
+        rows, the start is not tested.
+        """
         self.reset(cov)
         self.scans = 0
         if 0 < len(rows.residual) <= _MOST:
@@ -356,7 +360,7 @@ def _solve_regularised(matrix: Array, right: Array) -> Array:
 
 
 def _whitening(cov: Array, other: Array | None = None) -> Array:
-    """Return the inverse root (m, m) of a covariance; it whitens vectors with this covariance.
+    """Return the inverse root (m, m) of the covariance `cov` (m, m); it whitens vectors with this covariance.
 
     If rounding makes the covariance indefinite, `other` replaces it (if given), and small eigenvalues are
     raised.
@@ -433,8 +437,9 @@ class LastingErrors:
     def take(self, taken: Taken, dynamics: Dynamics, cov: Array, screen: tuple[float, float, float] | None) -> Array:
         """Return the covariance (n, n) of the state after a scan, lasting errors included.
 
-        `cov` (n, n) is the covariance of the filter after the scan. `screen` contains REPEATS, EXCESS and SPREAD
-        of the scan; it is None for a scan that the compiled filter does not support.
+        `taken` is the scan (see `Taken`), and `dynamics` is the model of motion. `cov` (n, n) is the covariance of
+        the filter after the scan. `screen` contains REPEATS, EXCESS and SPREAD of the scan; it is None for a scan
+        that the compiled filter does not support.
         """
         self._recent.append(taken)
         if not self._on:
@@ -464,7 +469,7 @@ class LastingErrors:
 
 
 def _process_scan(found: _Recursion, taken: Taken, dynamics: Dynamics, memory: Array | None) -> None:
-    """Process a scan in the recursion `found`.
+    """Process a scan (`taken`, see `Taken`) in the recursion `found`; `dynamics` is the model of motion.
 
     The rows of the scan are in `memory`, see `LastingErrors.memory`. Without `memory`, the rows are
     linearised again.

@@ -169,7 +169,7 @@ def _propagate(estimator: Array, apart: Problem, past: slice) -> Array:
 
 
 def _line_track(problem: Problem, apart: Problem, fitted: Array, cov: Array, ok: Array) -> Track:
-    """Return the track of fitted values (..., k, q, m) with covariance (..., k, q, m, q, m).
+    """Return the track of fitted values (..., k, q, m) with covariance `cov` (..., k, q, m, q, m).
 
     Here k counts only the epochs that can have a polynomial: the first `order` epochs are omitted. `ok` (..., k)
     marks epochs with a polynomial. `apart` is the run with a separate problem for each epoch.

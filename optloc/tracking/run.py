@@ -225,7 +225,10 @@ class _TrackRun:
             condition.judge(vague)
 
     def _start_entries(self, begun: Beginning, k: int, condition: Condition) -> Iterator[Entry]:
-        """Yield the scans of a start, from scan `k`; only the last scan has a state."""
+        """Yield the scans of a start (`begun`), from scan `k`; only the last scan has a state.
+
+        `condition` is the condition of the track before the start.
+        """
         n = (self.dynamics.order + 1) * self.problem.dimension
         # Scans of a start have no separate states: their common fix is valid at the last scan.
         why = condition.why
@@ -292,7 +295,7 @@ class _TrackRun:
     def _too_uncertain(self, ahead: State, silence: float) -> str:
         """Return the reason why a prediction is too uncertain to follow; empty if it is not.
 
-        `silence` is the time since the last valid row, s.
+        `ahead` is the prediction. `silence` is the time since the last valid row, s.
         """
         d = self.problem.dimension
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(ahead.cov[:d, :d])[-1], 0.0)))
@@ -320,7 +323,7 @@ class _TrackRun:
         return self._entry(k, done, int(code), gated, causes), fit, None
 
     def _entry(self, k: int, done: Updated, code: int, gated: int, causes: list[str]) -> Entry:
-        """Return the entry of an update `done` with a status `code`.
+        """Return the entry of scan `k` from its update `done` with a status `code`.
 
         `gated` is the number of rows that failed the gate. `causes` are the causes of a numerical failure.
         """

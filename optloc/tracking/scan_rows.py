@@ -288,7 +288,7 @@ def _first_of(problem: Problem, order: int, epochs: Array) -> Problem:
 
 
 def size_of(white: Array) -> Array:
-    """Return rank and ln det(2 pi R), (..., 2), of covariances R from their whitening matrices (..., r, r).
+    """Return rank and ln det(2 pi R), (..., 2), of covariances R from their whitening matrices `white` (..., r, r).
 
     For a singular covariance, the determinant follows from the nonzero singular values of the matrix.
     """

@@ -375,7 +375,11 @@ def _doubtful_start(best: _Stretch) -> Beginning:
 
 
 def _rivals(posed: Problem, best: _Stretch) -> Iterator[Rival]:
-    """Yield the other minima of a start as states; `posed` is its problem, of which only the kept rows are used."""
+    """Yield the other minima of a start as states.
+
+    `posed` is the problem of the start `best`; rows that a robust fix left out are not used. Each minimum is
+    refined again, because its covariance is needed.
+    """
     kept = posed.with_rows(weight=posed.weight * (best.fix.weights > 0.0))
     others = best.fix.alternatives
     for x, gap in zip(others.x, others.gap, strict=True):

@@ -294,7 +294,10 @@ def _prediction_only(ahead: State) -> Updated:
 
 
 def collect(times: Array, steps: list[tuple[Updated, Array]], dimension: int) -> Track:
-    """Return the updates and statuses of all scans, in the order of their `times` (k,), s, as a track."""
+    """Return the updates and statuses of all scans as a track.
+
+    `steps` are the update and status of each scan, in the order of the `times` (k,), s. `dimension` is 2 or 3.
+    """
     if not steps:
         raise InvalidProblem("no scan is later than the start", "start", "give a start before the last scan")
 

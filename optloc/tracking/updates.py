@@ -227,11 +227,14 @@ def reweighted(update: Update | str, loss: Loss | str) -> Update:
     chosen: Loss = loss
 
     def robust(scan: Problem, mean: Array, cov: Array) -> Updated:
-        """Return the update of predicted states (..., n) with weighted rows, until the weights are constant."""
+        """Return the update with weighted rows, repeated until the weights are constant.
+
+        `mean` (..., n) and `cov` (..., n, n) are the predicted states.
+        """
         # Scan and state may have different leading axes; the loss works on a flat batch.
         many = np.broadcast_shapes(scan.batch_shape, mean.shape[:-1])
         x, flat = np.broadcast_to(mean, (*many, mean.shape[-1])).reshape(-1, mean.shape[-1]), scan.flat()
-        # `doubt` holds, for each row, `base` (weight without the loss), `own` (variance) and `sided` (gross errors are
+        # `doubt` contains, for each row, `base` (weight without the loss), `own` (variance) and `sided` (gross errors are
         # positive only).
         doubt = Doubt.of(flat, x)
         # An innovation includes the uncertainty of the prediction, so an uncertain state does not reduce the weight of

@@ -217,7 +217,7 @@ def near(chains: Sequence[DetectionChain], single: DetectionChain, terms: ChainT
 
     The distance is the squared innovation in units of its covariance, divided by the gate: 1 at the edge of
     the gate. Chains without a Gaussian state have no prediction and get the distance 1. Chains beyond the
-    gate are omitted. `single` is the chain of the detection alone.
+    gate are omitted. `chains` are the waiting chains, and `single` is the chain of the detection alone.
     """
     detection = single.detections[-1]
     known = [

@@ -121,6 +121,8 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
     def initiate(self, detections: Any, timestamp: dt.datetime, **kwargs: Any) -> set[Track]:
         """Return the new tracks from detections that do not belong to a track yet.
 
+        Stone Soup passes `timestamp`; it is not used, because each detection has its own time.
+
         Raises
         ------
         InvalidProblem
@@ -148,6 +150,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         """Return new chains from a scan: extended chains (they replace the old chains), and single detections.
 
         Each chain and each detection is used at most once. The replaced chains are removed from the waiting chains.
+        `work` is the work that the call can still do.
         """
         terms = ChainTerms(self.order, self.speed, self.least_p)
         # If the rows of one detection do not fit together, no chain with this detection fits.

@@ -457,7 +457,7 @@ class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
             yield time, {self._join(group) for group in groups.values()}
 
     def _join(self, group: list[Detection]) -> Detection:
-        """Return one vector detection from the pair detections of one target at one time."""
+        """Return one vector detection from `group`, the pair detections of one target at one time."""
         group = sorted(group, key=lambda detection: np.atleast_2d(detection.measurement_model.pairs).tolist())
         models = [detection.measurement_model for detection in group]
         first = models[0]

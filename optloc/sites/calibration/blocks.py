@@ -301,9 +301,10 @@ def _station_fixes(net: Network, at: NetworkEstimate, which: list[int]) -> list[
 
 
 def _fixes_with_proof(problem: Problem, here: Array) -> Fix:
-    """Return fixes of a batch of blocks with their proof; with many rows, from the present positions `here` (n, d).
+    """Return fixes of a batch of blocks (`problem`) with their proof.
 
-    Other starts need matrices of all rows.
+    With more than `_MANY` rows, the refinement starts from the present positions `here` (n, d), metres, because
+    a search needs matrices of all rows.
     """
     if problem.count <= _MANY:
         return solve(problem)
@@ -365,9 +366,9 @@ def moved_pulses(lik: Likelihood, at: NetworkEstimate, which: Array, places: Arr
 
 
 def _moved_station(lik: Likelihood, at: NetworkEstimate, i: int, place: Array) -> NetworkEstimate:
-    """Return an estimate (S = 1) with station `i` at another position (d,), metres.
+    """Return an estimate (S = 1) with station `i` at the position `place` (d,), metres.
 
-    Its clock is changed to the value that fits there best.
+    Its clock is changed to the value that fits there best. A coordinate of `place` that is NaN does not change.
     """
     stations, clocks, net = at.stations.copy(), at.clocks.copy(), lik.network
     stations[0, i] = np.where(np.isfinite(place), place, stations[0, i])

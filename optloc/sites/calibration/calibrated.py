@@ -292,7 +292,7 @@ def _add_other_pulses(network: Network, at: NetworkEstimate, core: Array, rest: 
 def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, named: tuple[int, ...]) -> Calibration:
     """Return the calibration of the refined estimate `at` (S = 1): proofs, frame, covariance, findings and status.
 
-    `found` is the search, and `named` are the stations of the frame.
+    `lik` has all pulses with enough rows. `found` is the search, and `named` are the stations of the frame.
     """
     net = lik.network
     # `soft`: prior coordinates define the frame; otherwise `named` or all stations define it.

@@ -160,8 +160,8 @@ def _span(columns: Array) -> Array:
 def _null_space(jacobian: Array, basis: Array, size: float) -> Array:
     """Return a basis (P, f) of the directions in a subspace that a matrix maps to zero.
 
-    `basis` (P, k) spans the subspace. A singular value of at most `_ZERO` times `size`, the norm of the
-    matrix, is zero.
+    The matrix is `jacobian` (q, P), and `basis` (P, k) spans the subspace. A singular value of at most `_ZERO`
+    times `size`, the norm of the matrix, is zero.
     """
     if not basis.shape[1]:
         return basis

@@ -25,7 +25,8 @@ _EXACT = 1e-9
 def bent(lik: Likelihood, at: NetworkEstimate) -> tuple[NetworkEstimate, Array] | None:
     """Return the minima that moved networks reach, and their costs (S,); None if an open motion changes no row.
 
-    Each copy of the network (`at`, S = 1) is moved along one direction of large variance. A tether is a prior
+    `lik` is the likelihood of the network. Each copy of the network (`at`, S = 1) is moved along one direction of
+    large variance. A tether is a prior
     with a small standard deviation. In a first refinement, it keeps the stations at their new positions, so
     that better determined directions adapt. A second refinement has no tether.
     """

@@ -95,7 +95,10 @@ def search(
 
 
 def _add_round(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> NetworkSearchResult:
-    """Add the minima of a round to the search result, and return the result; `made` is the number of starts."""
+    """Add the minima of a round (`ends`) to the search result, and return the result.
+
+    `found` is the result so far, or None before the first round; it is changed. `made` is the number of starts.
+    """
     if found is not None:
         ends = joined([found.ends, ends])
     i = int(ends.cost.argmin())

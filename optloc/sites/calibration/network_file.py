@@ -153,8 +153,8 @@ def read_network(path: Path) -> Network:
 def _prior_places(section: NetworkStations, table: Table, where: str) -> tuple[Array, Array]:
     """Return prior station coordinates (M, d) and their standard deviations, metres.
 
-    If a cell is empty, the coordinate is 0 and its standard deviation is infinite. `where` is the location of
-    the section for messages.
+    `section` is the table of stations in the file, and `table` are its rows. If a cell is empty, the coordinate
+    is 0 and its standard deviation is infinite. `where` is the location of the section for messages.
     """
     unit = Units("length").conversion(section.unit, where)
     keys = ("x", "y", "z")[: section.dimension]
@@ -230,8 +230,8 @@ def check_name(out: Path) -> None:
 def write_calibrated(found: Calibration, title: str, out: Path, source: Path) -> None:
     """Write a problem file with the estimated stations, their standard deviations, and the rows of the pulses.
 
-    The clocks are subtracted from the rows. `source` is the network file, which must not be overwritten by
-    `out`.
+    `found` is the calibration, and `title` is the first part of the title of the new file. The clocks are
+    subtracted from the rows. `source` is the network file, which must not be overwritten by `out`.
 
     Raises
     ------

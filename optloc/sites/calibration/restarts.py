@@ -237,7 +237,11 @@ def _no_estimates(net: Network) -> NetworkEstimate:
 
 
 def starts_of(lik: Likelihood, seed: int) -> Starts:
-    """Return the generator of starts for a network; `seed` is the seed of its random numbers."""
+    """Return the generator of starts for a network; `seed` is the seed of its random numbers.
+
+    `lik` is the likelihood of the network. The extent of a pulse is its largest range, or the difference between
+    its last and first arrivals. The size of the network is the 90 % quantile of these extents.
+    """
     z, weight, emission = arrivals(lik.network)
     measured = weight > 0.0
     shift = np.where(emission, [np.median(z[j, measured[j]]) if measured[j].any() else 0.0 for j in range(len(z))], 0.0)
@@ -312,7 +316,7 @@ def _align(points: Array, place: Array, weight: Array, rng: np.random.Generator)
 
     `points` (S, M, d) are centred stations, and `place` (M, d) are the known coordinates, metres. `weight`
     (M, d) are inverse standard deviations, 0 for unknown coordinates. Gauss-Newton steps start from `_TURNS`
-    random rotations, because there can be several minima.
+    random rotations (from `rng`), because there can be several minima.
     """
     s, m, d = points.shape
     # Axes: S networks, `_TURNS` starts (t), M stations, d coordinates, rotation generators (g). The random matrices are

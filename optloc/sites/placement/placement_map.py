@@ -80,7 +80,7 @@ def plot_placement(
 
 
 def _mark(axes: Axes, found: BoundMap, chosen: Array, places: Array, weights: Array, scale: float) -> None:
-    """Draw places, candidates and taken stations into a map.
+    """Draw places, candidates and taken stations into a map (`found`).
 
     `chosen` (s,) marks the taken stations. `places` (P, 2) are in the units of the axes: metres, km or
     degrees. `scale` converts the positions of the stations to these units. The markers of places grow with

@@ -106,8 +106,8 @@ def cheapest(cost: Array, size: Array, most: float, at: Array) -> tuple[float, f
 
     All arrays are (n,), and no entry of `size` is negative: this is a fractional knapsack problem.
     """
-    # Sites with a negative cost are taken in the order of cost per size. The last one may be taken in part: its rate
-    # is the multiplier.
+    # Sites with a negative cost are taken in the order of cost per size. The last of them may be taken in part: its
+    # rate is the multiplier.
     n = cost.shape[0]
     rate = np.empty(n)
     total = 0.0
@@ -339,7 +339,8 @@ def mix(turns: Array, slopes: Array, gradient: Array) -> None:
 def product(x: Array, left: Array, duals: Array, level: float, values: Array, share: Array) -> float:
     """Return the mean product of slacks and multipliers of sites, rules and (if there are several) items.
 
-    The next barrier parameter is a share of this mean. `go` explains the arguments.
+    The next barrier parameter is a share of this mean. The arguments are as in `go`: weights `x`, slacks `left`,
+    multipliers `duals`, `level`, items `values` and multipliers `share` of the items.
     """
     n, count, items = x.shape[0], left.shape[0], share.shape[0]
     total, terms = 0.0, 2 * n + count
@@ -460,7 +461,7 @@ def meets(w: Array, rules: Array, limits: Array) -> bool:
 
 @compiled
 def begin(w: Array, left: Array, duals: Array, rules: Array, limits: Array, mu: float) -> None:
-    """Write the first slacks (R,) and multipliers (2 n + R,) at w: each product of slack and multiplier is mu.
+    """Write the first slacks `left` (R,) and multipliers `duals` (2 n + R,) at w: each of their products is mu.
 
     A slack is at least 0.1, also if the weights violate the rule: the steps then remove the violation.
     """

@@ -1,6 +1,6 @@
 """Selection files: candidates, places, measurements and rules; output of the chosen sites as a problem file.
 
-Arguments of many functions: `section` is a table of the file, `folder` is the folder of the file, and
+Arguments of many functions: `section` is a table of the file, and `folder` is the folder of the file.
 `source` or `where` is the location in the file for error messages. `frame` and `dimension` belong to the
 coordinates.
 """
