@@ -231,8 +231,8 @@ def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
     `scan` has one row for each channel. `ahead` contains the predicted targets (..., t), and `z` (..., m, c)
     the candidates. `clutter` gives detection probability and false rows.
 
-    Sets grow channel by channel: the density of a set is the product of the densities of each
-    row given the rows before it. If there are too many sets, only the best partial sets are kept.
+    Sets grow channel by channel: the density of a set is the product of the densities of each row given the
+    rows before it. If there are too many sets, only the best partial sets are kept.
     """
     apart, S = offsets(scan, ahead, z)
     distance = distances(apart, S, clutter.width)

@@ -1,4 +1,7 @@
-"""Track of a whole run: started by a fix, gated, and restarted if the model of motion cannot follow the target."""
+"""Track of a whole run: started by a fix, gated, and restarted if the model of motion cannot follow the target.
+
+Letters: m rows of the run, n numbers of a state.
+"""
 
 from __future__ import annotations
 
@@ -335,7 +338,7 @@ class _TrackRun:
 
 @dataclass(frozen=True, slots=True)
 class _ScanOutcome:
-    """A scan after its update: status, numbers of rejected and used rows, and causes of a numerical failure."""
+    """A scan after its update: status, numbers of rejected rows and of used rows (`count`), and causes of a failure."""
 
     status: Status
     rejected: int

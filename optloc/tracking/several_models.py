@@ -1,4 +1,7 @@
-"""Several models of motion for one target: in parallel, or interacting (IMM) for a target that changes its motion."""
+"""Several models of motion for one target: in parallel, or interacting (IMM) for a target that changes its motion.
+
+Letters: k scans, q models, n numbers of a state, d coordinates, (...) a batch of targets.
+"""
 
 from __future__ import annotations
 

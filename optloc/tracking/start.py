@@ -1,5 +1,7 @@
 """Initial states of tracks: a fix of one epoch, or of several epochs that determine a velocity.
 
+Letters: n numbers of a state, d of them coordinates of the position.
+
 Arguments of many functions: `problem` is a run of one target, and `dynamics` is the model of motion.
 `speed` (m/s) and `rate` (m/s^2) are prior sigmas of velocity and acceleration, or None. `method` is a
 method of `optloc.solve`.

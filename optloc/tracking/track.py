@@ -1,5 +1,7 @@
 """Prediction and update of the state of a target, scan by scan, and the types `State` and `Track`.
 
+Letters: k scans, m rows of a scan, n numbers of a state, d coordinates, (...) a batch of targets.
+
 Arguments of many functions: `problem` is a run of one target, `dynamics` is the model of motion, `rule`
 is the filter, and `ahead` is a predicted state.
 """
@@ -63,10 +65,10 @@ class Track:
     count : int array (..., k)
         Number of rows used.
     loglikelihood : array (..., k)
-        Log-likelihood of each scan given the prediction.
+        Log-likelihood of each scan given the prediction; 0 if no row was used.
     code : int array (..., k)
         `Status` of each scan. Ok. Too few rows: no valid row, the state is only predicted. Rejected: rows failed
-        the gate or are not finite. Numerical: the state is lost.
+        the gate or are not finite. Numerical: the update failed, the state is only predicted.
     dimension : int
         2 or 3.
     """

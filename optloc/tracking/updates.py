@@ -234,8 +234,8 @@ def reweighted(update: Update | str, loss: Loss | str) -> Update:
         # Scan and state may have different leading axes; the loss works on a flat batch.
         many = np.broadcast_shapes(scan.batch_shape, mean.shape[:-1])
         x, flat = np.broadcast_to(mean, (*many, mean.shape[-1])).reshape(-1, mean.shape[-1]), scan.flat()
-        # `doubt` contains, for each row, `base` (weight without the loss), `own` (variance) and `sided` (gross errors are
-        # positive only).
+        # `doubt` contains, for each row, `base` (weight without the loss), `own` (variance) and `sided` (gross errors
+        # are positive only).
         doubt = Doubt.of(flat, x)
         # An innovation includes the uncertainty of the prediction, so an uncertain state does not reduce the weight of
         # a row.

@@ -5,8 +5,8 @@ values needs one descent, which is an iterative refinement. A search without sta
 hundreds of descents.
 
 Letters: d coordinates, n numbers of a state (position, and velocity if it is known), B runs of
-detections, m rows, q states. The gate is the largest distance between a detection and a prediction at
-which both are compared.
+detections, C chains, K descents, m rows, q states. The gate is the largest distance between a detection
+and a prediction at which both are compared.
 
 Arguments of many functions: `terms` are the assumptions about all targets (`ChainTerms`), and `work` is
 the work that the call can still do.

@@ -1,8 +1,10 @@
 """Self-calibration of a network: search, block moves with proofs, and a result with status and findings.
 
-`calibrate` searches with up to 60 pulses, adds the other pulses as fixes, and refines everything together.
-Then it tests the result: open motions, mirror images, misfit, alternatives and proofs of single stations and
-pulses.
+`calibrate` searches with up to 60 pulses, adds the other pulses as fixes, and refines everything together. Then it
+tests the result: open motions, mirror images, misfit, alternatives and proofs of single stations and pulses.
+
+Letters: M stations, N pulses, R columns of measurements, d coordinates. P is the number of station coordinates M d,
+plus M clocks if the stations do not share a clock. `lik` is the likelihood of a network.
 """
 
 from __future__ import annotations
@@ -37,9 +39,8 @@ from optloc.solvers import AMBIGUOUS_GAP, LISTED_GAP, P_MISFIT, Finding, objecti
 _CORE = 60
 # Method for the other pulses; their proof follows with the proofs of all pulses.
 _QUICK = "gtrs+lsr"
-# Largest share of pulses with two possible positions. With more of them, the choice of their sides has many
-# combinations, and the cheapest one can give a wrong shape of the stations. At 3 cm noise, flat stations appear
-# 0.1 to 0.3 m thick.
+# Largest share of pulses with two possible positions. More of them have many combinations of sides, and the cheapest
+# combination can give a wrong shape of the stations. At 3 cm noise, flat stations appear 0.1 to 0.3 m thick.
 _TWOFOLD = 0.5
 # Difference of distances, as a share of the size, from which two networks are different.
 _ALIKE = 1e-3
@@ -47,8 +48,7 @@ _ALIKE = 1e-3
 _WITHIN = 0.05
 # Variances below this share of the largest belong to changes of distances that no motion of stations can make.
 _ZERO = 1e-9
-# Share of the largest pulse displacement from which another pulse has a different position too, and does not
-# only follow the stations.
+# Share of the largest pulse displacement above which another pulse is elsewhere too, and not only follows the stations.
 _GIVES_WAY = 0.1
 # Largest share that another network with nearly the same stations may add to the squared errors: 10 % of a
 # standard deviation.
@@ -292,7 +292,7 @@ def _add_other_pulses(network: Network, at: NetworkEstimate, core: Array, rest: 
 def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, named: tuple[int, ...]) -> Calibration:
     """Return the calibration of the refined estimate `at` (S = 1): proofs, frame, covariance, findings and status.
 
-    `lik` has all pulses with enough rows. `found` is the search, and `named` are the stations of the frame.
+    `found` is the search, and `named` are the stations of the frame.
     """
     net = lik.network
     # `soft`: prior coordinates define the frame; otherwise `named` or all stations define it.

@@ -1,4 +1,7 @@
-"""Joint motions of a network: all stations move along the directions with the largest variance."""
+"""Joint motions of a network: all stations move along the directions with the largest variance.
+
+Letters: S estimates of all unknowns.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +29,8 @@ def bent(lik: Likelihood, at: NetworkEstimate) -> tuple[NetworkEstimate, Array] 
     """Return the minima that moved networks reach, and their costs (S,); None if an open motion changes no row.
 
     `lik` is the likelihood of the network. Each copy of the network (`at`, S = 1) is moved along one direction of
-    large variance. A tether is a prior
-    with a small standard deviation. In a first refinement, it keeps the stations at their new positions, so
-    that better determined directions adapt. A second refinement has no tether.
+    large variance. A tether is a prior with a small standard deviation. In a first refinement, it keeps the
+    stations at their new positions, so that better determined directions adapt. A second refinement has no tether.
     """
     rank = determined(lik, at)
     if rank.open.shape[1]:

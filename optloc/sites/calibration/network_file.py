@@ -1,4 +1,8 @@
-"""Network files: stations with unknown coordinates, pulses and distances; output of a result as a problem file."""
+"""Network files: stations with unknown coordinates, pulses and distances; output of a result as a problem file.
+
+Letters: M stations, N pulses, R slots (columns of measurements), m rows of a section of the file, d
+coordinates.
+"""
 
 from __future__ import annotations
 

@@ -3,6 +3,8 @@
 `place` builds the candidates, searches the best set with a proven bound, and simulates fixes with it. If too
 many of these fixes are ambiguous, `place` takes the next best set.
 
+Letters: P places, n sites, q recorded moments of the search, d coordinates.
+
 Arguments of many functions: `candidates` are the sites as arrays, `task` is the search task, and `chosen`
 (n,) is a set of sites: 1 for each taken site.
 """

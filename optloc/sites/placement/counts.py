@@ -1,4 +1,7 @@
-"""Limits on the number of sites in groups, checked before the search starts."""
+"""Limits on the number of sites in groups, checked before the search starts.
+
+Letters: G groups, n sites.
+"""
 
 from __future__ import annotations
 

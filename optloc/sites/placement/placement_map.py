@@ -1,4 +1,7 @@
-"""Maps of the accuracy bound before and after a choice of stations, and the gap during the search."""
+"""Maps of the accuracy bound before and after a choice of stations, and the gap during the search.
+
+Letters: P places, s stations, q recorded moments of the search.
+"""
 
 from __future__ import annotations
 

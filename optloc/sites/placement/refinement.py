@@ -1,5 +1,7 @@
 """Continuous refinement of a placement: the new sites move inside their regions to reduce the bound.
 
+Letters: P places, k moving sites, n sites, d coordinates, m unknowns of the target.
+
 Arguments of many functions: `candidates` are the sites as arrays, and `places` are positions of the
 moving sites, metres.
 """

@@ -1,5 +1,7 @@
 """Selection files: candidates, places, measurements and rules; output of the chosen sites as a problem file.
 
+Letters: P places, s stations (candidates and existing stations), m rows, d coordinates.
+
 Arguments of many functions: `section` is a table of the file, and `folder` is the folder of the file.
 `source` or `where` is the location in the file for error messages. `frame` and `dimension` belong to the
 coordinates.

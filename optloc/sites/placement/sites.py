@@ -4,6 +4,9 @@ A site is a possible position of a station. A place is a possible position of th
 linearises the rows of all sites at all places, so that the search (`optloc.sites.placement.best_set`) needs
 no measurement model.
 
+Letters: P places, n sites, s stations, d coordinates. m is the number of rows of the problem; in arrays
+with a last axis of sites, and in (P, m, m), m is the number of unknowns of the target.
+
 Arguments of many functions: `problem` has the rows of all sites, `names` are the names of the sites, and
 `vectors` are the unknowns of the target at each place.
 """
