@@ -426,7 +426,7 @@ class LastingErrors:
         `stretch` contains the scans, with a motion of the order of the state. `state` belongs to the last scan.
         """
         found = self._found or _Recursion(len(state.mean))
-        rows = _LastingRows.of(stretch, state.mean, None)
+        rows = _LastingRows.of(stretch, state.mean, cov=None)
         self._start = _Start(rows, state.cov, found.info, found.score)
         self._recent.clear()
         self._memory[:] = 0.0
@@ -448,7 +448,7 @@ class LastingErrors:
             found = self._found = self._restored(len(cov))
             self._on = True
             for each in self._recent:
-                _process_scan(found, each, dynamics, None)
+                _process_scan(found, each, dynamics, memory=None)
         else:
             assert self._found is not None
             found = self._found

@@ -253,7 +253,8 @@ class _TrackRun:
 
         `entry` is the result of the scan for the track. `silence` is the time since the last valid row, s.
         """
-        found = [self._update(k, rival.state, silence, None) for rival in rivals]
+        # Without `memory`, the screen for lasting errors does not run: it belongs to the track.
+        found = [self._update(k, rival.state, silence, memory=None) for rival in rivals]
         others = [None if isinstance(one, str) else one[0] for one in found]
         return remaining(rivals, entry, others, self.rules.most)
 

@@ -366,9 +366,10 @@ def begin(
         posed = _start_problem(run, best.last - best.first + 1, dynamics.order, speed, rate)
         return replace(start, rivals=tuple(_rivals(posed, best)))
     if verdict == Status.CONTRADICTORY:  # these scans contradict each other; later scans may agree
-        return Beginning(last, None, Status.REJECTED, Status.REJECTED, "the rows of the scans contradict each other")
+        why = "the rows of the scans contradict each other"
+        return Beginning(last, state=None, code=Status.REJECTED, waiting=Status.REJECTED, reason=why)
     reason = f"the remaining scans do not determine a state: {verdict.label}"
-    return Beginning(problem.epochs - 1, None, verdict, verdict, reason)
+    return Beginning(problem.epochs - 1, state=None, code=verdict, waiting=verdict, reason=reason)
 
 
 def _doubtful_start(best: _Stretch) -> Beginning:

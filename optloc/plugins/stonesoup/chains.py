@@ -200,7 +200,7 @@ def _chain_of_fix(detections: tuple[Any, ...], fix: Fix, terms: ChainTerms) -> D
     p = float(fix.p_value)
     p = 1.0 if np.isnan(p) else p
     if not bool(fix.answered) or bool(fix.has(Status.UNBOUNDED)):
-        return DetectionChain(detections, np.zeros((0, len(fix.x))), None, p)
+        return DetectionChain(detections, x=np.zeros((0, len(fix.x))), cov=None, p=p)
     rivals = fix.alternatives.x[fix.alternatives.gap < GAP]
     x, cov = np.concatenate([fix.x[None], rivals])[:_KEPT], np.array(fix.cov)
     d = fix.position.shape[-1]
@@ -344,7 +344,7 @@ def _fit_runs(
         if len(starts[i]):
             continue
         if dof[i] < 0:  # too few rows for any state: wait for more scans
-            out[i] = DetectionChain(runs[i], np.zeros((0, problem.layout.size)), None, 1.0)
+            out[i] = DetectionChain(runs[i], x=np.zeros((0, problem.layout.size)), cov=None, p=1.0)
         elif work.take(LONG):
             fix = solve(problem.take(np.array([i])), "roots+lsr").flat()[0]
             out[i] = _chain_of_fix(runs[i], fix, terms)

@@ -3,8 +3,9 @@
 A block is one station or one pulse. Its partners are the stations and pulses that share rows with it. So
 a block is a fix from its partners, which are the stations of this fix.
 
-Letters: M stations, N pulses, R slots (columns of measurements), S estimates, B blocks with K start
-positions each, d coordinates. A clock is an offset times the propagation speed, metres.
+Letters: M stations, N pulses, R slots (columns of measurements), S estimates, B blocks with K start positions
+each, n selected pulses or stations, q rows of a block, d coordinates. A clock is an offset times the
+propagation speed, metres.
 
 Arguments of many functions: `net` is the network, `lik` is its likelihood, and `at` are estimates of all
 unknowns (one estimate, S = 1, unless a function says otherwise).
@@ -90,14 +91,15 @@ def blocks(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
         costs = lik.cost(together(*(_moved_station(lik, at, i, fix.position[:d]) for i, fix in fixes)))
         for (i, fix), best in zip(fixes, costs, strict=True):
             name = f"station {net.names[i]}"
-            found.append(_block_of_fix(fix, i, name, True, at.stations[0, i], cost - float(best)))
+            found.append(_block_of_fix(fix, i, name, station=True, here=at.stations[0, i], above=cost - float(best)))
     fix = place_pulses(net, at, np.arange(net.pulses))
     # pulses do not affect each other, so all of them move at once
     before = (lik.residual(at)[0] ** 2).sum(axis=1)
     after = (lik.residual(moved_pulses(lik, at, np.arange(net.pulses), fix.position))[0] ** 2).sum(axis=1)
     for j in range(net.pulses):
         above = float(before[j] - after[j])
-        found.append(_block_of_fix(fix[j], j, f"pulse {net.labels[j]}", False, at.pulses[0, j], above))
+        name = f"pulse {net.labels[j]}"
+        found.append(_block_of_fix(fix[j], j, name, station=False, here=at.pulses[0, j], above=above))
     return tuple(found)
 
 
@@ -170,8 +172,17 @@ def elsewhere(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
                 if all(np.linalg.norm(x[n, k] - other) > near for other in (here[n], *places)):
                     places.append(x[n, k])
                     name = f"station {net.names[which[n]]}" if station else f"pulse {net.labels[which[n]]}"
-                    lower, gaps = bool(gap[n, k] < 0.0), (float(gap[n, k]),)
-                    found.append(StationBlock(name, station, int(which[n]), False, False, lower, gaps, x[n, k][None]))
+                    block = StationBlock(
+                        name,
+                        station,
+                        int(which[n]),
+                        proven=False,
+                        cheapest=False,
+                        refuted=bool(gap[n, k] < 0.0),
+                        gaps=(float(gap[n, k]),),
+                        places=x[n, k][None],
+                    )
+                    found.append(block)
     return tuple(found)
 
 

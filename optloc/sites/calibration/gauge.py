@@ -5,7 +5,7 @@ module finds these motions, and other open motions, at an estimate. It also sets
 
 Letters: M stations, N pulses, d coordinates, S estimates. P is the number of station unknowns: M d
 coordinates, then M clocks if the stations do not share a clock. All of them are in metres. A motion is a
-direction (P,) of change.
+direction (P,) of change. The frame has g motions, and f is the number of other open motions.
 
 Arguments of many functions: `net` is the network, `lik` is its likelihood, and `at` is one estimate of
 all unknowns (S = 1).

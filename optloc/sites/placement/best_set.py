@@ -249,7 +249,7 @@ def search(
     task = replace(task, design=replace(task.design, rows=rows))
     progress, state = _SearchState(task, task.asked(), gap, max(1, keep), {}, []), np.array(task.state, dtype=np.int64)
     if not propagate(task.rules, task.limits, state):
-        return BestSetResult((), np.inf, True, np.inf, 0, np.zeros((0, 3)))
+        return BestSetResult((), bound=np.inf, closed=True, root=np.inf, nodes=0, course=np.zeros((0, 3)))
     root, w = -np.inf, np.where(state == IN, 1.0, 0.0)
     if (state == FREE).any():
         w[state == FREE] = 0.5
@@ -258,7 +258,7 @@ def search(
     for value, chosen in _start_sets(task, state, w, seed):
         progress.add(value, chosen)
     if not progress.seen:
-        return BestSetResult((), np.inf, True, np.inf, progress.nodes, np.zeros((0, 3)))
+        return BestSetResult((), bound=np.inf, closed=True, root=np.inf, nodes=progress.nodes, course=np.zeros((0, 3)))
     course = [(monotonic() - begun, progress.bound, progress.value)]
     while progress.heap and progress.heap[0][0] < progress.enough and monotonic() - begun < seconds:
         _branch(progress, *progress.heap[0][:1], *heappop(progress.heap)[2:])

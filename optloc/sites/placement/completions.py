@@ -5,9 +5,10 @@ site are compared at once. If one site may fail, the last two sites are compared
 enough without either of them, and few sites pass this test. A comparison by updates has a tolerance of a
 millionth for rounding errors. Values within the tolerance are recomputed from the sums.
 
-Letters: P places, n sites with r rows each, m unknowns, d of them coordinates of the position, R rules. g (m,) is a
-whitened row, M (m, m) the information (prior and rows of a set), C the selection of the position. The set under
-construction is the first `size` entries of an array `members` of site numbers.
+Letters: P places, n sites with r rows each, m unknowns, d of them coordinates of the position, R rules, q
+sites that can be added. g (m,) is a whitened row, M (m, m) the information (prior and rows of a set), C the
+selection of the position. The set under construction is the first `size` entries of an array `members` of
+site numbers.
 
 Arguments of all functions: `asked` contains rows, rules and criterion, `work` is scratch memory, and
 `others` are the sites that can be added. `enough` is the value to beat.
