@@ -11,7 +11,7 @@ measure h(x) + D b + v, with white noise v. The error e of the state has two ste
 Its covariance is the covariance of the filter, plus (c^2 - 1) times the part from v, plus s^2 times the part from
 b. c is the true standard deviation of v divided by the stated one. The filter and its estimates do not change. The
 covariance of the innovations of a scan is linear in s^2 and c^2, and so is their covariance with the innovations
-before. Weighted least squares estimates both factors, and its score tests them [2]_.
+before. Weighted least squares estimates s^2 and c^2, and its score tests them [2]_.
 
 Letters: m rows of a scan, n numbers of a state, q lasting errors (stations times kinds), j hypotheses about the
 correlation time. F is the transition of the prediction, H (m, n) the derivative of the rows, R (m, m) their stated

@@ -41,9 +41,9 @@ _TRIES = 11
 # on the model of motion, which has no noise here, than on the rows.
 _CLEAR = 24
 # Limits of the standard deviation of a position, in spreads of the stations and as a share of its distance from them.
-# If both are exceeded, the track ends. Three standard deviations then reach the stations, and far away all level
-# differences are alike: a track by level differences moved 650 m away from a flat of 9 m. With three spreads the track
-# lasts one scan longer.
+# If both are exceeded, the track ends. Three standard deviations then reach the stations. Far away, all differences of
+# received levels are alike: a track by level differences moved 650 m away from an apartment of 9 m. With a limit of
+# three spreads, this track lasts one scan longer.
 _SPREADS, _SHARE = 2.0, 1.0 / 3.0
 
 Fit = tuple[float, int]
