@@ -142,6 +142,7 @@ def _assign(sets: Sets) -> Array:
         number.append(numbers)
         wanted.append(sets.picks[target, numbers])
     owner_of_set, which, pick = np.concatenate(owners), np.concatenate(number), np.concatenate(wanted)
+    # `column` is a set, and `row` numbers each distinct candidate (channel and index) that a set takes.
     column, channel = np.nonzero(pick >= 0)
     _, row = np.unique(np.stack([channel, pick[column, channel]]), axis=1, return_inverse=True)
     # Constraints: one set for every target, possibly the empty set; no row in two chosen sets.
@@ -154,6 +155,7 @@ def _assign(sets: Sets) -> Array:
         constraints=[LinearConstraint(everyone, 1.0, 1.0), LinearConstraint(once, -np.inf, 1.0)],
     )
     assert solved.x is not None  # the empty sets of all targets are always feasible
+    # The solver may round 0 and 1. The chosen sets are sorted by target, because the result has one per target.
     taken = np.flatnonzero(solved.x > 0.5)
     return np.asarray(which[taken[np.argsort(owner_of_set[taken])]])
 
@@ -227,8 +229,10 @@ def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
     """Return the scores of all sets of candidates within their gates; see `optloc.tracking.associate.joint`.
 
     `scan` has one row for each channel. `ahead` contains the predicted targets (..., t), and `z` (..., m, c)
-    the candidates. Sets grow channel by channel: the density of a set is the product of the densities of each
-    row given the rows before it. If there are too many sets, only the best partial sets are kept.
+    the candidates. `clutter` gives detection probability and false rows.
+
+    Sets grow channel by channel: the density of a set is the product of the densities of each row given the
+    rows before it. If there are too many sets, only the best partial sets are kept.
     """
     apart, S = offsets(scan, ahead, z)
     distance = distances(apart, S, clutter.width)
@@ -243,12 +247,14 @@ def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
     # mean and V belong to the rows of the next channels, given the rows of a set; every set has separate values.
     V = np.broadcast_to(S, (*shape, m, m))[..., None, :, :]
     for i in range(m):
+        # s is the variance of channel i given the rows of a set; `away` are the candidates minus their mean.
         s = np.maximum(V[..., i, i], _LEFT * S[..., None, i, i])
         away = near[..., None, i, :] - mean[..., i, None]
         seen = (score + np.log(2.0 * np.pi * s) - gain[i])[..., None] + away**2 / s[..., None]
         # Option 0 of a channel is a missed detection, option j + 1 its j-th nearest candidate.
         both = np.concatenate([(score + missed)[..., None], np.where(np.isnan(seen), np.inf, seen)], axis=-1)
         number = _keep_best(both.reshape(*shape, -1))
+        # `parent` is the set that is extended, and `option` is its choice in channel i.
         parent, option = np.divmod(number, kept + 1)
         score = np.take_along_axis(both.reshape(*shape, -1), number, axis=-1)
         picks, mean = (np.take_along_axis(part, parent[..., None], axis=-2) for part in (picks, mean))

@@ -150,7 +150,7 @@ class Condition:
         self.state = State(entry.time, entry.updated.mean, entry.updated.cov)
 
     def judged(self, entry: Entry, cov: Array, vague: str) -> Entry:
-        """Return the entry with its covariance (n, n), lasting errors included, and its status.
+        """Return the entry with the covariance `cov` (n, n), lasting errors included, and its status.
 
         `vague` is the reason why the position is too uncertain to follow; empty if it is not.
         """

@@ -23,6 +23,7 @@ def differences(run: Problem) -> Problem:
     scans = [reduce(cut(run, k, k + 1)) for k in range(run.epochs)]
     kinds = dict.fromkeys(rows.kind for scan in scans for rows in scan.rows)
     blocks_of_kind: dict[str, list[Rows]] = {kind: [] for kind in kinds}
+    # New row numbers: the run has one block of rows per kind, with all epochs in a block.
     numbers = [np.zeros(scan.count, dtype=np.int64) for scan in scans]
     count = 0
     for kind, found in blocks_of_kind.items():

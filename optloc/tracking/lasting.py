@@ -11,7 +11,7 @@ measure h(x) + D b + v, with white noise v. The error e of the state has two ste
 Its covariance is the covariance of the filter, plus (c^2 - 1) times the part from v, plus s^2 times the part from
 b. c is the true standard deviation of v divided by the stated one. The filter and its estimates do not change. The
 covariance of the innovations of a scan is linear in s^2 and c^2, and so is their covariance with the innovations
-before. Weighted least squares estimates both factors, and its score tests them [2]_.
+before. Weighted least squares estimates s^2 and c^2, and its score tests them [2]_.
 
 Letters: m rows of a scan, n numbers of a state, q lasting errors (stations times kinds), j hypotheses about the
 correlation time. F is the transition of the prediction, H (m, n) the derivative of the rows, R (m, m) their stated
@@ -120,6 +120,7 @@ class _LastingRows:
         R = rows.covariance[item if len(rows.covariance) > 1 else 0]
         R = np.diag(R) if len(R) == m else R.reshape(m, m)
         used = line[:, n + 1] > 0.0
+        # The last number of a line is the weight of its row: it divides the variance.
         scale = np.sqrt(line[used, n + 1])
         noise = R[np.ix_(used, used)] / (scale[:, None] * scale)
         errors = _errors(R, rows.station, rows.sign, stations)[:, used]
@@ -202,7 +203,11 @@ class _Recursion:
         return np.asarray(0.5 * (wide + wide.T))
 
     def begin(self, rows: _LastingRows, cov: Array) -> None:
-        """Add the fix of a stretch of scans, with the covariance (n, n) of its state, and start the parts from it."""
+        """Add the fix of a stretch of scans, and start the parts of the covariance from it.
+
+        `rows` are the rows of the fix, and `cov` (n, n) is the covariance of its state. With more than `_MOST`
+        rows, the start is not tested.
+        """
         self.reset(cov)
         self.scans = 0
         if 0 < len(rows.residual) <= _MOST:
@@ -217,13 +222,16 @@ class _Recursion:
         `rows` are the rows of the fix, and `cov` (n, n) is its covariance.
         """
         H, R, D = rows.H, rows.R, rows.D
+        # `gain` (n, m) maps the errors of the rows to the error of the fix, and `left` maps them to its residuals.
         gain = _solve_regularised(R, H @ cov).T
         left = np.eye(len(R)) - H @ gain
         apart = np.abs(rows.scan[:, None] - rows.scan)
+        # `ties` (j, m, m) is the covariance of the rows from lasting errors of unit size.
         ties = self.phi**apart * (D @ np.swapaxes(D, -1, -2))
         self.cross = -gain @ (self.phi ** (rows.scan.max() - rows.scan)[:, None] * D)
         self.lasting = gain @ ties @ gain.T
         noise, errors = left @ R @ left.T, left @ ties @ left.T
+        # Each iteration starts again from the sums before this start, so that the start counts once.
         info, score = self.info, self.score
         for turn in range(_TURNS):
             now = R if turn == 0 else R * (1.0 + max(self.excess, 0.0)) + self.size * ties[self.best]
@@ -247,6 +255,8 @@ class _Recursion:
         self._widen(rows.D.shape[-1])
         H, R, D = rows.H, rows.R, np.pad(rows.D, [(0, 0), (0, 0), (0, self.cross.shape[-1] - rows.D.shape[-1])])
         back = np.swapaxes(D, -1, -2)
+        # S is the stated covariance of the innovations. `noise` and `errors` are the derivatives of their true
+        # covariance by c^2 and s^2.
         S, noise = H @ cov @ H.T + R, H @ self.white @ H.T + R
         tied = H @ self.cross @ back
         errors = H @ self.lasting @ H.T + tied + np.swapaxes(tied, -1, -2) + D @ back
@@ -257,8 +267,11 @@ class _Recursion:
         self._add_size(unit, w, S, noise, errors)
         if self.before is not None:
             last, white, lasting, seen = self.before
+            # `here` (j, m, r) is the covariance of these innovations with the last whitened ones, per s^2.
             here = unit @ (H @ F @ lasting + D @ (self.phi * seen))
             self._add_correlation(np.clip(w, -_WILD, _WILD), last, unit @ H @ F @ white, here)
+        # `seen` (j, q, m) is the covariance of the lasting errors with the innovations. The stored tuple: clipped
+        # whitened innovations, their covariances with the updated state per c^2 and per s^2, and with the errors.
         seen = np.swapaxes(self.cross, -1, -2) @ H.T + back
         self.before = (
             np.clip(w, -_WILD, _WILD),
@@ -266,6 +279,7 @@ class _Recursion:
             (self.lasting @ H.T + self.cross @ back - gain @ errors) @ unit.T,
             seen @ unit.T,
         )
+        # The update of the module docstring: e <- (I - K H) e - K (D b + v).
         left, KD = np.eye(len(cov)) - gain @ H, gain @ D
         self.white = left @ self.white @ left.T + gain @ R @ gain.T
         part = left @ self.cross
@@ -291,6 +305,7 @@ class _Recursion:
         (m, m) is their stated covariance. `noise` (m, m) and `errors` (j, m, m) are its derivatives by c^2 and
         s^2.
         """
+        # Half weight: the symmetric matrix has each pair of rows twice, and a squared innovation has variance 2.
         w = np.clip(w, -_WILD, _WILD)
         stated, noise, errors = (unit @ each @ unit.T for each in (stated, noise, errors))
         self._accumulate(0.5, np.outer(w, w) - stated, noise[None], errors)
@@ -323,6 +338,8 @@ class _Recursion:
         Errors count only if the score is significant; otherwise `size` and `excess` are 0.
         """
         info = self.info
+        # `alone` (j,) is the information about s^2 after elimination of c^2. `value` is the estimate of s^2, and
+        # `sure` is the estimate in its standard deviations. 1e-12 avoids a division by zero without rows.
         alone = np.maximum(info[:, 1, 1] - info[:, 0, 1] ** 2 / np.maximum(info[:, 0, 0], 1e-12), 1e-12)
         value = (self.score[:, 1] - info[:, 0, 1] * self.score[:, 0] / np.maximum(info[:, 0, 0], 1e-12)) / alone
         sure = value * np.sqrt(alone)
@@ -343,7 +360,7 @@ def _solve_regularised(matrix: Array, right: Array) -> Array:
 
 
 def _whitening(cov: Array, other: Array | None = None) -> Array:
-    """Return the inverse root (m, m) of a covariance; it whitens vectors with this covariance.
+    """Return the inverse root (m, m) of the covariance `cov` (m, m); it whitens vectors with this covariance.
 
     If rounding makes the covariance indefinite, `other` replaces it (if given), and small eigenvalues are
     raised.
@@ -409,7 +426,7 @@ class LastingErrors:
         `stretch` contains the scans, with a motion of the order of the state. `state` belongs to the last scan.
         """
         found = self._found or _Recursion(len(state.mean))
-        rows = _LastingRows.of(stretch, state.mean, None)
+        rows = _LastingRows.of(stretch, state.mean, cov=None)
         self._start = _Start(rows, state.cov, found.info, found.score)
         self._recent.clear()
         self._memory[:] = 0.0
@@ -420,8 +437,9 @@ class LastingErrors:
     def take(self, taken: Taken, dynamics: Dynamics, cov: Array, screen: tuple[float, float, float] | None) -> Array:
         """Return the covariance (n, n) of the state after a scan, lasting errors included.
 
-        `cov` (n, n) is the covariance of the filter after the scan. `screen` contains REPEATS, EXCESS and SPREAD
-        of the scan; it is None for a scan that the compiled filter does not support.
+        `taken` is the scan (see `Taken`), and `dynamics` is the model of motion. `cov` (n, n) is the covariance of
+        the filter after the scan. `screen` contains REPEATS, EXCESS and SPREAD of the scan; it is None for a scan
+        that the compiled filter does not support.
         """
         self._recent.append(taken)
         if not self._on:
@@ -430,7 +448,7 @@ class LastingErrors:
             found = self._found = self._restored(len(cov))
             self._on = True
             for each in self._recent:
-                _process_scan(found, each, dynamics, None)
+                _process_scan(found, each, dynamics, memory=None)
         else:
             assert self._found is not None
             found = self._found
@@ -451,7 +469,7 @@ class LastingErrors:
 
 
 def _process_scan(found: _Recursion, taken: Taken, dynamics: Dynamics, memory: Array | None) -> None:
-    """Process a scan in the recursion `found`.
+    """Process a scan (`taken`, see `Taken`) in the recursion `found`; `dynamics` is the model of motion.
 
     The rows of the scan are in `memory`, see `LastingErrors.memory`. Without `memory`, the rows are
     linearised again.

@@ -2,6 +2,10 @@
 
 Letters: k epochs, m rows of an epoch, d coordinates, N runs of a batch (...). A fitted polynomial has q =
 1 or 2 numbers for each row: its present value and, for an order above 0, its rate per second.
+
+Arguments of many functions: `problem` is the run, and `apart` is this run with a separate problem for
+each epoch. `window` is the number of past epochs in a fit, or None for all. `scan` is one epoch of N
+runs.
 """
 
 from __future__ import annotations
@@ -165,9 +169,10 @@ def _propagate(estimator: Array, apart: Problem, past: slice) -> Array:
 
 
 def _line_track(problem: Problem, apart: Problem, fitted: Array, cov: Array, ok: Array) -> Track:
-    """Return the track of fitted values (..., k, q, m) with covariance (..., k, q, m, q, m).
+    """Return the track of fitted values (..., k, q, m) with covariance `cov` (..., k, q, m, q, m).
 
-    `apart` is the run with a separate problem for each epoch. `ok` (..., k) marks epochs with a polynomial.
+    Here k counts only the epochs that can have a polynomial: the first `order` epochs are omitted. `ok` (..., k)
+    marks epochs with a polynomial. `apart` is the run with a separate problem for each epoch.
     """
     d, m, batch = problem.dimension, apart.count, fitted.shape[:-2]
     n = fitted.shape[-2] * d
@@ -296,10 +301,11 @@ def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, f
 
 @dataclass(frozen=True, slots=True)
 class _SpaceState:
-    """State of the simplified recursion for N runs.
+    """State of the simplified recursion for N runs. Range and angles are relative to the receiver.
 
     - value (N, 3), cov (N, 3, 3): range (m), azimuth and elevation (rad), and their covariance.
-    - P (N,): weight of the recursion for the range; its gain is P x / (1 + x P x), with the path slope x.
+    - P (N,): variance of the range in variances of one range sum. The gain is P x / (1 + x P x), with the path
+      slope x (derivative of the range sum by the range).
     - count (N,): number of used epochs.
     """
 
@@ -369,7 +375,7 @@ def _linearise_at(value: Array, scan: Problem, home: int) -> tuple[Array, Array,
 def _advance(state: _SpaceState, scan: Problem, home: int, floor: float) -> _SpaceState:
     """Return the state after one more scan: a step of the angles, then a step of the range by the rest of the path.
 
-    `home` is the number of the receiver, and `floor` is the smallest gain.
+    `home` is the number of the receiver. `floor` is the smallest share (0 to 1) of a residual that a step removes.
     """
     _, _, residual, slopes = _linearise_at(state.value, scan, home)
     x, across = slopes[:, 0], slopes[:, 1:]
@@ -379,6 +385,7 @@ def _advance(state: _SpaceState, scan: Problem, home: int, floor: float) -> _Spa
     # The residual of the path that the step of the angles does not explain.
     y = residual[:, 0] - (across * turned).sum(-1)
     optimal = state.P * x / (1.0 + x * state.P * x)
+    # A step of `gain * y` removes the share `gain * x` of y, so the floor is divided by x.
     gain = np.maximum(optimal, floor / np.where(x > 0.0, x, np.inf))
     value = state.value + np.concatenate([(gain * y)[:, None], turned], axis=-1)
     # New error = A old error + B noise, to first order; the first row is the range, which depends on the angles.
@@ -393,12 +400,15 @@ def _advance(state: _SpaceState, scan: Problem, home: int, floor: float) -> _Spa
 
 
 def _restart(stretch: Problem, scan: Problem, home: int) -> _SpaceState:
-    """Return the state of the mean measurement of a stretch of scans, solved in closed form and refined.
+    """Return the state (N runs) from the mean measurements of a stretch of scans, see `_SpaceState`.
 
-    `scan` is the last scan of the stretch, and `home` is the number of the receiver. A run without a fix gets
-    NaN.
+    `lines` of order 0 averages each row (range sum, azimuth, elevation) over the scans, weighted by inverse
+    variance. Then it solves the three means for a position. This position and its covariance are converted
+    to range, azimuth and elevation from the receiver. `scan` is the last scan of the stretch, and `home` is
+    the station number of the receiver. A run without a fix gets the value NaN.
     """
     track = lines(stretch, 0)
+    # `used` is the number of scans in the mean, for each run.
     start, used = track.last, (track.count > 0).sum(-1)
     at = scan.stations.position[..., 0, home, :]
     # Without a solution, use any direction: the value is set to NaN below.
@@ -406,10 +416,13 @@ def _restart(stretch: Problem, scan: Problem, home: int) -> _SpaceState:
     r = np.sqrt((away**2).sum(-1))
     linear = linearise(scan, at + away)
     order = _row_order(scan)[1:]
+    # Measurement minus residual is the predicted angle, in the same turn as the measurement.
     value = np.concatenate([r[:, None], (scan.observed - linear.residual)[:, order]], axis=-1)
+    # Rows: derivatives of range, azimuth and elevation by the position.
     outward = np.concatenate([(away / r[:, None])[:, None], linear.shared[:, order]], axis=1)
     cov = outward @ start.cov @ np.swapaxes(outward, -1, -2)
     good = np.asarray(np.isfinite(start.mean).all(-1))
+    # P = 1 / n is the weight of the recursion after n scans with path slope 1.
     return _SpaceState(np.where(good[:, None], value, np.nan), cov, 1.0 / np.maximum(used, 1), used.astype(float))
 
 

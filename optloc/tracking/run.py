@@ -1,4 +1,7 @@
-"""Track of a whole run: started by a fix, gated, and restarted if the model of motion cannot follow the target."""
+"""Track of a whole run: started by a fix, gated, and restarted if the model of motion cannot follow the target.
+
+Letters: m rows of the run, n numbers of a state.
+"""
 
 from __future__ import annotations
 
@@ -49,6 +52,7 @@ from optloc.tracking.updates import Filter, Update, Updated, filter_of, innovati
 # If the first scan is less likely than this, it contradicts the given state. The run is then refused, so the limit is
 # small.
 _CONTRADICTORY = 1e-9
+# Screen of a scan for lasting errors: REPEATS and EXCESS (sigmas) and SPREAD (m^2) of `optloc.kernels.filter`.
 Screen = tuple[float, float, float]
 
 
@@ -224,7 +228,10 @@ class _TrackRun:
             condition.judge(vague)
 
     def _start_entries(self, begun: Beginning, k: int, condition: Condition) -> Iterator[Entry]:
-        """Yield the scans of a start, from scan `k`; only the last scan has a state."""
+        """Yield the scans of a start (`begun`), from scan `k`; only the last scan has a state.
+
+        `condition` is the condition of the track before the start.
+        """
         n = (self.dynamics.order + 1) * self.problem.dimension
         # Scans of a start have no separate states: their common fix is valid at the last scan.
         why = condition.why
@@ -246,7 +253,8 @@ class _TrackRun:
 
         `entry` is the result of the scan for the track. `silence` is the time since the last valid row, s.
         """
-        found = [self._update(k, rival.state, silence, None) for rival in rivals]
+        # Without `memory`, the screen for lasting errors does not run: it belongs to the track.
+        found = [self._update(k, rival.state, silence, memory=None) for rival in rivals]
         others = [None if isinstance(one, str) else one[0] for one in found]
         return remaining(rivals, entry, others, self.rules.most)
 
@@ -291,7 +299,7 @@ class _TrackRun:
     def _too_uncertain(self, ahead: State, silence: float) -> str:
         """Return the reason why a prediction is too uncertain to follow; empty if it is not.
 
-        `silence` is the time since the last valid row, s.
+        `ahead` is the prediction. `silence` is the time since the last valid row, s.
         """
         d = self.problem.dimension
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(ahead.cov[:d, :d])[-1], 0.0)))
@@ -319,7 +327,7 @@ class _TrackRun:
         return self._entry(k, done, int(code), gated, causes), fit, None
 
     def _entry(self, k: int, done: Updated, code: int, gated: int, causes: list[str]) -> Entry:
-        """Return the entry of an update `done` with a status `code`.
+        """Return the entry of scan `k` from its update `done` with a status `code`.
 
         `gated` is the number of rows that failed the gate. `causes` are the causes of a numerical failure.
         """
@@ -331,7 +339,7 @@ class _TrackRun:
 
 @dataclass(frozen=True, slots=True)
 class _ScanOutcome:
-    """A scan after its update: status, numbers of rejected and used rows, and causes of a numerical failure."""
+    """A scan after its update: status, numbers of rejected rows and of used rows (`count`), and causes of a failure."""
 
     status: Status
     rejected: int

@@ -4,6 +4,9 @@ Scans have the same structure if their rows have the same kinds, stations and ta
 one `ScanRows`.
 
 Letters: m rows of a scan, n numbers of a state, G scans of one structure, N states of a batch (...).
+
+Arguments of many functions: `problem` is the run, and `order` is the order of the state (0: position, 1:
+with velocity, 2: with acceleration).
 """
 
 from __future__ import annotations
@@ -255,16 +258,19 @@ def _prepared(problem: Problem, order: int, epochs: Array, index: Array) -> Scan
     found = tables(scan, (np.arange(m)[None],))
     if found is None or found.tables.local:
         return None
+    # `white` are whitening matrices, and `total` is their `size_of`. Independent rows need neither: empty and zero.
     divided, white, total = sources(scan), np.zeros((1, 0)), np.zeros((1, 2))
     covariance = variances(problem.noise, problem.count)[index]
     if any(block.row.shape[1] > 1 for block in problem.noise.blocks):
         dense = gathered(problem.noise, index)
         if (dense * (1.0 - np.eye(m))).any():
             covariance = dense.reshape(len(index), m * m)
+    # Variances (G, m) or covariances (G, m m); one line if all scans have the same.
     covariance = np.ascontiguousarray(covariance[:1] if (covariance == covariance[:1]).all() else covariance)
     if covariance.shape[1] > m:
         matrix = linalg.whitening(covariance.reshape(-1, m, m))
         white, total = np.ascontiguousarray(matrix.reshape(len(matrix), m * m)), size_of(matrix)
+    # Placeholders for measurements and weights, which `Scans.of` replaces.
     none = np.zeros((1, 1, m))
     station, sign = touched(problem)
     pairs, signs = np.ascontiguousarray(station[index[0]]), sign[index[0]]
@@ -282,7 +288,7 @@ def _first_of(problem: Problem, order: int, epochs: Array) -> Problem:
 
 
 def size_of(white: Array) -> Array:
-    """Return rank and ln det(2 pi R), (..., 2), of covariances R from their whitening matrices (..., r, r).
+    """Return rank and ln det(2 pi R), (..., 2), of covariances R from their whitening matrices `white` (..., r, r).
 
     For a singular covariance, the determinant follows from the nonzero singular values of the matrix.
     """

@@ -1,4 +1,7 @@
-"""Several models of motion for one target: in parallel, or interacting (IMM) for a target that changes its motion."""
+"""Several models of motion for one target: in parallel, or interacting (IMM) for a target that changes its motion.
+
+Letters: k scans, q models, n numbers of a state, d coordinates, (...) a batch of targets.
+"""
 
 from __future__ import annotations
 
@@ -255,7 +258,8 @@ def _weigh(done: Sequence[tuple[Updated, Array]], coming: Array) -> tuple[Array,
 def _combine(done: Sequence[tuple[Updated, Array]], weight: Array, total: Array) -> tuple[Updated, Array]:
     """Return the update over all models, and its status (...): the best status of the models.
 
-    `weight` (..., q) are the probabilities of the models, and `total` (...) is the log-likelihood of the scan.
+    `done` are the update and status of each model. `weight` (..., q) are the probabilities of the models, and
+    `total` (...) is the log-likelihood of the scan.
     """
     n = max(each.mean.shape[-1] for each, _ in done)
     both = [_padded(each, n) for each, _ in done]
@@ -271,7 +275,7 @@ def _combine(done: Sequence[tuple[Updated, Array]], weight: Array, total: Array)
 def _padded(done: Updated, n: int) -> tuple[Array, Array]:
     """Return mean (..., n) and covariance (..., n, n); missing velocity or acceleration is zero without variance.
 
-    `n` is the size of the largest model.
+    `done` is the update of one model, and `n` is the size of the largest model.
     """
     present = done.mean.shape[-1]
     if present == n:

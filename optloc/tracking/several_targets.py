@@ -1,4 +1,8 @@
-"""Tracks of several targets from rows without labels, and runs of single targets from labelled rows."""
+"""Tracks of several targets from rows without labels, and runs of single targets from labelled rows.
+
+Letters: t targets, m channels of a scan (rows of a run), c candidates of a channel, n numbers of a state,
+k scans.
+"""
 
 from __future__ import annotations
 

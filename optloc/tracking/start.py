@@ -1,4 +1,11 @@
-"""Initial states of tracks: a fix of one epoch, or of several epochs that determine a velocity."""
+"""Initial states of tracks: a fix of one epoch, or of several epochs that determine a velocity.
+
+Letters: n numbers of a state, d of them coordinates of the position.
+
+Arguments of many functions: `problem` is a run of one target, and `dynamics` is the model of motion.
+`speed` (m/s) and `rate` (m/s^2) are prior sigmas of velocity and acceleration, or None. `method` is a
+method of `optloc.solve`.
+"""
 
 from __future__ import annotations
 
@@ -34,9 +41,9 @@ _TRIES = 11
 # on the model of motion, which has no noise here, than on the rows.
 _CLEAR = 24
 # Limits of the standard deviation of a position, in spreads of the stations and as a share of its distance from them.
-# If both are exceeded, the track ends. Three standard deviations then reach the stations, and far away all level
-# differences are alike: a track by level differences moved 650 m away from a flat of 9 m. With three spreads the track
-# lasts one scan longer.
+# If both are exceeded, the track ends. Three standard deviations then reach the stations. Far away, all differences of
+# received levels are alike: a track by level differences moved 650 m away from an apartment of 9 m. With a limit of
+# three spreads, this track lasts one scan longer.
 _SPREADS, _SHARE = 2.0, 1.0 / 3.0
 
 Fit = tuple[float, int]
@@ -330,6 +337,7 @@ def begin(
     doubtful: list[_Stretch] = []
     verdict, last = Status.TOO_FEW_ROWS, first
     observed = _scans_with_rows(problem, first)
+    # `i` is an index of `observed`: scans without a row are no start. `last` is the scan of the present attempt.
     for i in _trial_scans(len(observed) if ends else np.inf):
         if i >= len(observed):
             raise Undecided(problem.epochs + 1)
@@ -345,9 +353,11 @@ def begin(
             doubtful.append(found)
         elif verdict != Status.CONTRADICTORY:
             break  # if all later scans leave the state open, fewer scans do so too
+        # Another first scan is tried only if the rows contradict each other.
         if found is not None and found.p >= _PLAUSIBLE:
             break
     if doubtful:
+        # The stretch with the least chi-square per degree of freedom; its redundancy can be 0.
         best = min(doubtful, key=lambda each: each.fit[0] / max(each.fit[1], 1))
         start = _doubtful_start(best)
         if start.code != Status.AMBIGUOUS:
@@ -356,9 +366,10 @@ def begin(
         posed = _start_problem(run, best.last - best.first + 1, dynamics.order, speed, rate)
         return replace(start, rivals=tuple(_rivals(posed, best)))
     if verdict == Status.CONTRADICTORY:  # these scans contradict each other; later scans may agree
-        return Beginning(last, None, Status.REJECTED, Status.REJECTED, "the rows of the scans contradict each other")
+        why = "the rows of the scans contradict each other"
+        return Beginning(last, state=None, code=Status.REJECTED, waiting=Status.REJECTED, reason=why)
     reason = f"the remaining scans do not determine a state: {verdict.label}"
-    return Beginning(problem.epochs - 1, None, verdict, verdict, reason)
+    return Beginning(problem.epochs - 1, state=None, code=verdict, waiting=verdict, reason=reason)
 
 
 def _doubtful_start(best: _Stretch) -> Beginning:
@@ -367,7 +378,11 @@ def _doubtful_start(best: _Stretch) -> Beginning:
 
 
 def _rivals(posed: Problem, best: _Stretch) -> Iterator[Rival]:
-    """Yield the other minima of a start as states; `posed` is its problem, of which only the kept rows are used."""
+    """Yield the other minima of a start as states.
+
+    `posed` is the problem of the start `best`; rows that a robust fix left out are not used. Each minimum is
+    refined again, because its covariance is needed.
+    """
     kept = posed.with_rows(weight=posed.weight * (best.fix.weights > 0.0))
     others = best.fix.alternatives
     for x, gap in zip(others.x, others.gap, strict=True):

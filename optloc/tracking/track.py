@@ -1,4 +1,10 @@
-"""Prediction and update of the state of a target, scan by scan, and the types `State` and `Track`."""
+"""Prediction and update of the state of a target, scan by scan, and the types `State` and `Track`.
+
+Letters: k scans, m rows of a scan, n numbers of a state, d coordinates, (...) a batch of targets.
+
+Arguments of many functions: `problem` is a run of one target, `dynamics` is the model of motion, `rule`
+is the filter, and `ahead` is a predicted state.
+"""
 
 from __future__ import annotations
 
@@ -59,10 +65,10 @@ class Track:
     count : int array (..., k)
         Number of rows used.
     loglikelihood : array (..., k)
-        Log-likelihood of each scan given the prediction.
+        Log-likelihood of each scan given the prediction; 0 if no row was used.
     code : int array (..., k)
         `Status` of each scan. Ok. Too few rows: no valid row, the state is only predicted. Rejected: rows failed
-        the gate or are not finite. Numerical: the state is lost.
+        the gate or are not finite. Numerical: the update failed, the state is only predicted.
     dimension : int
         2 or 3.
     """
@@ -262,10 +268,12 @@ def _update_each(scan: Problem, ahead: State, rule: Update, causes: list[str]) -
         n, shape = ahead.mean.shape[-1], np.broadcast_shapes(scan.batch_shape, ahead.mean.shape[:-1])
         if math.prod(shape) == 1:
             causes.append(str(error) or type(error).__name__)
+            # A mean has one axis of n numbers, a covariance has two, and the other fields have none.
             mean, cov, none = (np.full((*shape, *([n] * core)), np.nan) for core in (1, 2, 0))
             return Updated(mean, cov, none, none, np.zeros(shape))
     mean = np.broadcast_to(ahead.mean, (*shape, n)).reshape(-1, n)
     cov = np.broadcast_to(ahead.cov, (*shape, n, n)).reshape(-1, n, n)
+    # `which` is the number of the scan of each state: several states may share one scan.
     size = math.prod(scan.batch_shape)
     which, flat = np.broadcast_to(np.arange(size).reshape(scan.batch_shape), shape).ravel(), scan.flat()
     each = [
@@ -288,7 +296,10 @@ def _prediction_only(ahead: State) -> Updated:
 
 
 def collect(times: Array, steps: list[tuple[Updated, Array]], dimension: int) -> Track:
-    """Return the updates and statuses of all scans, in the order of their `times` (k,), s, as a track."""
+    """Return the updates and statuses of all scans as a track.
+
+    `steps` are the update and status of each scan, in the order of the `times` (k,), s. `dimension` is 2 or 3.
+    """
     if not steps:
         raise InvalidProblem("no scan is later than the start", "start", "give a start before the last scan")
 

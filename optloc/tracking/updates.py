@@ -227,15 +227,21 @@ def reweighted(update: Update | str, loss: Loss | str) -> Update:
     chosen: Loss = loss
 
     def robust(scan: Problem, mean: Array, cov: Array) -> Updated:
-        """Return the update of predicted states (..., n) with weighted rows, until the weights are constant."""
+        """Return the update with weighted rows, repeated until the weights are constant.
+
+        `mean` (..., n) and `cov` (..., n, n) are the predicted states.
+        """
         # Scan and state may have different leading axes; the loss works on a flat batch.
         many = np.broadcast_shapes(scan.batch_shape, mean.shape[:-1])
         x, flat = np.broadcast_to(mean, (*many, mean.shape[-1])).reshape(-1, mean.shape[-1]), scan.flat()
+        # `doubt` contains, for each row, `base` (weight without the loss), `own` (variance) and `sided` (gross errors
+        # are positive only).
         doubt = Doubt.of(flat, x)
         # An innovation includes the uncertainty of the prediction, so an uncertain state does not reduce the weight of
         # a row.
         residual, H = differentiate(flat, x)
         spread = ((H @ np.broadcast_to(cov, (*many, *cov.shape[-2:])).reshape(-1, *cov.shape[-2:])) * H).sum(-1)
+        # `spread` is the variance of each row's prediction; u is the innovation in its standard deviations.
         u = np.where(doubt.base > 0.0, residual, 0.0) / np.sqrt(doubt.own + spread)
         weight = chosen.weight(fold_signs(chosen, u, doubt.sided))
         for _ in range(_TURNS):
@@ -339,22 +345,26 @@ def _with_likelihood(white: White, cov: Array, mean: Array, after: Array) -> Upd
 def _map_states(scan: Problem, mean: Array, cov: Array, white: White, how: Filtering) -> Array:
     """Return the maximum a posteriori states (..., n) by Gauss-Newton, starting from the predictions.
 
-    `mean` and `cov` are the predictions, and `white` are the rows linearised there. `how` contains the step
-    limits.
+    `mean` (..., n) and `cov` (..., n, n) are the predictions, and `white` are the rows linearised there.
+    `how.limit` is the largest number of steps. `how.tolerance` is the step length, in standard deviations of
+    the prediction, that ends the iteration.
     """
     # The prior is one more block of whitened rows: steps must not increase the cost of rows and prior together.
     prior = linalg.whitening(cov)
+    # At the prediction the prior costs nothing. `moving` marks the states that have not converged.
     x, cost, moving = mean, (white.residual**2).sum(-1), np.ones(mean.shape[:-1], dtype=bool)
     for _ in range(how.limit):
         # Gauss-Newton in the form of the filter: rows linearised at x, prior at the prediction.
         misfit = white.residual - (white.H @ (mean - x)[..., None])[..., 0]
         step = mean + (_gain(white.H, cov) @ misfit[..., None])[..., 0] - x
+        # The whole step first, then halves of it; a converged state does not move.
         share = np.where(moving, 1.0, 0.0)
         for _ in range(HALVINGS):
             tried = x + share[..., None] * step
             white = whitened(scan, tried)
             away = (prior @ (tried - mean)[..., None])[..., 0]
             now = (white.residual**2).sum(-1) + (away**2).sum(-1)
+            # RISE is the relative rise of the cost that counts as rounding.
             # NaN counts as worse: a step to a point where h is undefined is halved, too.
             worse = moving & ~(now <= cost + RISE * (1.0 + np.abs(cost)))
             if not worse.any():

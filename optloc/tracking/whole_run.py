@@ -1,4 +1,7 @@
-"""Whole-run fits: one polynomial course through all scans together, without a guess; and the posterior bound."""
+"""Whole-run fits: one polynomial course through all scans together, without a guess; and the posterior bound.
+
+Letters: k epochs, n numbers of a state, (...) a batch of runs.
+"""
 
 from __future__ import annotations
 

@@ -5,8 +5,11 @@ values needs one descent, which is an iterative refinement. A search without sta
 hundreds of descents.
 
 Letters: d coordinates, n numbers of a state (position, and velocity if it is known), B runs of
-detections, m rows, q states. The gate is the largest distance between a detection and a prediction at
-which both are compared.
+detections, C chains, K descents, m rows, q states. The gate is the largest distance between a detection
+and a prediction at which both are compared.
+
+Arguments of many functions: `terms` are the assumptions about all targets (`ChainTerms`), and `work` is
+the work that the call can still do.
 """
 
 from __future__ import annotations
@@ -197,11 +200,12 @@ def _chain_of_fix(detections: tuple[Any, ...], fix: Fix, terms: ChainTerms) -> D
     p = float(fix.p_value)
     p = 1.0 if np.isnan(p) else p
     if not bool(fix.answered) or bool(fix.has(Status.UNBOUNDED)):
-        return DetectionChain(detections, np.zeros((0, len(fix.x))), None, p)
+        return DetectionChain(detections, x=np.zeros((0, len(fix.x))), cov=None, p=p)
     rivals = fix.alternatives.x[fix.alternatives.gap < GAP]
     x, cov = np.concatenate([fix.x[None], rivals])[:_KEPT], np.array(fix.cov)
     d = fix.position.shape[-1]
     if terms.order and terms.speed and x.shape[1] == d:
+        # The velocity is zero with the prior covariance, independent of the position.
         x, cov = np.hstack([x, np.zeros_like(x)]), np.kron(np.diag([0.0, terms.speed**2]), np.eye(d))
         cov[:d, :d] = fix.cov
     good = len(x) == 1 and is_flat(cov[:d, :d], x[0, :d], detections[-1])
@@ -213,13 +217,14 @@ def near(chains: Sequence[DetectionChain], single: DetectionChain, terms: ChainT
 
     The distance is the squared innovation in units of its covariance, divided by the gate: 1 at the edge of
     the gate. Chains without a Gaussian state have no prediction and get the distance 1. Chains beyond the
-    gate are omitted. `single` is the chain of the detection alone.
+    gate are omitted. `chains` are the waiting chains, and `single` is the chain of the detection alone.
     """
     detection = single.detections[-1]
     known = [
         i for i, c in enumerate(chains) if c.last < detection.timestamp and _same_stations(c.detections[-1], detection)
     ]
     d = len(detection.measurement_model.mapping)
+    # `known` chains end before the detection. `blind` chains have no prediction, and `sharp` chains have a Gaussian.
     blind = [i for i in known if chains[i].cov is None or chains[i].x.shape[1] != d * (terms.order + 1)]
     sharp = [i for i in known if i not in set(blind)]
     out = [(1.0, i) for i in blind]
@@ -302,6 +307,7 @@ def grown(
     chosen: dict[Any, list[tuple[DetectionChain, DetectionChain, Array]]] = {}
     for chain, single in pairs:
         key, starts = _batch_key((*chain.detections, *single.detections)), _starts(chain, single, terms)
+        # Each new batch has a fixed amount of work, and each descent adds to it.
         if not work.take((0.0 if key in chosen else _BATCH) + _DESCENT * len(starts)):
             break
         chosen.setdefault(key, []).append((chain, single, starts))
@@ -327,6 +333,7 @@ def _fit_runs(
     out: list[DetectionChain | None] = [None] * len(runs)
     begun = [i for i, start in enumerate(starts) if len(start)]
     if begun:
+        # `item` is the run of each descent: a run has one descent for each start state.
         item = np.repeat(begun, [len(starts[i]) for i in begun])
         done = refine(problem, np.concatenate([starts[i] for i in begun]), item=item, limit=_STEPS)
         p = tail_probability(done.cost, dof[item])
@@ -337,7 +344,7 @@ def _fit_runs(
         if len(starts[i]):
             continue
         if dof[i] < 0:  # too few rows for any state: wait for more scans
-            out[i] = DetectionChain(runs[i], np.zeros((0, problem.layout.size)), None, 1.0)
+            out[i] = DetectionChain(runs[i], x=np.zeros((0, problem.layout.size)), cov=None, p=1.0)
         elif work.take(LONG):
             fix = solve(problem.take(np.array([i])), "roots+lsr").flat()[0]
             out[i] = _chain_of_fix(runs[i], fix, terms)
@@ -361,6 +368,7 @@ def _chain_of_descents(run: tuple[Any, ...], done: Refined, p: Array, cov: Array
         apart = [done.x[i] - done.x[j] for j in kept]
         if all(not (np.linalg.solve(cov[j], a) @ a < _SAME) for j, a in zip(kept, apart, strict=True)):
             kept.append(i)
+    # Without redundancy the p-value is NaN and counts as 1. A failed descent (infinite cost) gets 0.
     value = 1.0 if np.isnan(p[first]) and np.isfinite(done.cost[first]) else float(np.nan_to_num(p[first]))
     good = len(kept) == 1 and is_flat(cov[first, :d, :d], done.x[first, :d], run[-1])
     return DetectionChain(run, done.x[np.array(kept, dtype=int)], cov[first] if good else None, value)

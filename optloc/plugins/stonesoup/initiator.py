@@ -60,6 +60,7 @@ def mixture_state(
     found, place = mixture(problem, fix), list(mapping)
     components = []
     for weight, mean, cov in zip(found.weight, found.mean, found.covariance, strict=True):
+        # The fix replaces the position of the prior state, so its correlations with the rest become zero.
         vector = np.array(prior_state.state_vector, dtype=float)
         covariance = np.array(prior_state.covar, dtype=float)
         covariance[place], covariance[:, place] = 0.0, 0.0
@@ -120,6 +121,8 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
     def initiate(self, detections: Any, timestamp: dt.datetime, **kwargs: Any) -> set[Track]:
         """Return the new tracks from detections that do not belong to a track yet.
 
+        Stone Soup passes `timestamp`; it is not used, because each detection has its own time.
+
         Raises
         ------
         InvalidProblem
@@ -147,6 +150,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         """Return new chains from a scan: extended chains (they replace the old chains), and single detections.
 
         Each chain and each detection is used at most once. The replaced chains are removed from the waiting chains.
+        `work` is the work that the call can still do.
         """
         terms = ChainTerms(self.order, self.speed, self.least_p)
         # If the rows of one detection do not fit together, no chain with this detection fits.
@@ -158,6 +162,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         pairs.sort(key=lambda pair: (-len(pair[1]), pair[0]))
         fitting = grown([(chain, single) for _, chain, single in pairs], terms, work)
         fitting.sort(key=lambda found: (-len(found[0]), -found[0].p))
+        # Accept the longest and likeliest chains first; each old chain and each detection is used once.
         taken: set[int] = set()
         out = []
         for new, old, single in fitting:
@@ -188,6 +193,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         """Return a new track with the fix of a chain as its first state."""
         detection = chain.detections[-1]
         model = detection.measurement_model
+        # `place` are the state indices that the fix estimates; the others keep the prior state, or zero without one.
         place = [*model.mapping, *self._rates(model)]
         mean, cov = fix.gaussian()
         vector, covariance = np.zeros((model.ndim_state, 1)), np.zeros((model.ndim_state,) * 2)

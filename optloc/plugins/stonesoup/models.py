@@ -165,6 +165,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         NotImplementedError
             If a measurement has no clean and unique fix; initiators of Stone Soup can skip such measurements.
         """
+        # `order` sorts the values by kind, as the problem needs them.
         z = np.asarray(detection.state_vector, dtype=float)[self.order].T
         fix = solve(self.problem.with_rows(z=z if len(z) > 1 else z[0])).flat()
         bad = np.flatnonzero(~fix.answered | fix.has(*_NOT_ONE_PLACE))
@@ -456,7 +457,7 @@ class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
             yield time, {self._join(group) for group in groups.values()}
 
     def _join(self, group: list[Detection]) -> Detection:
-        """Return one vector detection from the pair detections of one target at one time."""
+        """Return one vector detection from `group`, the pair detections of one target at one time."""
         group = sorted(group, key=lambda detection: np.atleast_2d(detection.measurement_model.pairs).tolist())
         models = [detection.measurement_model for detection in group]
         first = models[0]

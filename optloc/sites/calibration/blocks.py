@@ -3,8 +3,12 @@
 A block is one station or one pulse. Its partners are the stations and pulses that share rows with it. So
 a block is a fix from its partners, which are the stations of this fix.
 
-Letters: M stations, N pulses, R slots (columns of measurements), S estimates, B blocks with K start
-positions each, d coordinates. A clock is an offset times the propagation speed, metres.
+Letters: M stations, N pulses, R slots (columns of measurements), S estimates, B blocks with K start positions
+each, n selected pulses or stations, q rows of a block, d coordinates. A clock is an offset times the
+propagation speed, metres.
+
+Arguments of many functions: `net` is the network, `lik` is its likelihood, and `at` are estimates of all
+unknowns (one estimate, S = 1, unless a function says otherwise).
 """
 
 from __future__ import annotations
@@ -87,14 +91,15 @@ def blocks(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
         costs = lik.cost(together(*(_moved_station(lik, at, i, fix.position[:d]) for i, fix in fixes)))
         for (i, fix), best in zip(fixes, costs, strict=True):
             name = f"station {net.names[i]}"
-            found.append(_block_of_fix(fix, i, name, True, at.stations[0, i], cost - float(best)))
+            found.append(_block_of_fix(fix, i, name, station=True, here=at.stations[0, i], above=cost - float(best)))
     fix = place_pulses(net, at, np.arange(net.pulses))
     # pulses do not affect each other, so all of them move at once
     before = (lik.residual(at)[0] ** 2).sum(axis=1)
     after = (lik.residual(moved_pulses(lik, at, np.arange(net.pulses), fix.position))[0] ** 2).sum(axis=1)
     for j in range(net.pulses):
         above = float(before[j] - after[j])
-        found.append(_block_of_fix(fix[j], j, f"pulse {net.labels[j]}", False, at.pulses[0, j], above))
+        name = f"pulse {net.labels[j]}"
+        found.append(_block_of_fix(fix[j], j, name, station=False, here=at.pulses[0, j], above=above))
     return tuple(found)
 
 
@@ -116,6 +121,7 @@ def mirrored(problem: Problem, here: Array) -> Array:
     centred = (partners - middle[:, None]) * np.sqrt(weight)[..., None]
     axes = np.linalg.eigh(np.swapaxes(centred, 1, 2) @ centred)[1]
     along = np.einsum("bd,bdk->bk", here - middle, axes)
+    # `along` are the coordinates of a block in the principal axes: a mirror image changes the sign of one of them.
     single = here[:, None] - 2.0 * along[..., None] * np.swapaxes(axes, 1, 2)
     return np.concatenate([single, (2.0 * middle - here)[:, None]], axis=1)
 
@@ -150,12 +156,14 @@ def elsewhere(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
     """
     net = lik.network
     stations, d = np.array(_inexact_stations(net), dtype=int), net.dimension
+    # Entries: True for stations, numbers, present positions, and the batch of their fixes.
     groups = [(False, np.arange(net.pulses), at.pulses[0], pulses_alone(net, at))]
     if stations.size:
         groups.append((True, stations, at.stations[0, stations], stations_alone(net, at, stations)))
     near = _APART * float(np.ptp(np.concatenate([at.stations[0], at.pulses[0]]), axis=0).max())
     found = []
     for station, which, here, problem in groups:
+        # Start 0 is the present position: its cost is the reference of the gaps.
         x, cost = minima(problem, np.concatenate([here[:, None], mirrored(problem, here)], axis=1))
         x, gap = x[:, 1:, :d], np.where(np.isfinite(cost[:, 1:]), cost[:, 1:] - cost[:, :1], np.inf)
         for n in np.flatnonzero(gap.min(axis=1) <= MOVED):
@@ -164,8 +172,17 @@ def elsewhere(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
                 if all(np.linalg.norm(x[n, k] - other) > near for other in (here[n], *places)):
                     places.append(x[n, k])
                     name = f"station {net.names[which[n]]}" if station else f"pulse {net.labels[which[n]]}"
-                    lower, gaps = bool(gap[n, k] < 0.0), (float(gap[n, k]),)
-                    found.append(StationBlock(name, station, int(which[n]), False, False, lower, gaps, x[n, k][None]))
+                    block = StationBlock(
+                        name,
+                        station,
+                        int(which[n]),
+                        proven=False,
+                        cheapest=False,
+                        refuted=bool(gap[n, k] < 0.0),
+                        gaps=(float(gap[n, k]),),
+                        places=x[n, k][None],
+                    )
+                    found.append(block)
     return tuple(found)
 
 
@@ -233,6 +250,7 @@ def _block_of_fix(fix: Fix, index: int, name: str, station: bool, here: Array, a
     `above` is the cost of the present position minus the cost of the fix.
     """
     claims, d = fix.claims, len(here)
+    # The candidates are the fix (gap 0) and its alternatives.
     x = np.concatenate([fix.position[None, :d], fix.alternatives.x.reshape(-1, fix.x.shape[-1])[:, :d]])
     gaps = np.concatenate([[0.0], fix.alternatives.gap.ravel()])
     kept = np.isfinite(gaps) & np.isfinite(x).all(axis=1)
@@ -294,9 +312,10 @@ def _station_fixes(net: Network, at: NetworkEstimate, which: list[int]) -> list[
 
 
 def _fixes_with_proof(problem: Problem, here: Array) -> Fix:
-    """Return fixes of a batch of blocks with their proof; with many rows, from the present positions `here` (n, d).
+    """Return fixes of a batch of blocks (`problem`) with their proof.
 
-    Other starts need matrices of all rows.
+    With more than `_MANY` rows, the refinement starts from the present positions `here` (n, d), metres, because
+    a search needs matrices of all rows.
     """
     if problem.count <= _MANY:
         return solve(problem)
@@ -319,6 +338,7 @@ def _ranges_to_pulses(net: Network, at: NetworkEstimate) -> tuple[tuple[Array, A
         weight = np.where(net.given[:, r], net.sigma[:, r] ** -2.0, 0.0)
         z = net.z[:, r]
         ends: tuple[tuple[int, Array], ...]
+        # A difference gives an arrival at one station if the distance from the other station is known.
         if slot.kind == "tdoa":
             ends = ((slot.a, z + apart[slot.b]), (slot.b, apart[slot.a] - z))
         else:
@@ -357,9 +377,9 @@ def moved_pulses(lik: Likelihood, at: NetworkEstimate, which: Array, places: Arr
 
 
 def _moved_station(lik: Likelihood, at: NetworkEstimate, i: int, place: Array) -> NetworkEstimate:
-    """Return an estimate (S = 1) with station `i` at another position (d,), metres.
+    """Return an estimate (S = 1) with station `i` at the position `place` (d,), metres.
 
-    Its clock is changed to the value that fits there best.
+    Its clock is changed to the value that fits there best. A coordinate of `place` that is NaN does not change.
     """
     stations, clocks, net = at.stations.copy(), at.clocks.copy(), lik.network
     stations[0, i] = np.where(np.isfinite(place), place, stations[0, i])

@@ -1,8 +1,10 @@
 """Self-calibration of a network: search, block moves with proofs, and a result with status and findings.
 
-`calibrate` searches with up to 60 pulses, adds the other pulses as fixes, and refines everything together.
-Then it tests the result: open motions, mirror images, misfit, alternatives and proofs of single stations and
-pulses.
+`calibrate` searches with up to 60 pulses, adds the other pulses as fixes, and refines everything together. Then it
+tests the result: open motions, mirror images, misfit, alternatives and proofs of single stations and pulses.
+
+Letters: M stations, N pulses, R columns of measurements, d coordinates. P is the number of station coordinates M d,
+plus M clocks if the stations do not share a clock. `lik` is the likelihood of a network.
 """
 
 from __future__ import annotations
@@ -37,9 +39,8 @@ from optloc.solvers import AMBIGUOUS_GAP, LISTED_GAP, P_MISFIT, Finding, objecti
 _CORE = 60
 # Method for the other pulses; their proof follows with the proofs of all pulses.
 _QUICK = "gtrs+lsr"
-# Largest share of pulses with two possible positions. With more of them, the choice of their sides has many
-# combinations, and the cheapest one can give a wrong shape of the stations. At 3 cm noise, flat stations appear
-# 0.1 to 0.3 m thick.
+# Largest share of pulses with two possible positions. More of them have many combinations of sides, and the cheapest
+# combination can give a wrong shape of the stations. At 3 cm noise, flat stations appear 0.1 to 0.3 m thick.
 _TWOFOLD = 0.5
 # Difference of distances, as a share of the size, from which two networks are different.
 _ALIKE = 1e-3
@@ -47,8 +48,7 @@ _ALIKE = 1e-3
 _WITHIN = 0.05
 # Variances below this share of the largest belong to changes of distances that no motion of stations can make.
 _ZERO = 1e-9
-# Share of the largest pulse displacement from which another pulse has a different position too, and does not
-# only follow the stations.
+# Share of the largest pulse displacement above which another pulse is elsewhere too, and not only follows the stations.
 _GIVES_WAY = 0.1
 # Largest share that another network with nearly the same stations may add to the squared errors: 10 % of a
 # standard deviation.
@@ -229,10 +229,10 @@ def calibrate(
     named = _station_indices(network, gauge)
     if robust:
         return _calibrate_robust(network, gauge, seed, starts, tell)
-    enough = _placeable(network)
+    enough = _placeable(network)  # mask (N,) of pulses
     if network.rows - network.unknowns + frame_size(network) < 0 or enough.sum() < 1:
         return _failure(network, Status.TOO_FEW_ROWS, "There are fewer measurements than unknowns.")
-    core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])
+    core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])  # pulses with the most rows
     core = core[enough[core]]
     found = search(network.take(core), seed, starts, tell)
     if found is None:
@@ -253,7 +253,7 @@ def _calibrate_robust(
     """Return the network of the rows that agree, with a list of the rows that were left out; see `calibrate`."""
     core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])
     gross = np.zeros(network.z.shape, dtype=bool)
-    gross[core] = outliers(network.take(core), seed)
+    gross[core] = outliers(network.take(core), seed)  # an infinite sigma leaves these rows out
     run = partial(calibrate, gauge=gauge, seed=seed, starts=starts, tell=tell)
     found = run(replace(network, sigma=np.where(gross, np.inf, network.sigma)))
     # test all rows again, also of pulses that were not in the search
@@ -282,7 +282,7 @@ def _add_other_pulses(network: Network, at: NetworkEstimate, core: Array, rest: 
     n, d = network.pulses, network.dimension
     pulses, emission = np.zeros((1, n, d)), np.zeros((1, n))
     pulses[0, core], emission[0, core] = at.pulses[0], at.emission[0]
-    pulses[0, rest] = at.stations[0].mean(axis=0)
+    pulses[0, rest] = at.stations[0].mean(axis=0)  # pulses without a fix stay there
     there = NetworkEstimate(at.stations, at.clocks, pulses, emission)
     whole = moved_pulses(likelihood(network), there, rest, place_pulses(network, at, rest, _QUICK).position)
     every = np.sort(np.concatenate([core, rest]))
@@ -295,11 +295,13 @@ def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, nam
     `found` is the search, and `named` are the stations of the frame.
     """
     net = lik.network
+    # `soft`: prior coordinates define the frame; otherwise `named` or all stations define it.
     soft = bool(np.isfinite(net.place_sigma).any())
     at, checked, others = proven(lik, at)
     at = with_mean_clock(net, at) if soft else in_frame(net, at, named)
     rank = determined(lik, at)
     cost = float(lik.cost(at)[0])
+    # Motions of the frame are among the unknowns, but no row determines them: they cost no degree of freedom.
     dof = net.rows - net.unknowns + rank.free.shape[1]
     p = float(tail_probability(np.array(cost), np.array(dof)))
     covariance, sides, departs = np.full((lik.free.size, lik.free.size), np.nan), list[str](), np.nan
@@ -310,6 +312,7 @@ def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, nam
     pulses = at.pulses[0].copy()
     pulses[[block.index for block in checked if not block.station and not block.proven]] = np.nan
     rivals = [other for other in alternatives if other.gap < AMBIGUOUS_GAP]
+    # A rival with the same stations makes only its moved pulses ambiguous; other rivals make the network ambiguous.
     same = [_same_stations(at, other, covariance) for other in rivals]
     for other in (one for one, alike in zip(rivals, same, strict=True) if alike):
         pulses[_moved_pulses(at, other)] = np.nan
@@ -476,7 +479,8 @@ def _alternatives(
 ) -> tuple[Alternative, ...]:
     """Return other minima than `at` (S = 1): moved blocks, minima of other starts, and the mirror image.
 
-    Their cost is within `LISTED_GAP`. `others` are estimates (S = 1) with a description; they are refined.
+    They cost at most `LISTED_GAP` more than `at`, which has the cost `cost`. `others` are estimates (S = 1) with a
+    description; they are refined. `found` is the search.
     """
     net = lik.network
     soft = bool(np.isfinite(net.place_sigma).any())
@@ -485,7 +489,7 @@ def _alternatives(
         _, first = np.unique(np.round(found.ends.cost[near], 3), return_index=True)
         others = others + [("another network", found.ends.at.take(np.flatnonzero(near)[[i]])) for i in first]
     if soft:
-        both = laid(at, net, np.random.default_rng(0))
+        both = laid(at, net, np.random.default_rng(0))  # the network, then its mirror image
         others = [*others, ("the mirror image", both.take(np.array([1])))]
     if not others:
         return ()
@@ -497,8 +501,7 @@ def _alternatives(
     for i in np.argsort(np.round(costs, 3), kind="stable"):
         one, gap = ends.take(np.array([i])), float(costs[i] - cost)
         shape = _shape(one, soft)
-        # Networks that differ by less than `_ALIKE` of the size are the same: equal costs allow a difference from
-        # rounding.
+        # Networks that differ by less than `_ALIKE` of the size are the same: the difference is rounding.
         if gap < LISTED_GAP and all(np.abs(shape - other).max() > _ALIKE * scale for other in shapes):
             shapes.append(shape)
             words = others[i][0]
@@ -520,6 +523,7 @@ def _same_stations(at: NetworkEstimate, other: Alternative, covariance: Array) -
     apart = spans(other.stations)[1] - spans(at.stations[0])[1]
     size = gradient.shape[1]
     width, axes = np.linalg.eigh(gradient @ covariance[:size, :size] @ gradient.T)
+    # `shift` is the squared distance in units of the covariance; `share` is the probability of the other network.
     known = width > _ZERO * width[-1]
     shift, dof = float((((axes.T @ apart)[known]) ** 2 / width[known]).sum()), int(known.sum())
     share = 1.0 / (1.0 + np.exp(0.5 * other.gap))
@@ -534,7 +538,7 @@ def _moved_pulses(at: NetworkEstimate, other: Alternative) -> Array:
 
 
 def _shape(at: NetworkEstimate, soft: bool) -> Array:
-    """Return distances of stations to stations and pulses, metres, to compare networks; if `soft`, also positions."""
+    """Return distances of stations to stations and pulses, metres; with a known frame (`soft`), also positions."""
     points = np.concatenate([at.stations[0], at.pulses[0]])
     apart = np.linalg.norm(points[:, None] - at.stations[0][None], axis=-1).ravel()
     return np.concatenate([apart, at.stations.ravel()]) if soft else apart

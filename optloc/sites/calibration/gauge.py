@@ -5,7 +5,10 @@ module finds these motions, and other open motions, at an estimate. It also sets
 
 Letters: M stations, N pulses, d coordinates, S estimates. P is the number of station unknowns: M d
 coordinates, then M clocks if the stations do not share a clock. All of them are in metres. A motion is a
-direction (P,) of change.
+direction (P,) of change. The frame has g motions, and f is the number of other open motions.
+
+Arguments of many functions: `net` is the network, `lik` is its likelihood, and `at` is one estimate of
+all unknowns (S = 1).
 """
 
 from __future__ import annotations
@@ -54,11 +57,14 @@ class GaugeRank:
         The frame is defined by `fixed` (g, P): `fixed` times each change of the unknowns is zero.
         """
         p = self.jacobian.shape[1]
+        # Unknowns that change no row (exact coordinates) get the covariance zero. `basis` spans the changes that the
+        # frame allows: the null space of `fixed`.
         moving = np.flatnonzero(np.abs(self.jacobian).max(axis=0) > 0.0)
         basis = np.eye(p)[:, moving]
         if len(fixed):
             within = np.linalg.svd(fixed[:, moving])[2][np.linalg.matrix_rank(fixed[:, moving]) :]
             basis = basis @ within.T
+        # With the triangle R of the QR factors, the covariance is (R'R)^-1 in this basis.
         triangle = np.linalg.qr(self.jacobian @ basis)[1]
         half = basis @ np.linalg.inv(triangle)
         return np.asarray(half @ half.T)
@@ -67,10 +73,12 @@ class GaugeRank:
 def determined(lik: Likelihood, at: NetworkEstimate) -> GaugeRank:
     """Return the determined, free and open motions at an estimate (S = 1): how far the rows fix stations and clocks."""
     p, jacobian = lik.free.size, without_pulses(lik, at)
+    # Exact coordinates do not move. A motion of the frame is free only if it changes no row.
     motions = frame_moves(lik.network, at)
     motions[~lik.free] = 0.0
     size = float(np.linalg.norm(jacobian, 2))
     free = _null_space(jacobian, _span(motions), size)
+    # `rest` are the other motions: the complement of the free ones, without motions of exact coordinates.
     rest = np.linalg.svd(free.T)[2][free.shape[1] :].T if free.shape[1] else np.eye(p)
     rest = rest[:, np.abs(rest[lik.free]).max(axis=0) > _ZERO]
     exact = np.flatnonzero(~lik.free)
@@ -87,6 +95,7 @@ def without_pulses(lik: Likelihood, at: NetworkEstimate) -> Array:
     n, r, p = by_station.shape
     # the columns of a distant pulse have different lengths, so scale them first
     length = np.sqrt((by_pulse**2).sum(axis=1, keepdims=True))
+    # Project out the part of the rows that each pulse explains; columns with a zero pivot explain nothing.
     q, triangle = np.linalg.qr(by_pulse / np.where(length > 0.0, length, 1.0))
     pivot = np.abs(np.einsum("nii->ni", triangle))
     q = q * (pivot > _ZERO)[:, None]
@@ -110,6 +119,7 @@ def departure(lik: Likelihood, at: NetworkEstimate, rank: GaugeRank) -> float:
     f is the cost and t is one standard deviation along the axis. `at` (S = 1) is the estimate. `rank`
     contains its determined motions; there must be no open motion.
     """
+    # `far` are moves of three standard deviations along the principal axes that have a variance.
     width, axes = np.linalg.eigh(rank.covariance(rank.free.T))
     far = (axes * (_FAR * np.sqrt(np.maximum(width, 0.0))))[:, width > _ZERO * width[-1]].T
     costs = lik.cost(together(at, settled(lik.network, shifted(at, np.concatenate([far, -far])))))
@@ -131,6 +141,7 @@ def over(one: NetworkEstimate, at: NetworkEstimate) -> NetworkEstimate:
     Then the positions of two free networks can be compared.
     """
     a, b = one.stations[0], at.stations[0]
+    # The orthogonal matrix nearest to the correlation of the centred stations; it may mirror.
     u, _, v = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
     turn = u @ v
     return replace(
@@ -149,8 +160,8 @@ def _span(columns: Array) -> Array:
 def _null_space(jacobian: Array, basis: Array, size: float) -> Array:
     """Return a basis (P, f) of the directions in a subspace that a matrix maps to zero.
 
-    `basis` (P, k) spans the subspace. A singular value of at most `_ZERO` times `size`, the norm of the
-    matrix, is zero.
+    The matrix is `jacobian` (q, P), and `basis` (P, k) spans the subspace. A singular value of at most `_ZERO`
+    times `size`, the norm of the matrix, is zero.
     """
     if not basis.shape[1]:
         return basis

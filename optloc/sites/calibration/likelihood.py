@@ -6,6 +6,8 @@ over the run.
 Letters: S estimates, M stations, N pulses, R slots (columns of measurements), m rows of a run, d coordinates. P is the
 number of station unknowns: M d coordinates, then M clocks if the stations do not share a clock. A
 whitened number is divided by its standard deviation.
+
+Arguments of many functions: `net` is the network, and `at` are estimates of all unknowns.
 """
 
 from __future__ import annotations
@@ -112,6 +114,7 @@ class Likelihood:
         coordinates, and the pulses.
         """
         net, problem, (j, r) = self.network, self.problem, rows_of(self.network)
+        # `far` is the prior sigma of free coordinates about their start: the tether, or very wide.
         known = np.isfinite(net.place_sigma)
         place = np.where(known, net.place, at.stations)
         exact = _EXACT * (float(np.ptp(at.stations)) or 1.0)
@@ -120,6 +123,7 @@ class Likelihood:
         covariance = deviation[..., None] ** 2 * np.eye(net.dimension)
         first, second, sign = clock_signs(net)
         clock = sign[0, r] * at.clocks[:, first[r]] + sign[1, r] * at.clocks[:, second[r]]
+        # Rows of pulses come first. Rows from `len(r)` on are distances between stations: no clock, no weight.
         rows = []
         for block, start in zip(problem.rows, problem.starts, strict=True):
             part = slice(start, start + block.count)

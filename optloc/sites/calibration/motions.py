@@ -1,4 +1,7 @@
-"""Joint motions of a network: all stations move along the directions with the largest variance."""
+"""Joint motions of a network: all stations move along the directions with the largest variance.
+
+Letters: S estimates of all unknowns.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +28,16 @@ _EXACT = 1e-9
 def bent(lik: Likelihood, at: NetworkEstimate) -> tuple[NetworkEstimate, Array] | None:
     """Return the minima that moved networks reach, and their costs (S,); None if an open motion changes no row.
 
-    Each copy of the network (`at`, S = 1) is moved along one direction of large variance. A tether is a prior
-    with a small standard deviation. In a first refinement, it keeps the stations at their new positions, so
-    that better determined directions adapt. A second refinement has no tether.
+    `lik` is the likelihood of the network. Each copy of the network (`at`, S = 1) is moved along one direction of
+    large variance. A tether is a prior with a small standard deviation. In a first refinement, it keeps the
+    stations at their new positions, so that better determined directions adapt. A second refinement has no tether.
     """
     rank = determined(lik, at)
     if rank.open.shape[1]:
         return None
     width, axes = np.linalg.eigh(rank.covariance(rank.free.T))
+    # Eigenvalues ascend, so the last directions have the largest variance. Each direction has a copy for each distance
+    # and sign.
     weak = np.flatnonzero(width > _EXACT * width[-1])[-_WEAK:]
     deviation = np.repeat(np.sqrt(width[weak]), 2 * len(_STEPS))
     far = np.tile([*_STEPS, *(-step for step in _STEPS)], len(weak)) * deviation

@@ -3,6 +3,9 @@
 Each round makes starts (`restarts.rounds`) and then moves single stations or pulses (`blocks`) of the
 cheapest networks. A block is one station or pulse. The cost is chi-square: the sum of squared whitened
 residuals.
+
+Arguments of many functions: `net` is the network, `lik` is its likelihood, and `at` is one estimate of
+all unknowns (S = 1).
 """
 
 from __future__ import annotations
@@ -85,13 +88,17 @@ def search(
             agreed = found.agreeing >= AGREEING and _fits(net, found.cost)
             if agreed or made >= limit:
                 return found
+        # No start of this round converged: stop after twice the limit.
         if made >= 2 * limit:
             return found
     return found
 
 
 def _add_round(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> NetworkSearchResult:
-    """Add the minima of a round to the search result, and return the result; `made` is the number of starts."""
+    """Add the minima of a round (`ends`) to the search result, and return the result.
+
+    `found` is the result so far, or None before the first round; it is changed. `made` is the number of starts.
+    """
     if found is not None:
         ends = joined([found.ends, ends])
     i = int(ends.cost.argmin())
@@ -129,6 +136,7 @@ def _sweep_block_moves(lik: Likelihood, at: NetworkEstimate, cost: float) -> tup
         if not found:
             break
         there, costs = lik.refine(together(*(moved(lik, at, block, block.places[0]) for block in found)))
+        # Accept only a fall of the cost that is larger than rounding.
         i = int(np.argmin(costs))
         if costs[i] >= cost - _SAME - equal_cost(cost):
             break

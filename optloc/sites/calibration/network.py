@@ -2,6 +2,8 @@
 
 A pulse is one emission at an unknown position and, except for two-way ranges, at an unknown time. A slot is the
 kind and the stations of one measurement; each pulse has at most one value for each slot.
+
+Letters: M stations, N pulses, R slots, d coordinates.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""Network files: stations with unknown coordinates, pulses and distances; output of a result as a problem file."""
+"""Network files: stations with unknown coordinates, pulses and distances; output of a result as a problem file.
+
+Letters: M stations, N pulses, R slots (columns of measurements), m rows of a section of the file, d
+coordinates.
+"""
 
 from __future__ import annotations
 
@@ -153,8 +157,8 @@ def read_network(path: Path) -> Network:
 def _prior_places(section: NetworkStations, table: Table, where: str) -> tuple[Array, Array]:
     """Return prior station coordinates (M, d) and their standard deviations, metres.
 
-    If a cell is empty, the coordinate is 0 and its standard deviation is infinite. `where` is the location of
-    the section for messages.
+    `section` is the table of stations in the file, and `table` are its rows. If a cell is empty, the coordinate
+    is 0 and its standard deviation is infinite. `where` is the location of the section for messages.
     """
     unit = Units("length").conversion(section.unit, where)
     keys = ("x", "y", "z")[: section.dimension]
@@ -200,6 +204,7 @@ def _tables_by_pulse(
     standard deviations. If the same stations measure a pulse several times, each repetition has its own slot.
     Cells without a measurement have an infinite standard deviation.
     """
+    # `pulse` is the pulse of each row over all sections. `seen` counts the repetitions of a row in a pulse.
     labels, _, pulse = distinct(np.concatenate([one[1] for one in rows]))
     slots: dict[tuple[str, int, int, int], int] = {}
     cells: list[tuple[int, int, float, float]] = []
@@ -229,8 +234,8 @@ def check_name(out: Path) -> None:
 def write_calibrated(found: Calibration, title: str, out: Path, source: Path) -> None:
     """Write a problem file with the estimated stations, their standard deviations, and the rows of the pulses.
 
-    The clocks are subtracted from the rows. `source` is the network file, which must not be overwritten by
-    `out`.
+    `found` is the calibration, and `title` is the first part of the title of the new file. The clocks are
+    subtracted from the rows. `source` is the network file, which must not be overwritten by `out`.
 
     Raises
     ------
@@ -243,6 +248,7 @@ def write_calibrated(found: Calibration, title: str, out: Path, source: Path) ->
             f"the network has the status {found.status.label} and cannot be written", str(out), "see its findings"
         )
     claim(out, inputs=[source])
+    # A problem file has one sigma per station: the root mean square of its coordinates.
     net, sigma = found.network, np.sqrt(np.mean(found.sigma**2, axis=1))
     stations = []
     for name, place, deviation in zip(net.names, found.stations, sigma, strict=True):

@@ -1,4 +1,7 @@
-"""A network in plan and elevation: stations with ellipses, pulses, prior positions and alternatives."""
+"""A network in plan and elevation: stations with ellipses, pulses, prior positions and alternatives.
+
+Letters: M stations, N pulses, d coordinates.
+"""
 
 from __future__ import annotations
 

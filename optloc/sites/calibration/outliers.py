@@ -9,6 +9,9 @@ Letters: S networks, N pulses, R slots, B blocks (a block is one station or puls
 
 Source: S. Geman and D. McClure, "Statistical methods for tomographic image reconstruction", Bull. Int.
 Stat. Inst. 52 (1987).
+
+Arguments of many functions: `lik` is the likelihood of the network, and `at` are estimates of all
+unknowns. `starts` provides random numbers and the size of the network.
 """
 
 from __future__ import annotations
@@ -73,7 +76,10 @@ def weights(residual: Array, given: Array) -> Array:
 
 
 def reweighted(lik: Likelihood, at: NetworkEstimate, rounds: int) -> NetworkEstimate:
-    """Return S networks refined in `rounds` rounds of weights; without weights, gross rows dominate the steps."""
+    """Return S networks refined in `rounds` rounds of weights; without weights, gross rows dominate the steps.
+
+    Each round computes the weights from the residuals of the round before.
+    """
     for _ in range(rounds):
         row_weights = weights(lik.residual(at), lik.network.given)
         at, _ = replace(lik, weight=row_weights).refine(at, _STEPS)
@@ -120,9 +126,11 @@ def _random_consensus(problem: Problem, here: Array, starts: Starts) -> Array:
     size, d = here.shape
     partners = problem.stations.places
     middle, spread = partners.mean(axis=-2), np.ptp(partners, axis=-2) * 2.0 + 1e-3 * starts.spread
+    # Random start positions of each subset, in a box of twice the extent of the partners.
     x = middle + (starts.rng.random((size, _PLACES, d)) - 0.5) * spread
     many = problem.take(np.repeat(np.arange(size), _PLACES))
     given = np.broadcast_to(many.weight > 0.0, (size * _PLACES, many.count))
+    # Random numbers below 1 sort the given rows first, in random order; `few` selects the first d + 1 of them.
     order = np.argsort(starts.rng.random(given.shape) + ~given, axis=1)
     few = np.zeros(given.shape)
     np.put_along_axis(few, order[:, : d + _SPARE], 1.0, axis=1)
@@ -130,6 +138,7 @@ def _random_consensus(problem: Problem, here: Array, starts: Starts) -> Array:
     for _ in range(_ALONE):
         row_weights = weights(whitened(many, x), given) * given
         x = minima(many.with_rows(weight=row_weights), x[:, None, :d])[0][:, 0]
+    # Candidate 0 is the present position, with the emission time or clock that fits there.
     now = vectors(problem, here[:, None])
     x = np.concatenate([now, x.reshape(size, _PLACES, -1)], axis=1)
     cost = np.stack([np.minimum(whitened(problem, x[:, k]) ** 2, PRICE).sum(axis=-1) for k in range(1 + _PLACES)])

@@ -131,6 +131,7 @@ def _arrivals_of_differences(ends: Array, values: Array, weight: Array, m: int) 
     design[np.arange(len(ends)), ends[:, 0]], design[np.arange(len(ends)), ends[:, 1]] = 1.0, -1.0
     design, values, weight = design[inside], values[inside], weight[inside]
     found = np.linalg.lstsq(design * np.sqrt(weight)[:, None], values * np.sqrt(weight), rcond=None)[0]
+    # The weight of each difference is divided between its two stations.
     total = (np.abs(design) * weight[:, None]).sum(axis=0)
     return np.where(group == largest, found, 0.0), np.where(group == largest, np.sqrt(total / 2.0), 0.0)
 
@@ -163,6 +164,8 @@ class Starts:
         One fit can give several networks, or none.
         """
         net, d = self.lik.network, self.dimension
+        # `full` marks the pulses with at least d + 3 arrivals, which the fit needs. The fit has no units: lengths are
+        # divided by `spread`, and arrivals are relative to `shift`.
         full = (self.weight > 0.0).sum(axis=1) >= d + 3
         relative = self.weight / self.weight.max()
         begun = random_stations(self.rng, count, net.stations, d)
@@ -175,9 +178,11 @@ class Starts:
         stations, pulses, which = upgrade(fit.take(order[new]))
         if not len(which):
             return _no_estimates(net), np.zeros(0, dtype=int)
+        # The fit calls the clock of a station b and the offset of a pulse o.
         b = fit.stations.b[order[new]][which] * self.spread
         places = np.zeros((len(which), net.pulses, d))
         places[:, full] = pulses * self.spread
+        # Pulses outside the fit start at the centre of the stations.
         places[:, ~full] = stations.mean(axis=1, keepdims=True) * self.spread
         offsets = np.zeros((len(which), net.pulses))
         offsets[:, full] = fit.pulses.o[order[new]][which] * self.spread
@@ -202,6 +207,7 @@ class Starts:
         net, d = self.lik.network, self.dimension
         size = np.full(d, self.spread)
         box = np.ones((count, 1, d)) * size
+        # In every second network, the last axis has only 30 % of the size: stations are often nearly flat.
         box[::2, :, -1] *= 0.3
         stations = (self.rng.random((count, net.stations, d)) - 0.5) * box
         pulses = (self.rng.random((count, net.pulses, d)) - 0.5) * box
@@ -231,7 +237,11 @@ def _no_estimates(net: Network) -> NetworkEstimate:
 
 
 def starts_of(lik: Likelihood, seed: int) -> Starts:
-    """Return the generator of starts for a network; `seed` is the seed of its random numbers."""
+    """Return the generator of starts for a network; `seed` is the seed of its random numbers.
+
+    `lik` is the likelihood of the network. The extent of a pulse is its largest range, or the difference between
+    its last and first arrivals. The size of the network is the 90 % quantile of these extents.
+    """
     z, weight, emission = arrivals(lik.network)
     measured = weight > 0.0
     shift = np.where(emission, [np.median(z[j, measured[j]]) if measured[j].any() else 0.0 for j in range(len(z))], 0.0)
@@ -249,6 +259,7 @@ def rounds(starts: Starts) -> Iterator[tuple[int, RoundEnds]]:
     net, d = starts.lik.network, starts.dimension
     full = int(((starts.weight > 0.0).sum(axis=1) >= d + 3).sum())
     able = net.stations >= d + 3 and full > 0 and max(net.stations, full) >= unknowns(d)
+    # `able`: a low-rank fit has enough stations and pulses. `patient`: the first round has only random positions.
     begun, patient = 0, net.stations >= _MANY
     while True:
         at, start = starts.random(_RANDOM), np.arange(_RANDOM) + begun
@@ -305,9 +316,11 @@ def _align(points: Array, place: Array, weight: Array, rng: np.random.Generator)
 
     `points` (S, M, d) are centred stations, and `place` (M, d) are the known coordinates, metres. `weight`
     (M, d) are inverse standard deviations, 0 for unknown coordinates. Gauss-Newton steps start from `_TURNS`
-    random rotations, because there can be several minima.
+    random rotations (from `rng`), because there can be several minima.
     """
     s, m, d = points.shape
+    # Axes: S networks, `_TURNS` starts (t), M stations, d coordinates, rotation generators (g). The random matrices are
+    # orthogonal; a change of one sign makes each of them a rotation.
     generators = np.array([_generator(i, k, d) for i in range(d) for k in range(i)])
     turn = np.linalg.qr(rng.standard_normal((_TURNS, d, d)))[0]
     turn[np.linalg.det(turn) < 0, 0] *= -1.0
@@ -318,10 +331,13 @@ def _align(points: Array, place: Array, weight: Array, rng: np.random.Generator)
     for _ in range(_LAID):
         turned = points[:, None] @ np.swapaxes(turn, -1, -2)
         residual = ((place - turned - move[:, :, None]) * weight).reshape(s, _TURNS, m * d)
+        # `spun` and `shifts` are the whitened derivatives of the stations by the rotation and by the shift.
         spun = np.einsum("gab,stmb->stmag", generators, turned) * weight[..., None]
         shifts = np.broadcast_to(np.eye(d) * weight[..., None], (s, _TURNS, m, d, d))
         columns = np.concatenate([spun, shifts], axis=-1).reshape(s, _TURNS, m * d, -1)
         normal = np.swapaxes(columns, -1, -2) @ columns
+        # `diagonal` is a view of the normal matrix. The small terms keep the matrix regular if some coordinates are
+        # unknown.
         diagonal = np.einsum("stii->sti", normal)
         diagonal += 1e-6 * diagonal + 1e-9 * diagonal.max(axis=-1, keepdims=True) + 1e-290
         gradient = np.einsum("stqp,stq->stp", columns, residual)

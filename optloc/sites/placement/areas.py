@@ -1,6 +1,7 @@
 """Polygons of GeoJSON files, their convex parts, and lines of sight over terrain.
 
-A ring is a closed polygon (v, 2): x and y of its v corners, without a repeated last corner.
+A ring is a closed polygon (v, 2): x and y of its v corners, without a repeated last corner. Letters: P
+places, s stations, q points.
 """
 
 from __future__ import annotations

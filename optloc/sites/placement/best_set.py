@@ -8,6 +8,10 @@ values of all its sets.
 The search takes the open node with the lowest bound first. The bound is a relaxation
 (`optloc.sites.placement.relaxation`) that starts with the weights of the parent node. Sites whose reduced
 cost excludes one of their two values are fixed at once.
+
+Arguments of many functions: `task` is the search task, `asked` are its arguments for the enumeration, and
+`progress` is the state of the running search. `chosen` (n,) is a set, and `seed` is the seed of random
+numbers.
 """
 
 from __future__ import annotations
@@ -245,7 +249,7 @@ def search(
     task = replace(task, design=replace(task.design, rows=rows))
     progress, state = _SearchState(task, task.asked(), gap, max(1, keep), {}, []), np.array(task.state, dtype=np.int64)
     if not propagate(task.rules, task.limits, state):
-        return BestSetResult((), np.inf, True, np.inf, 0, np.zeros((0, 3)))
+        return BestSetResult((), bound=np.inf, closed=True, root=np.inf, nodes=0, course=np.zeros((0, 3)))
     root, w = -np.inf, np.where(state == IN, 1.0, 0.0)
     if (state == FREE).any():
         w[state == FREE] = 0.5
@@ -254,7 +258,7 @@ def search(
     for value, chosen in _start_sets(task, state, w, seed):
         progress.add(value, chosen)
     if not progress.seen:
-        return BestSetResult((), np.inf, True, np.inf, progress.nodes, np.zeros((0, 3)))
+        return BestSetResult((), bound=np.inf, closed=True, root=np.inf, nodes=progress.nodes, course=np.zeros((0, 3)))
     course = [(monotonic() - begun, progress.bound, progress.value)]
     while progress.heap and progress.heap[0][0] < progress.enough and monotonic() - begun < seconds:
         _branch(progress, *progress.heap[0][:1], *heappop(progress.heap)[2:])
@@ -350,6 +354,7 @@ def _bound_node(progress: _SearchState, bound: float, state: Array, w: Array) ->
         if bound >= progress.enough:
             return
         fixed = settle(low, cost, progress.enough, state)
+        # If at least a fifth of the free sites was fixed, relax again at once; otherwise the node stays open.
         if not fixed or (state == FREE).sum() > 0.8 * ((state == FREE).sum() + fixed):
             if fixed and not propagate(task.rules, task.limits, state):
                 return
@@ -373,6 +378,8 @@ def _enumerate(
 
 def _is_small(task: SearchTask, state: Array) -> bool:
     """Return whether a node has so few sets that enumeration is faster than a relaxation; `state` (n,) is its state."""
+    # `addable` sites fit at most. `counted`: the number of sites is the only rule, so only full sets count. `at_once`:
+    # the enumeration compares all candidates of the last site at once.
     sizes = task.rules[0][state == FREE]
     left = task.limits[0] - task.rules[0][state == IN].sum()
     addable = int((np.cumsum(np.sort(sizes)) <= left + _ROOM * max(1.0, abs(task.limits[0]))).sum())
@@ -410,7 +417,7 @@ def _round_to_set(task: SearchTask, state: Array, priority: Array) -> Array | No
     if task.fits(chosen[None])[0]:
         return np.asarray(chosen)
     # The greedy set may violate a rule with a least number of sites. Then an integer programme finds a set that
-    # meets all rules.
+    # meets all rules. `_ROOM` is a small reward for sites with priority 0.
     lower, upper = (state == IN).astype(float), (state != 0).astype(float)
     rules = LinearConstraint(task.rules, -np.inf, task.limits)
     found = milp(

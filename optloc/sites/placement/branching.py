@@ -194,6 +194,7 @@ def expand(
             gather(rows[p, :, :, own : own + 1].copy(), total, ones, -1, 1.0, scaled, bases[0, p])
             put_rows(bases[0, p], total)
         bases[0, p] = total
+        # Scenario 0 has all taken sites. In each other scenario, the weight -1 subtracts one taken site again.
         for s in range(1, scenarios):
             gather(rows[p, :, :, taken[s - 1] : taken[s - 1] + 1].copy(), total, -ones, -1, 1.0, scaled, bases[s, p])
     if fail:
@@ -208,6 +209,7 @@ def expand(
     for j in range(count):
         x[j] = min(1.0 - _INSIDE, max(_INSIDE, w[free[j]]))
         room += x[j] * lines[0, j]
+    # Shrink the weights so that they meet the first rule; 1e-3 keeps them inside 0 < w.
     if room > left[0]:
         for j in range(count):
             x[j] *= max(left[0], 0.0) / room

@@ -2,6 +2,11 @@
 
 `place` builds the candidates, searches the best set with a proven bound, and simulates fixes with it. If too
 many of these fixes are ambiguous, `place` takes the next best set.
+
+Letters: P places, n sites, q recorded moments of the search, d coordinates.
+
+Arguments of many functions: `candidates` are the sites as arrays, `task` is the search task, and `chosen`
+(n,) is a set of sites: 1 for each taken site.
 """
 
 from __future__ import annotations
@@ -248,6 +253,7 @@ def _ban_sets(task: SearchTask, banned: Sequence[Array]) -> SearchTask:
     `banned` contains sets (n,), 1 for each taken site. A rule also excludes larger sets that contain a banned
     set.
     """
+    # Divide each rule by the size of its set, so that its entries are at most 1 as in the other rules.
     rules = np.array([chosen / chosen.sum() for chosen in banned]).reshape(len(banned), len(task.state))
     limits = np.array([1.0 - 1.0 / chosen.sum() for chosen in banned])
     return replace(task, rules=np.vstack([task.rules, rules]), limits=np.concatenate([task.limits, limits]))
@@ -321,6 +327,7 @@ def _bound_and_prior_share(candidates: Candidates, chosen: Array) -> tuple[Array
     information = candidates.design.prior + np.einsum(
         "prmn,n,prkn->pmk", candidates.design.rows, chosen.astype(float), candidates.design.rows
     )
+    # Noise of the prior contributes C M^-1 M0 M^-1 C' to the covariance (M information, M0 prior, C selects position).
     inverse = np.linalg.inv(information)[:, :d]
     from_prior = np.trace(inverse @ candidates.design.prior @ np.swapaxes(inverse, 1, 2), axis1=1, axis2=2)
     return np.sqrt(variance), from_prior / variance
@@ -331,6 +338,7 @@ def _bounds_after_loss(candidates: Candidates, chosen: Array) -> Array:
 
     `chosen` (n,) is 1 for each taken site.
     """
+    # Line i of `lost` is the set without its i-th site.
     lost = np.repeat(chosen[None], int(chosen.sum()), axis=0)
     lost[np.arange(len(lost)), np.flatnonzero(chosen)] = 0
     variance = np.trace(covariances(candidates.design, lost), axis1=-2, axis2=-1)

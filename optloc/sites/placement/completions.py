@@ -5,9 +5,13 @@ site are compared at once. If one site may fail, the last two sites are compared
 enough without either of them, and few sites pass this test. A comparison by updates has a tolerance of a
 millionth for rounding errors. Values within the tolerance are recomputed from the sums.
 
-Letters: P places, n sites with r rows each, m unknowns, d of them coordinates of the position, R rules. g (m,) is a
-whitened row, M (m, m) the information (prior and rows of a set), C the selection of the position. The set under
-construction is the first `size` entries of an array `members` of site numbers.
+Letters: P places, n sites with r rows each, m unknowns, d of them coordinates of the position, R rules, q
+sites that can be added. g (m,) is a whitened row, M (m, m) the information (prior and rows of a set), C the
+selection of the position. The set under construction is the first `size` entries of an array `members` of
+site numbers.
+
+Arguments of all functions: `asked` contains rows, rules and criterion, `work` is scratch memory, and
+`others` are the sites that can be added. `enough` is the value to beat.
 """
 
 from __future__ import annotations
@@ -163,6 +167,7 @@ def grow(
     recomputed from the sums. The returned number is an upper bound; it is infinite if an inverse does not
     exist.
     """
+    # An infinite `condition` means that `last` does not exist: the inverse is computed from the sums.
     places, _, r, m = asked.sites.shape
     most = 0.0
     for p in range(places):
@@ -333,6 +338,8 @@ def finish(
     them. If no set is better, the function returns `enough` and does not change `best`. `inverses` (P, m, m)
     and `condition` describe the set of the first `size` members.
     """
+    # If updates are too inaccurate for a comparison, the values stay at minus infinity and all sites are kept. The
+    # kept sets are computed again from the sums.
     count, keep, values = 0, np.empty(len(others.site), dtype=np.int64), np.full(len(others.site), -np.inf)
     limit = enough + _WRONG * abs(enough)
     if comparable(asked, inverses, condition, enough):
@@ -432,6 +439,7 @@ def exhaust(asked: CompletionRequest, state: Array, order: Array, most: int, eno
     while depth >= 0:
         size, begin, own = sure + depth, at[depth], inverses[depth]
         if fresh and (depth == deep or not counted):
+            # If the number of sites is the only rule, a full set is never worse: only full sets are tested.
             two = depth == deep and room - depth > 1
             one = not (two and counted)
             enough = finish(asked, members, size, others, begin, one, two, own, condition[depth], enough, best, work)

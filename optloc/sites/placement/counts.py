@@ -1,4 +1,7 @@
-"""Limits on the number of sites in groups, checked before the search starts."""
+"""Limits on the number of sites in groups, checked before the search starts.
+
+Letters: G groups, n sites.
+"""
 
 from __future__ import annotations
 
@@ -102,7 +105,7 @@ def _limiting_groups(groups: Sequence[CountGroup], members: Array, state: Array,
     """Return the indices of the groups that limit the number of free sites to `most`, for an error message.
 
     If the removal of one group allows more sites, the list has only this group. Otherwise it has all groups
-    with an effective upper limit.
+    with an effective upper limit. `members` (G, n) and `state` (n,) are as in `check_groups`.
     """
     limiting = [i for i, group in enumerate(groups) if group.most is not None and group.most < members[i].sum()]
     for i in limiting:

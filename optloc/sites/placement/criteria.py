@@ -293,6 +293,7 @@ def evaluate(
     values : array (2, Q)
         Output for each item of the maximum: smoothed value, and value of the tangent.
     """
+    # `mean` is the criterion of a scenario: over all places, or of one place for `worst`. `best` is the largest.
     places, r, m, n = rows.shape
     inverse, turn, basis, shares = state
     scaled, matrix, lower = np.empty((r, m, n)), np.empty((m, m)), np.empty((m, m))
@@ -333,8 +334,8 @@ def derive(
 ) -> None:
     """Write the gradients (Q, n) of the items with a positive share, and the Hessian (n, n) of their weighted sum.
 
-    Call `evaluate` first; the first arguments are the same, and `state` is its output. `share` (Q,) are the
-    weights of the items. The outputs are `slopes` (Q, n) and the lower triangle of `hessian` (n, n).
+    Call `evaluate` first; the arguments `rows` to `worst` are the same, and `state` is its output. `share` (Q,)
+    are the weights of the items. The outputs are `slopes` (Q, n) and the lower triangle of `hessian` (n, n).
     """
     places, r, m, n = rows.shape
     inverse, turn, basis, shares = state

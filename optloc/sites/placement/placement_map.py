@@ -1,4 +1,7 @@
-"""Maps of the accuracy bound before and after a choice of stations, and the gap during the search."""
+"""Maps of the accuracy bound before and after a choice of stations, and the gap during the search.
+
+Letters: P places, s stations, q recorded moments of the search.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +83,7 @@ def plot_placement(
 
 
 def _mark(axes: Axes, found: BoundMap, chosen: Array, places: Array, weights: Array, scale: float) -> None:
-    """Draw places, candidates and taken stations into a map.
+    """Draw places, candidates and taken stations into a map (`found`).
 
     `chosen` (s,) marks the taken stations. `places` (P, 2) are in the units of the axes: metres, km or
     degrees. `scale` converts the positions of the stations to these units. The markers of places grow with

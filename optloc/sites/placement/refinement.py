@@ -1,4 +1,10 @@
-"""Continuous refinement of a placement: the new sites move inside their regions to reduce the bound."""
+"""Continuous refinement of a placement: the new sites move inside their regions to reduce the bound.
+
+Letters: P places, k moving sites, n sites, d coordinates, m unknowns of the target.
+
+Arguments of many functions: `candidates` are the sites as arrays, and `places` are positions of the
+moving sites, metres.
+"""
 
 from __future__ import annotations
 
@@ -61,11 +67,13 @@ def refined(
     _check_refinable(candidates)
     task, free = task_of(candidates), candidates.state != 1
     taken = np.isin(candidates.names, (*found.chosen, *found.kept)).astype(np.int64)
+    # The refinement is local, so random sets give it other starts.
     sets = [taken, *(exchanged(task, one)[1] for one in random_sets(task, starts, selection.seed))]
     best: tuple[float, Array | None] = (np.inf, None)
     position = candidates.problem.stations.position.reshape(-1, candidates.design.dimension)
     owner = _station_of_site(candidates)
     for chosen in sets:
+        # Only the new sites move. Each of them starts at the nearest position inside a region and stays in this region.
         sites = np.flatnonzero((chosen == 1) & free)
         start = position[owner[sites]]
         homes = [_nearest_region(place, regions, ground) for place in start]
@@ -168,6 +176,8 @@ def _information(candidates: Candidates, sites: Array, symbols: Sequence[Any]) -
     """
     import casadi as ca
 
+    # t is the position of the target, and a is the position of the station. Rows with the same kind, axes and second
+    # station share one function of t and a.
     design, d = candidates.design, candidates.design.dimension
     kept = (candidates.state == 1).astype(float)
     base = design.prior + np.einsum("prmn,n,prkn->pmk", design.rows, kept, design.rows)

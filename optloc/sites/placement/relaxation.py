@@ -106,6 +106,8 @@ def cheapest(cost: Array, size: Array, most: float, at: Array) -> tuple[float, f
 
     All arrays are (n,), and no entry of `size` is negative: this is a fractional knapsack problem.
     """
+    # Sites with a negative cost are taken in the order of cost per size. The last of them may be taken in part: its
+    # rate is the multiplier.
     n = cost.shape[0]
     rate = np.empty(n)
     total = 0.0
@@ -167,6 +169,7 @@ def step(
     move, change, gain : array (n,), (2 n + R,), (R,)
         Output: the changes of w, multipliers and slacks.
     """
+    # Newton equations of the barrier problem; multipliers and slacks are eliminated, so only `move` is unknown.
     n, count = w.shape[0], rules.shape[0]
     for j in range(n):
         move[j] = mu / w[j] - mu / (1.0 - w[j]) - gradient[j]
@@ -182,6 +185,7 @@ def step(
     if not cholesky(hessian, len(move), 0.0):
         return 0.0
     solve_factored(hessian, move)
+    # Multipliers and slacks follow from the move. `reach` keeps the weights and slacks positive.
     reach = 1.0
     for i in range(count):
         for j in range(n):
@@ -292,6 +296,7 @@ def relax(
     while taken < most:
         taken += 1
         value = evaluate(rows, bases, weight, d, x, off, scale, kind, worst, state, values)
+        # `size` is the scale of the criterion. A log determinant can be 0, so its scale is d.
         if not np.isfinite(value):
             break
         size = float(d) if kind == VOLUME else abs(value)
@@ -300,6 +305,7 @@ def relax(
             begin(x, left, duals, rules, limits, mu)
             barrier_weights(values[0], _ABOVE * size, share)
             level = values[0].max() + _ABOVE * size
+        # The level must stay above all items: their slacks are positive.
         level = max(level, values[0].max() + 0.5 * mu)
         low = weigh(values, level, mu, share, turns)
         derive(rows, bases, weight, d, x, off, scale, kind, worst, state, turns, slopes, hessian)
@@ -333,7 +339,8 @@ def mix(turns: Array, slopes: Array, gradient: Array) -> None:
 def product(x: Array, left: Array, duals: Array, level: float, values: Array, share: Array) -> float:
     """Return the mean product of slacks and multipliers of sites, rules and (if there are several) items.
 
-    The next barrier parameter is a share of this mean. `go` explains the arguments.
+    The next barrier parameter is a share of this mean. The arguments are as in `go`: weights `x`, slacks `left`,
+    multipliers `duals`, `level`, items `values` and multipliers `share` of the items.
     """
     n, count, items = x.shape[0], left.shape[0], share.shape[0]
     total, terms = 0.0, 2 * n + count
@@ -387,6 +394,8 @@ def go(
     """
     n, count, items = x.shape[0], left.shape[0], share.shape[0]
     move, change, gain = np.empty(n), np.empty(2 * n + count), np.empty(count)
+    # `turn` are the changes of the multipliers of the items. `rise` is the change of the level: a constant part, plus
+    # `pull` times the move of the weights. `grow` is the change of the slack of an item.
     turn, pull, rise = np.empty(items), np.zeros(n), 0.0
     if items > 1:
         rise, pull = share_out(values, level, mu, share, active, slopes, gradient, hessian)
@@ -452,7 +461,7 @@ def meets(w: Array, rules: Array, limits: Array) -> bool:
 
 @compiled
 def begin(w: Array, left: Array, duals: Array, rules: Array, limits: Array, mu: float) -> None:
-    """Write the first slacks (R,) and multipliers (2 n + R,) at w: each product of slack and multiplier is mu.
+    """Write the first slacks `left` (R,) and multipliers `duals` (2 n + R,) at w: each of their products is mu.
 
     A slack is at least 0.1, also if the weights violate the rule: the steps then remove the violation.
     """

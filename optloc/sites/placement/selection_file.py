@@ -1,4 +1,11 @@
-"""Selection files: candidates, places, measurements and rules; output of the chosen sites as a problem file."""
+"""Selection files: candidates, places, measurements and rules; output of the chosen sites as a problem file.
+
+Letters: P places, s stations (candidates and existing stations), m rows, d coordinates.
+
+Arguments of many functions: `section` is a table of the file, and `folder` is the folder of the file.
+`source` or `where` is the location in the file for error messages. `frame` and `dimension` belong to the
+coordinates.
+"""
 
 from __future__ import annotations
 
@@ -290,6 +297,7 @@ def _problem_tables(
     keys = [key for key in _PLACE if any(table.has(key) for table, _ in tables)]
     rows: list[dict[str, Any]] = []
     for table, section in tables:
+        # This call only checks the coordinates: the column sigma belongs to measurements, so it is removed.
         survey(section.model_copy(update={"sigma": None}), _without_sigma(table), file.frame, table.source)
         for i, name in enumerate(table.labels("name")):
             rows.append({"name": str(name)} | {key: float(table.numbers(key)[i]) for key in keys if table.has(key)})
@@ -300,6 +308,7 @@ def _problem_tables(
         given = expected.model_dump(exclude_defaults=True, exclude=_ROWS | {"range_max"})
         place = join(source, f"[[measurements]] {i + 1}")
         measurements.append(given | {"rows": _expected_rows(expected, rows, sigmas, folder, place)})
+        # If the candidates have a column sigma, each row has a sigma, and a common one would conflict.
         if sigmas:
             measurements[-1].pop("sigma", None)
     out = {
@@ -467,6 +476,7 @@ def _sight_factors(
     if section is None:
         return None
     where, names = join(source, "[sight]"), problem.stations.names
+    # Terrain and table are multiplied: a pair that the terrain blocks stays out of sight.
     out = np.ones((len(places), len(names)))
     if section.terrain is not None:
         ground = ground_of(within(folder, section.terrain, join(where, "key 'terrain'")), join(where, "key 'terrain'"))
@@ -523,6 +533,7 @@ def write_chosen(loaded: LoadedSelection, taken: Sequence[str], out: Path, sourc
         raise InvalidProblem("the output is a problem file, so its name must end in .toml", str(out), "change the name")
     claim(out, inputs=[source])
     kept, settings = {*taken}, dict(loaded.settings)
+    # `others` are the second stations of sections of rows.
     others = {s.get("b") for s in settings["measurements"]}
     stations = [row for row in settings["stations"]["rows"] if row["name"] in kept | others]
     settings["stations"] = settings["stations"] | {"rows": stations}

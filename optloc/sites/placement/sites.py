@@ -3,6 +3,12 @@
 A site is a possible position of a station. A place is a possible position of the target. `candidates_of`
 linearises the rows of all sites at all places, so that the search (`optloc.sites.placement.best_set`) needs
 no measurement model.
+
+Letters: P places, n sites, s stations, d coordinates. m is the number of rows of the problem; in arrays
+with a last axis of sites, and in (P, m, m), m is the number of unknowns of the target.
+
+Arguments of many functions: `problem` has the rows of all sites, `names` are the names of the sites, and
+`vectors` are the unknowns of the target at each place.
 """
 
 from __future__ import annotations
@@ -252,6 +258,7 @@ def _check_apart(problem: Problem, site: Array, names: Sequence[str], places: Ar
     if apart[p, s] < _SAME:
         what = f"place {p + 1} is at the position of station {problem.stations.names[s]!r}"
         raise InvalidProblem(what, "places", "move the place or the station by more than a millimetre")
+    # The first station at each position is valid; the others repeat its position.
     first = np.unique(stations, axis=0, return_index=True)[1]
     repeated = np.setdiff1d(np.arange(len(stations)), first)
     if len(repeated):
@@ -321,6 +328,7 @@ def _whitened_rows(problem: Problem, vectors: Array, site: Array, count: int) ->
     """
     linear = linearise(problem, vectors)
     jacobian = np.concatenate([linear.shared, linear.local], axis=-1)
+    # A whitener covers groups of rows with common noise; each group must belong to one site.
     found: list[list[Array]] = [[] for _ in range(count)]
     for whitener in linear.noise:
         owner = site[whitener.row]
@@ -439,6 +447,7 @@ def _check_determined(candidates: Candidates) -> None:
     """
     in_sight = (candidates.design.rows != 0.0).any(axis=(1, 2)) & (candidates.state != 0)
     rows = candidates.design.rows[..., candidates.state != 0]
+    # `flat` (P, n r, m) are all rows of the allowed sites at each place, and `scale` are the prior sigmas.
     places, r, m, n = rows.shape
     flat = np.moveaxis(rows, -1, 1).reshape(places, n * r, m)
     prior = candidates.design.prior
