@@ -166,7 +166,6 @@ def measured(
     model = MODELS[kind]
     quantity = cast("Quantity", model.quantity)
     correction = in_si(correction, quantity, "correction")
-    # All values become arrays here, so that the code below handles shapes only and no other types.
     z, sigma, arrival_sigma = (
         numbers(in_si(z, quantity, "z"), "z"),
         as_deviations(in_si(sigma, quantity, "sigma", deviation=True), "sigma", kind),
@@ -175,19 +174,16 @@ def measured(
     covariance, weight, correction = (
         numbers(v, name) for v, name in ((covariance, "covariance"), (weight, "weight"), (correction, "correction"))
     )
-    a, b, epoch, target = (
-        as_integers(v, name) for v, name in ((a, "a"), (b, "b"), (epoch, "epoch"), (target, "target"))
-    )
+    integers = ((a, "a"), (b, "b"), (epoch, "epoch"), (target, "target"))
+    a, b, epoch, target = (as_integers(v, name) for v, name in integers)
     count = _count(kind, (z, sigma, covariance, a, b, epoch, target, weight, correction), covariance)
 
-    # The number -1 marks a station that the kind does not use.
-    def index(values: Array | None, needed: bool, name: str) -> Array:
+    def index(values: Array | None, needed: bool, name: str) -> Array:  # -1: the kind does not use the station
         if needed and values is None:
             raise InvalidProblem(f"{kind} needs station {name}", where=name, advice="give station indices")
         return _filled(values if needed and values is not None else -1, (count,), np.int64)
 
-    # One value per row; NaN for rows that are simulated later.
-    def row(values: Array | None) -> Array:
+    def row(values: Array | None) -> Array:  # one value per row; NaN for rows that are simulated later
         return _filled(np.nan, (count,)) if values is None else _filled(values, (*values.shape[:-1], count))
 
     _check_noise(kind, covariance, signal, sigma is not None or arrival_sigma is not None)

@@ -161,8 +161,7 @@ def search_boxes(
             bound_nodes(kinds, data, centre, sense, gram, half, line, nodes)
         linearise_rows(K, w, nodes, rows)
         low = least_residual(K, weight, floor, half, nodes, rows)
-        # `low` is a length, and the level is a cost. Below 1 a length is larger than its square, so the length is
-        # squared.
+        # `low` is a length and the level a cost, so the length is squared.
         if exceeds_level(low, aim.level):
             continue
         here, noise = cost_at(K, w, nodes), rounding_error(K, weight, floor, nodes)
@@ -171,7 +170,6 @@ def search_boxes(
         # Parts with residuals longer than rho, and parts that contain no minimum, are cut off from all sides.
         reset_cut(half, cut)
         contract_box(K, weight, rho + noise, half, half[2] == 0.0, nodes, rows, cut, solve)
-        # `sound`: the box may be dropped if it contains no minimum.
         sound = aim.whole or exceeds_level(low, aim.value)
         if _is_done(at, half, minima, sides, aim, (unique or aim.whole) and sound):
             continue
@@ -185,7 +183,6 @@ def search_boxes(
                 continue
             if here < aim.level and not is_empty(cut):
                 low_points += 1
-                # Descend often at first, then rarely; and from each box that contains at most one minimum.
                 seldom = low_points & (low_points - 1) == 0
                 if seldom or is_convex_over_box(shapes, A, half, nodes, curves, sums, 0.0):
                     outcome = _follow(cost, chart, box, minima, sides, aim)
@@ -375,8 +372,7 @@ def prove_locally(
         A certified lower bound of f over the region or over all positions; -inf without a bound. For a proven value it
         is below the cost of the fix by the final eps.
     """
-    # The units are standard deviations of the fix, so that boxes are about as wide as the cost requires in each
-    # direction.
+    # Units are standard deviations of the fix: boxes are about as wide as the cost requires.
     chart, good = chart_on(cost, x, box, known.planes, known.surface)
     if not good:
         return SINGULAR, 0, -inf
@@ -407,8 +403,7 @@ def prove_locally(
         return BUDGET, 0, -inf
     own, free, hole = (1, free, sides[0]) if count else (0, 0, np.zeros(3))
     count = free if kappa <= 0.0 else count  # for the value alone, boxes of other minima are bounded like all others
-    # Hidden minima leave an open boundary: where the position becomes visible, the cost may be least and still have a
-    # slope.
+    # Hidden minima leave an open boundary: where the position becomes visible, the least cost may have a slope.
     better, whole = _refuting(least, eps, noise), (closed or isnan(lower[0])) and known.hidden == 0
     level = least + kappa if kappa > 0.0 else least - eps
     aim, stack = Goal(level, least - eps, better, whole, free, own), np.empty((_CAPACITY, DEPTH))

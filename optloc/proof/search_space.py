@@ -280,7 +280,6 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
     information[0, 1] = information[1, 0] = sums[H01]
     information[0, 2] = information[2, 0] = sums[H02]
     information[1, 2] = information[2, 1] = sums[H12]
-    # `gram` temporarily contains the axes; T'T replaces them below.
     if planes.shape[0] + surface.shape[0] == 0:
         count = D
         roughly_principal(information, gram)
@@ -321,8 +320,7 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
     if own.shape[0] > 0 and reaches_infinity(cost.kinds, cost.K):
         middle, _ = station_cube(cost.kinds, cost.data, x)
         floor += _length_of_lines(cost, own, middle)
-        # Lines from the reference position have fewer exact digits than lines from the fix, which sharp rows
-        # need.
+        # Lines from the reference position have fewer exact digits than lines from the fix.
         if relative_rounding(cost.K) * floor < _SHARP:
             chart = LocalAxes(origin, sense, back, gram, slip, floor, own, True, middle)
     return chart, good

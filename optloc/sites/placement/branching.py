@@ -174,11 +174,15 @@ def expand(
         Start and output as in `relax`, but for all sites: w is 1 for taken sites; the cost of fixed sites is 0.
     enough, most
         See `relax`.
+
+    Notes
+    -----
+    `inner` are the rows of the free sites; `lines` and `left` are their rules and the limits that remain. Scenario 0
+    has all taken sites. In each other scenario, the weight -1 subtracts one taken site again.
     """
     places, r, m, n = rows.shape
     free, taken = np.flatnonzero(state == FREE), np.flatnonzero(state == IN)
     count, sure = len(free), len(taken)
-    # `inner` are the rows of the free sites; `lines` and `left` are their rules and the limits that remain
     inner = np.empty((places, r, m, count))
     for p in range(places):
         for q in range(r):
@@ -194,7 +198,6 @@ def expand(
             gather(rows[p, :, :, own : own + 1].copy(), total, ones, -1, 1.0, scaled, bases[0, p])
             put_rows(bases[0, p], total)
         bases[0, p] = total
-        # Scenario 0 has all taken sites. In each other scenario, the weight -1 subtracts one taken site again.
         for s in range(1, scenarios):
             gather(rows[p, :, :, taken[s - 1] : taken[s - 1] + 1].copy(), total, -ones, -1, 1.0, scaled, bases[s, p])
     if fail:
@@ -209,8 +212,7 @@ def expand(
     for j in range(count):
         x[j] = min(1.0 - _INSIDE, max(_INSIDE, w[free[j]]))
         room += x[j] * lines[0, j]
-    # Shrink the weights so that they meet the first rule; 1e-3 keeps them inside 0 < w.
-    if room > left[0]:
+    if room > left[0]:  # shrink the weights so that they meet the first rule; 1e-3 keeps them inside 0 < w
         for j in range(count):
             x[j] *= max(left[0], 0.0) / room
             x[j] = max(1e-3, x[j])

@@ -277,6 +277,11 @@ def relax(
         Largest number of steps.
     cost : array (n,)
         Output: rise of the bound if a site is taken (positive), or left out (negative).
+
+    Notes
+    -----
+    `turns` are the weights of the items, and `best` is the least criterion of weights that meet the rules. `late`
+    counts the steps after `best` fell below `enough`, and `taken` counts all steps.
     """
     places, m, n = rows.shape[0], rows.shape[2], w.shape[0]
     scenarios, count = bases.shape[0], rules.shape[0]
@@ -290,8 +295,6 @@ def relax(
     values, share, slopes = np.empty((2, items)), np.ones(items), np.empty((items, n))
     gradient, hessian, reduced, at = np.empty(n), np.empty((n, n)), np.empty(n), np.empty(n)
     left, duals, x, turns = np.empty(count), np.empty(2 * n + count), w.copy(), np.zeros(items)
-    # `turns` are the weights of the items, and `best` is the least criterion of weights that meet the rules. `late`
-    # counts the steps after `best` fell below `enough`, and `taken` counts all steps.
     bound, best, mu, level, late, taken = -np.inf, np.inf, -1.0, 0.0, 0, 0
     while taken < most:
         taken += 1
