@@ -5,6 +5,8 @@ satisfied with equality. So every candidate is among the minima along the faces,
 inequalities. Minima that violate another constraint do not count. Minima from which the cost falls inwards do not
 count either.
 
+Face 0 has no inequality, so it is the problem without inequalities. In messages, a face with inequalities is an edge.
+
 Letters: n problems, q slots for minima of a problem, d coordinates, `size` numbers of a parameter vector. Costs are
 chi-square values. `margin` is the difference of costs to prove: other minimum minus fix. `effort` multiplies the
 number of boxes that a proof may use.
@@ -239,11 +241,13 @@ def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort:
             # edge to one of them, so this edge needs no proof.
             face_gap = np.where(np.isfinite(along.rest) | ~all_admitted, face_gap, margin)
         else:
+            # the minima without inequalities start the searches along all other faces
             seeds = pack(np.concatenate([fix.x[:, None], along.x], axis=1))
             all_admitted = np.asarray((admitted | ~(along.cost < fix.cost[:, None] + margin)).all(1))
         found_minima.append((along.x, np.where(admitted, along.cost, np.inf), np.full(admitted.shape, number)))
         proven_gap, boxes = np.minimum(proven_gap, face_gap), boxes + along.boxes
         reasons = np.where((face_gap < 0.0) & (reasons == ""), along.why, reasons)
+    # -inf means that a face is not proven; any other negative gap means that a cheaper minimum is not excluded
     listed = (fix.alternatives.gap < proven_gap[:, None]).sum(1)
     bound = fix.cost - equal_cost(fix.cost)
     claims, unproven = state_claims(fix.cost, bound, proven_gap, boxes, listed), proven_gap < 0.0
@@ -275,6 +279,7 @@ def _explore_face(
     """
     n, size = len(seeds), seeds.shape[-1]
     costly, boxes = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
+    # a face with inequalities may cost too much as a whole
     if len(face) > len(exact(problem)) and not why_unsupported(on_face(problem, face)):
         limits = admitted_states(problem, problem.dimension)
         costly, boxes = _is_costly(on_face(problem, face), limits, costs, seeds, fix.cost + margin, effort)
@@ -355,6 +360,7 @@ def _request(on: Problem, limits: Array, costs: Costs, x: Array, difference: Arr
     (n, d), value = place.shape, np.zeros(len(x))
     planes, surface = surfaces_of(on, place)
     region = limits if np.isfinite(limits).all() else np.full_like(limits, np.nan)
+    # a gap of 0 proves the value alone, and `eps` is the difference up to which a lower cost counts as equal
     return ProofRequest(
         x=place,
         others=np.zeros((n, 0, d)),

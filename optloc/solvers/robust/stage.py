@@ -157,6 +157,7 @@ def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[S
     # The weights belong to a position. If the verdict shows no position, rows keep their earlier weights.
     answered = np.asarray(np.isfinite(surviving_candidates(found, judge(problem, found))[:, 0]).all(-1))
     weights = _equations(problem, loss, np.where(answered[:, None], found.x[:, 0], 0.0))[1]
+    # `refined` is False, so that a following least squares runs
     return replace(found, refined=False, weights=np.where(answered[:, None], weights, found.weights))
 
 

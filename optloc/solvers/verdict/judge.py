@@ -116,6 +116,7 @@ def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
         reason[i] = _undetermined_sentence(problem, _information(curvature)[i])
     _explain_missing(problem, pool, np.flatnonzero(missing), code, reason)
     finished = answered & (code == Status.OK)
+    # the mark of an unfinished answer is the bit of its status
     marks = np.where(finished, finding_marks(problem, pool, gap), 1 << code.astype(np.int32)).astype(np.int32)
     proven = merged_claims(finished, _claims(pool), NO_ANSWER)
     if pool.free is not None:
@@ -211,6 +212,7 @@ def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, re
     straight = bool(len(items)) and not isinstance(problem.medium, Layers)
     measured = is_measured(problem.take(items)) if straight else np.zeros(len(items), dtype=bool)
     for place, i in enumerate(items):
+        # groups of stations: ranges link the stations within a group, but no range links two groups
         groups = () if found is None else found.groups[int(found.pattern[place])]
         if len(groups) > 1:
             names = problem.stations.names
@@ -400,7 +402,8 @@ def surviving_candidates(pool: Pool, fix: Fix) -> Array:
 def _as_finished(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
     """Return the fixes of settled pools as if all were finished and near the stations.
 
-    If `pool.plain` is None, they have no status yet: `_apply_rules` decides it.
+    If `pool.plain` is None, they have no status yet: `_apply_rules` decides it. A *law* is the distribution of the
+    position after near bounds have cut it off.
     """
     count, cost, proven = len(pool), pool.cost[:, 0], _claims(pool)
     law = law_at(problem, pool)
@@ -540,7 +543,7 @@ def hide_open_epochs(fix: Fix) -> Fix:
     """Return fixes of runs with NaN for the states of undetermined epochs; their reasons name these epochs."""
     if fix.local is None or not fix.answered.any():
         return fix
-    size = fix.local.shape[-1]
+    size = fix.local.shape[-1]  # the states come first among the local unknowns
     undetermined = np.isnan(np.diagonal(fix.local, axis1=-2, axis2=-1)).any(-1) & fix.answered[..., None]
     if not undetermined.any():
         return fix

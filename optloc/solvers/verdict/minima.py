@@ -59,7 +59,7 @@ def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array
             continue
         items = np.flatnonzero(face == number)
         part = problem.take(items)
-        if len(sides[number]) > len(sides[0]):
+        if len(sides[number]) > len(sides[0]):  # an inequality is active
             if free is None or shift is None:
                 free, shift = np.full(covariance.shape, np.nan), np.full(vector.shape, np.nan)
             free[items], shift[items] = _without_bounds(part, sides[0], x[items], information[items], vector[items])
