@@ -208,6 +208,7 @@ def extent(problem: Problem, places: Array | None = None, *, widen: float = 0.5)
     if earth:  # one interval of longitudes, also across the date line
         flat[:, 0] = (flat[:, 0] - flat[0, 0] + 180.0) % 360.0 - 180.0 + flat[0, 0]
     low, high = flat.min(0), flat.max(0)
+    # a degree of longitude is shorter than a degree of latitude by this factor
     squeeze = np.array([np.cos(np.radians(np.clip(flat[:, 1].mean(), -_SQUEEZED, _SQUEEZED))) if earth else 1.0, 1.0])
     side = max(float(((high - low) * squeeze).max()), _LEAST[0] if earth else _LEAST[1])
     low, high = low - widen * side / squeeze, high + widen * side / squeeze

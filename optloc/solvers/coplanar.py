@@ -180,7 +180,7 @@ def _sides(problem: Problem, across: Across, found: _FoundSides) -> _Sides:
     count, slots, size = found.x.shape
     x, cost = np.full((count, 2 * slots, size), np.nan), np.full((count, 2 * slots), np.inf)
     off = found.x[..., across.part.stop - 1] > across.least[:, None]
-    # the upper side first, as in the verdict
+    # the upper side first, as in the verdict; `upward` is the sign of the normal that points up
     upward = np.where(across.axes[:, -1, -1] < 0.0, -1.0, 1.0)
     for slot in range(slots):
         minimum = np.array(found.x[:, slot])
@@ -266,7 +266,7 @@ def _curvature(problem: Problem, across: Across, found: _FoundSides, x: Array, j
     rotation = np.broadcast_to(np.eye(information.shape[-1]), information.shape).copy()
     rotation[:, across.part, across.part] = across.axes
     covariance[items] = rotation @ square @ np.swapaxes(rotation, -1, -2)
-    kappa[items] = np.inf
+    kappa[items] = np.inf  # no single Gaussian describes both sides
     regular_now, weakest, of_all = (
         np.array(curvature.regular),
         np.array(curvature.weakest),

@@ -314,6 +314,7 @@ def _plan_run(problem: Problem) -> RunPlan | None:
         return None
     one = problem.take(np.zeros(1, dtype=int)).with_rows(z=np.zeros((1, problem.count)))
     epoch = fold(one, found).take(np.zeros(1, dtype=int))
+    # one epoch as a problem of a target at rest, without biases: `RunPlan.settle` subtracts the known biases
     still = replace(without_biases(epoch), motions=(Motion(),))
     plan = plan_of(still)
     dof = int(degrees_of_freedom(one)[0])
@@ -329,6 +330,7 @@ def _plan_run(problem: Problem) -> RunPlan | None:
     )
     columns = np.full(problem.layout.n_local, -1)
     slots = {slot.name: slot for slot in plan.layout.shared}
+    # in the fix of an epoch the local unknowns follow the shared unknowns
     slots |= {slot.name: replace(slot, start=slot.start + plan.layout.n_shared) for slot in plan.layout.local}
     for slot in problem.layout.local:
         if slot.name in slots:

@@ -140,6 +140,7 @@ def row_wise(problem: Problem) -> RowWise:
     errors: list[tuple[slice, Callable[[Array | None], Array]]] = []
     for block, start in zip(problem.rows, problem.starts, strict=True):
         part = _lift_ranges(problem, block, start, origin, scale, pairs, first)
+        # kinds without ranges, such as bearings
         part = part or _lift_others(problem, block, start, Coordinates(origin, scale, False))
         if part is None:
             continue
@@ -397,7 +398,7 @@ def _test_support(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Arra
     limit = -ndtri(0.5 * _LEVEL / np.maximum(present.sum(1, keepdims=True), 1))
     wrong, active = wrong.copy(), np.arange(len(x))
     x = x.copy()
-    # if the support leaves too few rows for a fix, its first rows stay in it
+    # If the support leaves too few rows for a fix, only its first rows are left out: the flags as sizes are all equal.
     wrong = _spare(problem, wrong.astype(float), wrong)
     for _ in range(_PASSES):
         part, left_out = problem.take(active), wrong[active]

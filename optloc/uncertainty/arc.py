@@ -126,6 +126,7 @@ class Arc:
         mass, d = self.mass, self.node.shape[-1]
         spaced, offsets, density = student(d - 1, n, seed)
         before = np.append(0.0, np.cumsum(mass))
+        # number of the chord between two nodes, in proportion to the probability of the chords
         piece = np.searchsorted(before[1:-1], spaced, side="right")
         fraction = np.clip((spaced - before[piece]) / np.where(mass[piece] > 0.0, mass[piece], 1.0), 0.0, 1.0)
         along = self.node[piece] + fraction[:, None] * np.diff(self.node, axis=0)[piece]

@@ -120,6 +120,7 @@ def _outline_in_cells(surface: RegionSurface, cells: Array, plane: Array, level:
     reach = FAR * float(surface.chart.distance)
     cost = _profile(surface, cells, plane)
 
+    # negative inside the region, zero on its outline
     def value(points: Array) -> Array:
         beyond = np.sqrt(((points - centre) ** 2).sum(-1)) / reach - 1.0
         return np.asarray(np.maximum((cost(points) - surface.least) / q - 1.0, beyond))
@@ -140,6 +141,7 @@ def _profile(surface: RegionSurface, cells: Array, plane: Array) -> Callable[[Ar
     in_plane, depth = (cells - surface.position) @ plane.T, (cells - surface.position) @ normal
     origin = in_plane.min((0, 1))
     step = max(float((in_plane.max((0, 1)) - origin).max()), np.finfo(float).tiny) / (_ACROSS - 3)
+    # table over nodes of a grid in the plane: least and greatest hidden coordinate of the cells there
     low, high = np.full((_ACROSS + 1, _ACROSS + 1), np.inf), np.full((_ACROSS + 1, _ACROSS + 1), -np.inf)
     first = np.floor((in_plane.min(1) - origin) / step).astype(int)
     last = np.ceil((in_plane.max(1) - origin) / step).astype(int) + 2
@@ -184,6 +186,7 @@ def _least_along(surface: RegionSurface, base: Array, normal: Array, low: Array,
         new = at(np.clip(t + step, low[:, None], high[:, None]))
         better = new[0] < cost
         cost, t = np.where(better, new[0], cost), np.where(better, new[1], t)
+        # a Newton step that does not lower the cost is tried again at a quarter of its length
         step = np.where(better, new[2], 0.25 * step)
     return np.asarray(cost.min(1))
 

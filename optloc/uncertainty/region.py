@@ -71,6 +71,7 @@ class Cells:
         from_point = np.linalg.inv(np.swapaxes(self.edges, -1, -2))
         out = np.zeros(len(points), dtype=bool)
         for i, point in enumerate(np.append(points - self.base, np.ones((len(points), 1)), axis=1)):
+            # the weight of the middle of each cell, then of its edges; a ratio of at most 1 is inside
             share = from_point @ point
             size = np.abs(share[:, 1:]).max(-1) if len(share) else np.zeros(0)
             out[i] = ((share[:, 0] > 0.0) & (size <= (1.0 + _ROUNDED) * share[:, 0])).any()
@@ -223,6 +224,7 @@ def _cover(surface: RegionSurface, threshold: float, boxes: int | None) -> tuple
     cost, x = _without_unused_terms(costs.kinds, costs.data[0], costs.K[0], costs.w[0]), np.array(surface.position)
     box, d = empty_box(*cost.K.shape), len(x)
     most = boxes or (_MOST[d] if enabled() else _MOST_PLAIN)
+    # `cover_region` writes these arrays; `ends` has the cost at infinity of each cell, infinite if the cell has an end
     base, edges, ends = np.zeros(3), np.zeros((2 * most, 1 + d, 1 + d)), np.zeros(2 * most)
     above, bent = threshold - surface.least, surface.kind != CARTESIAN
     count, inside, highest = cover_region(cost, box, x, above, most, bent, base, edges, ends)
@@ -266,13 +268,14 @@ def boundary(surface: RegionSurface, threshold: float) -> Array:
     q = np.sqrt(threshold - surface.least)
     count = int(np.ceil(np.log(_LAST / _FIRST) / np.log(_FACTOR)))
     ladder = q * _FIRST * _FACTOR ** np.arange(count + 1)
+    # a ray starts at the fix, and its coordinate counts standard deviations
     start, steps = _axes(surface.chart)
     steps = rays @ steps.T
     limit = _limit(surface, steps)
     along = np.minimum(ladder, limit[:, None])
     costs = surface.cost(_points(surface, start + along[..., None] * steps[:, None]))
     above = np.asarray(costs > threshold)
-    first = above.argmax(1)
+    first = above.argmax(1)  # index of the first point above the threshold; 0 also for a ray without any
     ray = np.arange(len(rays))
     low, high = np.where(first > 0, along[ray, np.maximum(first - 1, 0)], 0.0), along[ray, first]
     for _ in range(_HALVINGS):

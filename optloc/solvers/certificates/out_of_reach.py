@@ -174,10 +174,11 @@ def are_out_of_reach(
     count, constraint = len(edges.levels), edges.constraint
     lay_planes(edges, x, cov, edges.value - value[:, constraint], normal[:, constraint], room.asked)
     room.costs.w[:] = np.repeat(costs.w, count, axis=0)
-    if len(room.costs.data) > 1:
+    if len(room.costs.data) > 1:  # the fixes do not share the data of their terms
         room.costs.data[:] = np.repeat(costs.data, count, axis=0)
     cost_here(room.costs, room.asked.x[:, None], room.found)
     level = np.repeat(cost + LISTED_GAP, count)
+    # The proof is: no position of the plane costs less than the point on it by more than `eps`, so all are above `level`.
     room.asked.eps[:] = room.found[0, :, 0] - level
     if not (room.asked.eps > equal_cost(level)).all():
         return False

@@ -190,7 +190,7 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
             return
         nodes = _nodes(found, i)
         centre, spread = centre_and_spread(place[i, nodes])
-        size = float(spread) or 1.0
+        size = float(spread) or 1.0  # stations at one point have no spread, so the unit is a metre
         scaled = _scaled(found, i, nodes, (place[i, nodes] - centre) / size, size)
         point = (fix.position[i] - centre) / size
         cost = float(scaled.cost(point))

@@ -300,6 +300,7 @@ def course_starts(problem: Problem) -> Array | None:
     place = np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))[:, 0]
     home, away = place[:, receiver], place[:, illuminator] - place[:, receiver]
     length = float(spread_of(problem)[1][0])
+    # unit vectors of increasing azimuth, of increasing elevation, and along the line of sight
     axes = triad(value[0], value[1])
     if problem.stations.axes is not None:
         values = np.broadcast_to(problem.stations.axes, (size, *problem.stations.axes.shape[-4:]))[:, 0, receiver]

@@ -167,6 +167,7 @@ def _shares(problem: Problem, truth: Array, found: Repeats) -> Array:
     part = slice(slot.start, slot.start + slot.size)
     away = found.x[:, part] - truth[:, part]
     with np.errstate(all="ignore"):
+        # squared distance from the truth, in standard deviations of the repeat
         form = (away * linalg.solve(found.spread[:, part, part], away[..., None])[0][..., 0]).sum(-1)
     # an unfinished repeat counts as one outside every ellipse
     form = np.where(found.good & np.isfinite(form), form, np.inf).reshape(-1, _REPEATS)
