@@ -173,7 +173,7 @@ def _slot(problem: Problem) -> slice:
 def _places(frame: Frame, x: Array, y: Array, height: float, dimension: int, earth: bool) -> Array:
     """Return grid points as positions (n, d) in the frame, metres.
 
-    x and y (n,) are degrees if `earth` is True, else metres. `height` is in metres.
+    x and y (n,) are degrees if `earth` is True, else metres. `height` is in metres, and `dimension` is d.
     """
     if earth:
         return frame.from_geodetic(np.radians(y), np.radians((x + 180.0) % 360.0 - 180.0), np.full(len(x), height))
@@ -198,8 +198,8 @@ def _deviation(problem: Problem) -> float:
 def extent(problem: Problem, places: Array | None = None, *, widen: float = 0.5) -> tuple[float, float, float, float]:
     """Return x and y limits around stations and positions (n, d): least and greatest x, least and greatest y.
 
-    Every side is widened by a share of the larger side. Limits are degrees in three-dimensional frames of the Earth,
-    else metres.
+    Every side is widened by `widen` times the larger side. `places` (n, d) are the positions, None for stations only.
+    Limits are degrees in three-dimensional frames of the Earth, else metres.
     """
     earth = problem.frame.geodetic and problem.dimension == 3
     stations = problem.stations.position.reshape(-1, problem.dimension)

@@ -4,7 +4,8 @@ The data separate mirror images only if the cost on the plane between them is cl
 one region.
 
 Letters: N problems, r minima of a problem, q slots of a pool, `size` numbers of a parameter vector. w is the distance
-from the plane in metres. The minima are found in the coordinates of `Across`: position in the plane, and w^2.
+from the plane in metres. The minima are found in the coordinates of `Across`: position in the plane, and w^2. The
+parameter `across` holds the plane of each problem, and `own` the pool before.
 """
 
 from __future__ import annotations

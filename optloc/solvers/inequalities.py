@@ -205,7 +205,10 @@ _STEPS = 100
 
 
 def by_least_squares(problem: Problem, start: Array, item: Array, face: Face) -> tuple[Array, Array, Array]:
-    """Return x (M, size), cost (M,) and status (M,) of the minima on a face next to starts of problems `item` (M,)."""
+    """Return x (M, size), cost (M,) and status (M,) of the minima on a face next to starts.
+
+    `start` (M, size) are the starts, and `item` (M,) is the problem of each start.
+    """
     strata = strata_of(problem, face)
     if strata is None:
         done = refine(problem, start, item=item, face=face, limit=_STEPS)

@@ -189,9 +189,13 @@ def _program(problem: Problem, data: int, rows: int) -> Program:
 
 
 def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compiled: bool) -> Program:
-    """Return a new program for a structure: `choice` is the solver, and `compiled` requests a C compiler."""
+    """Return a new program for a structure: `choice` is the solver, and `compiled` requests a C compiler.
+
+    `data` and `rows` are as in `_program`.
+    """
     n = problem.layout.size
-    # The numbers p of a problem are n units, n centres, the numbers of the rows, the spread of the stations, and bounds.
+    # The numbers p of a problem are n units, n centres, the numbers of the rows, the spread of the stations, and the
+    # bounds of the constraints.
 
     def scaled_residual(y: Any, p: Any, z: Any) -> list[Any]:
         return residual(problem, y * p[:n] + p[n : 2 * n], p[2 * n :], z)

@@ -150,9 +150,9 @@ def _along_border(
 ) -> tuple[tuple[Array, Array, Array], Array]:
     """Return the minima along the borders next to x (M, size), and flags (M,): the cost falls inwards.
 
-    A minimum has a vector, a cost and a status.
-
-    `limits` are the ends of the layers of the points, and `limit` is the largest number of steps.
+    The minima are vectors (M, size), costs (M,) and statuses (M,). `limits` are the ends of the layers of the points,
+    `item` (M,) is the problem of each point, and `limit` is the largest number of steps. `face` are other constraints
+    that are satisfied with equality.
     """
     side = limits.reached(x, _REACHED)
     z = np.where(side < 0, limits.low, limits.high)
@@ -266,7 +266,8 @@ def equations_in_layers(problem: Problem, x: Array) -> Normal:
 def _rise_of_one(problem: Problem, limits: Limits, x: Array, cost: Array, face: Face) -> Array:
     """Return the distance (M,), metres, from a border to the depth at which the least cost is larger by one.
 
-    `cost` (M,) is the cost at x (M, size). The search ends at the other border of the layer.
+    `cost` (M,) is the cost at x (M, size), `limits` are the ends of the layers, and `face` are the equalities. The
+    search ends at the other border of the layer.
     """
     z, side = x[:, limits.column], limits.reached(x, _REACHED)
     longest = np.where(side > 0, z - limits.low, limits.high - z)

@@ -5,6 +5,7 @@ the constant columns of the verdict. For a fix with a complication, such as a ri
 unfinished proof, the result is None. The caller then runs the stages of the method: the long path.
 
 Letters: n fixes, m rows, d coordinates, e planes of equalities, k constraints, `size` numbers of a parameter vector.
+The parameter `answer` has the arrays that the compiled code of the plan writes.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The stage "sparse": starts and suspected rows from a convex program that allows gross errors in a few rows.
 
 Letters: N problems, m rows, n unknowns y, d coordinates, x a position, s a station, t an emission time as a distance.
-q stations b are the second stations of pairs; r_a and r_b are the ranges to the stations a and b.
+q stations b are the second stations of pairs; r_a and r_b are the ranges to the stations a and b. `block` are the rows
+of one kind.
 """
 
 from __future__ import annotations

@@ -113,7 +113,8 @@ def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) ->
 def _outline_in_cells(surface: RegionSurface, cells: Array, plane: Array, level: float) -> Outline | None:
     """Return the outline, in a plane, of a region without equalities; None if it has no part in the plane.
 
-    `cells` (m, v, d) are the corners of convex cells that contain the region, metres. `plane` (2, d) has the axes of
+    `surface` is the cost around the fix. `cells` (m, v, d) are the corners of convex cells that contain the region,
+    metres. `plane` (2, d) has the axes of
     the plane, and `level` is the probability. The outline ends at `FAR` distances of the fix from the stations.
     """
     q, centre = quantile(level, 2), (surface.chart.centre - surface.position) @ plane.T
@@ -192,7 +193,10 @@ def _least_along(surface: RegionSurface, base: Array, normal: Array, low: Array,
 
 
 def _far_cells(chart: Chart, level: float) -> Array:
-    """Return cells (m, 2^d, d), metres, that contain the region of a fix that is Gaussian in its inverse range."""
+    """Return cells (m, 2^d, d), metres, that contain the region of a fix that is Gaussian in its inverse range.
+
+    `chart` has the coordinates in which the fix is Gaussian, and `level` is the probability.
+    """
     d = len(chart.position)
     values, vectors = np.linalg.eigh(chart.spread)
     axes = np.sqrt(np.maximum(values, 0.0) * quantile(level, 2)) * vectors

@@ -202,7 +202,7 @@ def _scaled(information: Array, position: Array, centre: Array, inverse: bool) -
 
 
 def along(arc: Arc, n: int, seed: int, within: float | None = None) -> Samples:
-    """Return n samples along an arc, see `optloc.uncertainty.arc.Arc.draw`.
+    """Return n samples along an arc from a seed, see `optloc.uncertainty.arc.Arc.draw`.
 
     `within` is the radius of a ball that limits the positions, metres; None for no limit.
     """

@@ -215,7 +215,8 @@ def likelihood_region(problem: Problem, fix: Fix, level: float = 0.95, *, boxes:
 def _cover(surface: RegionSurface, threshold: float, boxes: int | None) -> tuple[Cells | None, bool, str]:
     """Return cells that contain the region or None, whether a cell reaches infinity, and the reason for None or "".
 
-    `threshold` is the highest cost in the region, and `boxes` the largest number of cells, None for the default.
+    `surface` is the cost around the fix, and `threshold` the highest cost in the region. `boxes` is the largest number
+    of cells, None for the default.
     """
     why = why_unsupported(surface.problem) or why_too_large(surface.problem)
     if why:

@@ -4,7 +4,8 @@ A proof may find a better or another minimum. The minimum is then refined and ad
 
 Letters: N problems of a batch, n problems of a round, q gaps, P points of a problem. d is the number of coordinates of
 the state: position, and velocity if the target moves. Costs, gaps and margins are chi-square values. `items` (n,) are
-numbers of problems in the batch, and `work` is the state of all proofs, which functions change.
+numbers of problems in the batch, and `work` is the state of all proofs, which functions change. `asked` and `answer`
+are the requests and the results of the proofs of a round.
 """
 
 from __future__ import annotations

@@ -178,7 +178,8 @@ def are_out_of_reach(
         room.costs.data[:] = np.repeat(costs.data, count, axis=0)
     cost_here(room.costs, room.asked.x[:, None], room.found)
     level = np.repeat(cost + LISTED_GAP, count)
-    # The proof is: no position of the plane costs less than the point on it by more than `eps`, so all are above `level`.
+    # The proof shows that no position of the plane costs less than the point on it by more than `eps`. So no position
+    # of the plane costs less than the level.
     room.asked.eps[:] = room.found[0, :, 0] - level
     if not (room.asked.eps > equal_cost(level)).all():
         return False

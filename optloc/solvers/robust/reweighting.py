@@ -269,7 +269,8 @@ class _Step:
 def _step(problem: Problem, x: Array, last: Array, face: Face, tolerance: float) -> _Step:
     """Return one least-squares step with fixed weights from x (M, size).
 
-    `last` (M, size) is the step before, and `tolerance` the length of a last step in sigma.
+    `last` (M, size) is the step before, and `tolerance` the length of a last step in sigma. `face` are the constraints
+    that are satisfied with equality.
     """
     strata = strata_of(problem, face)
     # in layers a point may cross a border, since the next step refines it again

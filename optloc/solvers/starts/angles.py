@@ -1,6 +1,7 @@
 """Starts and bounds from angles alone: instrumental variables, unit directions, the smallest maximal angle.
 
-Letters: N problems, m bearings or rows, k epochs, d coordinates, `order` the degree of a polynomial course.
+Letters: N problems, m bearings or rows, k epochs, d coordinates, `order` the degree of a polynomial course. `seen` are
+the bearings of all problems.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ the position of a station at an epoch. A *whitening* matrix W turns correlated r
 
 Letters: N problems, m rows, s stations with ranges, n = d + 1 unknowns y, d coordinates, q points of a problem. The
 range of station i is r_i = c_i + sign_i t. A squared-range problem is ``rows . y = right`` in least squares, with y on
-the quadric: rows (N, m, n), right (N, m).
+the quadric: rows (N, m, n), right (N, m). `found` are the least-squares ranges of the problems: c_i is their offset.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 A *group* is a row, the rows of a station, a prior or a common offset. A *rest* is the problem without some groups. An
 *explanation* is a set of groups whose rest passes the chi-square test. Letters: N problems, m rows, `size` numbers of a
-parameter vector. A *score* is a chi-square cost plus the prices of the groups left out.
+parameter vector. A *score* is a chi-square cost plus the prices of the groups left out. `alike` are problems with the
+same rows, `case` is one problem, `outcome` its search result, and `found` are explanations as of `_with_conclusions`.
 """
 
 from __future__ import annotations

@@ -161,7 +161,8 @@ def _information(curvature: Curvature) -> Array:
 def _runs_away(problem: Problem, curvature: Curvature, distance: Array, lost: Array) -> Array:
     """Return flags (N,) of positions so far away or so uncertain that the data determine a direction only.
 
-    `distance` (N,) is in spreads of the stations. `lost` (N,) flags fixes with another fault.
+    `curvature` has the covariances of the fixes. `distance` (N,) is in spreads of the stations. `lost` (N,) flags fixes
+    with another fault.
     """
     covariance = np.where(_is_determined(curvature)[:, None, None], curvature.covariance, np.nan)
     with np.errstate(invalid="ignore"):
@@ -313,7 +314,10 @@ def _mark_contradictions(pool: Pool, cost: Array, finished: Array, marks: Array,
 
 
 def _name_redundancy(pool: Pool, finished: Array, reason: Array) -> None:
-    """Write to the reasons the limits that a redundancy of 0 or 1 sets to a search for suspects."""
+    """Write to `reason` (N,) the limits that a redundancy of 0 or 1 sets to a search for suspects.
+
+    Only the reasons of fixes flagged in `finished` (N,) change.
+    """
     for dof, limit in (
         (0, "a wrong measurement would not be noticed"),
         (1, "a wrong measurement would be noticed, but not identified"),
@@ -443,7 +447,10 @@ def _as_finished(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
 
 
 def _truncated_covariance(problem: Problem, pool: Pool, law: Truncated) -> Array:
-    """Return the covariances (N, n, n) of the shared unknowns after the bounds have truncated their laws."""
+    """Return the covariances (N, n, n) of the shared unknowns after the bounds have truncated their laws.
+
+    `law` has the truncated laws of the positions.
+    """
     curvature = pool.curvature
     assert curvature is not None
     out = np.array(curvature.covariance)

@@ -46,7 +46,8 @@ _AWAY, _MOST = 1.3, 0.5
 def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array) -> Curvature:
     """Return the curvature of the cost at vectors x (N, size) on faces `face` (N,) of the constraints.
 
-    `optloc.linear.constraints.faces` lists the faces; face 0 has no inequalities.
+    `optloc.linear.constraints.faces` lists the faces; face 0 has no inequalities. `equations` are the normal equations
+    at x.
     """
     information, vector, ok = marginal(equations)
     covariance, regular = linalg.inverse(information)
@@ -79,8 +80,8 @@ def _without_bounds(
 ) -> tuple[Array, Array]:
     """Return covariance (N, n, n), and mean minus x (N, n), of the quadratic model with equalities but without bounds.
 
-    `vector` (N, n) is half the downhill gradient of the cost. If the data and the equalities leave a direction
-    undetermined, the result is NaN.
+    `information` (N, n, n) and `vector` (N, n), half the downhill gradient of the cost, are the model at x. If the data
+    and the equalities leave a direction undetermined, the result is NaN.
     """
     if equalities:
         covariance, regular = linalg.inverse_within(information, tangent_at(problem, equalities, x))

@@ -137,7 +137,8 @@ def _parts(count: int) -> Iterator[Array]:
 def _measured(problem: Problem, x: Array, covariance: Array, wrong: Array | None) -> tuple[Problem, Array]:
     """Return repeated measurements, N r problems for r repeats, and their true vectors (N r, size).
 
-    `wrong` (N, m) are errors that are added to the rows of all repeats, or None.
+    `covariance` (N, n, n) belongs to the fixes x (N, size). `wrong` (N, m) are errors that are added to the rows of all
+    repeats, or None.
     """
     each = np.repeat(np.arange(len(x)), _REPEATS)
     truth, noise, means = _drawn(problem, x, covariance)
