@@ -104,10 +104,13 @@ def settle_by_plan(
     # most of these problems only need another start, which the eigenvalues of the pencil give
     rest = problems_at(unsettled)
     start = in_parts(rest, lambda part, _: gtrs(part, None))
-    single = np.isfinite(start.x).all(-1).sum(1) == 1  # if there are several starts, all of them compete
+    # A problem with several starts gets NaN as start: the plan does not settle it, and all starts compete in the
+    # stages.
+    single = np.isfinite(start.x).all(-1).sum(1) == 1
     second, again = plan.run(
         load.take(unsettled), z[unsettled], threads, np.where(single[:, None], start.x[:, 0], np.nan)
     )
+    # the second answers replace the first answers of these problems
     for whole, part in zip(answer, second, strict=True):
         whole[unsettled] = part
     pool = _with_sides(_pool(plan, _preferred(answer, problems_at), max(steps, again), began), problems_at)

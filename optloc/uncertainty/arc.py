@@ -184,6 +184,7 @@ def trace_from(surface: RegionSurface) -> Arc:
     nodes = one
     if not closed:
         other, closed = valley.walk(start, -first)
+        # the nodes of the other direction in reverse order, without the fix, which is the first node of `one`
         nodes = other[:0:-1] + one
     if closed:
         # A closed curve is cut at its least likely node, and shares count from there.
@@ -254,6 +255,7 @@ class _Valley:
             if found is None or moved > _HARD or abs(found.cost - here.cost) > _JUMP:
                 size *= _SHORTER
                 continue
+            # the first chords begin at the fix or near it, so they are not tested
             if len(nodes) > 3 and self._passes(start, here, found):
                 return nodes, True
             nodes.append(found)
@@ -278,6 +280,7 @@ class _Valley:
             weakest = np.linalg.eigh(information)[1][:, 0]
             along = weakest if weakest @ along > 0.0 else -weakest
             node = self._node(z, cost, information, along)
+            # Gauss-Newton step across the curve, in standard deviations
             step = node.across.T @ vector
             size = float(np.sqrt((step**2).sum()))
             moved = size if number == 0 else moved

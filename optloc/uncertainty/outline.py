@@ -4,7 +4,8 @@ In the plane the region is ``f <= f(fix) + q``. In space a picture shows two coo
 takes its best value, and q is the quantile of chi-square with two degrees of freedom, as for an ellipse from a
 covariance. So the outline contains the two visible coordinates with the stated probability.
 
-Here f is the cost over the position. Points of the plane are metres from the fix along its two axes.
+Here f is the cost over the position, and `surface` holds this cost and the fix. Points of the plane are metres from the
+fix along its two axes.
 """
 
 from __future__ import annotations

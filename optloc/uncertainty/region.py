@@ -263,7 +263,7 @@ _NEAR_INFINITY = 1e-6
 def boundary(surface: RegionSurface, threshold: float) -> Array:
     """Return the first points (k, d), metres, at which rays from the fix leave the region; NaN for endless rays.
 
-    `threshold` is the highest cost in the region.
+    `surface` is the cost around the fix, and `threshold` the highest cost in the region.
     """
     rays = directions(len(surface.position))
     q = np.sqrt(threshold - surface.least)

@@ -119,7 +119,9 @@ def certified(
         more += len(changed)
         pool = pool.merge(items[changed], take(new, changed))
         fix = overwrite(fix, items[changed], better[changed])
+        # fixes that changed and have an answer need another proof
         items = items[changed[better.answered[changed]]]
+    # the fixes that still change after the last round
     proven.write(items, unknown_claim(RESTLESS))
     detail = f"{int(asked.sum())} within {violation_names(problem)}" + (f", {more} other minima found" if more else "")
     return replace(pool, proven=proven, stages=(*stages, certify_stage(detail, began)))
@@ -283,6 +285,7 @@ def _explore_face(
     if len(face) > len(exact(problem)) and not why_unsupported(on_face(problem, face)):
         limits = admitted_states(problem, problem.dimension)
         costly, boxes = _is_costly(on_face(problem, face), limits, costs, seeds, fix.cost + margin, effort)
+    # a face that costs too much is at least the margin above the fix, and has no minimum of interest
     least = np.full(n, margin)
     out = FaceMinima(np.full((n, 1, size), np.nan), np.full((n, 1), np.inf), least, least, boxes, filled_objects(n, ""))
     rest = np.flatnonzero(~costly)

@@ -505,6 +505,7 @@ def _give_up_forbidden(work: BoundWorkspace, items: Array, points: Array, barred
 def _ignore(work: BoundWorkspace, items: Array, points: Array) -> Array:
     """Store the minima next to points (n, d) that the Earth hides; return flags (n,) of new ones."""
     problem = work.problem
+    # only the Earth hides minima, and a fix with more than `HIDDEN` of them has no proof
     if not problem.frame.geodetic or problem.motions[0].order or not len(items) or work.ignored.shape[1] >= HIDDEN:
         return np.zeros(len(items), dtype=bool)
     part = problem.take(items)

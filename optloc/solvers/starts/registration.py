@@ -500,8 +500,8 @@ def _places(problem: Problem, station: Array | slice = slice(None)) -> Array:
 def _whiten(found: Ranges, others: Array, present: Array) -> Array:
     """Return whitening matrices (N k, s - 1, s - 1) of the offsets, 1/metres; zero for stations without an offset.
 
-    `others` are the numbers of the s - 1 stations without the reference, and `present` (N k, s - 1) flags their
-    offsets.
+    `found` are the ranges. `others` are the numbers of the s - 1 stations without the reference, and `present` (N k,
+    s - 1) flags their offsets.
     """
     covariance = found.covariance[:, others][:, :, others]
     return linalg.whitening(np.where(present[:, :, None] & present[:, None, :], covariance, 0.0))

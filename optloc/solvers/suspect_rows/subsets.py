@@ -2,7 +2,7 @@
 
 If the sets are few, all of them are tried, so that one error cannot mask another. If they are many, `grow_explanation`
 leaves out one group at a time. A *group* is a row, the rows of a station, a prior or a common offset. A *rest* is the
-problem without a set of groups.
+problem without a set of groups. `alike` are problems with the same rows, and `whole` are the fixes of all data.
 """
 
 from __future__ import annotations

@@ -108,8 +108,8 @@ def _local_covariance(problem: Problem, equations: Normal, shared: Array) -> Arr
 def _multipliers(problem: Problem, face: Face, x: Array, vector: Array) -> Array:
     """Return the active constraints of each problem (N,), tuples of `Active` with Lagrange multipliers.
 
-    The multipliers meet: gradient of the cost + sum of multiplier * gradient of the constraint = 0. `vector` (N, n) is
-    half the downhill gradient of the cost.
+    The multipliers meet: gradient of the cost + sum of multiplier * gradient of the constraint = 0. `face` are the
+    constraints that are satisfied with equality. `vector` (N, n) is half the downhill gradient of the cost.
     """
     _, gradients = levels(problem, face, x)
     names = face_names(problem, face)
