@@ -65,8 +65,8 @@ class SolverEntry:
     stage : callable, optional
         ``(problem, pool or None) -> pool``: replaces `solver` for optloc's own stages.
     batched : bool
-        Whether it solves a batch at a time; other solvers go one by one. A study sizes its chunks by this: too small a
-        chunk costs a file, and too large a chunk loses minutes of work when a run is stopped.
+        Whether it solves a batch at a time; other solvers go one by one. A study chooses the size of its chunks by
+        this. Each chunk costs a file, and a stopped run loses the work on its last chunk.
     """
 
     solver: FixSolver | None

@@ -3,8 +3,9 @@
 Ranges from stations on a line leave a circle around it. Ranges from stations in a plane leave an arc through the fix
 and its mirror image. Along such a curve no Gaussian covers; across it a Gaussian does.
 
-A *node* is a point of the curve. Its coordinates z are metres, or those of the inverse-range chart: a direction p and
-an inverse range w, which is 1 at the fix and 0 at infinity (`optloc.problem.chart`). Costs are chi-square values.
+A *node* is a point of the curve. Its coordinates z are metres, or coordinates of the inverse-range chart. The chart
+(`optloc.problem.chart`) has a direction p and an inverse range w, which is 1 at the fix and 0 at infinity. Costs are
+chi-square values. Letters: m nodes, n samples, q points, d coordinates.
 """
 
 from __future__ import annotations

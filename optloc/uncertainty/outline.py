@@ -32,8 +32,8 @@ _CELLS = {2: 400, 3: 3000}
 FAR = 3.0
 # Share of that distance from which a line counts as cut off.
 _AT_EDGE = 0.995
-# Steps across the ellipsoid of a far fix, by dimension, and the factor by which the search extends beyond the
-# ellipsoid, since the fix is not exactly Gaussian there.
+# Steps across the ellipsoid of a far fix, by dimension. The search extends beyond the ellipsoid by a factor, since the
+# fix is not exactly Gaussian there.
 _STEPS, _BEYOND = {2: 24, 3: 14}, 1.4
 # Positions along the hidden coordinate, and steps from the best two of them: a cost with two minima there has both.
 _ALONG, _NEWTON = 9, 4
@@ -44,7 +44,7 @@ _WIDTH = 2e-3
 # Halvings that find the ends of a line within a step.
 _HALVINGS = 20
 # Steps of the grid from the fix to the level of a Gaussian, most nodes (more than a picture shows), and most doublings
-# of the step for larger regions: a region of a million standard deviations still ends.
+# of the step. With the doublings the grid covers a region of a million standard deviations.
 _FINE, _NODES, _DOUBLINGS = 8.0, 4000, 20
 
 

@@ -45,8 +45,8 @@ class Cells:
     base : array (d,)
         A position, metres.
     edges : array (n, 1 + d, 1 + d)
-        Middle of each cell, then half of each edge, in homogeneous coordinates: (P, v) is the position ``base + P /
-        v``. The cell is the middle plus the edges times numbers between -1 and 1.
+        Middle of each cell, then half of each edge, in homogeneous coordinates. Here (P, v) is the position
+        ``base + P / v``. The cell is the middle plus the edges times numbers between -1 and 1.
     inside : int
         Number of cells, at the beginning, that are completely inside the region.
     """

@@ -175,8 +175,8 @@ class FaceMinima:
     cost : array (n, q)
         Their costs; infinite in empty slots.
     least, rest : array (n,)
-        Lower bounds of the cost minus the cost of the fix: for every point of the face, and for every minimum that is
-        not listed in `x`; -inf if not proven.
+        Lower bounds of the cost minus the cost of the fix; -inf if not proven. `least` is the bound for every point of
+        the face, and `rest` the bound for every minimum that is not in `x`.
     boxes : int array (n,)
         Boxes used.
     why : object array (n,)
@@ -305,8 +305,8 @@ def _is_costly(
     is admitted.
 
     A proof has the form: no position costs less than a given position by more than a difference. Here the difference is
-    the cost of that position minus the level. So every position above the level will do; it need not be a minimum. The
-    proof restarts nearer to the minimum in two cases: the cost is steep at the position, or the proof found a position
+    the cost of that position minus the level. So every position above the level will do; it need not be a minimum. If
+    the cost is steep at the position, the proof restarts nearer to the minimum. It also restarts if it found a position
     with less than half of the difference.
     """
     costly, boxes = np.zeros(len(seeds), dtype=bool), np.zeros(len(seeds), dtype=np.int64)

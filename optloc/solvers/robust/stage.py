@@ -267,8 +267,8 @@ def _rivals(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     """Return candidates with costs whose gaps to the cheapest measure how clearly the data exclude them.
 
     A loss that rises without limit also compares sizes of gross errors, and a gap from these sizes is no evidence.
-    Under truncated least squares all gross errors cost the same. Its gap is evidence, if each row left out adds the gap
-    of a rival: a candidate that leaves out one row more than the cheapest is then less likely for that reason.
+    Under truncated least squares all gross errors cost the same. Its gap is evidence if each row left out adds the gap
+    of a rival, 9. A candidate that leaves out one more row than the cheapest is then less likely.
     """
     finished = np.isfinite(pool.cost) & (pool.code == Status.OK)
     item, slot = np.nonzero(finished & (finished.sum(1) > 1)[:, None])

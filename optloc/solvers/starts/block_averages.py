@@ -1,7 +1,7 @@
 """Block averages: a long run as a short run with the same unknowns, as the start of a fix.
 
-A *block* is a number of consecutive epochs. The new row of a block is the value, in the middle of the block, of a line
-through the old rows of the same kind, stations and target.
+A *block* is a number of consecutive epochs. A line is fitted to the old rows of a block with the same kind, stations
+and target. The new row is the value of this line in the middle of the block.
 """
 
 from __future__ import annotations

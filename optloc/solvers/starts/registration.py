@@ -57,8 +57,8 @@ _RADII = (1.5, 5.0)
 _ANYWHERE = (0.3, 0.8, 1.5, 5.0)
 # Standard deviations along the valley, doubling from one: nearer positions lead back to the fix.
 _STEPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)
-# Share of the distance above which the error of a fix of a whole run allows another minimum within a few sigma, which
-# block averages merge with it. There are few steps, since each is refined on all epochs.
+# Share of the distance above which the error of a fix of a whole run allows another minimum within a few sigma. Block
+# averages merge such minima. There are few steps, since each is refined on all epochs.
 _WEAK_WHOLE = 2e-3
 _WHOLE_STEPS = (-6.0, -2.0, 2.0, 6.0)
 # Images of the best minimum: turns by eighths of a circle about the axis of the stations. Images of new minima follow

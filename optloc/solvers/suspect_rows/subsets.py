@@ -41,8 +41,8 @@ _FEW = 2_000
 # a cost up to the second from all starts. The cheapest start may end at another minimum, and a rest that costs a
 # hundred times too much almost never has a minimum that passes.
 _NEAR, _CLOSE = 100.0, 4.0
-# Share of the boxes of a proof that a rest may use: good rests need tens of these hundreds, and more boxes take longer
-# than other starts.
+# Share of the boxes of a proof that a rest may use: a few hundred boxes. Good rests need tens of boxes, and more boxes
+# take longer than other starts.
 _SHORT = 0.01
 _BLIND = "a measurement is wrong, but redundancy 1 cannot identify it"
 
@@ -156,9 +156,9 @@ class _Request:
 def explain(alike: Sequence[SameRows]) -> list[list[Outcome]]:
     """Return the explanations of each problem: all sets of groups within the gap of the best.
 
-    Sets of one group, of two groups and so on are tried under three conditions: their prices alone do not exceed the
-    best score, the rest has redundancy, and the sets are few enough. Rests of all problems of a batch are fixed
-    together.
+    Sets of one group, of two groups and so on are tried under three conditions. Their prices alone do not exceed the
+    best score by more than the gap. The rest has redundancy. The sets are few enough. Rests of all problems of a batch
+    are fixed together.
     """
     searches = dict(enumerate(_search(one) for one in alike))
     out: list[list[Outcome]] = [[] for _ in alike]
