@@ -120,6 +120,7 @@ def _minima(across: Across, pool: Pool) -> _FoundSides:
     x, cost = np.full(pool.x.shape, np.nan), np.full(shape, np.inf)
     good = (code == Status.OK) & np.isfinite(least)
     x[item[good], slot[good]], cost[item[good], slot[good]] = end[good], least[good]
+    # least cost on the plane: the other coordinates are refined at the distance that counts as zero
     _, level = each.profile(np.where(good[:, None], end, start), each.least)
     on_plane = np.full(len(pool), np.inf)
     np.minimum.at(on_plane, item, np.where(np.isfinite(level), level, np.inf))
@@ -138,7 +139,7 @@ def _distinct(across: Across, x: Array, cost: Array) -> Array:
     n = across.problem.layout.n_shared
     information, _ = information_in_square(across, np.where(np.isfinite(x[:, 0]), x[:, 0], 0.0))
     folded = np.array(x[..., :n])
-    folded[..., across.part.stop - 1] **= 2
+    folded[..., across.part.stop - 1] **= 2  # w^2 is the coordinate of the information
     with np.errstate(invalid="ignore"):
         keep = np.isfinite(cost) & (cost <= cost[:, :1] + LISTED_GAP)
     for slot in range(1, x.shape[1]):

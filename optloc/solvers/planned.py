@@ -101,7 +101,7 @@ def settle_by_plan(
     unsettled = np.flatnonzero(~answer.settled)
     if not len(unsettled):
         return _with_sides(_pool(plan, _preferred(answer, problems_at), steps, began), problems_at)
-    # most of these problems only need another start, which the eigenvalues of the pencil give
+    # most of these problems only need another start, which the closed form `gtrs` computes
     rest = problems_at(unsettled)
     start = in_parts(rest, lambda part, _: gtrs(part, None))
     # A problem with several starts gets NaN as start: the plan does not settle it, and all starts compete in the

@@ -462,6 +462,7 @@ def _derivatives(problem: Problem, x: Array) -> tuple[Array, Array]:
     full = np.zeros((*compact.shape[:-1], problem.layout.size))
     full[..., :n] = compact[..., :n]
     # local columns are compact: each row has the columns of its epoch
+    # the local unknowns of epoch k are columns n + k * width and the following ones of a parameter vector
     for j in range(width):
         full[:, np.arange(problem.count), n + problem.epoch * width + j] = compact[..., n + j]
     return residual, np.where(problem.weight[..., None] > 0.0, full, 0.0)

@@ -345,6 +345,7 @@ def _by_slice(drawn: Samples, slice_of: Array, k: int) -> Mixture:
 
     `slice_of` (n,) is the slice of each sample; samples outside all slices are dropped.
     """
+    # neighbouring slices are collected in a group until the group has enough samples for a covariance
     fewest, groups = _FEWEST * drawn.position.shape[1], [np.zeros(len(slice_of), dtype=bool)]
     for i in range(k):
         if groups[-1].sum() >= fewest:

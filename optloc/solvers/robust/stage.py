@@ -142,8 +142,8 @@ def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[S
     """
     began = perf_counter()
     pool = _minima(problem, loss, robust_starts(problem, loss) if start is None else start)
-    # A flat loss has a minimum for almost every set of rows. So start from a rising loss, and try sets next to the best
-    # one.
+    # A flat loss is constant for large residuals, and has a minimum for almost every set of rows. So start from a
+    # rising loss, and try sets of rows that differ from the best set in one row.
     if start is None and loss.flat:
         pool = _join(pool, _minima(problem, loss, _minima(problem, LOSSES["cauchy"], pool.x).x))
         pool = _join(pool, _minima(problem, loss, flip_rows(problem, loss, pool)))

@@ -1,7 +1,8 @@
 """Starts for a robust cost, without a first guess: fixes without some stations or rows.
 
 Letters: N problems, m rows, S subsets of rows, q starts of a problem, M starts of all problems, `size` numbers of a
-parameter vector. u are residuals in sigma.
+parameter vector. u are residuals in sigma. The *cut* of a loss is its constant c, in sigma: truncated least squares
+rejects rows with larger residuals.
 """
 
 from __future__ import annotations
