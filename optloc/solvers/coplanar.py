@@ -57,12 +57,14 @@ def join_sides(problem: Problem, pool: Pool) -> Pool:
         return pool
     began, across, own = perf_counter(), Across.of(problem.take(items)), take(pool, items)
     found = _minima(across, own)
+    # a problem without a finished minimum keeps its pool
     good = np.flatnonzero(np.isfinite(found.cost[:, 0]))
     if not len(good):
         return pool
     items, across, own, found = items[good], across.take(good), take(own, good), found.take(good)
     part = problem.take(items)
     sides = _sides(part, across, found)
+    # a problem of which constraints or the Earth exclude both sides keeps its pool too
     met = np.flatnonzero(np.isfinite(sides.cost[:, :2]).any(1))
     if not len(met):
         return pool

@@ -128,6 +128,7 @@ def _measured_by(problem: Problem, target: int) -> tuple[Array, Array, Array, Ar
     no_rows = np.zeros(len(weight), dtype=bool)
     found: dict[tuple[int, int], Array] = {}
     sighted: dict[tuple[int, int], Array] = {}
+    # for each pair (epoch, station): flags (N,) of problems with a row, and of problems with an angle
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         present, model = weight[:, start : start + rows.count] > 0.0, MODELS[rows.kind]
         rows_of_target = np.flatnonzero(rows.target == target).tolist()

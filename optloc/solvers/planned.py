@@ -264,6 +264,7 @@ class RunPlan:
 
         began, count = perf_counter(), problem.batch_shape[0]
         z = np.broadcast_to(problem.z, (count, problem.count))[:, self.rows].reshape(-1, self.rows.shape[1])
+        # the fix of each epoch without its known biases is the start of the run
         answer, _ = self.epoch.run(self.load, (z - self.added) / self.gain)
         start, n = np.tile(self.x, (count, 1)), problem.layout.n_shared
         local = start[:, n:].reshape(len(z), len(self.columns))
@@ -275,6 +276,7 @@ class RunPlan:
         done, found = fixed_runs(runs, item, start, StopRules(TOLERANCE, LIMIT), problem.dimension)
         curvature = Curvature(found.covariance, found.information, found.regular, found.weakest, local=found.local)
         good = (done.status == Status.OK) & np.isfinite(done.cost) & found.regular & (found.weakest >= WEAK)
+        # a run has no complication if the fix of every epoch is valid and the refinement of the run has converged
         plain = answer.settled.reshape(count, -1).all(1) & good
         seconds = perf_counter() - began
         pool = Pool(

@@ -90,6 +90,7 @@ def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) ->
         None if an ellipse covers, or if the region cannot be enclosed.
     """
     if fix.chart is not None and fix.chart.truncated is not None and fix.chart.cut_off:
+        # a law that bounds cut off has a single closed outline, which must run counter-clockwise
         line = fix.chart.truncated.outline(plane, level)
         return Outline(([line if area(line) > 0.0 else line[::-1]],))
     if fix.chart is None or int(fix.chart.kind) not in (CURVED, INVERSE_RANGE) or not np.isfinite(fix.cov).all():
@@ -104,6 +105,7 @@ def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) ->
             if region.cells is None:
                 return None
             surface, cells = region.surface, region.cells.corners
+            # a corner at infinity is replaced by a point at the distance where the picture ends
             away = fix.chart.centre + FAR * float(fix.chart.distance) * region.cells.directions
             cells = np.where(np.isfinite(cells).all(-1, keepdims=True), cells, away)
     except InvalidProblem:

@@ -420,6 +420,7 @@ class RegionSurface:
         flat = np.ascontiguousarray(points).reshape(-1, d)
         good = np.isfinite(flat).all(-1)
         slot, _ = self.problem.layout.find("position")
+        # points that are not finite are evaluated at the fix, and their cost is replaced below
         x = np.repeat(self.x, len(flat), axis=0)
         x[:, slot.start : slot.start + d] = np.where(good[:, None], flat, self.position)
         cost, information, vector = np.empty(len(x)), np.empty((len(x), d, d)), np.empty((len(x), d))

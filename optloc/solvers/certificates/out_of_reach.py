@@ -215,8 +215,10 @@ def out_of_reach(problem: Problem, edges: Edges, costs: PositionCosts, fix: Fix,
     lay_planes(edges, fix.x[:, columns], fix.cov[:, columns, columns], -values, gradients[..., columns], asked)
     plane_costs = costs.take(np.repeat(np.arange(len(fix.x)), count))
     level = np.repeat(fix.cost + gap, count)
+    # the cost of the point on the plane minus the level: the proof must show that no position is cheaper by more
     asked.eps[:] = costs_at(plane_costs, asked.x[:, None])[0][:, 0] - level
     out = np.zeros(len(level), dtype=bool)
+    # above `plane_costs.level` angles may be off by a whole turn, so the costs are not valid there
     items = np.flatnonzero((asked.eps > equal_cost(level)) & (plane_costs.level > level))
     if len(items):
         out[items] = _are_shown(prove_all(plane_costs.take(items), asked.take(items)), level[items])

@@ -133,6 +133,7 @@ def courses(problem: Problem) -> BearingCourses | None:
     if seen is None:
         return None
     seen = _in_plan(problem, seen)
+    # True if azimuths are used as bearings in the plane of a problem in space
     flat = seen.station.shape[-1] < problem.dimension
     block = next(rows for rows in problem.rows if rows.kind == "azimuth")
     found = sight_courses(
@@ -146,6 +147,7 @@ def courses(problem: Problem) -> BearingCourses | None:
         order=problem.motions[0].order,
     )
 
+    # coefficients of the course in metres: only the first one is a position, and gets the centre
     def metres(c: Array) -> Array:
         out = c * seen.scale[:, None, None]
         out[:, 0] += seen.centre

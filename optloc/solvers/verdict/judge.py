@@ -415,6 +415,7 @@ def _as_finished(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
     truncated = None if law is None else law.truncated
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
+    # if `pool.plain` is None, `_apply_rules` writes marks, reasons and charts
     marks, reason, chart = np.zeros(count, dtype=np.int32), filled_objects(count, ""), None
     if pool.plain is not None or truncated is not None:
         chart = chart_of(problem, pool.x[:, 0], covariance, curvature, truncated)
