@@ -399,7 +399,7 @@ def _test_support(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Arra
     limit = -ndtri(0.5 * _LEVEL / np.maximum(present.sum(1, keepdims=True), 1))
     wrong, active = wrong.copy(), np.arange(len(x))
     x = x.copy()
-    # If the support leaves too few rows for a fix, only its first rows are left out: the flags as sizes are all equal.
+    # If the support leaves too few rows for a fix, only its first rows are left out. All sizes are equal here.
     wrong = _spare(problem, wrong.astype(float), wrong)
     for _ in range(_PASSES):
         part, left_out = problem.take(active), wrong[active]

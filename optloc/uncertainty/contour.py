@@ -128,7 +128,7 @@ def _nodes_in_rectangles(first: Array, last: Array, shape: tuple[int, int]) -> A
 
     `shape` is the shape of the grid.
     """
-    # signs at the corners of a rectangle, whose cumulative sums along both axes are 1 inside it and 0 elsewhere
+    # signs at the corners of rectangles: their cumulative sums along both axes count the rectangles at each node
     count = np.zeros((shape[0] + 1, shape[1] + 1), dtype=int)
     (west, south), (east, north) = first.T, last.T + 1
     for x, y, sign in ((west, south, 1), (east, south, -1), (west, north, -1), (east, north, 1)):

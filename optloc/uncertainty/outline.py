@@ -117,8 +117,8 @@ def _outline_in_cells(surface: RegionSurface, cells: Array, plane: Array, level:
     """Return the outline, in a plane, of a region without equalities; None if it has no part in the plane.
 
     `surface` is the cost around the fix. `cells` (m, v, d) are the corners of convex cells that contain the region,
-    metres. `plane` (2, d) has the axes of
-    the plane, and `level` is the probability. The outline ends at `FAR` distances of the fix from the stations.
+    metres. `plane` (2, d) has the axes of the plane, and `level` is the probability. The outline ends at `FAR`
+    distances of the fix from the stations.
     """
     q, centre = quantile(level, 2), (surface.chart.centre - surface.position) @ plane.T
     reach = FAR * float(surface.chart.distance)

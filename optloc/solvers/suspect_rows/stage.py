@@ -340,7 +340,7 @@ def _with_group_by_group(alike: SameRows, doubted: _RejectedRows, outcomes: list
     Each search starts from the cheapest of the rests that were tried last. `doubted` has the rows to suspect first.
     """
     dof = alike.whole.dof
-    # a set of `dof` groups or more leaves no redundancy, so `dof - 1` is the largest size that a test can accept
+    # a set of `dof` rows or more leaves no redundancy, so `dof - 1` is the largest size of a set that a test can accept
     untried = [not outcome.rests and outcome.tried < most - 1 for outcome, most in zip(outcomes, dof, strict=True)]
     for i in np.flatnonzero(untried).tolist():
         more = _group_by_group(alike, i, doubted, outcomes[i].closest)

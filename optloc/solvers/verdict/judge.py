@@ -406,8 +406,8 @@ def surviving_candidates(pool: Pool, fix: Fix) -> Array:
 def _as_finished(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
     """Return the fixes of settled pools as if all were finished and near the stations.
 
-    If `pool.plain` is None, they have no status yet: `_apply_rules` decides it. A *law* is the distribution of the
-    position after near bounds have cut it off.
+    If `pool.plain` is None, they have no status yet: `_apply_rules` decides it. A *law* is the normal
+    distribution of the position, from which bounds near the fix cut off a part.
     """
     count, cost, proven = len(pool), pool.cost[:, 0], _claims(pool)
     law = law_at(problem, pool)
