@@ -193,9 +193,9 @@ def _totals_of_walks(problem: Problem, x: Array, counts: Array) -> tuple[Array, 
 
 
 def _each_epoch(problem: Problem, x: Array) -> Iterator[tuple[int, Array, Array]]:
-    """Yield for each part of a run: its first epoch, the information (k, n, n) of its k epochs, and its size.
+    """Yield for each part of a run: its first epoch, the information (k, n, n) of its k epochs, and a size (k, n).
 
-    The information is about the shared unknowns. The size is its diagonal (k, n) before elimination.
+    The information is about the shared unknowns. The size is its diagonal before the local unknowns are eliminated.
     """
     n = problem.layout.n_shared
     for first, last, part in windows(problem):

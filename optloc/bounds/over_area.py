@@ -173,7 +173,7 @@ def _slot(problem: Problem) -> slice:
 def _places(frame: Frame, x: Array, y: Array, height: float, dimension: int, earth: bool) -> Array:
     """Return grid points as positions (n, d) in the frame, metres.
 
-    x and y (n,) are degrees if `earth` is True, else metres. `height` is in metres.
+    x and y (n,) are degrees if `earth` is True, else metres. `height` is in metres, and `dimension` is d.
     """
     if earth:
         return frame.from_geodetic(np.radians(y), np.radians((x + 180.0) % 360.0 - 180.0), np.full(len(x), height))
@@ -198,8 +198,8 @@ def _deviation(problem: Problem) -> float:
 def extent(problem: Problem, places: Array | None = None, *, widen: float = 0.5) -> tuple[float, float, float, float]:
     """Return x and y limits around stations and positions (n, d): least and greatest x, least and greatest y.
 
-    Every side is widened by a share of the larger side. Limits are degrees in three-dimensional frames of the Earth,
-    else metres.
+    Every side is widened by `widen` times the larger side. `places` (n, d) are the positions, None for stations only.
+    Limits are degrees in three-dimensional frames of the Earth, else metres.
     """
     earth = problem.frame.geodetic and problem.dimension == 3
     stations = problem.stations.position.reshape(-1, problem.dimension)
@@ -208,6 +208,7 @@ def extent(problem: Problem, places: Array | None = None, *, widen: float = 0.5)
     if earth:  # one interval of longitudes, also across the date line
         flat[:, 0] = (flat[:, 0] - flat[0, 0] + 180.0) % 360.0 - 180.0 + flat[0, 0]
     low, high = flat.min(0), flat.max(0)
+    # a degree of longitude is shorter than a degree of latitude by this factor
     squeeze = np.array([np.cos(np.radians(np.clip(flat[:, 1].mean(), -_SQUEEZED, _SQUEEZED))) if earth else 1.0, 1.0])
     side = max(float(((high - low) * squeeze).max()), _LEAST[0] if earth else _LEAST[1])
     low, high = low - widen * side / squeeze, high + widen * side / squeeze

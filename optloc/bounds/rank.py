@@ -24,8 +24,8 @@ TIED = 0.99
 
 _SHOWN = 8  # names in one sentence, a line of text; the rest is counted
 _FEW = 2  # combinations that are written out; for more, only the names of the unknowns are listed
-_NOTHING = 1e-6  # entries of a unit vector below this are rounding, which eigenvectors of close eigenvalues share
-_ROUNDED = 1e-5  # the same after elimination, which magnifies rounding
+_NOTHING = 1e-6  # smaller entries of a unit vector are rounding errors; close eigenvalues make these errors larger
+_ROUNDED = 1e-5  # the same limit after elimination, which makes rounding errors larger
 _ALIKE = 1e-4  # relative difference of changes that are reported as one common change, as printed to three digits
 
 

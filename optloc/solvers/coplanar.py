@@ -4,7 +4,8 @@ The data separate mirror images only if the cost on the plane between them is cl
 one region.
 
 Letters: N problems, r minima of a problem, q slots of a pool, `size` numbers of a parameter vector. w is the distance
-from the plane in metres. The minima are found in the coordinates of `Across`: position in the plane, and w^2.
+from the plane in metres. The minima are found in the coordinates of `Across`: position in the plane, and w^2. The
+parameter `across` holds the plane of each problem, and `own` the pool before.
 """
 
 from __future__ import annotations
@@ -56,12 +57,14 @@ def join_sides(problem: Problem, pool: Pool) -> Pool:
         return pool
     began, across, own = perf_counter(), Across.of(problem.take(items)), take(pool, items)
     found = _minima(across, own)
+    # a problem without a finished minimum keeps its pool
     good = np.flatnonzero(np.isfinite(found.cost[:, 0]))
     if not len(good):
         return pool
     items, across, own, found = items[good], across.take(good), take(own, good), found.take(good)
     part = problem.take(items)
     sides = _sides(part, across, found)
+    # a problem of which constraints or the Earth exclude both sides keeps its pool too
     met = np.flatnonzero(np.isfinite(sides.cost[:, :2]).any(1))
     if not len(met):
         return pool
@@ -119,6 +122,7 @@ def _minima(across: Across, pool: Pool) -> _FoundSides:
     x, cost = np.full(pool.x.shape, np.nan), np.full(shape, np.inf)
     good = (code == Status.OK) & np.isfinite(least)
     x[item[good], slot[good]], cost[item[good], slot[good]] = end[good], least[good]
+    # least cost on the plane: the other coordinates are refined at the distance that counts as zero
     _, level = each.profile(np.where(good[:, None], end, start), each.least)
     on_plane = np.full(len(pool), np.inf)
     np.minimum.at(on_plane, item, np.where(np.isfinite(level), level, np.inf))
@@ -137,7 +141,7 @@ def _distinct(across: Across, x: Array, cost: Array) -> Array:
     n = across.problem.layout.n_shared
     information, _ = information_in_square(across, np.where(np.isfinite(x[:, 0]), x[:, 0], 0.0))
     folded = np.array(x[..., :n])
-    folded[..., across.part.stop - 1] **= 2
+    folded[..., across.part.stop - 1] **= 2  # w^2 is the coordinate of the information
     with np.errstate(invalid="ignore"):
         keep = np.isfinite(cost) & (cost <= cost[:, :1] + LISTED_GAP)
     for slot in range(1, x.shape[1]):
@@ -180,7 +184,7 @@ def _sides(problem: Problem, across: Across, found: _FoundSides) -> _Sides:
     count, slots, size = found.x.shape
     x, cost = np.full((count, 2 * slots, size), np.nan), np.full((count, 2 * slots), np.inf)
     off = found.x[..., across.part.stop - 1] > across.least[:, None]
-    # the upper side first, as in the verdict
+    # the upper side first, as in the verdict; `upward` is the sign of the normal that points up
     upward = np.where(across.axes[:, -1, -1] < 0.0, -1.0, 1.0)
     for slot in range(slots):
         minimum = np.array(found.x[:, slot])
@@ -266,7 +270,7 @@ def _curvature(problem: Problem, across: Across, found: _FoundSides, x: Array, j
     rotation = np.broadcast_to(np.eye(information.shape[-1]), information.shape).copy()
     rotation[:, across.part, across.part] = across.axes
     covariance[items] = rotation @ square @ np.swapaxes(rotation, -1, -2)
-    kappa[items] = np.inf
+    kappa[items] = np.inf  # no single Gaussian describes both sides
     regular_now, weakest, of_all = (
         np.array(curvature.regular),
         np.array(curvature.weakest),

@@ -100,6 +100,7 @@ def sights(problem: Problem) -> list[Sight]:
     found, position = list[Sight](), problem.stations.position
     place = problem.frame.to_ecef(position if position.ndim == 4 else position[None]) * _STRETCH
     for target, motion in enumerate(problem.motions):
+        # only targets whose unknown state lasts the run are tested
         if motion.known is not None or motion.span == "epoch":
             continue
         slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
@@ -127,6 +128,7 @@ def _measured_by(problem: Problem, target: int) -> tuple[Array, Array, Array, Ar
     no_rows = np.zeros(len(weight), dtype=bool)
     found: dict[tuple[int, int], Array] = {}
     sighted: dict[tuple[int, int], Array] = {}
+    # for each pair (epoch, station): flags (N,) of problems with a row, and of problems with an angle
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         present, model = weight[:, start : start + rows.count] > 0.0, MODELS[rows.kind]
         rows_of_target = np.flatnonzero(rows.target == target).tolist()
@@ -155,6 +157,7 @@ def _is_blocked(point: Array, station: Array, present: Array, angular: Array, re
     reach : float
         Further depth that a line must reach to count, in the same unit.
     """
+    # SATELLITE, GRAZE and GROUND are distances from the centre in Earth radii
     satellite = (station**2).sum(-1) > SATELLITE**2
     limit = np.where(satellite, GRAZE, GROUND)
     line = station - point
@@ -203,7 +206,10 @@ _STEPS = 100
 
 
 def by_least_squares(problem: Problem, start: Array, item: Array, face: Face) -> tuple[Array, Array, Array]:
-    """Return x (M, size), cost (M,) and status (M,) of the minima on a face next to starts of problems `item` (M,)."""
+    """Return x (M, size), cost (M,) and status (M,) of the minima on a face next to starts.
+
+    `start` (M, size) are the starts, and `item` (M,) is the problem of each start.
+    """
     strata = strata_of(problem, face)
     if strata is None:
         done = refine(problem, start, item=item, face=face, limit=_STEPS)
@@ -250,6 +256,7 @@ def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Poo
     sides = faces(problem)
     first = np.argmin(np.where(np.isfinite(pool.cost), pool.cost, np.inf), axis=1)
     unanswered = np.flatnonzero(broken[np.arange(len(first)), first])
+    # finished candidates that noise explains, but that are not admitted: a sentence names those behind the Earth
     refused = np.where(broken & (pool.code == Status.OK) & _fits(pool, pool.cost), pool.cost, np.inf)
     kept = replace(
         _mark_infeasible(pool, broken), hidden=_first_sentence(_name_hidden(problem, pool.x, refused), pool.hidden)
@@ -269,6 +276,7 @@ def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Poo
     for array, place in ((x, 0), (cost, 1), (code, 2), (face, 3), (refused_on_faces, 4)):
         array[unanswered] = np.concatenate([found[place] for found in on_faces], axis=1)
     refused_on_faces = np.where(_fits(pool, refused_on_faces), refused_on_faces, np.inf)
+    # the slope of the cost inwards is computed for least squares, so a robust loss is not tested
     if not pool.loss:
         inside = np.where(kept.code == Status.OK, kept.cost, np.inf).min(1)
         falling = _falls(problem, sides, inside, x, cost, face)

@@ -59,6 +59,7 @@ def nlp(problem: Problem, pool: Pool | None) -> Pool:
         raise InvalidProblem("nlp needs a start", "method", "give start= or a method such as 'gtrs+nlp'")
     began = perf_counter()
     # a program with thousands of rows is slow to build and to solve; the least squares after it use all epochs
+    # with fewer than two epochs per block, nothing would be averaged
     if is_registration_run(problem) and problem.epochs >= 2 * BLOCKS:
         return lsr(problem, offer(problem, _of_blocks(problem, pool.x), pool, "nlp", began))
     # IPOPT gets one covariance, so station errors of an epoch become noise
@@ -188,8 +189,13 @@ def _program(problem: Problem, data: int, rows: int) -> Program:
 
 
 def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compiled: bool) -> Program:
-    """Return a new program for a structure: `choice` is the solver, and `compiled` requests a C compiler."""
+    """Return a new program for a structure: `choice` is the solver, and `compiled` requests a C compiler.
+
+    `data` and `rows` are as in `_program`.
+    """
     n = problem.layout.size
+    # The numbers p of a problem are n units, n centres, the numbers of the rows, the spread of the stations, and the
+    # bounds of the constraints.
 
     def scaled_residual(y: Any, p: Any, z: Any) -> list[Any]:
         return residual(problem, y * p[:n] + p[n : 2 * n], p[2 * n :], z)

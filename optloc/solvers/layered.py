@@ -139,7 +139,7 @@ def refine_in_layers(
         active = ended[inwards]
         if not len(active):
             break
-    else:
+    else:  # all rounds were used, and some points have not settled
         status[active] = Status.STALLED
     _leave_falling(problem, strata, (x, cost, status), item, cross)
     return Refined(x, cost, status, steps, lambda: equations_at(problem.take(item), x))
@@ -150,9 +150,9 @@ def _along_border(
 ) -> tuple[tuple[Array, Array, Array], Array]:
     """Return the minima along the borders next to x (M, size), and flags (M,): the cost falls inwards.
 
-    A minimum has a vector, a cost and a status.
-
-    `limits` are the ends of the layers of the points, and `limit` is the largest number of steps.
+    The minima are vectors (M, size), costs (M,) and statuses (M,). `limits` are the ends of the layers of the points,
+    `item` (M,) is the problem of each point, and `limit` is the largest number of steps. `face` are other constraints
+    that are satisfied with equality.
     """
     side = limits.reached(x, _REACHED)
     z = np.where(side < 0, limits.low, limits.high)
@@ -217,6 +217,7 @@ def _leave_falling(
     other, part, side = x[rows].copy(), problem.take(item[rows]), side[rows]
     other[:, strata.column] = np.where(side > 0, strata.low[neighbour[rows]], strata.high[neighbour[rows]])
     over, on = equations_at(part, other), equations_at(part, x[rows])
+    # the upward force times the side is positive if the cost falls further from the border on the other side
     force, tolerance = marginal(over)[1][:, strata.column], equal_cost(cost[rows])
     falls = (over.cost < cost[rows] - tolerance) | ((over.cost < cost[rows] + tolerance) & (force * side > 0.0))
     cost[rows[falls]] = over.cost[falls] if cross else np.inf
@@ -265,7 +266,8 @@ def equations_in_layers(problem: Problem, x: Array) -> Normal:
 def _rise_of_one(problem: Problem, limits: Limits, x: Array, cost: Array, face: Face) -> Array:
     """Return the distance (M,), metres, from a border to the depth at which the least cost is larger by one.
 
-    `cost` (M,) is the cost at x (M, size). The search ends at the other border of the layer.
+    `cost` (M,) is the cost at x (M, size), `limits` are the ends of the layers, and `face` are the equalities. The
+    search ends at the other border of the layer.
     """
     z, side = x[:, limits.column], limits.reached(x, _REACHED)
     longest = np.where(side > 0, z - limits.low, limits.high - z)
@@ -275,7 +277,8 @@ def _rise_of_one(problem: Problem, limits: Limits, x: Array, cost: Array, face: 
         done = refine(fixed, x, face=border)
         x, rise = done.x, np.maximum(done.cost - cost, 0.0)
         reached = ~found & (rise >= 1.0)
-        # between two distances the rise is a power of the distance, the second or more
+        # Between two distances the rise is a power of the distance, the second or more. At the first distance `before`
+        # is 0, so the power is infinite and the distance does not change.
         with np.errstate(divide="ignore"):
             power = np.maximum(np.log2(np.maximum(rise, 1.0) / before), 2.0)
         apart = np.where(reached, apart * np.maximum(rise, 1.0) ** (-1.0 / power), apart)

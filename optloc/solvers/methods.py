@@ -65,8 +65,8 @@ class SolverEntry:
     stage : callable, optional
         ``(problem, pool or None) -> pool``: replaces `solver` for optloc's own stages.
     batched : bool
-        Whether it solves a batch at a time; other solvers go one by one. A study sizes its chunks by this: too small a
-        chunk costs a file, and too large a chunk loses minutes of work when a run is stopped.
+        Whether it solves a batch at a time; other solvers go one by one. A study chooses the size of its chunks by
+        this. Each chunk costs a file, and a stopped run loses the work on its last chunk.
     """
 
     solver: FixSolver | None
@@ -119,7 +119,7 @@ def compare_bounds(problem: Problem, pool: Pool | None) -> Pool:
 def _claim(cost: float, bound: float, tight: bool, name: str) -> Claims:
     """Return the claim from a lower bound of a relaxation; a tight bound is a global proof of the value.
 
-    `name` is the name of the relaxation.
+    `cost` and `bound` are the cost of the fix and its lower bound, and `name` is the name of the relaxation.
     """
     reason = "no position has a lower chi-square" if tight else f"a lower bound leaves a gap of {cost - bound:.2g}"
     text = f"{reason}; other minima were searched for, not excluded"

@@ -101,13 +101,16 @@ def settle_by_plan(
     unsettled = np.flatnonzero(~answer.settled)
     if not len(unsettled):
         return _with_sides(_pool(plan, _preferred(answer, problems_at), steps, began), problems_at)
-    # most of these problems only need another start, which the eigenvalues of the pencil give
+    # most of these problems only need another start, which the closed form `gtrs` computes
     rest = problems_at(unsettled)
     start = in_parts(rest, lambda part, _: gtrs(part, None))
-    single = np.isfinite(start.x).all(-1).sum(1) == 1  # if there are several starts, all of them compete
+    # A problem with several starts gets NaN as start: the plan does not settle it, and all starts compete in the
+    # stages.
+    single = np.isfinite(start.x).all(-1).sum(1) == 1
     second, again = plan.run(
         load.take(unsettled), z[unsettled], threads, np.where(single[:, None], start.x[:, 0], np.nan)
     )
+    # the second answers replace the first answers of these problems
     for whole, part in zip(answer, second, strict=True):
         whole[unsettled] = part
     pool = _with_sides(_pool(plan, _preferred(answer, problems_at), max(steps, again), began), problems_at)
@@ -261,6 +264,7 @@ class RunPlan:
 
         began, count = perf_counter(), problem.batch_shape[0]
         z = np.broadcast_to(problem.z, (count, problem.count))[:, self.rows].reshape(-1, self.rows.shape[1])
+        # the fix of each epoch without its known biases is the start of the run
         answer, _ = self.epoch.run(self.load, (z - self.added) / self.gain)
         start, n = np.tile(self.x, (count, 1)), problem.layout.n_shared
         local = start[:, n:].reshape(len(z), len(self.columns))
@@ -272,6 +276,7 @@ class RunPlan:
         done, found = fixed_runs(runs, item, start, StopRules(TOLERANCE, LIMIT), problem.dimension)
         curvature = Curvature(found.covariance, found.information, found.regular, found.weakest, local=found.local)
         good = (done.status == Status.OK) & np.isfinite(done.cost) & found.regular & (found.weakest >= WEAK)
+        # a run has no complication if the fix of every epoch is valid and the refinement of the run has converged
         plain = answer.settled.reshape(count, -1).all(1) & good
         seconds = perf_counter() - began
         pool = Pool(
@@ -314,6 +319,7 @@ def _plan_run(problem: Problem) -> RunPlan | None:
         return None
     one = problem.take(np.zeros(1, dtype=int)).with_rows(z=np.zeros((1, problem.count)))
     epoch = fold(one, found).take(np.zeros(1, dtype=int))
+    # one epoch as a problem of a target at rest, without biases: `RunPlan.settle` subtracts the known biases
     still = replace(without_biases(epoch), motions=(Motion(),))
     plan = plan_of(still)
     dof = int(degrees_of_freedom(one)[0])
@@ -329,6 +335,7 @@ def _plan_run(problem: Problem) -> RunPlan | None:
     )
     columns = np.full(problem.layout.n_local, -1)
     slots = {slot.name: slot for slot in plan.layout.shared}
+    # in the fix of an epoch the local unknowns follow the shared unknowns
     slots |= {slot.name: replace(slot, start=slot.start + plan.layout.n_shared) for slot in plan.layout.local}
     for slot in problem.layout.local:
         if slot.name in slots:

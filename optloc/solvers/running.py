@@ -94,6 +94,7 @@ class Running:
         if not np.isfinite(fix.x).all():
             raise InvalidProblem("the fix has no answer to start from", "fix", "wait for more epochs; see fix.status")
         flat = problem.flat()
+        # the first numbers of a vector are the shared unknowns
         at = fix.x[..., : problem.layout.n_shared].reshape(-1, problem.layout.n_shared)
         return _linearise(flat, at, 0, tolerance)
 

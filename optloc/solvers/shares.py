@@ -117,8 +117,8 @@ def _solve_trials(
 ) -> tuple[Fix, Array]:
     """Return the fixes (q trials,) of measurements at q positions, and the true vectors (q trials, size).
 
-    `single` is the problem, without measurements. `places` (q, size) are the true vectors at the positions, and
-    `numbers` (q,) the numbers of the positions: together with `seed` they determine the draws.
+    `single` is the problem, without measurements, and `method` solves it. `places` (q, size) are the true vectors at
+    the positions, and `numbers` (q,) the numbers of the positions: together with `seed` they determine the draws.
     """
     drawn, true = [], []
     for number, place in zip(numbers.tolist(), places, strict=True):
@@ -139,7 +139,7 @@ def _with_drawn_priors(problem: Problem, place: Array, trials: int, rng: np.rand
     """Return `trials` problems with drawn prior means, and their true vectors (trials, size).
 
     Prior means of states are drawn about the true vector `place` (size,). Biases and other unknowns are drawn from
-    their priors.
+    their priors. `rng` makes all draws.
     """
     layout, n = problem.layout, problem.layout.n_shared
     x, means = np.tile(place, (trials, 1)), dict[str, Array]()

@@ -5,6 +5,7 @@ the constant columns of the verdict. For a fix with a complication, such as a ri
 unfinished proof, the result is None. The caller then runs the stages of the method: the long path.
 
 Letters: n fixes, m rows, d coordinates, e planes of equalities, k constraints, `size` numbers of a parameter vector.
+The parameter `answer` has the arrays that the compiled code of the plan writes.
 """
 
 from __future__ import annotations
@@ -215,6 +216,7 @@ class PreparedFix:
         if self.absent is not None:
             workspace.z[:, self.absent] = 0.0
         answer = Answer(np.empty((n, size)), np.empty((n, shared, shared)), *workspace.found)
+        # False: the kernel computes the start from the measurements, instead of reading it from `answer`
         steps = kernel(*self.load[:2], workspace.z, self.load.place, TOLERANCE, LIMIT, False, answer)
         found = [EngineResult(*numbers) for numbers in answer.number.tolist()]
         for one in found:
@@ -279,6 +281,7 @@ class PreparedFix:
                 self._pass_hidden(workspace, answer.x[i], i)
         if self.edges is not None and not self._is_inside(self.edges, answer, workspace):
             return False
+        # fields 2 to 5 of the results: bound, everywhere, gap, met
         results = zip(found, *(array.tolist() for array in (answered.verdict, *answered[2:6])), strict=True)
         for one, verdict, bound, everywhere, shown, met in results:
             if verdict != UNIQUE or not everywhere or shown != LISTED_GAP or met:
@@ -340,7 +343,7 @@ class PreparedFix:
         marks, kinds, gaps = [], [], []
         for one in found:
             excess, gap = one.infinity - one.cost, one.rival_cost - one.cost
-            if one.kappa > STRAIGHT and isnan(excess):  # the cost at infinity was not computed
+            if one.kappa > STRAIGHT and isnan(excess):  # not Gaussian in metres, and no cost at infinity
                 return None
             marks.append(marks_of(one.cost > self.refuted, excess, self.region, gap, one.kappa, self.map is not None))
             kinds.append(chart_kind(one.kappa, one.kappa_far))
@@ -407,7 +410,7 @@ class PreparedFix:
     def _make_workspace(self, shape: tuple[int, ...]) -> _SingleWorkspace:
         """Return a new workspace for a batch shape."""
         n, size, d, m = max(1, *shape, 1), self.plan.layout.size, self.load.place.shape[-1], self.problem.count
-        found = tuple(blank_answer(n, *self.plan.widths))[2:]
+        found = tuple(blank_answer(n, *self.plan.widths))[2:]  # without position and covariance
         affine = self.map
         none = np.empty(0, dtype=np.int64), np.empty((1, 0, 0)), np.empty((1, 0, 0)), np.empty((n, 0)), np.empty(n)
         costs = PositionCosts(*none) if affine is None else affine.room(n)

@@ -55,7 +55,7 @@ def solve(problem: Problem, method: str = "auto", *, start: ArrayLike | None = N
 
 
 def solve_in_stages(problem: Problem, run: Method, start: Any = None, *, refine: bool = True) -> Fix:
-    """Return the fixes of `solve` by the stages of a method, which work on batches."""
+    """Return the fixes of `solve` by the stages of the method `run`; `start` and `refine` are as in `solve`."""
     if problem.layout.size == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     if separable(problem):

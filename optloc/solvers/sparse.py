@@ -1,7 +1,8 @@
 """The stage "sparse": starts and suspected rows from a convex program that allows gross errors in a few rows.
 
 Letters: N problems, m rows, n unknowns y, d coordinates, x a position, s a station, t an emission time as a distance.
-q stations b are the second stations of pairs; r_a and r_b are the ranges to the stations a and b.
+q stations b are the second stations of pairs; r_a and r_b are the ranges to the stations a and b. `block` are the rows
+of one kind.
 """
 
 from __future__ import annotations
@@ -140,6 +141,7 @@ def row_wise(problem: Problem) -> RowWise:
     errors: list[tuple[slice, Callable[[Array | None], Array]]] = []
     for block, start in zip(problem.rows, problem.starts, strict=True):
         part = _lift_ranges(problem, block, start, origin, scale, pairs, first)
+        # kinds without ranges, such as bearings
         part = part or _lift_others(problem, block, start, Coordinates(origin, scale, False))
         if part is None:
             continue
@@ -397,7 +399,7 @@ def _test_support(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Arra
     limit = -ndtri(0.5 * _LEVEL / np.maximum(present.sum(1, keepdims=True), 1))
     wrong, active = wrong.copy(), np.arange(len(x))
     x = x.copy()
-    # if the support leaves too few rows for a fix, its first rows stay in it
+    # If the support leaves too few rows for a fix, only its first rows are left out. All sizes are equal here.
     wrong = _spare(problem, wrong.astype(float), wrong)
     for _ in range(_PASSES):
         part, left_out = problem.take(active), wrong[active]
@@ -460,6 +462,7 @@ def _derivatives(problem: Problem, x: Array) -> tuple[Array, Array]:
     full = np.zeros((*compact.shape[:-1], problem.layout.size))
     full[..., :n] = compact[..., :n]
     # local columns are compact: each row has the columns of its epoch
+    # the local unknowns of epoch k are columns n + k * width and the following ones of a parameter vector
     for j in range(width):
         full[:, np.arange(problem.count), n + problem.epoch * width + j] = compact[..., n + j]
     return residual, np.where(problem.weight[..., None] > 0.0, full, 0.0)

@@ -52,7 +52,10 @@ _WEAK = 1e-2
 
 
 def start_with(word: str) -> Solver:
-    """Return the stage of a word of a method: it offers the starts of all formulations for the word."""
+    """Return the stage of a word of a method, such as "gtrs": it offers the starts of all formulations for the word.
+
+    If offsets of azimuths may be any part of a turn, the starts come from several trial offsets.
+    """
 
     def start(problem: Problem, pool: Pool | None) -> Pool:
         began, offsets = perf_counter(), headings(problem)
@@ -67,7 +70,7 @@ def start_with(word: str) -> Solver:
         whole, problem = problem, problem.straightened()
         serving = [form for form in FORMULATIONS.values() if word in form.starts and form.serves(problem)]
         # A formulation that serves fewer problems is more specific: without a refinement its answer is the fix, so it
-        # comes first.
+        # comes first. The key is False for these formulations, and False sorts before True.
         serving.sort(key=lambda form: form.serves is one_position)
         if one_position(problem):
             at_rest = problem_at_rest(problem)
@@ -102,7 +105,8 @@ def explain_absence(problem: Problem, pool: Pool, word: str) -> Pool:
     if failures():  # a back end failed, so the rows are not the reason
         return pool
     part = problem.take(items)
-    # if no other method can start the rows either, the verdict finds a better reason
+    # If no other method can start the rows, the verdict finds a better reason. If rows and equalities determine the
+    # position, a search can start them.
     items = items[~roots(part, None).empty | is_measured(part)]
     forms = FORMULATIONS.values()
     own = [form for form in forms if word in form.starts] or [form for form in forms if word in form.words]
@@ -148,7 +152,7 @@ def lsr_with_mirror(problem: Problem, start: Pool) -> Pool:
 def _without_halted(problem: Problem, pool: Pool) -> Pool:
     """Return a settled pool without rivals from which an undamped step would move on; such a point is no minimum."""
     item, slot = pool.occupied
-    item, slot = item[slot > 0], slot[slot > 0]
+    item, slot = item[slot > 0], slot[slot > 0]  # slot 0 has the best minimum, which stays
     # free steps would leave minima on constraints and interfaces
     if not len(item) or problem.constraints or strata_of(problem) is not None:
         return pool
@@ -159,6 +163,7 @@ def _without_halted(problem: Problem, pool: Pool) -> Pool:
     cost, code, dropped = np.array(pool.cost), np.array(pool.code), (item[halted], slot[halted])
     x[dropped], cost[dropped], code[dropped] = np.nan, np.inf, Status.UNAVAILABLE
     width = max(1, int(np.isfinite(cost).sum(1).max(initial=0)))
+    # move the remaining candidates to the first slots, in the same order
     order = np.argsort(~np.isfinite(cost), axis=1, kind="stable")[:, :width]
     cost, code, face = (np.take_along_axis(array, order, axis=1) for array in (cost, code, pool.face))
     return replace(pool, x=np.take_along_axis(x, order[..., None], axis=1), cost=cost, code=code, face=face)
@@ -293,6 +298,7 @@ def _search_unanswered(
     # closed forms use straight lines, so in layers their starts need not have a ray to every station
     bent = isinstance(problem.medium, Layers) & (fix.code == Status.INFEASIBLE)
     unanswered = ~fix.answered & (hidden | bent | ~np.isin(fix.code, _SETTLED))
+    # on Earth a misfit whose position the Earth hides is searched again too
     refuted = fix.answered & (fix.code == Status.MISFIT) & problem.frame.geodetic
     misfits: Array = np.flatnonzero(refuted)
     unanswered[misfits] = is_hidden(problem.take(misfits), fix.x[misfits]) if len(misfits) else False
@@ -384,7 +390,8 @@ def search_widely(problem: Problem) -> Pool:
 def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int = 100) -> Pool:
     """Return the minima that damped least squares reaches from all candidates of the pool before.
 
-    `limit` is the largest number of steps. A settled pool without new candidates is returned unchanged.
+    `limit` is the largest number of steps. A settled pool without new candidates is returned unchanged. If `damped` is
+    False, the steps are plain Gauss-Newton steps that ignore constraints, layers and the plane of the stations.
     """
     if pool is None:
         raise InvalidProblem("lsr needs a start", "method", "give start= or a method such as 'gtrs+lsr'")
@@ -400,7 +407,7 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
     item, slot = pool.occupied
     detail = "nothing to refine"
     if len(item):
-        # with one candidate each, the problems are not copied
+        # With one candidate each, the problems are not copied: the argument None means that start i has problem i.
         whole = len(item) == len(pool) and bool((item == np.arange(len(pool))).all())
         face = exact(problem) if damped else ()
         item_of = None if whole else item
@@ -419,6 +426,7 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
     # face 0 has no inequalities; `bound_pool` adds candidates on other faces
     inside, missing = np.zeros(shape, dtype=int), pool.missing
     refined = Pool(x, cost, code, inside, weights, pool.dof, pool.stages, missing=missing, hidden=pool.hidden)
+    # least cost without inequalities, from which the verdict finds contradictions between data and constraints
     free = least_finished(refined) if problem.constraints else None
     refined = replace(bound_pool(problem, refined) if damped else refined, free=free)
     stage = Stage("lsr" if damped else "taylor", detail, perf_counter() - began)

@@ -3,8 +3,9 @@
 Ranges from stations on a line leave a circle around it. Ranges from stations in a plane leave an arc through the fix
 and its mirror image. Along such a curve no Gaussian covers; across it a Gaussian does.
 
-A *node* is a point of the curve. Its coordinates z are metres, or those of the inverse-range chart: a direction p and
-an inverse range w, which is 1 at the fix and 0 at infinity (`optloc.problem.chart`). Costs are chi-square values.
+A *node* is a point of the curve. Its coordinates z are metres, or coordinates of the inverse-range chart. The chart
+(`optloc.problem.chart`) has a direction p and an inverse range w, which is 1 at the fix and 0 at infinity. Costs are
+chi-square values. Letters: m nodes, n samples, q points, d coordinates.
 """
 
 from __future__ import annotations
@@ -126,6 +127,7 @@ class Arc:
         mass, d = self.mass, self.node.shape[-1]
         spaced, offsets, density = student(d - 1, n, seed)
         before = np.append(0.0, np.cumsum(mass))
+        # number of the chord between two nodes, in proportion to the probability of the chords
         piece = np.searchsorted(before[1:-1], spaced, side="right")
         fraction = np.clip((spaced - before[piece]) / np.where(mass[piece] > 0.0, mass[piece], 1.0), 0.0, 1.0)
         along = self.node[piece] + fraction[:, None] * np.diff(self.node, axis=0)[piece]
@@ -183,6 +185,7 @@ def trace_from(surface: RegionSurface) -> Arc:
     nodes = one
     if not closed:
         other, closed = valley.walk(start, -first)
+        # the nodes of the other direction in reverse order, without the fix, which is the first node of `one`
         nodes = other[:0:-1] + one
     if closed:
         # A closed curve is cut at its least likely node, and shares count from there.
@@ -253,6 +256,7 @@ class _Valley:
             if found is None or moved > _HARD or abs(found.cost - here.cost) > _JUMP:
                 size *= _SHORTER
                 continue
+            # the first chords begin at the fix or near it, so they are not tested
             if len(nodes) > 3 and self._passes(start, here, found):
                 return nodes, True
             nodes.append(found)
@@ -277,6 +281,7 @@ class _Valley:
             weakest = np.linalg.eigh(information)[1][:, 0]
             along = weakest if weakest @ along > 0.0 else -weakest
             node = self._node(z, cost, information, along)
+            # Gauss-Newton step across the curve, in standard deviations
             step = node.across.T @ vector
             size = float(np.sqrt((step**2).sum()))
             moved = size if number == 0 else moved

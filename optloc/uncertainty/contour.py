@@ -95,7 +95,7 @@ def trace_nodes(value: Value, nodes: Array, step: float) -> list[Polygon]:
 
     `step` is the distance between neighbouring nodes.
     """
-    low = nodes.min(0) - 2
+    low = nodes.min(0) - 2  # two nodes of margin on each side, so that every line closes
     mask = np.zeros(np.ptp(nodes, axis=0) + 5, dtype=bool)
     mask[tuple((nodes - low).T)] = True
     grid = _Grid(low * step, np.eye(2), np.full(2, step))
@@ -128,6 +128,7 @@ def _nodes_in_rectangles(first: Array, last: Array, shape: tuple[int, int]) -> A
 
     `shape` is the shape of the grid.
     """
+    # signs at the corners of rectangles: their cumulative sums along both axes count the rectangles at each node
     count = np.zeros((shape[0] + 1, shape[1] + 1), dtype=int)
     (west, south), (east, north) = first.T, last.T + 1
     for x, y, sign in ((west, south, 1), (east, south, -1), (west, north, -1), (east, north, 1)):
@@ -174,7 +175,7 @@ def _first_grid(cells: Array, axes: Array, middle: Array) -> tuple[_Grid, Array]
 
 
 def _promising(values: Array, mask: Array) -> Array | None:
-    """Return flags of the nodes near the set on a grid of half the step; None if there are too many.
+    """Return flags of the nodes near the set on a grid of half the step; None if there are too many, or none.
 
     `values` (nx, ny) are the values on the present grid, and `mask` (nx, ny) flags its nodes in use.
     """
@@ -289,9 +290,10 @@ def _crossings(value: Value, grid: _Grid, values: Array, edges: Array) -> Array:
     direction = np.where((one < 0.0)[:, None], along, -along)
     low, high = np.zeros(len(edges)), np.ones(len(edges))
     at_low, at_high = np.minimum(one, two), np.maximum(one, two)
-    last_side = np.zeros(len(edges))
+    last_side = np.zeros(len(edges))  # 1 if the last point was inside, -1 if it was outside
     for _ in range(_STEPS):
         share = at_low / (at_low - at_high)
+        # not at an end of the interval, so that the interval always becomes shorter
         middle = low + np.clip(share, 0.02, 0.98) * (high - low)
         found = value(grid.points(start + middle[:, None] * direction))
         found = np.where(np.isnan(found), _CUT, np.clip(found, -_CUT, _CUT))

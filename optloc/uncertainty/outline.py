@@ -4,7 +4,8 @@ In the plane the region is ``f <= f(fix) + q``. In space a picture shows two coo
 takes its best value, and q is the quantile of chi-square with two degrees of freedom, as for an ellipse from a
 covariance. So the outline contains the two visible coordinates with the stated probability.
 
-Here f is the cost over the position. Points of the plane are metres from the fix along its two axes.
+Here f is the cost over the position, and `surface` holds this cost and the fix. Points of the plane are metres from the
+fix along its two axes.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ _CELLS = {2: 400, 3: 3000}
 FAR = 3.0
 # Share of that distance from which a line counts as cut off.
 _AT_EDGE = 0.995
-# Steps across the ellipsoid of a far fix, by dimension, and the factor by which the search extends beyond the
-# ellipsoid, since the fix is not exactly Gaussian there.
+# Steps across the ellipsoid of a far fix, by dimension. The search extends beyond the ellipsoid by a factor, since the
+# fix is not exactly Gaussian there.
 _STEPS, _BEYOND = {2: 24, 3: 14}, 1.4
 # Positions along the hidden coordinate, and steps from the best two of them: a cost with two minima there has both.
 _ALONG, _NEWTON = 9, 4
@@ -43,7 +44,7 @@ _WIDTH = 2e-3
 # Halvings that find the ends of a line within a step.
 _HALVINGS = 20
 # Steps of the grid from the fix to the level of a Gaussian, most nodes (more than a picture shows), and most doublings
-# of the step for larger regions: a region of a million standard deviations still ends.
+# of the step. With the doublings the grid covers a region of a million standard deviations.
 _FINE, _NODES, _DOUBLINGS = 8.0, 4000, 20
 
 
@@ -89,6 +90,7 @@ def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) ->
         None if an ellipse covers, or if the region cannot be enclosed.
     """
     if fix.chart is not None and fix.chart.truncated is not None and fix.chart.cut_off:
+        # a law that bounds cut off has a single closed outline, which must run counter-clockwise
         line = fix.chart.truncated.outline(plane, level)
         return Outline(([line if area(line) > 0.0 else line[::-1]],))
     if fix.chart is None or int(fix.chart.kind) not in (CURVED, INVERSE_RANGE) or not np.isfinite(fix.cov).all():
@@ -103,6 +105,7 @@ def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) ->
             if region.cells is None:
                 return None
             surface, cells = region.surface, region.cells.corners
+            # a corner at infinity is replaced by a point at the distance where the picture ends
             away = fix.chart.centre + FAR * float(fix.chart.distance) * region.cells.directions
             cells = np.where(np.isfinite(cells).all(-1, keepdims=True), cells, away)
     except InvalidProblem:
@@ -113,13 +116,15 @@ def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) ->
 def _outline_in_cells(surface: RegionSurface, cells: Array, plane: Array, level: float) -> Outline | None:
     """Return the outline, in a plane, of a region without equalities; None if it has no part in the plane.
 
-    `cells` (m, v, d) are the corners of convex cells that contain the region, metres. `plane` (2, d) has the axes of
-    the plane, and `level` is the probability. The outline ends at `FAR` distances of the fix from the stations.
+    `surface` is the cost around the fix. `cells` (m, v, d) are the corners of convex cells that contain the region,
+    metres. `plane` (2, d) has the axes of the plane, and `level` is the probability. The outline ends at `FAR`
+    distances of the fix from the stations.
     """
     q, centre = quantile(level, 2), (surface.chart.centre - surface.position) @ plane.T
     reach = FAR * float(surface.chart.distance)
     cost = _profile(surface, cells, plane)
 
+    # negative inside the region, zero on its outline
     def value(points: Array) -> Array:
         beyond = np.sqrt(((points - centre) ** 2).sum(-1)) / reach - 1.0
         return np.asarray(np.maximum((cost(points) - surface.least) / q - 1.0, beyond))
@@ -140,6 +145,7 @@ def _profile(surface: RegionSurface, cells: Array, plane: Array) -> Callable[[Ar
     in_plane, depth = (cells - surface.position) @ plane.T, (cells - surface.position) @ normal
     origin = in_plane.min((0, 1))
     step = max(float((in_plane.max((0, 1)) - origin).max()), np.finfo(float).tiny) / (_ACROSS - 3)
+    # table over nodes of a grid in the plane: least and greatest hidden coordinate of the cells there
     low, high = np.full((_ACROSS + 1, _ACROSS + 1), np.inf), np.full((_ACROSS + 1, _ACROSS + 1), -np.inf)
     first = np.floor((in_plane.min(1) - origin) / step).astype(int)
     last = np.ceil((in_plane.max(1) - origin) / step).astype(int) + 2
@@ -184,12 +190,16 @@ def _least_along(surface: RegionSurface, base: Array, normal: Array, low: Array,
         new = at(np.clip(t + step, low[:, None], high[:, None]))
         better = new[0] < cost
         cost, t = np.where(better, new[0], cost), np.where(better, new[1], t)
+        # a Newton step that does not lower the cost is tried again at a quarter of its length
         step = np.where(better, new[2], 0.25 * step)
     return np.asarray(cost.min(1))
 
 
 def _far_cells(chart: Chart, level: float) -> Array:
-    """Return cells (m, 2^d, d), metres, that contain the region of a fix that is Gaussian in its inverse range."""
+    """Return cells (m, 2^d, d), metres, that contain the region of a fix that is Gaussian in its inverse range.
+
+    `chart` has the coordinates in which the fix is Gaussian, and `level` is the probability.
+    """
     d = len(chart.position)
     values, vectors = np.linalg.eigh(chart.spread)
     axes = np.sqrt(np.maximum(values, 0.0) * quantile(level, 2)) * vectors

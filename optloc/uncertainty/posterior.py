@@ -158,6 +158,7 @@ def around(surface: RegionSurface, n: int, seed: int, prior: str = "jeffreys", w
     _, points, log_proposal = student(len(start), n, seed)
     scale = np.sqrt(np.diagonal(spread))
     y = start + _WIDER * scale * (points @ np.linalg.cholesky(spread / np.outer(scale, scale)).T)
+    # samples beyond infinity are moved to the fix, and get no weight
     good = y[:, -1] > _LEAST_W if inverse else np.ones(n, dtype=bool)
     y = np.where(good[:, None], y, start)
     position = chart.to_position(y) if inverse else y
@@ -166,6 +167,7 @@ def around(surface: RegionSurface, n: int, seed: int, prior: str = "jeffreys", w
     log_weight += chart.log_volume(y) if inverse else 0.0
     if prior == "jeffreys":
         log_weight += 0.5 * np.linalg.slogdet(_scaled(information, position, chart.centre, inverse))[1]
+        # `_scaled` has multiplied the root of the determinant by the distance to the power of d
         log_weight -= (len(start) * np.log(np.sqrt(((position - chart.centre) ** 2).sum(-1)))) if inverse else 0.0
     if within is not None:
         good &= ((position - chart.centre) ** 2).sum(-1) <= within**2
@@ -200,7 +202,7 @@ def _scaled(information: Array, position: Array, centre: Array, inverse: bool) -
 
 
 def along(arc: Arc, n: int, seed: int, within: float | None = None) -> Samples:
-    """Return n samples along an arc, see `optloc.uncertainty.arc.Arc.draw`.
+    """Return n samples along an arc from a seed, see `optloc.uncertainty.arc.Arc.draw`.
 
     `within` is the radius of a ball that limits the positions, metres; None for no limit.
     """
@@ -343,6 +345,7 @@ def _by_slice(drawn: Samples, slice_of: Array, k: int) -> Mixture:
 
     `slice_of` (n,) is the slice of each sample; samples outside all slices are dropped.
     """
+    # neighbouring slices are collected in a group until the group has enough samples for a covariance
     fewest, groups = _FEWEST * drawn.position.shape[1], [np.zeros(len(slice_of), dtype=bool)]
     for i in range(k):
         if groups[-1].sum() >= fewest:

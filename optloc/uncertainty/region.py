@@ -45,8 +45,8 @@ class Cells:
     base : array (d,)
         A position, metres.
     edges : array (n, 1 + d, 1 + d)
-        Middle of each cell, then half of each edge, in homogeneous coordinates: (P, v) is the position ``base + P /
-        v``. The cell is the middle plus the edges times numbers between -1 and 1.
+        Middle of each cell, then half of each edge, in homogeneous coordinates. Here (P, v) is the position
+        ``base + P / v``. The cell is the middle plus the edges times numbers between -1 and 1.
     inside : int
         Number of cells, at the beginning, that are completely inside the region.
     """
@@ -71,6 +71,7 @@ class Cells:
         from_point = np.linalg.inv(np.swapaxes(self.edges, -1, -2))
         out = np.zeros(len(points), dtype=bool)
         for i, point in enumerate(np.append(points - self.base, np.ones((len(points), 1)), axis=1)):
+            # the weight of the middle of each cell, then of its edges; a ratio of at most 1 is inside
             share = from_point @ point
             size = np.abs(share[:, 1:]).max(-1) if len(share) else np.zeros(0)
             out[i] = ((share[:, 0] > 0.0) & (size <= (1.0 + _ROUNDED) * share[:, 0])).any()
@@ -214,7 +215,8 @@ def likelihood_region(problem: Problem, fix: Fix, level: float = 0.95, *, boxes:
 def _cover(surface: RegionSurface, threshold: float, boxes: int | None) -> tuple[Cells | None, bool, str]:
     """Return cells that contain the region or None, whether a cell reaches infinity, and the reason for None or "".
 
-    `threshold` is the highest cost in the region, and `boxes` the largest number of cells, None for the default.
+    `surface` is the cost around the fix, and `threshold` the highest cost in the region. `boxes` is the largest number
+    of cells, None for the default.
     """
     why = why_unsupported(surface.problem) or why_too_large(surface.problem)
     if why:
@@ -223,6 +225,7 @@ def _cover(surface: RegionSurface, threshold: float, boxes: int | None) -> tuple
     cost, x = _without_unused_terms(costs.kinds, costs.data[0], costs.K[0], costs.w[0]), np.array(surface.position)
     box, d = empty_box(*cost.K.shape), len(x)
     most = boxes or (_MOST[d] if enabled() else _MOST_PLAIN)
+    # `cover_region` writes these arrays; `ends` has the cost at infinity of each cell, infinite if the cell has an end
     base, edges, ends = np.zeros(3), np.zeros((2 * most, 1 + d, 1 + d)), np.zeros(2 * most)
     above, bent = threshold - surface.least, surface.kind != CARTESIAN
     count, inside, highest = cover_region(cost, box, x, above, most, bent, base, edges, ends)
@@ -260,19 +263,20 @@ _NEAR_INFINITY = 1e-6
 def boundary(surface: RegionSurface, threshold: float) -> Array:
     """Return the first points (k, d), metres, at which rays from the fix leave the region; NaN for endless rays.
 
-    `threshold` is the highest cost in the region.
+    `surface` is the cost around the fix, and `threshold` the highest cost in the region.
     """
     rays = directions(len(surface.position))
     q = np.sqrt(threshold - surface.least)
     count = int(np.ceil(np.log(_LAST / _FIRST) / np.log(_FACTOR)))
     ladder = q * _FIRST * _FACTOR ** np.arange(count + 1)
+    # a ray starts at the fix, and its coordinate counts standard deviations
     start, steps = _axes(surface.chart)
     steps = rays @ steps.T
     limit = _limit(surface, steps)
     along = np.minimum(ladder, limit[:, None])
     costs = surface.cost(_points(surface, start + along[..., None] * steps[:, None]))
     above = np.asarray(costs > threshold)
-    first = above.argmax(1)
+    first = above.argmax(1)  # index of the first point above the threshold; 0 also for a ray without any
     ray = np.arange(len(rays))
     low, high = np.where(first > 0, along[ray, np.maximum(first - 1, 0)], 0.0), along[ray, first]
     for _ in range(_HALVINGS):
@@ -416,6 +420,7 @@ class RegionSurface:
         flat = np.ascontiguousarray(points).reshape(-1, d)
         good = np.isfinite(flat).all(-1)
         slot, _ = self.problem.layout.find("position")
+        # points that are not finite are evaluated at the fix, and their cost is replaced below
         x = np.repeat(self.x, len(flat), axis=0)
         x[:, slot.start : slot.start + d] = np.where(good[:, None], flat, self.position)
         cost, information, vector = np.empty(len(x)), np.empty((len(x), d, d)), np.empty((len(x), d))

@@ -5,6 +5,8 @@ satisfied with equality. So every candidate is among the minima along the faces,
 inequalities. Minima that violate another constraint do not count. Minima from which the cost falls inwards do not
 count either.
 
+Face 0 has no inequality, so it is the problem without inequalities. In messages, a face with inequalities is an edge.
+
 Letters: n problems, q slots for minima of a problem, d coordinates, `size` numbers of a parameter vector. Costs are
 chi-square values. `margin` is the difference of costs to prove: other minimum minus fix. `effort` multiplies the
 number of boxes that a proof may use.
@@ -117,7 +119,9 @@ def certified(
         more += len(changed)
         pool = pool.merge(items[changed], take(new, changed))
         fix = overwrite(fix, items[changed], better[changed])
+        # fixes that changed and have an answer need another proof
         items = items[changed[better.answered[changed]]]
+    # the fixes that still change after the last round
     proven.write(items, unknown_claim(RESTLESS))
     detail = f"{int(asked.sum())} within {violation_names(problem)}" + (f", {more} other minima found" if more else "")
     return replace(pool, proven=proven, stages=(*stages, certify_stage(detail, began)))
@@ -171,8 +175,8 @@ class FaceMinima:
     cost : array (n, q)
         Their costs; infinite in empty slots.
     least, rest : array (n,)
-        Lower bounds of the cost minus the cost of the fix: for every point of the face, and for every minimum that is
-        not listed in `x`; -inf if not proven.
+        Lower bounds of the cost minus the cost of the fix; -inf if not proven. `least` is the bound for every point of
+        the face, and `rest` the bound for every minimum that is not in `x`.
     boxes : int array (n,)
         Boxes used.
     why : object array (n,)
@@ -239,11 +243,13 @@ def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort:
             # edge to one of them, so this edge needs no proof.
             face_gap = np.where(np.isfinite(along.rest) | ~all_admitted, face_gap, margin)
         else:
+            # the minima without inequalities start the searches along all other faces
             seeds = pack(np.concatenate([fix.x[:, None], along.x], axis=1))
             all_admitted = np.asarray((admitted | ~(along.cost < fix.cost[:, None] + margin)).all(1))
         found_minima.append((along.x, np.where(admitted, along.cost, np.inf), np.full(admitted.shape, number)))
         proven_gap, boxes = np.minimum(proven_gap, face_gap), boxes + along.boxes
         reasons = np.where((face_gap < 0.0) & (reasons == ""), along.why, reasons)
+    # -inf means that a face is not proven; any other negative gap means that a cheaper minimum is not excluded
     listed = (fix.alternatives.gap < proven_gap[:, None]).sum(1)
     bound = fix.cost - equal_cost(fix.cost)
     claims, unproven = state_claims(fix.cost, bound, proven_gap, boxes, listed), proven_gap < 0.0
@@ -275,9 +281,11 @@ def _explore_face(
     """
     n, size = len(seeds), seeds.shape[-1]
     costly, boxes = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
+    # a face with inequalities may cost too much as a whole
     if len(face) > len(exact(problem)) and not why_unsupported(on_face(problem, face)):
         limits = admitted_states(problem, problem.dimension)
         costly, boxes = _is_costly(on_face(problem, face), limits, costs, seeds, fix.cost + margin, effort)
+    # a face that costs too much is at least the margin above the fix, and has no minimum of interest
     least = np.full(n, margin)
     out = FaceMinima(np.full((n, 1, size), np.nan), np.full((n, 1), np.inf), least, least, boxes, filled_objects(n, ""))
     rest = np.flatnonzero(~costly)
@@ -297,8 +305,8 @@ def _is_costly(
     is admitted.
 
     A proof has the form: no position costs less than a given position by more than a difference. Here the difference is
-    the cost of that position minus the level. So every position above the level will do; it need not be a minimum. The
-    proof restarts nearer to the minimum in two cases: the cost is steep at the position, or the proof found a position
+    the cost of that position minus the level. So every position above the level will do; it need not be a minimum. If
+    the cost is steep at the position, the proof restarts nearer to the minimum. It also restarts if it found a position
     with less than half of the difference.
     """
     costly, boxes = np.zeros(len(seeds), dtype=bool), np.zeros(len(seeds), dtype=np.int64)
@@ -355,6 +363,7 @@ def _request(on: Problem, limits: Array, costs: Costs, x: Array, difference: Arr
     (n, d), value = place.shape, np.zeros(len(x))
     planes, surface = surfaces_of(on, place)
     region = limits if np.isfinite(limits).all() else np.full_like(limits, np.nan)
+    # a gap of 0 proves the value alone, and `eps` is the difference up to which a lower cost counts as equal
     return ProofRequest(
         x=place,
         others=np.zeros((n, 0, d)),

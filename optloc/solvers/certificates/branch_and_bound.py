@@ -4,7 +4,8 @@ A proof may find a better or another minimum. The minimum is then refined and ad
 
 Letters: N problems of a batch, n problems of a round, q gaps, P points of a problem. d is the number of coordinates of
 the state: position, and velocity if the target moves. Costs, gaps and margins are chi-square values. `items` (n,) are
-numbers of problems in the batch, and `work` is the state of all proofs, which functions change.
+numbers of problems in the batch, and `work` is the state of all proofs, which functions change. `asked` and `answer`
+are the requests and the results of the proofs of a round.
 """
 
 from __future__ import annotations
@@ -296,7 +297,7 @@ def _compare(work: BoundWorkspace, items: Array) -> None:
 
 
 def _run_round(work: BoundWorkspace, items: Array) -> None:
-    """Run one proof for each item, and write its claim, add its minima, or lower its margin."""
+    """Run one proof for each item (n,). Then write its claim, add the minima that it found, or lower its margin."""
     free = is_free(work.problem, work.fix, items)
     _give_up(work, items[~free], HELD)
     asked, costs = _requests(work, items), work.costs.take(items)
@@ -316,12 +317,12 @@ def _run_round(work: BoundWorkspace, items: Array) -> None:
         holds[done & has_rivals] = _list_rivals(work, items[done & has_rivals], answer.take(done & has_rivals))
     _claim(work, items, asked, answer, np.flatnonzero(holds))
     out_of_budget, last = answer.verdict == BUDGET, len(work.margins) - 1
-    # the budget of the value alone may show what the budget of the gap did not
+    # The proof failed at smaller gaps too, so only the value alone is left: `_lower_margin` adds 1 to the level.
     below = out_of_budget & (answer.gap < asked.gaps[:, 0])
     work.level[items[below]] = last - 1
     _lower_margin(work, items[out_of_budget], _unfinished(work.costs, len(items)))
     remote = answer.verdict == UNBOUNDED
-    work.level[items[remote & (answer.gap == 0.0)]] = last
+    work.level[items[remote & (answer.gap == 0.0)]] = last  # the value alone failed too, so a region is next
     _lower_margin(work, items[remote], REMOTE, remote=True)
     found = np.isin(answer.verdict, (BETTER, OTHER))
     if found.any():
@@ -391,13 +392,13 @@ def _lower_margin(work: BoundWorkspace, items: Array, why: str, *, remote: bool 
     """
     last = len(work.margins) - 1
     work.level[items] += 1
-    if not remote:
+    if not remote:  # skip the gap of the 95 % region, the last but one
         work.level[items] += work.level[items] == max(last - 1, 1)
     spent = items[work.level[items] > last]
     everywhere = np.isnan(work.region[spent, 0, 0])
     regional = spent[everywhere]
     work.region[regional] = work.fallback[regional]
-    work.level[regional] = 1 if last > 2 else last
+    work.level[regional] = 1 if last > 2 else last  # the largest gap failed, so it is not tried in the region
     _give_up(work, spent[~everywhere], why)
 
 
@@ -504,6 +505,7 @@ def _give_up_forbidden(work: BoundWorkspace, items: Array, points: Array, barred
 def _ignore(work: BoundWorkspace, items: Array, points: Array) -> Array:
     """Store the minima next to points (n, d) that the Earth hides; return flags (n,) of new ones."""
     problem = work.problem
+    # only the Earth hides minima, and a fix with more than `HIDDEN` of them has no proof
     if not problem.frame.geodetic or problem.motions[0].order or not len(items) or work.ignored.shape[1] >= HIDDEN:
         return np.zeros(len(items), dtype=bool)
     part = problem.take(items)

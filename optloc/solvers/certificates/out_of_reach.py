@@ -174,10 +174,12 @@ def are_out_of_reach(
     count, constraint = len(edges.levels), edges.constraint
     lay_planes(edges, x, cov, edges.value - value[:, constraint], normal[:, constraint], room.asked)
     room.costs.w[:] = np.repeat(costs.w, count, axis=0)
-    if len(room.costs.data) > 1:
+    if len(room.costs.data) > 1:  # the fixes do not share the data of their terms
         room.costs.data[:] = np.repeat(costs.data, count, axis=0)
     cost_here(room.costs, room.asked.x[:, None], room.found)
     level = np.repeat(cost + LISTED_GAP, count)
+    # The proof shows that no position of the plane costs less than the point on it by more than `eps`. So no position
+    # of the plane costs less than the level.
     room.asked.eps[:] = room.found[0, :, 0] - level
     if not (room.asked.eps > equal_cost(level)).all():
         return False
@@ -213,8 +215,10 @@ def out_of_reach(problem: Problem, edges: Edges, costs: PositionCosts, fix: Fix,
     lay_planes(edges, fix.x[:, columns], fix.cov[:, columns, columns], -values, gradients[..., columns], asked)
     plane_costs = costs.take(np.repeat(np.arange(len(fix.x)), count))
     level = np.repeat(fix.cost + gap, count)
+    # the cost of the point on the plane minus the level: the proof must show that no position is cheaper by more
     asked.eps[:] = costs_at(plane_costs, asked.x[:, None])[0][:, 0] - level
     out = np.zeros(len(level), dtype=bool)
+    # above `plane_costs.level` angles may be off by a whole turn, so the costs are not valid there
     items = np.flatnonzero((asked.eps > equal_cost(level)) & (plane_costs.level > level))
     if len(items):
         out[items] = _are_shown(prove_all(plane_costs.take(items), asked.take(items)), level[items])

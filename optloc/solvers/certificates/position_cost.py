@@ -184,8 +184,10 @@ def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Ar
     if n == problem.dimension:
         return out, given > 0
     limits = admitted_states(problem, n)
+    # constraints limit the coordinates without requested corners
     known = np.flatnonzero(np.isfinite(limits).all(0) & (np.arange(n) >= given))
     out[..., known] = limits[:, known]
+    # a known height determines these coordinates, so they need no limit
     free = _across(problem)
     out[..., free] = [[-np.inf], [np.inf]]
     return out, set(range(n)) <= {*range(given), *known.tolist(), *free}

@@ -3,7 +3,8 @@
 Every bound is recomputed from a dual point. It is valid over all positions or over a named region. For a method that
 bounds another cost than the likelihood, the bound is NaN and the reason names that cost.
 
-Letters: N fixes of a batch, i the number of one of them, d coordinates. Costs are chi-square values.
+Letters: N fixes of a batch, i the number of one of them, d coordinates. Costs are chi-square values. `found` are the
+least-squares ranges of all problems, from which the moment relaxation takes the ranges of problem i.
 """
 
 from __future__ import annotations
@@ -190,7 +191,7 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
             return
         nodes = _nodes(found, i)
         centre, spread = centre_and_spread(place[i, nodes])
-        size = float(spread) or 1.0
+        size = float(spread) or 1.0  # stations at one point have no spread, so the unit is a metre
         scaled = _scaled(found, i, nodes, (place[i, nodes] - centre) / size, size)
         point = (fix.position[i] - centre) / size
         cost = float(scaled.cost(point))

@@ -64,7 +64,7 @@ class Doubt:
     Parameters
     ----------
     noise : Noise
-        Noise, including station errors of span "noise".
+        Noise of the rows, including the station errors that the problem treats as noise.
     base : array (N, m)
         Weights of the rows before the loss; 0 = absent.
     own, given : array (N, m)
@@ -218,7 +218,7 @@ def reweight(
     """
     # more than fifty updates mean slow progress along a flat valley, and the status shows it
     x, weight = np.array(start), np.ones(doubt.base.shape)
-    last = np.zeros(x.shape)
+    last = np.zeros(x.shape)  # the step before, from which the extrapolation follows
     status = np.full(len(x), int(Status.MAX_ITERATIONS), dtype=np.int8)
     active = np.arange(len(x))
     # the weighted cost is no upper bound of the robust cost, so steps are checked
@@ -269,9 +269,11 @@ class _Step:
 def _step(problem: Problem, x: Array, last: Array, face: Face, tolerance: float) -> _Step:
     """Return one least-squares step with fixed weights from x (M, size).
 
-    `last` (M, size) is the step before, and `tolerance` the length of a last step in sigma.
+    `last` (M, size) is the step before, and `tolerance` the length of a last step in sigma. `face` are the constraints
+    that are satisfied with equality.
     """
     strata = strata_of(problem, face)
+    # in layers a point may cross a border, since the next step refines it again
     if strata is None:
         done = refine(problem, x, tolerance=_SHARE * tolerance, limit=_STEPS, face=face)
     else:

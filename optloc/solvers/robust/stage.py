@@ -142,8 +142,8 @@ def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[S
     """
     began = perf_counter()
     pool = _minima(problem, loss, robust_starts(problem, loss) if start is None else start)
-    # A flat loss has a minimum for almost every set of rows. So start from a rising loss, and try sets next to the best
-    # one.
+    # A flat loss is constant for large residuals, and has a minimum for almost every set of rows. So start from a
+    # rising loss, and try sets of rows that differ from the best set in one row.
     if start is None and loss.flat:
         pool = _join(pool, _minima(problem, loss, _minima(problem, LOSSES["cauchy"], pool.x).x))
         pool = _join(pool, _minima(problem, loss, flip_rows(problem, loss, pool)))
@@ -157,6 +157,7 @@ def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[S
     # The weights belong to a position. If the verdict shows no position, rows keep their earlier weights.
     answered = np.asarray(np.isfinite(surviving_candidates(found, judge(problem, found))[:, 0]).all(-1))
     weights = _equations(problem, loss, np.where(answered[:, None], found.x[:, 0], 0.0))[1]
+    # `refined` is False, so that a following least squares runs
     return replace(found, refined=False, weights=np.where(answered[:, None], weights, found.weights))
 
 
@@ -266,8 +267,8 @@ def _rivals(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     """Return candidates with costs whose gaps to the cheapest measure how clearly the data exclude them.
 
     A loss that rises without limit also compares sizes of gross errors, and a gap from these sizes is no evidence.
-    Under truncated least squares all gross errors cost the same. Its gap is evidence, if each row left out adds the gap
-    of a rival: a candidate that leaves out one row more than the cheapest is then less likely for that reason.
+    Under truncated least squares all gross errors cost the same. Its gap is evidence if each row left out adds the gap
+    of a rival, 9. A candidate that leaves out one more row than the cheapest is then less likely.
     """
     finished = np.isfinite(pool.cost) & (pool.code == Status.OK)
     item, slot = np.nonzero(finished & (finished.sum(1) > 1)[:, None])

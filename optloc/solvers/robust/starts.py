@@ -1,7 +1,8 @@
 """Starts for a robust cost, without a first guess: fixes without some stations or rows.
 
 Letters: N problems, m rows, S subsets of rows, q starts of a problem, M starts of all problems, `size` numbers of a
-parameter vector. u are residuals in sigma.
+parameter vector. u are residuals in sigma. The *cut* of a loss is its constant c, in sigma: truncated least squares
+rejects rows with larger residuals.
 """
 
 from __future__ import annotations
@@ -76,6 +77,7 @@ def subsets(problem: Problem, clean: Array) -> tuple[Array, Array]:
         Problems for which subsets leave out one station only.
     """
     present = np.broadcast_to(problem.weight > 0.0, (problem.batch_shape[0], problem.count))
+    # `touched` flags the rows of each station, and `single` the one row of each row
     touched, single = rows_of_stations(problem), np.eye(problem.count, dtype=bool)
     measured = np.asarray((present[:, None] & touched).any(-1))
     short = np.flatnonzero(present.sum(1) <= _ROWS)
@@ -159,6 +161,7 @@ def _through_epochs(problem: Problem, loss: Loss) -> Array:
         time = elapsed(problem, 0)[epoch][:, None, None]
         velocity = (place[:, j] - place[:, i]) / (time[j] - time[i])
         rest = np.zeros((*velocity.shape[:-1], d * (order - 1)))
+        # position at the reference time of the state, velocity, and zeros for higher derivatives
         place = np.concatenate([place[:, i] - velocity * time[i], velocity, rest], axis=-1)
     x = vectors(problem, place.reshape(size, -1, place.shape[-1]))
     item, slot = np.nonzero(np.isfinite(x).all(-1))
@@ -229,6 +232,7 @@ def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *,
             return chosen[:, :slot]
         begins = np.append(True, item[1:] != item[:-1])
         best = np.flatnonzero(begins)
+        # `best[np.cumsum(begins) - 1]` is the index of the cheapest start of the problem of each start
         chosen[item[best], slot] = x[best]
         different = np.abs(u - u[:, best[np.cumsum(begins) - 1]]).max(0) >= _SAME
         x, u, item = x[different], u[:, different], item[different]

@@ -30,11 +30,11 @@ from optloc.solvers.verdict.findings import is_improbable
 from optloc.solvers.verdict.judge import filled_objects, judge, verdict
 from optloc.solvers.verdict.repeats import TOLERANCE, Repeats, holds, is_repeatable, repeated
 
-# Squared distance in standard deviations up to which the minimum of the loss and the minimum of the rows with weight
-# are one answer: with clean data nine in ten are within half of it.
+# Largest squared distance, in standard deviations, between the minimum of the loss and the minimum of the rows with
+# weight, if both are one answer. With clean data nine in ten are within half of it.
 _NEAR = 1.0
-# A change of one row is another explanation in two cases: without a row the cost falls by more than _OUT, or with a
-# rejected row the cost rises by less than _BACK. A search for suspects has the same limits.
+# Limits for a change of one row to be another explanation. Without a row the cost must fall by more than _OUT; with a
+# rejected row taken back it must rise by less than _BACK. A search for suspects has the same limits.
 _OUT, _BACK = ROW_PRICE - AMBIGUOUS_GAP, ROW_PRICE + AMBIGUOUS_GAP
 # Most rows for which each row is left out in turn: with more rows a single one rarely decides, and the time grows with
 # the square.

@@ -1,6 +1,7 @@
 """Starts and bounds from angles alone: instrumental variables, unit directions, the smallest maximal angle.
 
-Letters: N problems, m bearings or rows, k epochs, d coordinates, `order` the degree of a polynomial course.
+Letters: N problems, m bearings or rows, k epochs, d coordinates, `order` the degree of a polynomial course. `seen` are
+the bearings of all problems.
 """
 
 from __future__ import annotations
@@ -132,6 +133,7 @@ def courses(problem: Problem) -> BearingCourses | None:
     if seen is None:
         return None
     seen = _in_plan(problem, seen)
+    # True if azimuths are used as bearings in the plane of a problem in space
     flat = seen.station.shape[-1] < problem.dimension
     block = next(rows for rows in problem.rows if rows.kind == "azimuth")
     found = sight_courses(
@@ -145,6 +147,7 @@ def courses(problem: Problem) -> BearingCourses | None:
         order=problem.motions[0].order,
     )
 
+    # coefficients of the course in metres: only the first one is a position, and gets the centre
     def metres(c: Array) -> Array:
         out = c * seen.scale[:, None, None]
         out[:, 0] += seen.centre
@@ -300,6 +303,7 @@ def course_starts(problem: Problem) -> Array | None:
     place = np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))[:, 0]
     home, away = place[:, receiver], place[:, illuminator] - place[:, receiver]
     length = float(spread_of(problem)[1][0])
+    # unit vectors of increasing azimuth, of increasing elevation, and along the line of sight
     axes = triad(value[0], value[1])
     if problem.stations.axes is not None:
         values = np.broadcast_to(problem.stations.axes, (size, *problem.stations.axes.shape[-4:]))[:, 0, receiver]

@@ -1,7 +1,7 @@
 """Block averages: a long run as a short run with the same unknowns, as the start of a fix.
 
-A *block* is a number of consecutive epochs. The new row of a block is the value, in the middle of the block, of a line
-through the old rows of the same kind, stations and target.
+A *block* is a number of consecutive epochs. A line is fitted to the old rows of a block with the same kind, stations
+and target. The new row is the value of this line in the middle of the block.
 """
 
 from __future__ import annotations
@@ -151,8 +151,8 @@ def _rise_at(times: Array, rise: Array | None, middle: Array) -> Array | None:
 def _means(rows: Rows, when: _Blocks, present: Array, start: int, taken: int) -> _Mean:
     """Return the averages of the rows of a kind as combinations of old rows.
 
-    `present` flags the old rows to use. `start` is the global number of their first row, and `taken` the number of new
-    rows of earlier kinds.
+    `when` is the division into blocks, and `present` flags the old rows to use. `start` is the global number of their
+    first row, and `taken` the number of new rows of earlier kinds.
     """
     inside = np.flatnonzero((when.place[rows.epoch] >= 0) & present)
     key = np.stack([when.place[rows.epoch], rows.a, rows.b, rows.target])[:, inside]
@@ -184,7 +184,10 @@ def _line_coefficients(since: Array, row: Array) -> Array:
 
 
 def _average_rows(rows: Rows, mean: _Mean) -> Rows:
-    """Return the averaged rows of one kind; angles are averaged relative to one angle of their row."""
+    """Return the averaged rows of one kind; angles are averaged relative to one angle of their row.
+
+    `mean` has the old rows of each new row, with their coefficients.
+    """
 
     def middle(values: Array, wrapped: bool) -> Array:
         sorted_, base = values[..., mean.order], np.zeros(())
@@ -228,8 +231,8 @@ def _stations(stations: Stations, when: _Blocks) -> Stations:
 def _noise(problem: Problem, means: list[_Mean], block: Array) -> Noise:
     """Return the covariance of the new rows, C R C', with one noise block for each block of epochs.
 
-    R is the covariance of the old rows, and C has the coefficients of old rows in new rows. `block` is the block of
-    each new row.
+    R is the covariance of the old rows, and C has the coefficients of old rows in new rows, from the `means` of each
+    kind. `block` is the block of each new row.
     """
     count, size = problem.count, sum(len(mean.head) for mean in means)
     # C (new rows, old rows) is sparse

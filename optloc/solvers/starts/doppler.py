@@ -144,7 +144,8 @@ def _ranges(rows: Rows) -> tuple[int, int]:
 def _start(problem: Problem, i: int, every: _DopplerRows, surface: Ellipsoid | None) -> Array:
     """Return the points (1 + 2 d, d) of the relaxation of problem i, metres; NaN without usable rates.
 
-    `every` are the rows of all problems in the relaxation. `surface` is the ellipsoid of a known height, or None.
+    The first point is the mean of the relaxation, and the others are around it, the farthest first. `every` are the
+    rows of all problems in the relaxation. `surface` is the ellipsoid of a known height, or None.
     """
     one = problem.take(np.array([i]))
     z, weight = one.observed[0, every.row], np.broadcast_to(one.weight, (1, one.count))[0, every.row]
@@ -170,10 +171,11 @@ def _start(problem: Problem, i: int, every: _DopplerRows, surface: Ellipsoid | N
 
 
 def _limit_rows(problem: Problem, rows: _DopplerRows, z: Array, weight: Array) -> tuple[Array, Array, Array | None]:
-    """Return the numbers of the rows used, their values, and their standard deviations; None if they are original rows.
+    """Return the numbers of the rows used, their values and their standard deviations.
 
-    If the relaxation is too large, rows of one group are averaged to normal points, which are independent. `z` and
-    `weight` (m,) are the values and weights of the rows.
+    The standard deviations are None if all original rows are used, which may be correlated. If the relaxation is too
+    large, rows of one group are averaged to normal points, which are independent. `z` and `weight` (m,) are the values
+    and weights of the rows.
     """
     if _size(problem, rows) <= SIZE:
         return np.arange(len(z)), z, None

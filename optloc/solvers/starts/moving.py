@@ -159,9 +159,12 @@ class _MovingRows:
         residual = self.K @ nodes[:, PHI] - self.w
         residual = residual - basis @ (basis.T @ residual)
         size = float(np.linalg.norm(residual))
+        # the last term chooses the widest side if no node has a slope
         steep = np.linalg.norm(self.K @ nodes[:, SLOPE0 : SLOPE0 + 3], axis=0) * half + 1e-9 * half
         if not size > 0.0:
             return 0.0, 0.0, int(np.argmax(steep))
+        # The norm of the residuals is at least their component along the residuals at the centre. `pull` has the
+        # weights of the nodes in this component.
         pull = residual @ self.K / size
         low = size - np.abs(pull @ nodes[:, SLOPE0 : SLOPE0 + 3]) @ half
         low += np.minimum(pull * nodes[:, LOW], pull * nodes[:, HIGH]).sum()

@@ -175,6 +175,7 @@ def _orient(problem: Problem, found: Headings, x: Array) -> Array:
     # a row with two offsets determines one of them if the other is known
     one_unknown = np.isnan(value).astype(float) @ np.abs(found.touch) == 1.0
     share = np.where(usable & one_unknown, weight.reshape(size, q, -1), 0.0)
+    # the sense of a row changes the sign of the sine only
     sine, cosine = (
         (share * part_of(residual)) @ sign.T for part_of, sign in ((np.sin, found.touch), (np.cos, np.abs(found.touch)))
     )

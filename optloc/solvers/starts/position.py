@@ -1,4 +1,8 @@
-"""Starts of one position without a first guess, from closed forms; and tests of the problems that they serve."""
+"""Starts of one position without a first guess, from closed forms; and tests of the problems that they serve.
+
+Letters: N problems, q starts of a problem, s stations with ranges, d coordinates. `found` are the least-squares ranges
+of the problems (`optloc.linear.least_squares_ranges`).
+"""
 
 from __future__ import annotations
 
@@ -148,7 +152,10 @@ _AXES = np.array([1.0, 1.0, 1.0 - WGS84_F])
 
 
 def known_height(problem: Problem) -> Array | None:
-    """Return the height (N,) from rows or an exact constraint, metres, or None without either."""
+    """Return the height (N,) from rows or an exact constraint, metres, or None without either.
+
+    The height is NaN for a problem whose rows of the kind "height" are all absent.
+    """
     size = problem.batch_shape[0]
     for constraint in problem.constraints:
         if not isinstance(constraint, Band) or constraint.kind != "height":

@@ -57,8 +57,8 @@ _RADII = (1.5, 5.0)
 _ANYWHERE = (0.3, 0.8, 1.5, 5.0)
 # Standard deviations along the valley, doubling from one: nearer positions lead back to the fix.
 _STEPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)
-# Share of the distance above which the error of a fix of a whole run allows another minimum within a few sigma, which
-# block averages merge with it. There are few steps, since each is refined on all epochs.
+# Share of the distance above which the error of a fix of a whole run allows another minimum within a few sigma. Block
+# averages merge such minima. There are few steps, since each is refined on all epochs.
 _WEAK_WHOLE = 2e-3
 _WHOLE_STEPS = (-6.0, -2.0, 2.0, 6.0)
 # Images of the best minimum: turns by eighths of a circle about the axis of the stations. Images of new minima follow
@@ -500,8 +500,8 @@ def _places(problem: Problem, station: Array | slice = slice(None)) -> Array:
 def _whiten(found: Ranges, others: Array, present: Array) -> Array:
     """Return whitening matrices (N k, s - 1, s - 1) of the offsets, 1/metres; zero for stations without an offset.
 
-    `others` are the numbers of the s - 1 stations without the reference, and `present` (N k, s - 1) flags their
-    offsets.
+    `found` are the ranges. `others` are the numbers of the s - 1 stations without the reference, and `present` (N k,
+    s - 1) flags their offsets.
     """
     covariance = found.covariance[:, others][:, :, others]
     return linalg.whitening(np.where(present[:, :, None] & present[:, None, :], covariance, 0.0))

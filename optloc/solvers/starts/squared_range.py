@@ -3,9 +3,12 @@
 If all ranges share an unknown, t is the range to the reference station, and ``t = |x|`` is a cone. If ranges are known,
 the last unknown is |x|^2. Both surfaces are quadrics.
 
+A *lifted* row is a row of a kind without ranges, such as a bearing, in linear form in the same unknowns. A *node* is
+the position of a station at an epoch. A *whitening* matrix W turns correlated rows into rows with unit covariance.
+
 Letters: N problems, m rows, s stations with ranges, n = d + 1 unknowns y, d coordinates, q points of a problem. The
 range of station i is r_i = c_i + sign_i t. A squared-range problem is ``rows . y = right`` in least squares, with y on
-the quadric: rows (N, m, n), right (N, m).
+the quadric: rows (N, m, n), right (N, m). `found` are the least-squares ranges of the problems: c_i is their offset.
 """
 
 from __future__ import annotations
@@ -223,9 +226,9 @@ def squared_rows(problem: Problem, found: Ranges | None) -> Squared:
 
 
 def _station_nodes(problem: Problem, found: Ranges | None) -> tuple[Array, Array]:
-    """Return the positions (N, s, d), metres, of the stations of ranges, and flags (N, s) of stations in use.
+    """Return the positions (N, s, d), metres, of the nodes with ranges, and flags (N, s) of nodes in use.
 
-    Without ranges these are all stations with rows.
+    Without ranges the result has all stations with rows, at the first epoch.
     """
     position = np.broadcast_to(
         problem.stations.position, (problem.batch_shape[0], *problem.stations.position.shape[-3:])
@@ -339,6 +342,7 @@ def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to
         return None
     a, b = (_point(problem, rows, index, to) for index in (rows.a, rows.b))
     m, paired = rows.z - rows.correction, None
+    # row number of the azimuth of each elevation; None if one of them has no azimuth
     beside = azimuths_beside(problem, rows) if rows.kind == "elevation" else None
     if beside is not None:
         # an absent elevation counts as present, since it needs no azimuth

@@ -2,7 +2,8 @@
 
 A *group* is a row, the rows of a station, a prior or a common offset. A *rest* is the problem without some groups. An
 *explanation* is a set of groups whose rest passes the chi-square test. Letters: N problems, m rows, `size` numbers of a
-parameter vector. A *score* is a chi-square cost plus the prices of the groups left out.
+parameter vector. A *score* is a chi-square cost plus the prices of the groups left out. `alike` are problems with the
+same rows, `case` is one problem, `outcome` its search result, and `found` are explanations as of `_with_conclusions`.
 """
 
 from __future__ import annotations
@@ -207,7 +208,7 @@ def _choose_noise(
     larger = _larger_noise(problem, pool, fix) if together else None
     if larger is None:
         return None, explain_all(problem, fix)
-    # with the larger noise fewer rows are suspects
+    # with the larger noise fewer rows are suspects; the larger noise adds the price of one row
     other = judge(larger.problem, larger.pool)
     again, present = explain_all(larger.problem, other), np.broadcast_to(problem.weight, fix.weights.shape)
     more = 2.0 * (present @ np.log(larger.sizes)) / np.maximum(present.sum(1), 1.0)
@@ -223,7 +224,7 @@ def _larger_noise(problem: Problem, pool: Pool, fix: Fix) -> _LargerNoise | None
     """Return the problems with the noise level that their fixes show; None if it is not larger than stated.
 
     A kind whose noise is smaller than stated keeps the stated noise: its ellipses then cover more than they promise.
-    The upper ends of the intervals are used, so that ellipses cover even if few fixes determine the factors.
+    The factor of a kind is the upper end of its interval, so that ellipses cover even if few fixes determine it.
     """
     if problem.epochs > 1 or len(fix.x) < SEVERAL:
         return None
@@ -272,10 +273,10 @@ def _fix_with_larger_noise(larger: _LargerNoise, found: _Explained) -> Array:
 def _explain(problem: Problem, fix: Fix, present: Array, doubted: _RejectedRows, by: Sequence[GroupKind]) -> _Explained:
     """Return the explanations of problems with a contradiction: sets of item numbers, their groups, and their outcomes.
 
-    `present` (N, m) are the weights of the rows, `doubted` the rows to suspect first, and `by` the kinds of groups.
+    `present` (N, m) are the stated weights of the rows. `doubted` are rows to suspect first, `by` the kinds of groups.
     """
     with np.errstate(invalid="ignore"):
-        # at a lower cost every set has a score beyond the gap
+        # a set has at least the price of a row: at a lower cost of all data its score is beyond the gap
         noticed = ~fix.answered | (fix.cost > ROW_PRICE - AMBIGUOUS_GAP)
     noticed |= problem.epochs > 1  # the chi-square test of a whole run does not notice a few wrong rows
     items = np.flatnonzero(noticed & (fix.dof > 0) & ~np.isin(fix.code, _BEYOND))
@@ -336,9 +337,10 @@ def _same_rows(problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind]
 def _with_group_by_group(alike: SameRows, doubted: _RejectedRows, outcomes: list[Outcome]) -> list[Outcome]:
     """Return outcomes after a search group by group for the problems whose sets were too many to try all.
 
-    The search starts from the rest with the least cost so far.
+    Each search starts from the cheapest of the rests that were tried last. `doubted` has the rows to suspect first.
     """
     dof = alike.whole.dof
+    # a set of `dof` rows or more leaves no redundancy, so `dof - 1` is the largest size of a set that a test can accept
     untried = [not outcome.rests and outcome.tried < most - 1 for outcome, most in zip(outcomes, dof, strict=True)]
     for i in np.flatnonzero(untried).tolist():
         more = _group_by_group(alike, i, doubted, outcomes[i].closest)
@@ -484,7 +486,7 @@ def _explained(
 
 def _same_place(best: Fix, other: Fix) -> bool:
     """Return whether two fixes give the same answer: the position of `other` is inside the ellipsoid of `best`."""
-    # unknowns that only one of the fixes has, such as an offset, do not count
+    # unknowns that only one fix has, such as an offset, do not count; if both have positions, only positions count
     other_names = {slot.name for slot in other.layout.shared}
     common = [slot for slot in best.layout.shared if slot.name in other_names]
     common = [slot for slot in common if slot.name.partition("[")[0] == "position"] or common

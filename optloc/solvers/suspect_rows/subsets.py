@@ -2,7 +2,7 @@
 
 If the sets are few, all of them are tried, so that one error cannot mask another. If they are many, `grow_explanation`
 leaves out one group at a time. A *group* is a row, the rows of a station, a prior or a common offset. A *rest* is the
-problem without a set of groups.
+problem without a set of groups. `alike` are problems with the same rows, and `whole` are the fixes of all data.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ _FEW = 2_000
 # a cost up to the second from all starts. The cheapest start may end at another minimum, and a rest that costs a
 # hundred times too much almost never has a minimum that passes.
 _NEAR, _CLOSE = 100.0, 4.0
-# Share of the boxes of a proof that a rest may use: good rests need tens of these hundreds, and more boxes take longer
-# than other starts.
+# Share of the boxes of a proof that a rest may use: a few hundred boxes. Good rests need tens of boxes, and more boxes
+# take longer than other starts.
 _SHORT = 0.01
 _BLIND = "a measurement is wrong, but redundancy 1 cannot identify it"
 
 
-# A set of groups, the rows that it leaves out, and its groups without rows.
+# Numbers of the groups of a set, flags (m,) of the rows that it leaves out, numbers of its groups without rows.
 _Set = tuple[tuple[int, ...], Array, frozenset[int]]
 
 
@@ -86,7 +86,7 @@ class Outcome:
     closest : RemainingFix, optional
         The cheapest of the rests that were tried last.
     tried : int
-        Size of the largest sets that are covered: all were tried, or their prices exclude them.
+        Size of the largest sets that are covered: they were tried, or their prices or lack of redundancy exclude them.
     least : float
         Least score of all sets tried, whether they pass or not.
     dof : int
@@ -156,9 +156,9 @@ class _Request:
 def explain(alike: Sequence[SameRows]) -> list[list[Outcome]]:
     """Return the explanations of each problem: all sets of groups within the gap of the best.
 
-    Sets of one group, of two groups and so on are tried under three conditions: their prices alone do not exceed the
-    best score, the rest has redundancy, and the sets are few enough. Rests of all problems of a batch are fixed
-    together.
+    Sets of one group, of two groups and so on are tried under three conditions. Their prices alone do not exceed the
+    best score by more than the gap. The rest has redundancy. The sets are few enough. Rests of all problems of a batch
+    are fixed together.
     """
     searches = dict(enumerate(_search(one) for one in alike))
     out: list[list[Outcome]] = [[] for _ in alike]
@@ -178,7 +178,7 @@ def explain(alike: Sequence[SameRows]) -> list[list[Outcome]]:
 def _search(alike: SameRows) -> Generator[list[_Request], list[list[_Tried]], list[Outcome]]:
     """Yield requests for the sets to try, size by size; receive their results, and return the outcomes (N,)."""
     groups, whole, count = alike.groups, alike.whole, alike.batch.count
-    prices = np.cumsum(np.sort([group.price for group in groups]))
+    prices = np.cumsum(np.sort([group.price for group in groups]))  # least price of a set of each size
     rests = [[remaining_fix_of(groups, (), whole[i])] if ok else [] for i, ok in enumerate(passes_noise_test(whole))]
     probability: list[dict[tuple[int, ...], float]] = [{(): float(p)} for p in whole.p_value]
     closest: list[RemainingFix | None] = [None] * len(rests)
@@ -188,7 +188,7 @@ def _search(alike: SameRows) -> Generator[list[_Request], list[list[_Tried]], li
         best = np.array([min((rest.score for rest in rests_of), default=np.inf) for rests_of in rests])
         # no set of this size or larger can come within the gap
         done = (prices[size - 1] > best + AMBIGUOUS_GAP) | (whole.dof <= size)
-        tried[done] = len(groups)
+        tried[done] = len(groups)  # no larger set can be an explanation
         if done.all() or not enumerable(groups, count, size):
             break
         tried[~done] = size
@@ -250,14 +250,14 @@ def _parts(groups: Sequence[Group], left: Sequence[int]) -> frozenset[tuple[int,
 
 @dataclass(slots=True)
 class _Tried:
-    """Results of the sets of one size for a problem: `best` is the least score, `cheapest` the cost of `closest`."""
+    """Results of the sets of one size for one problem; the fields are as in `Outcome`."""
 
     rests: list[RemainingFix]
     p_value: dict[tuple[int, ...], float]
     closest: RemainingFix | None = None
-    least: tuple[float, int] = (np.inf, 0)
-    best: float = np.inf
-    cheapest: float = np.inf
+    least: tuple[float, int] = (np.inf, 0)  # least score of all sets, and the redundancy of the rest with this score
+    best: float = np.inf  # least score of the rests that passed so far
+    cheapest: float = np.inf  # cost of `closest`
 
 
 def _promising(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set], whole: Fix, best: float) -> list[_Set]:
@@ -274,7 +274,7 @@ def _promising(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set], 
     drop, _ = drops(at, [np.flatnonzero(rows) for _, rows, _ in plain])
     prices = np.array([sum(groups[i].price for i in left) for left, _, _ in plain])
     wanted = float(whole.cost) + prices - best - AMBIGUOUS_GAP
-    # two offsets leave out no row
+    # sets with a prior or an offset have no first-order estimate here, so all of them are tried
     return [one for one in sets if one[2]] + [plain[i] for i in np.flatnonzero(2.0 * drop >= wanted)]
 
 
@@ -528,10 +528,10 @@ def _most_contradictory(
     ]
     at = _influence(problem, groups, left, rest.x)
     small = [i for i in open_ if len(groups[i].rows) <= _LARGE]
-    first = not left
+    first = not left  # the first round tests groups of any size together
     for members in [open_] if first else [small, [i for i in open_ if len(groups[i].rows) > _LARGE]]:
         if members:
-            tail = significance(at, [_present(groups[i], left_out) for i in members])
+            tail = significance(at, [_present(groups[i], left_out) for i in members])  # logarithms of p-values
             if tail.min() < level:
                 return members[int(tail.argmin())]
     return None

@@ -126,7 +126,8 @@ class Finding:
     status : Status
         The status of an answer, unless a finding with a higher precedence applies. Its sentence is the advice.
     test : callable
-        Maps the evidence to a flag. For fixes it uses operators only, so that numbers and arrays follow the same rules.
+        Maps the evidence to a flag. For fixes it uses operators only, so that numbers and arrays follow the same rules:
+        ``^ True`` means "not".
     sentence : callable
         For a network or a start: maps the evidence to sentences. For fixes: maps `Finished` and item numbers to one
         sentence for all items, or to one sentence for each item.

@@ -116,6 +116,7 @@ def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
         reason[i] = _undetermined_sentence(problem, _information(curvature)[i])
     _explain_missing(problem, pool, np.flatnonzero(missing), code, reason)
     finished = answered & (code == Status.OK)
+    # the mark of an unfinished answer is the bit of its status
     marks = np.where(finished, finding_marks(problem, pool, gap), 1 << code.astype(np.int32)).astype(np.int32)
     proven = merged_claims(finished, _claims(pool), NO_ANSWER)
     if pool.free is not None:
@@ -160,7 +161,8 @@ def _information(curvature: Curvature) -> Array:
 def _runs_away(problem: Problem, curvature: Curvature, distance: Array, lost: Array) -> Array:
     """Return flags (N,) of positions so far away or so uncertain that the data determine a direction only.
 
-    `distance` (N,) is in spreads of the stations. `lost` (N,) flags fixes with another fault.
+    `curvature` has the covariances of the fixes. `distance` (N,) is in spreads of the stations. `lost` (N,) flags fixes
+    with another fault.
     """
     covariance = np.where(_is_determined(curvature)[:, None, None], curvature.covariance, np.nan)
     with np.errstate(invalid="ignore"):
@@ -211,6 +213,7 @@ def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, re
     straight = bool(len(items)) and not isinstance(problem.medium, Layers)
     measured = is_measured(problem.take(items)) if straight else np.zeros(len(items), dtype=bool)
     for place, i in enumerate(items):
+        # groups of stations: ranges link the stations within a group, but no range links two groups
         groups = () if found is None else found.groups[int(found.pattern[place])]
         if len(groups) > 1:
             names = problem.stations.names
@@ -311,7 +314,10 @@ def _mark_contradictions(pool: Pool, cost: Array, finished: Array, marks: Array,
 
 
 def _name_redundancy(pool: Pool, finished: Array, reason: Array) -> None:
-    """Write to the reasons the limits that a redundancy of 0 or 1 sets to a search for suspects."""
+    """Write to `reason` (N,) the limits that a redundancy of 0 or 1 sets to a search for suspects.
+
+    Only the reasons of fixes flagged in `finished` (N,) change.
+    """
     for dof, limit in (
         (0, "a wrong measurement would not be noticed"),
         (1, "a wrong measurement would be noticed, but not identified"),
@@ -400,7 +406,8 @@ def surviving_candidates(pool: Pool, fix: Fix) -> Array:
 def _as_finished(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
     """Return the fixes of settled pools as if all were finished and near the stations.
 
-    If `pool.plain` is None, they have no status yet: `_apply_rules` decides it.
+    If `pool.plain` is None, they have no status yet: `_apply_rules` decides it. A *law* is the normal
+    distribution of the position, from which bounds near the fix cut off a part.
     """
     count, cost, proven = len(pool), pool.cost[:, 0], _claims(pool)
     law = law_at(problem, pool)
@@ -408,6 +415,7 @@ def _as_finished(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
     truncated = None if law is None else law.truncated
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
+    # if `pool.plain` is None, `_apply_rules` writes marks, reasons and charts
     marks, reason, chart = np.zeros(count, dtype=np.int32), filled_objects(count, ""), None
     if pool.plain is not None or truncated is not None:
         chart = chart_of(problem, pool.x[:, 0], covariance, curvature, truncated)
@@ -440,7 +448,10 @@ def _as_finished(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
 
 
 def _truncated_covariance(problem: Problem, pool: Pool, law: Truncated) -> Array:
-    """Return the covariances (N, n, n) of the shared unknowns after the bounds have truncated their laws."""
+    """Return the covariances (N, n, n) of the shared unknowns after the bounds have truncated their laws.
+
+    `law` has the truncated laws of the positions.
+    """
     curvature = pool.curvature
     assert curvature is not None
     out = np.array(curvature.covariance)
@@ -540,7 +551,7 @@ def hide_open_epochs(fix: Fix) -> Fix:
     """Return fixes of runs with NaN for the states of undetermined epochs; their reasons name these epochs."""
     if fix.local is None or not fix.answered.any():
         return fix
-    size = fix.local.shape[-1]
+    size = fix.local.shape[-1]  # the states come first among the local unknowns
     undetermined = np.isnan(np.diagonal(fix.local, axis1=-2, axis2=-1)).any(-1) & fix.answered[..., None]
     if not undetermined.any():
         return fix

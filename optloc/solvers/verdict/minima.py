@@ -46,7 +46,8 @@ _AWAY, _MOST = 1.3, 0.5
 def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array) -> Curvature:
     """Return the curvature of the cost at vectors x (N, size) on faces `face` (N,) of the constraints.
 
-    `optloc.linear.constraints.faces` lists the faces; face 0 has no inequalities.
+    `optloc.linear.constraints.faces` lists the faces; face 0 has no inequalities. `equations` are the normal equations
+    at x.
     """
     information, vector, ok = marginal(equations)
     covariance, regular = linalg.inverse(information)
@@ -59,7 +60,7 @@ def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array
             continue
         items = np.flatnonzero(face == number)
         part = problem.take(items)
-        if len(sides[number]) > len(sides[0]):
+        if len(sides[number]) > len(sides[0]):  # an inequality is active
             if free is None or shift is None:
                 free, shift = np.full(covariance.shape, np.nan), np.full(vector.shape, np.nan)
             free[items], shift[items] = _without_bounds(part, sides[0], x[items], information[items], vector[items])
@@ -79,8 +80,8 @@ def _without_bounds(
 ) -> tuple[Array, Array]:
     """Return covariance (N, n, n), and mean minus x (N, n), of the quadratic model with equalities but without bounds.
 
-    `vector` (N, n) is half the downhill gradient of the cost. If the data and the equalities leave a direction
-    undetermined, the result is NaN.
+    `information` (N, n, n) and `vector` (N, n), half the downhill gradient of the cost, are the model at x. If the data
+    and the equalities leave a direction undetermined, the result is NaN.
     """
     if equalities:
         covariance, regular = linalg.inverse_within(information, tangent_at(problem, equalities, x))
@@ -107,8 +108,8 @@ def _local_covariance(problem: Problem, equations: Normal, shared: Array) -> Arr
 def _multipliers(problem: Problem, face: Face, x: Array, vector: Array) -> Array:
     """Return the active constraints of each problem (N,), tuples of `Active` with Lagrange multipliers.
 
-    The multipliers meet: gradient of the cost + sum of multiplier * gradient of the constraint = 0. `vector` (N, n) is
-    half the downhill gradient of the cost.
+    The multipliers meet: gradient of the cost + sum of multiplier * gradient of the constraint = 0. `face` are the
+    constraints that are satisfied with equality. `vector` (N, n) is half the downhill gradient of the cost.
     """
     _, gradients = levels(problem, face, x)
     names = face_names(problem, face)

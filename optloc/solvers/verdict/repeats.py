@@ -137,7 +137,8 @@ def _parts(count: int) -> Iterator[Array]:
 def _measured(problem: Problem, x: Array, covariance: Array, wrong: Array | None) -> tuple[Problem, Array]:
     """Return repeated measurements, N r problems for r repeats, and their true vectors (N r, size).
 
-    `wrong` (N, m) are errors that are added to the rows of all repeats, or None.
+    `covariance` (N, n, n) belongs to the fixes x (N, size). `wrong` (N, m) are errors that are added to the rows of all
+    repeats, or None.
     """
     each = np.repeat(np.arange(len(x)), _REPEATS)
     truth, noise, means = _drawn(problem, x, covariance)
@@ -167,6 +168,7 @@ def _shares(problem: Problem, truth: Array, found: Repeats) -> Array:
     part = slice(slot.start, slot.start + slot.size)
     away = found.x[:, part] - truth[:, part]
     with np.errstate(all="ignore"):
+        # squared distance from the truth, in standard deviations of the repeat
         form = (away * linalg.solve(found.spread[:, part, part], away[..., None])[0][..., 0]).sum(-1)
     # an unfinished repeat counts as one outside every ellipse
     form = np.where(found.good & np.isfinite(form), form, np.inf).reshape(-1, _REPEATS)
