@@ -105,11 +105,13 @@ def elements(problem: Problem, x: Array, by: By, common: By | None = None) -> El
     """
     ends = ends_of(problem, by)
     names = sorted({*ends.name.ravel().tolist()} - {""})
+    # one sigma for all parts, so that the size of a shared error does not depend on the division into parts
     size = typical_sigma(problem, common) if common else {}
     parts = []
     for first in range(0, len(x), _BATCH):
         items = np.arange(first, min(first + _BATCH, len(x)))
         parts.append(_part(problem.take(items), x[items], by, (common, size)))
+    # groups of shared errors, and groups of correlated rows, come after the groups of single rows
     more = sorted({name for part in parts for name in part.names} - set(names))
     return _join((*names, *more), parts)
 
@@ -156,7 +158,11 @@ def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str,
 
 
 def _linearise(problem: Problem, x: Array) -> tuple[Array, Array]:
-    """Return residuals (N, m) and Jacobians (N, m, p) along the directions that equality constraints leave free."""
+    """Return residuals (N, m) and Jacobians (N, m, p) at the vectors `x` (N, size).
+
+    The columns of a Jacobian are all shared unknowns and the local unknowns of each epoch. With equality constraints,
+    columns along the constraints replace the columns of the shared unknowns.
+    """
     residual, jacobian = differentiate(problem, x)
     if problem.epochs > 1 and problem.layout.n_local:
         n, length = problem.layout.n_shared, problem.layout.n_local
@@ -231,7 +237,11 @@ def common_name(name: str) -> str:
 
 
 def typical_sigma(problem: Problem, by: By) -> dict[str, float]:
-    """Return the stated standard deviation of the rows of each group: the root mean square over all problems."""
+    """Return the stated standard deviation of the rows of each group: the root mean square over all problems.
+
+    The result is a dictionary by the name of the group, in the units of the rows. A group without present rows is
+    omitted.
+    """
     variance = np.broadcast_to(variances(problem.noise, problem.count), (problem.batch_shape[0], problem.count))
     weight, ends = np.broadcast_to(problem.weight > 0.0, variance.shape), ends_of(problem, by).name
     found = {}
@@ -261,7 +271,10 @@ def common_effects(problem: Problem, by: By, size: dict[str, float]) -> tuple[Ar
 
 
 def _ungrouped_noise(problem: Problem, x: Array) -> Array:
-    """Return the covariance (N, m, m) that station errors and weights between 0 and 1 add to the noise."""
+    """Return the covariance (N, m, m) that station errors and weights between 0 and 1 add to the noise.
+
+    The effect of station errors is computed at the fixes `x` (N, size).
+    """
     rows = np.arange(problem.count)[None]
     stated = gathered(problem.noise, rows)[..., 0, :, :]
     whole = gathered(with_station_noise(problem, x).noise, rows)[..., 0, :, :]
@@ -477,6 +490,7 @@ def _arrivals(
     # D: the sign with which the arrival at each station (columns) enters each row.
     design = ((ends.name[row][..., None] == labels) * ends.sign[row][..., None]).sum(-2) * here[..., None]
     single = np.eye(row.shape[1]) * here[..., None]
+    # the group of each arrival: its station, or the kind of the rows
     groups = labels if by == "station" else np.full(len(labels), kind, dtype=object)
     # Try arrivals alone first, then arrivals and errors of the rows. If neither fits, the correlation has another form.
     for parts, names in (

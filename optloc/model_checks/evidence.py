@@ -51,7 +51,7 @@ class Influence:
     - shared (q, n): S of the shared unknowns.
     - local (q, l): T of the unknowns of each epoch.
     - epoch (q,): epoch of each row; -1 for priors.
-    - prior: the rows of each prior by its number.
+    - prior: for the number of each prior, the numbers of the rows that it adds.
     - deviation (n, n): a square root of the covariance of the shared unknowns.
     """
 
@@ -140,6 +140,7 @@ def influences(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()
     # whitening is applied to neither: Q needs P and J separately
     linear, equations = linearise(problem, x), equations_at(problem, x)
     selections, means, prior_precisions = _prior_rows(problem)
+    # first row number of each prior: priors come after the m rows
     cuts = np.cumsum([problem.count, *(len(pick) for pick in selections)])
     prior_count = int(cuts[-1]) - problem.count
     present = np.broadcast_to(problem.weight > 0.0, linear.residual.shape)
@@ -147,6 +148,7 @@ def influences(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()
     prior_residuals = [mean - x[:, :n] @ pick.T for mean, pick in zip(means, selections, strict=True)]
     residual = np.concatenate([np.where(present, linear.residual, 0.0), *prior_residuals], axis=1)
     picked = (np.broadcast_to(pick, (size, *pick.shape)) for pick in selections)
+    # derivatives of all rows by the shared unknowns (A) and by the local unknowns of their epoch (B)
     A = np.concatenate([linear.shared, *picked], axis=1)
     B = np.concatenate([linear.local, np.zeros((size, prior_count, layout.n_local))], axis=1)
     epoch = np.concatenate([problem.epoch, np.full(prior_count, -1)])
@@ -266,7 +268,10 @@ def drops(at: Influence, rows: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def errors(at: Influence, groups: Sequence[Group]) -> list[Error]:
-    """Return the estimated error of each of some groups, if all of them have errors at once."""
+    """Return the estimated error of each of some groups, if all of them have errors at once.
+
+    A component that the other rows do not determine has an infinite sigma.
+    """
     rows = [at.rows(group) for group in groups]
     index = np.concatenate(rows)
     block, root = at.block(index), at.root(index)
@@ -352,6 +357,7 @@ def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) ->
         [at.block(rows).sum() > _ROUNDING * at.precision[rows][:, rows].sum() for _, rows in channels]
     )
     least = np.where(determined, NOTICEABLE / np.sqrt(np.where(determined, seen, 1.0)), np.inf)
+    # shift of the shared unknowns by an error of one unit in all rows of a channel, a station and kind
     moved = np.stack([at.deviation @ at.shared[rows].sum(0) for _, rows in channels])
     places = [slot.start + i for slot in work.layout.shared if slot.name == "position" for i in range(slot.size)]
     pull = np.linalg.norm(moved[:, places], axis=-1)

@@ -227,8 +227,8 @@ def priced_cost(tests: Tested) -> Array:
 def _lowest_deviance(cost: Array, dof: Array, factor: float) -> Array:
     """Return the minimum (N,) of twice the negative log-likelihood of each fix, over the number of excluded errors.
 
-    `cost` and `dof` (N, 1 + k) come from `_exclusion_path`. Sigma is multiplied by `factor`; the penalties are
-    included.
+    `cost` and `dof` (N, 1 + k) come from `_exclusion_path`: column j is the fix without j errors. Sigma is multiplied
+    by `factor`; the penalties are included.
     """
     left = np.arange(cost.shape[1])
     return np.asarray((cost / factor**2 + dof * np.log(factor**2) + ROW_PRICE * left).min(1))
@@ -237,12 +237,14 @@ def _lowest_deviance(cost: Array, dof: Array, factor: float) -> Array:
 def _single_groups(packed: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[tuple[str, float, float]]:
     """Yield for each group its name, the most likely factor of sigma of its errors alone, and the likelihood with it.
 
-    The likelihood is twice the negative logarithm. `tests` are the tests with the noise as stated, and `cost`
-    (N, 1 + k) comes from `_exclusion_path`. A factor f adds (f^2 - 1) B B' to V, with the columns B of the group. Let l
-    be the eigenvalues of T of `Tested` for these columns, and y the components of t along its eigenvectors. The cost
-    decreases by the sum of (f^2 - 1) y^2 / (1 + (f^2 - 1) l), and the determinant of V is multiplied by 1 + (f^2 - 1) l
-    for each l (A. J. Woodbury 1950). Instead of the factor, a fix may also exclude measurements.
+    The likelihood is twice the negative logarithm. `tests` are the tests with the noise as stated, and `cost` (N, 1 +
+    k) comes from `_exclusion_path`. `packed` are the linearised fixes. A factor f adds (f^2 - 1) B B' to V, with the
+    columns B of the group. Let l be the eigenvalues of T of `Tested` for these columns, and y the components of t along
+    its eigenvectors. The cost decreases by the sum of (f^2 - 1) y^2 / (1 + (f^2 - 1) l), and the determinant of V is
+    multiplied by 1 + (f^2 - 1) l for each l (A. J. Woodbury 1950). Instead of the factor, a fix may also exclude
+    measurements.
     """
+    # the lowest cost with excluded measurements; infinite if no measurement has a large test
     penalty = ROW_PRICE * np.arange(1, cost.shape[1])
     instead = (cost[:, 1:] + penalty).min(1, initial=np.inf)
     for g in np.flatnonzero(total(packed.of_effect, len(packed.names))):
@@ -256,6 +258,7 @@ def _single_groups(packed: Elements, tests: Tested, cost: Array, dof: Array) -> 
         vector = np.where(here, np.take_along_axis(tests.vector, order, 1), 0.0)
         squared = np.where(seen, (np.swapaxes(vectors, 1, 2) @ vector[..., None])[..., 0] ** 2, 0.0)
         values = np.where(seen, values, 0.0)
+        # only factors above 1 are tried: f^2 - 1 for each
         increase = _FACTORS[_FACTORS > 1.0, None, None] ** 2 - 1.0
         grown = 1.0 + increase * values
         determinant = np.log(grown).sum(-1)
@@ -372,6 +375,7 @@ def _late_kinds(problem: Problem) -> list[str]:
 def _late_rows(packed: Elements, able: list[str]) -> LateSignals:
     """Return the late rows of linearised fixes with the noise as stated; `able` are the kinds that can be late."""
     tests = tested(packed, np.ones(()))
+    # errors without a group have the number -1, which selects the empty name
     fit_for = np.isin(np.array([*packed.names, ""], dtype=object)[packed.of_effect], able)
     share, delay, gain, late, seen = _select_late(tests, fit_for)
     none = np.zeros(len(late), dtype=int)
@@ -395,7 +399,8 @@ def _common_delay(problem: Problem, x: Array, kind: str) -> tuple[str, float, fl
 
     Gauss-Newton estimates the offset over all fixes together and refines each fix after each step, because a large
     delay moves the fixes far. Offset and standard deviation are in SI units; the cost includes the penalty of the
-    offset.
+    offset. If another unknown absorbs the offset, the offset is 0, and its standard deviation and cost are infinite.
+    `problem` is a flat batch of n problems, and `x` (n, size) are their fixes.
     """
     of_kind = np.concatenate([np.full(rows.count, rows.kind == kind) for rows in problem.rows])
     offset, error = 0.0, np.inf
@@ -420,7 +425,8 @@ def _select_late(tests: Tested, able: Array) -> tuple[float, float, float, Array
     """Return share, mean delay in sigmas, gain, late rows (N, q) and the number of rows that other rows check.
 
     The share and the delay are estimated from rows of unknown state; then each row gets the more probable state. Both
-    steps repeat until no state changes. `able` (N, q) marks errors of kinds whose rows can be late.
+    steps repeat until no state changes. `able` (N, q) marks errors of kinds whose rows can be late. The gain is twice
+    the gain of the log-likelihood over the model without late rows.
     """
     found = snooped(tests, slice(0, tests.errors), _FIRST_CUT)
     late = found.gross & able & (found.shift > 0.0)
@@ -444,10 +450,11 @@ def _leave_one_out(tests: Tested, late: Array) -> tuple[Array, Array]:
     """Return the estimated error (N, q) of each row and its standard deviation, from the other rows that are not late.
 
     `late` (N, q) marks late rows. Both results are in sigmas of the row; NaN if the other rows do not determine the
-    error.
+    error. For a late row, all other late rows are excluded as well.
     """
     items, q = np.arange(len(late)), tests.errors
     shift, sigma = error_sizes(without(tests, late), slice(0, q))
+    # one iteration for the first late row of each fix, one for the second, and so on
     order = np.argsort(~late, axis=1, kind="stable")[:, : int(late.sum(1).max(initial=0))]
     for column in order.T:
         own = late[items, column]
@@ -465,6 +472,7 @@ def _fit_mixture(error: Array, sigma: Array, late: Array) -> tuple[float, float,
 
     `error` and `sigma` (r,) are from `_leave_one_out`, and `late` (r,) is the first selection. The errors are normal. A
     late row has an additional exponentially distributed delay. If the mean delay is negligible, all results are zero.
+    The gain is as in `_select_late`.
     """
     from scipy.special import erfcx, log_ndtr
 
