@@ -186,7 +186,9 @@ def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: S
     _on_earth(problem.frame.geodetic)
     several = [fixes] if isinstance(fixes, Fix) else list(fixes)
     found, others = fixed_spots(problem, several, labels), other_spots(problem, several)
+    # Lines of position need a single fix.
     single = several[0] if len(several) == 1 and several[0].code.size == 1 else None
+    # Number of fixes without redundancy.
     alone = sum(int(np.sum(fix.unchecked)) for fix in several)
     count = sum(fix.code.size for fix in several)
     which = "" if count == 1 else f"{alone if alone < count else 'all'} of {count} fixes: "
@@ -194,7 +196,11 @@ def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: S
 
 
 def track_page(problem: Problem, tracks: Spots, title: str) -> str:
-    """Return an HTML page with an interactive map of the scans of tracks; `tracks` are their marks."""
+    """Return an HTML page with an interactive map of the scans of tracks; `tracks` are their marks.
+
+    `problem` gives the stations, and `title` is the title of the page. If the frame is not on Earth, the function
+    raises InvalidProblem.
+    """
     _on_earth(problem.frame.geodetic)
     return _marks_page(problem, tracks, Spots(np.zeros((0, 2)), (), np.zeros(0, dtype=bool), ()), title, "track", None)
 
@@ -293,7 +299,9 @@ def _map_limits(places: Sequence[Array]) -> tuple[float, float, float, float]:
     # Move all longitudes to within 180 degrees of the first point.
     points = _shift_near(points, points[0, 0])
     low, high = points.min(0), points.max(0)
+    # A degree of longitude is shorter than a degree of latitude by this factor.
     squeeze = np.array([np.cos(np.radians((low + high)[1] / 2.0)), 1.0])
+    # Half the width and height with margins, in degrees of latitude; `_LEAST` replaces the extent of a single point.
     half = (0.5 + _RIM) * np.maximum(
         (high - low) * squeeze, _SLIMMEST * float(((high - low) * squeeze).max() or _LEAST)
     )
@@ -351,9 +359,11 @@ def _station(name: str, x: float, y: float, tell: str) -> tuple[Drawn, ...]:
 
 
 def _ellipses(marks: Spots, plane: Plane, middle: float) -> list[Drawn]:
-    """Return the 95 % ellipses and outlines of marks as curves; nothing if there are too many.
+    """Return the 95 % ellipses and outlines of marks as curves; nothing if there are more than `_ELLIPSES`.
 
-    Ellipses that are not valid have another class, so that the style sheet draws them dotted.
+    All valid ellipses and outlines are one curve, and all other ellipses another curve. `middle` is the longitude of
+    the middle of the map, degrees. Ellipses that are not valid have another class, so that the style sheet draws them
+    dotted.
     """
     if len(marks.rings) > _ELLIPSES:
         return []
@@ -372,7 +382,10 @@ def _ellipses(marks: Spots, plane: Plane, middle: float) -> list[Drawn]:
 
 
 def _dots(marks: Spots, plane: Plane, middle: float, size: float) -> list[Drawn]:
-    """Return marks as dots of `size` pixels: blue if the status is `ok`, else orange; none for a missing position."""
+    """Return marks as dots of `size` pixels: blue if the status is `ok`, else orange; none for a missing position.
+
+    `middle` is the longitude of the middle of the map, degrees.
+    """
     return [
         dot(x, y, BLUE if ok else ORANGE, size, text)
         for (x, y), ok, text in zip(plane(_shift_near(marks.place, middle)), marks.clean, marks.text, strict=True)
@@ -437,6 +450,7 @@ def _image(found: BoundMap, plane: Plane) -> Image:
     # Cells without a bound are transparent.
     rgba[~np.isfinite(found.sigma)] = 0.0
     file = BytesIO()
+    # The first row of a picture is at the top, the first row of the bound in the south.
     imsave(file, np.ascontiguousarray(rgba[::-1]), format="png")
     # Grid points are centres of pixels, so the picture extends half a step beyond the grid.
     dx, dy = ((v[1] - v[0]) / 2.0 for v in (found.x, found.y))
