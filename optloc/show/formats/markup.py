@@ -50,7 +50,10 @@ def _number(value: float, digits: int = _METRES) -> str:
 
 
 def _courses(marks: Sequence[Mark]) -> Iterator[tuple[str, list[list[Mark]]]]:
-    """Yield each target with the parts of its track; a part ends where the track is lost."""
+    """Yield each target with the parts of its track.
+
+    A part is a sequence of marks that are `sure`. It ends at the first mark that is not, where the track is lost.
+    """
     for target in dict.fromkeys(mark.target for mark in marks):
         marks_of_target = (mark for mark in marks if mark.target == target)
         yield target, [list(part) for sure, part in groupby(marks_of_target, key=lambda mark: mark.sure) if sure]
