@@ -352,12 +352,13 @@ def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) ->
         work = work.with_rows(weight=np.where(_rows_of_suspect(work, origin, one), 0.0, work.weight))
     at = influence(work, embed(flat.layout, work.layout, np.asarray(x, dtype=float)))
     channels = _channels(work)
+    # c'Q c of each channel, for an error of one unit in all its rows
     seen = np.array([at.block(rows).sum() for _, rows in channels])
     determined = np.array(
         [at.block(rows).sum() > _ROUNDING * at.precision[rows][:, rows].sum() for _, rows in channels]
     )
     least = np.where(determined, NOTICEABLE / np.sqrt(np.where(determined, seen, 1.0)), np.inf)
-    # shift of the shared unknowns by an error of one unit in all rows of a channel, a station and kind
+    # shift of the shared unknowns by such an error
     moved = np.stack([at.deviation @ at.shared[rows].sum(0) for _, rows in channels])
     places = [slot.start + i for slot in work.layout.shared if slot.name == "position" for i in range(slot.size)]
     pull = np.linalg.norm(moved[:, places], axis=-1)
@@ -395,7 +396,10 @@ def embed(layout: Layout, other: Layout, x: Array) -> Array:
 
 
 def _channels(problem: Problem) -> list[tuple[str, Array]]:
-    """Return the name and the row numbers of each station and kind with present rows that have a station."""
+    """Return the name and the row numbers of each channel, a station together with a kind of rows.
+
+    Rows without a station and rows with weight zero belong to no channel. A difference belongs to its first station.
+    """
     present, out = problem.weight.reshape(-1)[: problem.count] > 0.0, []
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         inside = present[start : start + rows.count] & (rows.a >= 0)

@@ -157,7 +157,8 @@ def common_level_at(problem: Problem, x: Array) -> CommonLevel:
         return unchanged
     stated = _lowest_deviance(cost, dof, 1.0)
     common = np.array([_lowest_deviance(cost, dof, f).sum() for f in _FACTORS])
-    # Instead of the factor of one group, every fix may also exclude measurements.
+    # Instead of the factor of one group, every fix may also exclude measurements. With a single kind, the factor of the
+    # kind is the common factor.
     single = [*_single_groups(by_station, tests, cost, dof)]
     single += [*_single_groups(by_kind, tested(by_kind, np.ones(())), cost, dof)] if len(kinds) > 1 else []
     name, size, least = min(single, key=lambda one: one[2], default=("", np.nan, np.inf))
@@ -237,12 +238,14 @@ def _lowest_deviance(cost: Array, dof: Array, factor: float) -> Array:
 def _single_groups(packed: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[tuple[str, float, float]]:
     """Yield for each group its name, the most likely factor of sigma of its errors alone, and the likelihood with it.
 
-    The likelihood is twice the negative logarithm. `tests` are the tests with the noise as stated, and `cost` (N, 1 +
-    k) comes from `_exclusion_path`. `packed` are the linearised fixes. A factor f adds (f^2 - 1) B B' to V, with the
-    columns B of the group. Let l be the eigenvalues of T of `Tested` for these columns, and y the components of t along
-    its eigenvectors. The cost decreases by the sum of (f^2 - 1) y^2 / (1 + (f^2 - 1) l), and the determinant of V is
-    multiplied by 1 + (f^2 - 1) l for each l (A. J. Woodbury 1950). Instead of the factor, a fix may also exclude
-    measurements.
+    The likelihood is given as twice its negative logarithm. `packed` are the linearised fixes, and `tests` the tests
+    with the noise as stated. `cost` (N, 1 + k) comes from `_exclusion_path`. Instead of the factor, a fix may also
+    exclude measurements.
+
+    A factor f adds (f^2 - 1) B B' to V, with the columns B of the group. Let l be the eigenvalues of T of `Tested` for
+    these columns, and y the components of t along its eigenvectors. The cost decreases by the sum of
+    (f^2 - 1) y^2 / (1 + (f^2 - 1) l), and the determinant of V is multiplied by 1 + (f^2 - 1) l for each l
+    (A. J. Woodbury 1950).
     """
     # the lowest cost with excluded measurements; infinite if no measurement has a large test
     penalty = ROW_PRICE * np.arange(1, cost.shape[1])

@@ -174,8 +174,8 @@ def _without_prior(problem: Problem) -> Array:
 def _planes_of(problem: Problem, count: int) -> tuple[Array, Array, Array, Array, Array]:
     """Return the planes of the stations, for the problems whose stations are coplanar.
 
-    The results are centre (n, d) in m, unit normal (n, d), unit tangents (n, d, d - 1), spread (n,) in m, and the
-    numbers (n,) of these problems. `count` is the number of all problems.
+    The first two results are the centres (n, d), m, and the unit normals (n, d). They are followed by the unit tangents
+    (n, d, d - 1), the spreads (n,), m, and the numbers (n,) of these problems. `count` is the number of all problems.
     """
     places = problem.stations.places
     places = np.broadcast_to(places, (count, *places.shape[-2:]))
@@ -201,7 +201,7 @@ def _multiplying(problem: Problem) -> list[Bias]:
 
 
 def _is_level(model: Model) -> bool:
-    """Return whether a kind is a received power, which decreases with the distance."""
+    """Return whether a kind is a received power (a level), which depends on the logarithm of the range alone."""
     return {node for _, node in model.nodes} == {"log range"}
 
 

@@ -1,7 +1,8 @@
 """Score tests for systematic errors of one channel, and refits that confirm them.
 
-A score test needs no fit of the larger model, so it can rank many possible errors. The best candidates are then fitted.
-A candidate is an error that the problem does not model, and q is the number of its unknowns.
+A channel is a station together with a kind of rows. A score test needs no fit of the larger model, so it can rank many
+possible errors. The best candidates are then fitted. A candidate is an error that the problem does not model, and q is
+the number of its unknowns.
 """
 
 from __future__ import annotations
@@ -132,7 +133,7 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
     channels = sum(one.is_channel_offset for one in found)
     more = channels * problem.epochs * (2 * _search_width(problem) + 2) if any(o.form == "step" for o in found) else 0
     level = 1.0 - FALSE_ALARM / (len(found) + more)
-    # a statistic is the square of a projection of the residual, so it is at most the cost
+    # a statistic is the square of a projection of the residual, so it is at most the cost: no test can be significant
     if cost[0] <= quantile(level, 1):
         return ()
     scores = score(problem, x, found)

@@ -40,7 +40,7 @@ _CUT_SHARED = 10.0
 """The same limit for an error that several rows share.
 
 A fix can absorb a shared error like a change of position, so the test is not reliable. An error that is excluded from
-the level is in no covariance. One in fifteen headings of the robot data exceeds 3.5."""
+the estimate of the variance is in no covariance. One in fifteen headings of the robot data exceeds 3.5."""
 
 # Margin between the squared test of a gross row and the squared test of a shared error: a likelihood ratio of ninety.
 _MARGIN = 9.0
@@ -232,14 +232,14 @@ def visible(packed: Elements, found: VarianceFit, left: Array) -> Array:
     return np.asarray(determined & (per_fix.sum(0) > _SIGNIFICANT * np.sqrt(np.where(determined, remaining, 1.0))))
 
 
-# A shared error of three times the sigma of the rows must have a level with at most this relative error. Range fixes
-# from one side absorb most of a shared error, so the residuals allow any level: estimates of thirty times the sigma of
-# the rows occurred.
+# If a shared error has three times the sigma of the rows, the estimate of its sigma must have at most this relative
+# error. If all stations are on one side, a range fix absorbs most of a shared error, so the residuals allow any sigma:
+# estimates of thirty times the sigma of the rows occurred.
 _TIMES, _RELATIVE = 3.0, 0.25
 
 
 def _determinable(tests: Tested, packed: Elements, found: VarianceFit, left: Array) -> Array:
-    """Return a mask (g,) of groups whose level would be determined if it were a few times the level of the rows.
+    """Return a mask (g,) of groups whose sigma would be determined if it were a few times the sigma of the rows.
 
     `found` is a fit without the groups that `left` (g,) marks, and `tests` are the tests with its variances.
     """
@@ -378,7 +378,7 @@ def _confidence_interval(found: _MaximumLikelihood, classes: Array, fixed: Array
     from scipy.special import gammaincinv
 
     variance, q = found.variance, classes.shape[1]
-    # T_jj theta is the redundancy of one error; the redundancy of a class is the mean, weighted by itself.
+    # T_jj theta is the redundancy of one error. In the mean over a class, errors with more redundancy count more.
     share = found.tests.size[:, :q] * variance[classes]
     redundancy = total(classes, len(variance), share**2) / np.maximum(total(classes, len(variance), share), _MIN_MEDIAN)
     redundancy = np.clip(redundancy, _MIN_REDUNDANCY, 1.0)
