@@ -72,6 +72,7 @@ class Across:
         """Return a flat batch of N problems with coplanar stations in the coordinates of their plane."""
         count = problem.batch_shape[0]
         centre, axes, _, size = plane_of_stations(problem)
+        # the normal, the first column, becomes the last
         centre, axes = np.broadcast_to(centre, (count, centre.shape[-1])), axes[..., ::-1]
         axes = np.broadcast_to(axes, (count, *axes.shape[-2:]))
         place = (problem.stations.position - centre[:, None, None]) @ axes[:, None]
@@ -254,6 +255,8 @@ def interval_across(across: Across, x: Array, cost: Array, level: float = REGION
     rise, w = quantile(level, 1), x[:, across.part.stop - 1]
     sigma = _spread_of_square(across, x)
     _, on_plane = across.profile(x, across.least)
+    # The lower end is above zero only if the cost on the plane is too high. `ends` are q and cost of the fix, then of a
+    # point with a higher cost. A quadratic cost reaches the limit sqrt(rise) standard deviations from the fix.
     off_plane, low = np.flatnonzero(on_plane - cost > rise), np.zeros(len(x))
     if len(off_plane):
         least = across.least[off_plane] ** 2

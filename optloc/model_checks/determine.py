@@ -105,6 +105,7 @@ def _determined_of_problem(flat: Problem, dof: int) -> Determined:
     axes, line = plane_of_stations(flat)[1][0], _about_line(flat)
     if line is not None:
         return Determined(surface.centre, level, north, (), _along_line(line), axis=axes[:, -1])
+    # `outside` states that the result assumes a target outside the sphere of the stations
     outside, (name, curve, numbers) = False, _curve(flat)
     if curve is not None:
         return Determined(surface.centre, level, north, (), numbers, curve, name)
@@ -224,6 +225,7 @@ def _coordinates(across: Across, place: Array, covariance: Array) -> tuple[Quant
     the frame if enough of these are in the plane, else along the principal axes of the stations.
     """
     centre, axes = across.centre[0], across.axes[0]
+    # axes of the frame that are perpendicular to the normal of the plane
     level = np.flatnonzero(np.abs(axes[:, -1]) <= _IN_PLANE)
     if len(level) == len(place):
         names, turn, start = ["xyz"[i] for i in level], axes[level, :-1], centre[level]

@@ -131,6 +131,7 @@ def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str,
         effect = np.concatenate([effect, np.broadcast_to(more, (count, *more.shape))], axis=-1)
         sigma = np.concatenate([sigma, np.broadcast_to(size, (count, len(size)))], axis=-1)
         error_names = np.concatenate([error_names, more_names])
+    # the empty name, for no group, has the number -1
     offset, offset_names = _offsets(problem, by)
     names = tuple(sorted({*error_names.tolist(), *offset_names.tolist()} - {""}))
     number = {name: i for i, name in enumerate(names)} | {"": -1}
@@ -314,6 +315,7 @@ def _with_priors(problem: Problem, x: Array, packed: Elements) -> Elements:
     for name, mean, precision in parts:
         slot, shared = problem.layout.find(name)
         start = slot.start if shared else problem.layout.n_shared + slot.start
+        # a prior is a row that measures its unknowns directly
         columns = start + np.arange(slot.size)
         more = np.zeros((len(x), slot.size, packed.jacobian.shape[-1]))
         more[:, np.arange(slot.size), columns] = 1.0

@@ -195,6 +195,7 @@ def _precisions(linear: Linear, count: int, prior_precisions: Sequence[Array], s
     """
     parts = []
     for whitener in linear.noise:
+        # with a whitening matrix W, the inverse covariance is W'W
         weights = np.swapaxes(whitener.matrix, -1, -2) @ whitener.matrix
         g, r = whitener.row.shape
         weights = np.broadcast_to(weights, (size, g, r, r)).reshape(size, -1)

@@ -33,7 +33,7 @@ class Advice:
         The remedy, a sentence without its full stop.
     toml : str
         Lines of a problem file for the remedy. Put them at the end of the file; put keys into `[[measurements]]`. Empty
-        if there is no such line.
+        if the remedy needs no lines.
     """
 
     cause: str

@@ -181,6 +181,7 @@ def _with_factors(unchanged: CommonLevel, packed: Elements) -> CommonLevel:
     """
     none = np.zeros(len(packed.names), dtype=bool)
     found = fit(packed, none, none)
+    # a kind without a group gets NaN, which is not significant
     place = [packed.names.index(kind) if kind in packed.names else -1 for kind in unchanged.kinds]
     factor, low, high = (np.append(np.sqrt(v), np.nan)[place] for v in (found.variance, found.low, found.high))
     with np.errstate(invalid="ignore"):
@@ -188,6 +189,7 @@ def _with_factors(unchanged: CommonLevel, packed: Elements) -> CommonLevel:
     if not significant.any():
         return unchanged
     factor, low, high = (np.where(significant, v, 1.0) for v in (factor, low, high))
+    # the factor of each group; the last entry, 1, is for errors without a group
     factor_of_group = np.append(factor, 1.0)[
         [unchanged.kinds.index(n) if n in unchanged.kinds else -1 for n in (*packed.names, "")]
     ]
@@ -291,8 +293,8 @@ class LateSignals:
     carried : bool array (N,)
         True for a fix that depends on late rows: without them it has no redundancy.
     alike : str
-        Kind whose rows are all late by the same amount; these rows do not count as late. Empty if there is no such
-        kind.
+        Kind whose rows are all late by the same amount; these rows do not count as late. Empty if no kind
+        has this error.
     offset, offset_error : float
         The common delay and its standard deviation, SI units.
     left : float
@@ -347,6 +349,7 @@ def late_signals_at(problem: Problem, kept: Array, x: Array) -> LateSignals:
     part = problem.take(kept)
     found = _late_rows(elements(part, x, "kind"), able)
     if found.share:
+        # a common offset of all rows of one kind may explain the misfit better than single late rows
         kind, offset, error, left = min((_common_delay(part, x, one) for one in able), key=lambda one: one[3])
         if offset > 0.0 and left < found.left:
             found = replace(found, share=0.0, delay=0.0, alike=kind, offset=offset, offset_error=error)
@@ -479,6 +482,7 @@ def _fit_mixture(error: Array, sigma: Array, late: Array) -> tuple[float, float,
     """
     from scipy.special import erfcx, log_ndtr
 
+    # EM cannot leave a share of zero or one, so the first share is between them
     share = float(np.clip(late.mean(), 0.5 / max(len(late), 1), 0.9)) if len(late) else 0.0
     delay = float(np.mean(error[late])) if late.any() else 0.0
     if not share or delay <= 0.0:

@@ -391,6 +391,7 @@ def _with_families(problem: Problem, found: tuple[Candidate, ...]) -> tuple[Prob
     for form in dict.fromkeys(one.bias.form for one in found):
         numbers = [i for i, one in enumerate(found) if one.bias.form == form]
         parts = [found[i].bias for i in numbers]
+        # `size` is the number of unknowns of each member
         name, size = f"{form} that is tested", prod(FORMS[form].shape(parts[0], problem.dimension)[1:])
         member = np.concatenate([np.full(len(part.row), j) for j, part in enumerate(parts)])
         row, coefficient = (np.concatenate([getattr(part, key) for part in parts]) for key in ("row", "coefficient"))

@@ -78,6 +78,7 @@ def law_of(problem: Problem, x: Array, covariance: Array, shift: Array) -> Law |
         near = open_ones & (values <= _NEAR * sigma)
         if not near.any():
             return None
+        # if one bound is near, the farther bounds of the same fix count up to `_REACH`
         slack = np.where(near.any(1)[:, None] & open_ones & (values <= _REACH * sigma), np.maximum(values, 0.0), np.inf)
         departures = _departures(problem, sides, x, spread, values, normal, np.isfinite(slack))
     bent = np.isfinite(slack) & (departures > _FLAT * sigma)
