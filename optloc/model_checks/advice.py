@@ -201,7 +201,7 @@ def _without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:
     """Return the problem without values that are not finite and without epochs that have no fix, and a finite vector.
 
     These rows stay in the arrays with weight zero. In the vector (1, size), an epoch without a fix gets the mean of the
-    local unknowns of the other epochs.
+    local unknowns of the other epochs. `x` (1, size) is the vector before.
     """
     weight = np.where(np.isfinite(problem.z), problem.weight, 0.0)
     n, length = problem.layout.n_shared, problem.layout.n_local

@@ -284,7 +284,10 @@ def _hyperbola(a: Array, b: Array, z: float) -> Array:
 
 
 def _ellipse(a: Array, b: Array, total: float) -> Array:
-    """Return points (k, 2) with a given sum of distances from a and b, m; the segment a-b if the sum is too small."""
+    """Return points (k, 2) with a given sum of distances from a and b, m; the segment a-b if the sum is too small.
+
+    `total` is the sum, and `a` and `b` (2,) are the positions of the stations, m.
+    """
     base = float(np.hypot(*(a - b)))
     along = (b - a) / base if base > 0.0 else np.array([1.0, 0.0])
     if total <= base:
@@ -322,7 +325,8 @@ def of_fix(fix: Fix) -> Determined | None:
 def _interval(fix: Fix, axis: Extent) -> tuple[float, float]:
     """Return the 95 % interval of a coordinate ("x", "y" or "z") of a fix, m.
 
-    If bounds truncate the distribution, it is the shortest interval, else plus and minus 1.96 sigma.
+    If bounds truncate the distribution, it is the shortest interval, else plus and minus 1.96 sigma. `axis` is the name
+    of the coordinate.
     """
     if fix.chart is not None and fix.chart.cut_off:
         low, high = fix.interval(axis)

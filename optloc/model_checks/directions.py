@@ -150,7 +150,8 @@ class DirectionCost:
     def _moved(self, u: Array, v: Array, move: Array) -> tuple[Array, Array]:
         """Return directions (q, d) and inverse ranges (q,) after steps (q, d): d - 1 rotations, rad, and a change of v.
 
-        A rotation is at most `_TURN`, and an inverse range stays within its bounds.
+        A rotation is at most `_TURN`, and an inverse range stays within its bounds. `u` (q, d) and `v` (q,) are the
+        starts, and `move` (q, d) are the steps.
         """
         turn = move[:, :-1]
         length = np.sqrt((turn**2).sum(-1, keepdims=True))

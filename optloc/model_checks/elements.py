@@ -119,7 +119,8 @@ def elements(problem: Problem, x: Array, by: By, common: By | None = None) -> El
 def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str, float]]) -> Elements:
     """Return the elements of a part of a batch at the fixes `x` (n, size).
 
-    `common` is the grouping of the shared errors, or None, and the sigma of each group (see `elements`).
+    `common` is the grouping of the shared errors, or None, and the sigma of each group (see `elements`). `by` selects
+    the groups, see `ends_of`.
     """
     count, rows = len(x), problem.count
     present = np.broadcast_to(problem.weight > 0.0, (count, rows))
@@ -208,7 +209,8 @@ def _paths(problem: Problem, x: Array, residual: Array) -> Array:
 def _effects(problem: Problem, by: By, present: Array) -> tuple[Array, Array, Array]:
     """Return the effects (N, m, q) of all errors, the group names (q,) and the standard deviations (N, q).
 
-    `present` (N, m) marks rows with a weight above zero. Effects and deviations are in the units of the rows.
+    `present` (N, m) marks rows with a weight above zero. Effects and deviations are in the units of the rows. `by`
+    selects the groups, see `ends_of`.
     """
     count, rows = present.shape
     effects, names, sigmas = [], [], []
@@ -308,7 +310,11 @@ def _pack(columns: Array, number: Array) -> tuple[Array, Array, Array]:
 
 
 def _with_priors(problem: Problem, x: Array, packed: Elements) -> Elements:
-    """Return the elements with additional rows for the priors of the problem; these rows belong to no group."""
+    """Return the elements with additional rows for the priors of the problem; these rows belong to no group.
+
+    `x` (N, size) are the fixes. An additional row is the mean of a prior minus the unknown at the fix. With equality
+    constraints, no rows are added.
+    """
     # With equality constraints, priors are omitted: their columns on the tangent space are not unit vectors, and the
     # constraint is stronger than the prior.
     parts = [] if exact(problem) else prior_parts(problem)
@@ -398,7 +404,7 @@ def ends_of(problem: Problem, by: By) -> Ends:
 def _ends(problem: Problem, kind: str, a: Array, b: Array, by: By) -> tuple[Array, Array]:
     """Return the group names and signs (m, 2) of rows of one kind with the station numbers `a` and `b` (m,).
 
-    The signs are as in `Ends`, before the sense of compass bearings is applied.
+    The signs are as in `Ends`, before the sense of compass bearings is applied. `by` selects the groups, see `ends_of`.
     """
     name, sign = np.full((len(a), 2), "", dtype=object), np.zeros((len(a), 2))
     model = MODELS[kind]
@@ -451,7 +457,8 @@ def split(problem: Problem, block: Block, by: By, present: Array) -> tuple[Array
 
     The block has g groups of r rows; `present` (..., m) marks rows with a weight above zero. The results are the
     effects (..., g, r, q), the names (g, q) of the groups, and the stated standard deviations (..., g, q). Effects and
-    deviations are in the units of the rows, and ``effect @ effect'`` is the covariance of the present rows.
+    deviations are in the units of the rows, and ``effect @ effect'`` is the covariance of the present rows. `by`
+    selects the groups, see `ends_of`.
     """
     _g, r = block.row.shape
     if r == 1:
@@ -484,7 +491,8 @@ def _arrivals(
     """Return the noise of groups of rows (g, r) as errors of arrivals, plus errors of the rows if necessary.
 
     `row` are the row numbers, `covariance` (..., g, r, r) the noise, and `here` (..., g, r) marks present rows. The
-    results are as in `split`. Return None if the covariance does not have this form.
+    results are as in `split`. Return None if the covariance does not have this form. `by` selects the groups, see
+    `ends_of`.
     """
     ends = ends_of(problem, "station")
     kind = str(kinds_of(problem)[row[0, 0]])

@@ -191,7 +191,8 @@ def _precisions(linear: Linear, count: int, prior_precisions: Sequence[Array], s
     """Return the inverse covariances (q, q) of the rows and priors of each problem; absent rows are zero.
 
     `count` is the number of rows without priors, `prior_precisions` the precisions of the priors, and `size` the number
-    of problems. The result is dense for few rows and sparse for many rows.
+    of problems. The result is dense for few rows and sparse for many rows. `linear` are the linearised rows with their
+    whitening matrices.
     """
     parts = []
     for whitener in linear.noise:
@@ -220,6 +221,7 @@ def _roots(equations: Normal, A: Array, B: Array, epoch: Array) -> tuple[Array, 
 
     The products of the factors with their transposes sum to J (J'P J)^-1 J', the second only within each epoch. `A` (N,
     q, n) and `B` (N, q, l) are the derivatives by shared and local unknowns, and `epoch` (q,) is -1 for priors.
+    `equations` are the normal equations of the problems.
     """
     information, _, _ = marginal(equations)
     root, _ = linalg.root(information)
@@ -235,8 +237,8 @@ def _roots(equations: Normal, A: Array, B: Array, epoch: Array) -> tuple[Array, 
 def log_tail(statistic: Array, dof: Array) -> Array:
     """Return the logarithm of the tail probability of a chi-square, also for small probabilities.
 
-    Below the range of floating-point numbers, the leading term of the asymptotic series is used (Abramowitz, Stegun
-    1964, eq. 6.5.32). With `dof` of zero, the result is 0, a probability of one.
+    `statistic` is the chi-square, and `dof` its degrees of freedom. Below the range of floating-point numbers, the
+    leading term of the asymptotic series is used (Abramowitz, Stegun 1964, eq. 6.5.32). With `dof` of zero, the result is 0, a probability of one.
     """
     from scipy.special import gammaincc, gammaln
 
@@ -255,7 +257,10 @@ def significance(at: Influence, groups: Sequence[Group]) -> Array:
 
 
 def drops(at: Influence, rows: Sequence[Array]) -> tuple[Array, Array]:
-    """Return the first-order decrease of the cost without each of G sets of rows, and its degrees of freedom, (G,)."""
+    """Return the first-order decrease of the cost without each of G sets of rows, and its degrees of freedom, (G,).
+
+    `at` is the influence of all rows, and `rows` are the row numbers of each set.
+    """
     drop, dof = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
     # handle sets of one size together: thousands of small eigenvalue problems are one batch
     sizes = np.array([len(own) for own in rows])
@@ -371,7 +376,7 @@ def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) ->
 def _rows_of_suspect(work: Problem, origin: Sequence[Array], suspect: Suspect) -> Array:
     """Return a mask (m,) of the rows of a suspect; the problem may have arrival times instead of differences.
 
-    `origin` has the numbers of the original rows from which each row comes.
+    `origin` has the numbers of the original rows from which each row comes. `work` is the problem with m rows.
     """
     if suspect.group == "station":
         a, b = (np.concatenate([getattr(rows, end) for rows in work.rows]) for end in "ab")

@@ -141,7 +141,10 @@ def _noise(problem: Problem) -> float:
 
 
 def _mirror_advice(problem: Problem, x: Array) -> Iterator[Advice]:
-    """Yield advice if the stations are in a plane or on a line, or if the mirror image of a fix fits."""
+    """Yield advice if the stations are in a plane or on a line, or if the mirror image of a fix fits.
+
+    `x` (1, size) is the fix; NaN if there is no fix.
+    """
     shape = _shape(problem)
     if shape is None or shape.extent[-1] == 0.0:
         return

@@ -124,7 +124,10 @@ def groups_of(problem: Problem, present: Array, by: Sequence[GroupKind] = KINDS)
 
 
 def _offsets(problem: Problem, present: Array) -> Iterator[Group]:
-    """Yield a common offset for each kind of length without an emission time and without a bias."""
+    """Yield a common offset for each kind of length without an emission time and without a bias.
+
+    `present` (m,) marks the present rows; a kind needs more than one of them.
+    """
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         own, model = slice(start, start + rows.count), MODELS[rows.kind]
         # differences have no common offset, and rows with a bias already have an offset
@@ -185,7 +188,7 @@ def _sightings(columns: _Columns, present: Array) -> list[tuple[int, ...]]:
 def _row_name(problem: Problem, columns: _Columns, rows: tuple[int, ...]) -> str:
     """Return the description of the rows with the numbers `rows`: kinds, stations, target and epoch.
 
-    All rows are of the same stations.
+    All rows are of the same stations. `columns` are the columns of all rows of the problem.
     """
     first, names = rows[0], problem.stations.names
     kinds = " and ".join(dict.fromkeys(columns.kind[i] for i in rows))

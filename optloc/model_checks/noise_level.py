@@ -241,8 +241,8 @@ def _single_groups(packed: Elements, tests: Tested, cost: Array, dof: Array) -> 
     """Yield for each group its name, the most likely factor of sigma of its errors alone, and the likelihood with it.
 
     The likelihood is given as twice its negative logarithm. `packed` are the linearised fixes, and `tests` the tests
-    with the noise as stated. `cost` (N, 1 + k) comes from `_exclusion_path`. Instead of the factor, a fix may also
-    exclude measurements.
+    with the noise as stated. `cost` and `dof` (N, 1 + k) come from `_exclusion_path`; `dof` is not used. Instead of
+    the factor, a fix may also exclude measurements.
 
     A factor f adds (f^2 - 1) B B' to V, with the columns B of the group. Let l be the eigenvalues of T of `Tested` for
     these columns, and y the components of t along its eigenvectors. The cost decreases by the sum of

@@ -147,7 +147,7 @@ def _above_one_place(problem: Problem, there: Array, at: Array, part: Array, tan
     """Return the lowest cost (N,) of distant waves with several free factors, which all come from one position.
 
     The method is Gauss-Newton along the tangents (N, d, d - 1), whose length is one spread. A step is at most one
-    spread. The other arguments are as in `_above_any_place`.
+    spread. The other arguments are as in `_above_any_place`. The centre of the starts is `there` (N, size).
     """
     count, along = tangents.shape[-1], np.swapaxes(tangents, -1, -2)
     first = np.stack(np.meshgrid(*[_OFFSETS] * count), axis=-1).reshape(-1, 1, count)
@@ -216,7 +216,8 @@ def _rows(problem: Problem, x: Array, at: Array) -> tuple[Array, Array]:
     """Return whitened residuals (..., r) and derivatives (..., r, size) of all rows and priors at vectors (..., size).
 
     The noise of the rows includes station errors of span "noise", which are new at each epoch. Their effect is computed
-    at the vectors `at`. Column j of the derivatives belongs to unknown j of the vectors.
+    at the vectors `at`. Column j of the derivatives belongs to unknown j of the vectors. `x` (..., size) are the
+    vectors.
     """
     layout, (residual, folded) = problem.layout, differentiate(problem, x)
     n, length, total = layout.n_shared, layout.n_local, layout.size

@@ -159,7 +159,8 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
 def _distinct(explained: list[Explained]) -> tuple[Explained, ...]:
     """Return the explanations whose cost is almost the lowest, in ascending order of the cost.
 
-    Of explanations of the same station that fit equally well, only the simplest is returned.
+    Of explanations of the same station that fit equally well, only the simplest is returned. `explained` are the
+    explanations that pass all tests, in any order.
     """
     # for one row, an offset, a scale and a drift are equal, and also for rows of one position
     simple = sorted(explained, key=lambda one: (_is_time_scale(one), _ORDER.index(one.candidate.form), one.cost))
@@ -385,7 +386,7 @@ def _with_families(problem: Problem, found: tuple[Candidate, ...]) -> tuple[Prob
     """Return the problem with one additional bias per form, and the place of each candidate in these biases.
 
     A place is the name of the bias, its first entry and the entry after its last entry. All candidates of a form are
-    members of one bias: a bias with many members takes no more time than a bias with one.
+    members of one bias: a bias with many members takes no more time than a bias with one. `found` are the candidates.
     """
     more, places = [], [("", (0, 0))] * len(found)
     for form in dict.fromkeys(one.bias.form for one in found):

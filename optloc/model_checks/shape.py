@@ -190,7 +190,8 @@ class ShapeTest:
 def _axes(covariance: Array) -> Array:
     """Return displacements (N, k, d) of one standard deviation along all principal axes of covariances (N, d, d).
 
-    For equal variances, axes rotated by 45 degrees are added.
+    For equal variances, axes rotated by 45 degrees are added. `covariance` belongs to the positions, m^2; a covariance
+    that is not finite counts as zero.
     """
     known = np.isfinite(covariance).all((-1, -2), keepdims=True)
     values, vectors = np.linalg.eigh(np.where(known, covariance, 0.0))
@@ -214,7 +215,8 @@ _EXACT = 1e-14
 def _in_inverse_range(test: ShapeTest, centre: Array, covariance: Array) -> Array:
     """Return the largest departure (N,) along the principal axes of the inverse-range chart.
 
-    `centre` (N, d) is the origin of the chart, and `covariance` (N, d, d) belongs to the positions, m^2.
+    `centre` (N, d) is the origin of the chart, and `covariance` (N, d, d) belongs to the positions, m^2. `test` holds
+    the fixes and their problems.
     """
     position = test.x[:, test.part]
     chart = Chart(np.full(len(position), INVERSE_RANGE, dtype=np.int8), position, covariance, centre)

@@ -111,7 +111,8 @@ def _departures(
     """Return the departures (N, h) of near bounds from their tangent planes at three standard deviations, m.
 
     `spread` (N, d, d) are the covariances of the positions. `values` (N, h) and `normal` (N, h, d) are from `_planes`.
-    `near` (N, h) marks the bounds to compute; the other departures are zero.
+    `near` (N, h) marks the bounds to compute; the other departures are zero. `sides` are the h bounds, and `x` (N,
+    size) are the fixes.
     """
     departures, d = np.zeros(values.shape), spread.shape[-1]
     slot, _ = problem.layout.find("position")
@@ -139,7 +140,8 @@ def _departures(
 def _edges(problem: Problem, sides: tuple[Level, ...], x: Array, part: slice) -> tuple[Array, Array]:
     """Return unit vectors (N, h, d) along the edges of polygons, and their ends (N, h, 2), m from the fix.
 
-    For a bound that is no edge of a polygon, the vector is zero and the ends are infinite.
+    For a bound that is no edge of a polygon, the vector is zero and the ends are infinite. `sides` are the h bounds,
+    `x` (N, size) are the fixes, and `part` is the slice of the position.
     """
     n, d = len(x), part.stop - part.start
     along, span = np.zeros((n, len(sides), d)), np.tile([-np.inf, np.inf], (n, len(sides), 1))

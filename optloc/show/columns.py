@@ -83,7 +83,8 @@ def covariance_columns(covariance: Array, axes: str) -> Columns:
 def geodetic_columns(frame: Frame, position: Array, covariance: Array) -> Columns:
     """Return latitude and longitude (degrees), height (m) and the covariance along east, north, up (m^2) as columns.
 
-    If the frame is not on Earth, the result is empty. Positions are (n, d), m; covariances are (n, d, d), m^2.
+    If the frame is not on Earth, the result is empty. Positions are (n, d), m; covariances are (n, d, d), m^2. A
+    `position` that is NaN gives NaN in all columns.
     """
     if not frame.geodetic:
         return {}
@@ -256,7 +257,7 @@ def _hide_undetermined_levels(local: Columns, limit: Array, before: Sequence[str
     """Return geodetic columns with NaN for undetermined axes (east, north, up), and the undetermined names of each row.
 
     An axis is undetermined if its standard deviation exceeds `limit` (n,), m. `before` holds the names (n texts) that
-    other columns already gave.
+    other columns already gave. `local` are the columns of `geodetic_columns`.
     """
     axes = [axis for axis in _LEVEL if f"cov_{axis}{axis}" in local]
     with np.errstate(invalid="ignore"):

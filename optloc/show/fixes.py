@@ -65,7 +65,8 @@ NOT_DETERMINED = "not determined"
 def with_sigma(value: float, sigma: float, unit: str) -> str:
     """Return a number with its standard deviation, both rounded to two digits of the standard deviation.
 
-    If a constraint fixes the number, "(held)" replaces the standard deviation.
+    If a constraint fixes the number, "(held)" replaces the standard deviation. `value` and `sigma` are in the unit
+    `unit`. An infinite or NaN `sigma` is omitted.
     """
     unit = unit if unit != "1" else ""
     if sigma <= _HELD * (1.0 + abs(value)):
@@ -156,7 +157,7 @@ def _state(columns: Columns, i: int, whose: str) -> list[tuple[str, str]]:
     """Return labels and texts of the state in row `i`: position, velocity, acceleration and accuracy.
 
     `whose` is added to each label, to name target and epoch. A row without a position has no lines. The ellipse is
-    omitted if the distribution is not Gaussian in metres.
+    omitted if the distribution is not Gaussian in metres. `columns` is the table of the fix.
     """
     if not np.isfinite(columns["x"][i]):
         return []
@@ -334,7 +335,10 @@ def alternative_sheet(fix: Fix) -> FixSheet | None:
 
 
 def count_sheet(columns: Columns, title: str) -> FixSheet:
-    """Return a sheet of a batch: for each status the number of fixes, their sigmas and their p-value."""
+    """Return a sheet of a batch: for each status the number of fixes, their sigmas and their p-value.
+
+    `columns` is the table of the batch, and `title` is the first part of the title of the sheet.
+    """
     # One number for the accuracy of a position: the root of the trace of its covariance.
     sigma = np.sqrt(sum(columns[f"sigma_{axis}"] ** 2 for axis in "xyz" if axis in columns))
     rows = []

@@ -72,7 +72,10 @@ def _centre_text(found: Determined) -> str:
 
 
 def _direction_text(found: Determined, direction: Direction) -> str:
-    """Return the text of a direction with its cone, degrees."""
+    """Return the text of a direction with its cone, degrees.
+
+    `found` are the quantities of the fix; they state whether azimuths convert to bearings from north.
+    """
     if found.north:
         middle, low, high = bearing_of(direction.azimuth)
         text = f"bearing {_angle_text(middle, low, high)}"
@@ -86,7 +89,8 @@ def _direction_text(found: Determined, direction: Direction) -> str:
 def _angle_text(middle: float, low: float, high: float) -> str:
     """Return the text of an angle with its interval, degrees.
 
-    The width of the interval sets the number of digits: one digit more than the width needs.
+    The width of the interval sets the number of digits: one digit more than the width needs. `middle` is the angle, and
+    `low` and `high` are the ends of the interval. If the interval is a full turn, the angle is not determined.
     """
     width = high - low
     if width >= 360.0:

@@ -234,6 +234,8 @@ def live_page(problem: Problem, title: str) -> str:
 def map_page(found: BoundMap, title: str) -> str:
     """Return an HTML page with the interactive map of a bound; the page needs no network.
 
+    `found` is the bound over a grid, and `title` the title of the page.
+
     Raises
     ------
     InvalidProblem
@@ -321,6 +323,7 @@ def _focus(marks: Spots, plane: Plane, middle: float) -> list[float] | None:
 
     The width is three times the size of its ellipse. `middle` is the longitude of the middle of the map, degrees. The
     result is None if the width is at least half the width of the map, or if there are several marks or no ellipse.
+    `plane` is the projection of the map.
     """
     rings = [ring for ring in marks.rings if len(ring)]
     if len(marks.place) != 1 or not rings:
@@ -363,7 +366,7 @@ def _ellipses(marks: Spots, plane: Plane, middle: float) -> list[Drawn]:
 
     All valid ellipses and outlines are one curve, and all other ellipses another curve. `middle` is the longitude of
     the middle of the map, degrees. Ellipses that are not valid have another class, so that the style sheet draws them
-    dotted.
+    dotted. `plane` is the projection of the map.
     """
     if len(marks.rings) > _ELLIPSES:
         return []
@@ -384,7 +387,7 @@ def _ellipses(marks: Spots, plane: Plane, middle: float) -> list[Drawn]:
 def _dots(marks: Spots, plane: Plane, middle: float, size: float) -> list[Drawn]:
     """Return marks as dots of `size` pixels: blue if the status is `ok`, else orange; none for a missing position.
 
-    `middle` is the longitude of the middle of the map, degrees.
+    `middle` is the longitude of the middle of the map, degrees. `plane` is the projection of the map.
     """
     return [
         dot(x, y, BLUE if ok else ORANGE, size, text)
@@ -438,7 +441,10 @@ def _metres(level: float) -> str:
 
 
 def _image(found: BoundMap, plane: Plane) -> Image:
-    """Return the bound as a picture for the map: one pixel for each grid point, transparent where there is no bound."""
+    """Return the bound as a picture for the map: one pixel for each grid point, transparent where there is no bound.
+
+    `found` is the bound over a grid, and `plane` is the projection of the map.
+    """
     from matplotlib import colormaps
     from matplotlib.colors import LogNorm
     from matplotlib.image import imsave
@@ -460,7 +466,10 @@ def _image(found: BoundMap, plane: Plane) -> Image:
 
 
 def _lines(found: BoundMap, plane: Plane) -> list[Drawn]:
-    """Return the isolines of the bound as curves, with one label for each level."""
+    """Return the isolines of the bound as curves, with one label for each level.
+
+    `found` is the bound over a grid, and `plane` is the projection of the map.
+    """
     parts: list[Drawn] = []
     for level, lines in isolines(found):
         drawn = [plane(line) for line in lines]
@@ -482,7 +491,7 @@ def _map_stations(found: BoundMap, plane: Plane) -> list[Drawn]:
 def _trials(plane: Plane, places: Array, off: Array) -> list[Drawn]:
     """Return at most `_DOTS` trials as dots at longitude and latitude `places` (n, 2), degrees.
 
-    Trials with a wrong result, marked by `off` (n,), are orange and larger.
+    Trials with a wrong result, marked by `off` (n,), are orange and larger. `plane` is the projection of the map.
     """
     kept = np.unique(np.linspace(0, len(places) - 1, min(_DOTS, len(places))).astype(int))
     order = kept[np.argsort(off[kept], kind="stable")]  # Draw wrong trials last, on top.
@@ -496,7 +505,7 @@ def _data(found: BoundMap) -> dict[str, Any]:
     """Return the values from which the script of the page reads the bound at the pointer.
 
     `x` and `y` are first and last grid line, degrees, and their number. `values` are the bounds in m, row by row from
-    the south; None where there is no bound.
+    the south; None where there is no bound. `found` is the bound over the grid.
     """
     return {
         "x": [float(found.x[0]), float(found.x[-1]), len(found.x)],

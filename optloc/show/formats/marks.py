@@ -362,7 +362,10 @@ def _region(frame: Frame, centre: Array, region: Outline) -> dict[str, Any]:
 
 
 def _ellipse(frame: Frame, centre: Array, level: Array) -> dict[str, Any]:
-    """Return the horizontal 95 % ellipse of a level covariance (2, 2), m^2, as a counter-clockwise GeoJSON geometry."""
+    """Return the horizontal 95 % ellipse of a level covariance (2, 2), m^2, as a counter-clockwise GeoJSON geometry.
+
+    The ellipse is centred at the position `centre` (d,), m, in the frame `frame`.
+    """
     from optloc.show.pictures.outlines import earth_line, polygon_geometry
 
     semi_axes, directions = error_ellipse(level)

@@ -99,7 +99,7 @@ def kml(results: Results) -> str:
 def _kml_mark(document: Element, mark: Mark, area: Area | None) -> None:
     """Add a mark to a KML document: its position, its 95 % region and its alternatives.
 
-    A mark without a position is a placemark without a geometry.
+    A mark without a position is a placemark without a geometry. `area` is the region; None if it is not known.
     """
     if not mark.known:
         _placemark(document, mark.name, mark.words, "doubtful", mark)
@@ -300,7 +300,8 @@ def _event(
     """Return one event of Cursor on Target as XML text on one line.
 
     `place` (3,) is longitude, latitude (degrees) and height (m). `errors` are `ce` and `le`, m. `atom` is the type of
-    the event, and `about` a remark. With `moves`, course and speed of the mark are added.
+    the event, and `about` a remark. With `moves`, course and speed of the mark are added. `name` is the name of the
+    object, and a part of the id of the event.
     """
     now = datetime.now(UTC)
     start = mark.date or now

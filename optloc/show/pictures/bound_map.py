@@ -93,7 +93,8 @@ def plot_status_map(found: StatusMap, title: str = "") -> Figure:
 def _draw(grid: Grid, values: Array, steps: list[float], norm: Normalize, name: str, title: str) -> Figure:
     """Return a map of values (ny, nx) with isolines at the values `steps`.
 
-    `norm` converts values to colours, and `name` is the label of the colour scale.
+    `norm` converts values to colours, and `name` is the label of the colour scale. `grid` holds the grid points, m or
+    degrees, and the stations.
     """
     scale = 1.0 if grid.geodetic or max(np.ptp(grid.x), np.ptp(grid.y)) < _FAR else 1e-3
     x, y = grid.x * scale, grid.y * scale

@@ -445,7 +445,7 @@ def _chosen_rows(rates: Sequence[Rows], target: int) -> list[tuple[Rows, int]]:
 def _rate(problem: Problem, rows: Rows, row: int, places: Array, velocity: Array) -> Array:
     """Return the modelled value (n,) of a row, m/s, for a target at positions (n, d), m, with `velocity` (d,), m/s.
 
-    `row` is the number of the row in `rows`.
+    `row` is the number of the row in `rows`. `places` are the positions.
     """
 
     def at(array: Array | None, index: int) -> tuple[float, ...]:

@@ -135,7 +135,8 @@ def _rows_of_panels(counts: Sequence[int], width: float, line: float) -> tuple[F
 def _panel(panel: Axes, kind: str, sets: Sets) -> None:
     """Draw the residuals of one kind, one line for each station or pair.
 
-    Few residuals are single points. Many residuals are a box of the middle half with a line of 95 %.
+    Few residuals are single points. Many residuals are a box of the middle half with a line of 95 %. `sets` are the
+    residuals by the names of the stations or pairs.
     """
     unit = SI_UNIT[MODELS[kind].quantity]  # type: ignore[index]  # the table holds known quantities only
     # Use milliradians: residuals in radians have too many zeros.

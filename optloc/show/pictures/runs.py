@@ -142,7 +142,8 @@ def _course_panel(panel: Axes, course: Course, known: Course | None, slot: Slot)
     """Draw the bound of one family of unknowns against time.
 
     A state of a target has a curve for each axis and for all axes together. A large family of biases has one curve, the
-    root mean square. `known` is the bound with known biases, or None.
+    root mean square. `known` is the bound with known biases, or None. `course` is the bound of all unknowns, and `slot`
+    is the place of the family in the vector of unknowns.
     """
     word, unit = _WORDS.get(slot.name.partition("[")[0], (slot.name, slot.unit))
     sigma, entries = course.sigma(slot.name), slot.entries
@@ -209,7 +210,8 @@ def plot_biases(
 def _bias_panel(panel: Axes, found: GrowingRun, slot: Slot, truth: Array | None) -> None:
     """Draw the estimates of one family against time with their 95 % intervals.
 
-    If `truth` is given, the true values are drawn as dotted lines.
+    If `truth` is given, the true values are drawn as dotted lines. `found` are the estimates, and `slot` is the place
+    of the family in the vector of unknowns.
     """
     values, sigma = found.take(slot.name)
     for i, entry in enumerate(slot.entries[:_MOST]):
