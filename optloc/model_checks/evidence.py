@@ -238,7 +238,8 @@ def log_tail(statistic: Array, dof: Array) -> Array:
     """Return the logarithm of the tail probability of a chi-square, also for small probabilities.
 
     `statistic` is the chi-square, and `dof` its degrees of freedom. Below the range of floating-point numbers, the
-    leading term of the asymptotic series is used (Abramowitz, Stegun 1964, eq. 6.5.32). With `dof` of zero, the result is 0, a probability of one.
+    leading term of the asymptotic series is used (Abramowitz, Stegun 1964, eq. 6.5.32). With `dof` of zero, the result
+    is 0, a probability of one.
     """
     from scipy.special import gammaincc, gammaln
 

@@ -129,8 +129,8 @@ def _above_any_place(problem: Problem, there: Array, at: Array, part: Array, tan
     """Return the lowest cost (N,) of distant waves with one free factor; a position is a tilt of the wave front.
 
     `there` (N, size) are vectors with distant positions. `at` (N, size) are the fixes, at which the noise of station
-    errors is computed. `part` (d,) are the columns of the position, `tangents` (N, d, d - 1) span the plane of the
-    stations, and `j` is the column of the factor.
+    errors is computed. `part` (d,) are the columns of the position, and `j` is the column of the factor. `tangents`
+    (N, d, d - 1) span the plane of the stations.
     """
     residual, design = _rows(problem, there, at)
     # the factor multiplies only these rows; only they receive a tilt

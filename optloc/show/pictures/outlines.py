@@ -182,8 +182,8 @@ def _parts_between_crossings(line: Array) -> list[Array]:
     parts, part = [], [line[0]]
     for one, two in pairwise(line):
         if abs(two[0] - one[0]) > 180.0:  # The shorter way between the points crosses the antimeridian.
-            # `side` is the longitude of the side of the map on which the line leaves, and `before` and `after` are the
-            # differences in longitude from its neighbours to the crossing.
+            # The line leaves the map at the longitude `side`. `before` and `after` are the differences in longitude
+            # between the crossing and its two neighbours.
             side = float(np.copysign(180.0, one[0]))
             before, after = side - one[0], two[0] + side
             middle = one + before / (before + after) * (two - one)

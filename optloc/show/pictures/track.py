@@ -121,7 +121,7 @@ def plot_tracks(drawn: Sequence[PlottedTrack], title: str = "") -> Figure:
 def _along_picture_axes(drawn: Sequence[PlottedTrack]) -> tuple[list[_Line], Array, tuple[str, ...]]:
     """Return tracks and stations (s, d) of the first scan along the axes of the picture, and the names of the axes.
 
-    `drawn` are at least one track; the first one gives the stations and the frame.
+    `drawn` are at least one track; the first track gives the stations and the frame.
     """
     first = drawn[0].problem
     d = first.dimension
